@@ -1,0 +1,102 @@
+"""The order of the rooms: who may import whom."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "torchsfm"
+
+# room -> the rooms it may import from, lower ones only; `_types` is open to all.
+ALLOWED: dict[str, set[str]] = {
+    "_types": set(),
+    "linalg": set(),
+    "optim": {"linalg"},
+    "robust": {"linalg", "optim"},
+    "images": set(),
+    "geometry": {"linalg"},
+    "tensors": {"linalg", "geometry"},
+    "simulation": {"linalg", "geometry", "tensors", "images"},
+    "triangulation": {"linalg", "optim", "robust", "geometry", "tensors"},
+    "resection": {"linalg", "optim", "robust", "geometry", "tensors"},
+    "bundle": {"linalg", "optim", "geometry"},
+    "motion": {"linalg", "optim", "robust", "geometry", "tensors", "triangulation"},
+    "autocalibration": {"linalg", "optim", "robust", "geometry", "tensors"},
+    "reconstruction": {
+        "linalg", "optim", "robust", "geometry", "tensors", "images",
+        "triangulation", "resection", "motion", "autocalibration", "bundle",
+    },
+    "formats": {"geometry", "reconstruction"},
+    "plot": {"geometry", "tensors", "reconstruction"},
+}  # fmt: skip
+FREE = {"__init__", "cli", "__main__"}
+LAZY = {"kornia", "cv2", "matplotlib", "plotly", "pycolmap"}
+"""Slow or optional packages, imported inside the functions that use them, and only in the rooms named below."""
+OWNERS = {
+    "kornia": {"images"},
+    "cv2": {"images"},
+    "matplotlib": {"plot"},
+    "plotly": {"plot"},
+    "pycolmap": {"formats"},
+}
+
+
+def room_of(path: Path) -> str:
+    relative = path.relative_to(PACKAGE)
+    return relative.parts[0].removesuffix(".py")
+
+
+def imported_modules(tree: ast.AST) -> list[str]:
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute here"
+            names.append(node.module or "")
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return names
+
+
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_go_down(path: Path) -> None:
+    room = room_of(path)
+    tree = ast.parse(path.read_text())
+    used = {name.split(".")[1] for name in imported_modules(tree) if name.startswith("torchsfm.")} - {room, "_types"}
+    assert not {name for name in imported_modules(tree) if name == "torchsfm"}, (
+        "import from rooms, not from the package"
+    )
+    if room in FREE:
+        return
+    assert room in ALLOWED, f"{room} is not in the table of rooms"
+    assert used <= ALLOWED[room], f"{room} may not import {sorted(used - ALLOWED[room])}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_slow_packages_stay_in_their_rooms(path: Path) -> None:
+    tree = ast.parse(path.read_text())
+    for package in {name.split(".")[0] for name in imported_modules(tree)} & LAZY:
+        assert room_of(path) in OWNERS[package], f"{package} belongs to {OWNERS[package]}"
+    top_level = ast.Module(body=[n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], type_ignores=[])
+    eager = {name.split(".")[0] for name in imported_modules(top_level)} & LAZY
+    assert not eager, f"import {sorted(eager)} inside the functions that use them"
+
+
+def test_the_table_has_no_cycle() -> None:
+    seen: set[str] = set()
+    rooms = dict(ALLOWED)
+    while rooms:
+        free = [room for room, below in rooms.items() if below <= seen]
+        assert free, f"cycle among {sorted(rooms)}"
+        seen.update(free)
+        for room in free:
+            del rooms[room]
+
+
+def test_every_room_has_a_tenant() -> None:
+    for room in PACKAGE.iterdir():
+        if room.is_dir() and room.name != "__pycache__":
+            assert len(list(room.glob("*.py"))) > 1, f"{room.name} is empty"
