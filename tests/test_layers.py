@@ -66,9 +66,7 @@ def test_imports_go_down(path: Path) -> None:
     room = room_of(path)
     tree = ast.parse(path.read_text())
     used = {name.split(".")[1] for name in imported_modules(tree) if name.startswith("torchsfm.")} - {room, "_types"}
-    assert not {name for name in imported_modules(tree) if name == "torchsfm"}, (
-        "import from rooms, not from the package"
-    )
+    assert not {name for name in imported_modules(tree) if name == "torchsfm"}, "import from rooms, not from the package"
     if room in FREE:
         return
     assert room in ALLOWED, f"{room} is not in the table of rooms"

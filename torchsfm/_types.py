@@ -49,9 +49,7 @@ def tensor_map(function: Callable[[Tensor], Tensor], tree: T) -> T:
     if isinstance(value, Tensor):
         value = function(value)
     elif is_dataclass(value) and not isinstance(value, type):
-        value = replace(
-            value, **{f.name: tensor_map(function, getattr(value, f.name)) for f in fields(value) if f.init}
-        )
+        value = replace(value, **{f.name: tensor_map(function, getattr(value, f.name)) for f in fields(value) if f.init})
     elif isinstance(value, tuple):
         items = [tensor_map(function, item) for item in value]
         value = type(value)(*items) if hasattr(value, "_fields") else tuple(items)
@@ -87,9 +85,7 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
             continue
         shape_spec, _, kind = (part.strip() for part in spec.partition(":"))
         if not isinstance(tensor, Tensor):
-            raise ValueError(
-                f"{name}: wanted a torch.Tensor of shape (*batch, {shape_spec}), got {type(tensor).__name__}"
-            )
+            raise ValueError(f"{name}: wanted a torch.Tensor of shape (*batch, {shape_spec}), got {type(tensor).__name__}")
         _check_kind(name, tensor, kind)
         if kind == "":
             if floating is not None and tensor.dtype != floating[1].dtype:
@@ -117,7 +113,7 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
             sizes.setdefault(label, (size, name))
         batches[name] = tensor.shape[: tensor.ndim - len(tokens)]
     try:
-        return torch.Size(torch.broadcast_shapes(*batches.values()))
+        return torch.Size(torch.broadcast_shapes(*batches.values()))  # type: ignore[no-untyped-call]
     except RuntimeError:
         listing = ", ".join(f"{name} {tuple(shape)}" for name, shape in batches.items())
         raise ValueError(f"batch dimensions do not broadcast: {listing}") from None
