@@ -1,0 +1,165 @@
+"""Retractions: how a step in a tangent space moves a parameter block.
+
+A `Manifold` says how many numbers a block holds (`ambient`), how many it is free in (`tangent`), and how a tangent step moves it.
+`retract(x, 0) == x`; to first order a step is the derivative of the curve. Optimisers take their steps through it, so that a
+rotation stays a rotation and a direction keeps its length. All functions broadcast over leading dimensions.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@runtime_checkable
+class Manifold(Protocol):
+    """What an optimiser needs to know of a parameter block."""
+
+    @property
+    def ambient(self) -> int:
+        """Numbers stored."""
+
+    @property
+    def tangent(self) -> int:
+        """Degrees of freedom."""
+
+    def retract(self, x: Tensor, delta: Tensor) -> Tensor:
+        """The block `x (*b, ambient)` moved by the step `delta (*b, tangent)`."""
+
+
+@dataclass(frozen=True)
+class Euclidean:
+    """Plain numbers: `x + delta`."""
+
+    size: int
+
+    @property
+    def ambient(self) -> int:
+        """Numbers stored."""
+        return self.size
+
+    @property
+    def tangent(self) -> int:
+        """Degrees of freedom."""
+        return self.size
+
+    def retract(self, x: Float[Tensor, "*#b n"], delta: Float[Tensor, "*#b n"]) -> Float[Tensor, "*b n"]:
+        """Addition."""
+        return x + delta
+
+
+@dataclass(frozen=True)
+class Subset:
+    """Some coordinates of a block free, the others held: `x[free] + delta`."""
+
+    size: int
+    free: tuple[int, ...]
+
+    @property
+    def ambient(self) -> int:
+        """Numbers stored."""
+        return self.size
+
+    @property
+    def tangent(self) -> int:
+        """Degrees of freedom."""
+        return len(self.free)
+
+    def retract(self, x: Float[Tensor, "*#b n"], delta: Float[Tensor, "*#b d"]) -> Float[Tensor, "*b n"]:
+        """Addition in the free coordinates."""
+        index = torch.tensor(self.free, dtype=torch.long, device=x.device)
+        shape = torch.broadcast_shapes(x.shape[:-1], delta.shape[:-1])  # type: ignore[no-untyped-call]
+        step = torch.zeros((*shape, self.size), dtype=x.dtype, device=x.device)
+        return x + step.index_add(-1, index, delta.expand(*shape, len(self.free)))
+
+
+@dataclass(frozen=True)
+class RigidMotion:
+    """`(R row by row, t)` in 12 numbers, moved from the left: `R <- exp(w) R`, `t <- exp(w) t + v`, `delta = (w, v)`."""
+
+    ambient: int = 12
+    tangent: int = 6
+
+    def retract(self, x: Float[Tensor, "*#b 12"], delta: Float[Tensor, "*#b 6"]) -> Float[Tensor, "*b 12"]:
+        """The motion after the step."""
+        step = rotation_exponential(delta[..., :3])
+        rotation = step @ x[..., :9].unflatten(-1, (3, 3))
+        translation = (step @ x[..., 9:, None])[..., 0] + delta[..., 3:]
+        return torch.cat((rotation.flatten(-2), translation), -1)
+
+
+@dataclass(frozen=True)
+class Rotation:
+    """A rotation matrix row by row in 9 numbers, moved from the left: `R <- exp(w) R`."""
+
+    ambient: int = 9
+    tangent: int = 3
+
+    def retract(self, x: Float[Tensor, "*#b 9"], delta: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 9"]:
+        """The rotation after the step."""
+        return (rotation_exponential(delta) @ x.unflatten(-1, (3, 3))).flatten(-2)
+
+
+@dataclass(frozen=True)
+class UnitSphere:
+    """Vectors of a fixed length (directions, homogeneous points): the length of `x` is kept whatever it is."""
+
+    size: int
+
+    @property
+    def ambient(self) -> int:
+        """Numbers stored."""
+        return self.size
+
+    @property
+    def tangent(self) -> int:
+        """Degrees of freedom."""
+        return self.size - 1
+
+    def retract(self, x: Float[Tensor, "*#b n"], delta: Float[Tensor, "*#b d"]) -> Float[Tensor, "*b n"]:
+        """The point of the sphere along the great circle of the step, in units of radians."""
+        length = torch.linalg.vector_norm(x, dim=-1, keepdim=True)
+        unit = x / length.clamp_min(torch.finfo(x.dtype).tiny)
+        # Householder reflection taking the last axis to -+unit; its other columns span the tangent space.
+        sign = torch.where(unit[..., -1:] < 0, -1.0, 1.0).to(x.dtype)
+        head, tail = unit[..., :-1], unit[..., -1:] + sign
+        inner = (head * delta).sum(-1, keepdim=True)
+        denominator = 1 + sign * unit[..., -1:]
+        tangent = torch.cat((delta - head * (inner / denominator), -sign * inner * torch.ones_like(tail)), -1)
+        square = (delta * delta).sum(-1, keepdim=True)
+        return length * (_cos_sqrt(square) * unit + _sinc_sqrt(square) * tangent)
+
+
+def rotation_exponential(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """The rotation `exp([w]x)`, smooth at zero (Rodrigues)."""
+    square = (w * w).sum(-1)[..., None, None]
+    a, b = _sinc_sqrt(square), _cosc_sqrt(square)
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=w.dtype, device=w.device)
+    return eye + a * cross + b * (w[..., :, None] * w[..., None, :] - square * eye)
+
+
+def _sinc_sqrt(s: Tensor) -> Tensor:
+    """`sin(sqrt s) / sqrt s`."""
+    small = s < 1e-6
+    root = torch.where(small, torch.ones_like(s), s).sqrt()
+    return torch.where(small, 1 - s / 6 * (1 - s / 20), root.sin() / root)
+
+
+def _cosc_sqrt(s: Tensor) -> Tensor:
+    """`(1 - cos(sqrt s)) / s`."""
+    small = s < 1e-6
+    root = torch.where(small, torch.ones_like(s), s).sqrt()
+    half = (root / 2).sin() / root
+    return torch.where(small, 0.5 - s / 24 * (1 - s / 30), 2 * half * half)
+
+
+def _cos_sqrt(s: Tensor) -> Tensor:
+    """`cos(sqrt s)`."""
+    small = s < 1e-6
+    root = torch.where(small, torch.ones_like(s), s).sqrt()
+    return torch.where(small, 1 - s / 2 * (1 - s / 12), root.cos())
