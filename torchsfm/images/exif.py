@@ -1,0 +1,175 @@
+"""What a camera wrote beside the pixels: orientation, maker, model and the numbers that give a focal length.
+
+The few tags needed are read straight from the bytes (TIFF 6.0; Exif 2.32, JEITA CP-3451; CIPA DC-008), in JPEG, PNG, TIFF and
+WebP files. Metadata is often damaged, so nothing here raises: what cannot be read is absent.
+"""
+
+import math
+import struct
+from dataclasses import dataclass
+
+_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8}
+_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i"}
+_WANTED = {
+    0x010F: "make",
+    0x0110: "model",
+    0x0112: "orientation",
+    0x8769: "exif_offset",
+    0x920A: "focal_mm",
+    0xA405: "focal_35mm",
+    0xA002: "width",
+    0xA003: "height",
+    0xA20E: "plane_x_resolution",
+    0xA20F: "plane_y_resolution",
+    0xA210: "plane_unit",
+}
+_MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_FILM_DIAGONAL = math.hypot(36.0, 24.0)
+
+
+@dataclass(frozen=True)
+class Exif:
+    """The tags of one photograph; `None` and the empty string stand for absent or senseless values."""
+
+    orientation: int = 1
+    """1 to 8: how the stored pixels are to be turned, as Exif numbers it."""
+    make: str = ""
+    model: str = ""
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    """The focal length that gives the same diagonal angle of view on 36 mm x 24 mm film."""
+    width: int | None = None
+    height: int | None = None
+    """The size the camera wrote, before a program scaled or cropped the image."""
+    plane_x_resolution: float | None = None
+    plane_y_resolution: float | None = None
+    """Pixels per millimetre on the sensor, for the size the camera wrote."""
+
+    def focal(self, width: int, height: int) -> float | None:
+        """The focal length in pixels of an image of the given stored size, or None where the tags do not tell.
+
+        The 35 mm equivalent is taken by the diagonal, as CIPA DCG-001 defines it. A size written by the camera that has another
+        aspect than the image means a crop of unknown scale: no focal length is given then.
+        """
+        long_side, short_side = max(width, height), min(width, height)
+        camera_long = long_side
+        if self.width and self.height:
+            camera_long = max(self.width, self.height)
+            camera_short = min(self.width, self.height)
+            if abs(camera_long * short_side - camera_short * long_side) > 0.02 * camera_long * long_side:
+                return None
+        focal = None
+        if self.focal_35mm:
+            focal = self.focal_35mm / _FILM_DIAGONAL * math.hypot(width, height)
+        elif self.focal_mm and self.plane_x_resolution:
+            focal = self.focal_mm * self.plane_x_resolution * long_side / camera_long
+        # Outside these bounds (about 4 to 165 degrees of view) the tags are wrong more often than the lens is special.
+        return focal if focal is not None and 0.13 < focal / long_side < 15 else None
+
+
+def parse_exif(data: bytes) -> Exif:
+    """The Exif tags in the bytes of an image file (JPEG, PNG, TIFF, WebP); an empty `Exif` where there are none."""
+    block = _find_block(data)
+    tags = _read_tags(block) if block is not None else {}
+
+    def number(name: str) -> float | None:
+        value = tags.get(name)
+        return float(value) if isinstance(value, int | float) and math.isfinite(value) and value > 0 else None
+
+    def integer(name: str) -> int | None:
+        value = number(name)
+        return None if value is None else int(value)
+
+    def text(name: str) -> str:
+        value = tags.get(name)
+        return value if isinstance(value, str) else ""
+
+    orientation = integer("orientation") or 1
+    per_unit = _MILLIMETRES.get(integer("plane_unit") or 2)
+    x_resolution, y_resolution = number("plane_x_resolution"), number("plane_y_resolution")
+    return Exif(
+        orientation=orientation if 1 <= orientation <= 8 else 1,
+        make=text("make"),
+        model=text("model"),
+        focal_mm=number("focal_mm"),
+        focal_35mm=number("focal_35mm"),
+        width=integer("width"),
+        height=integer("height"),
+        plane_x_resolution=x_resolution / per_unit if x_resolution and per_unit else None,
+        plane_y_resolution=y_resolution / per_unit if y_resolution and per_unit else None,
+    )
+
+
+def _find_block(data: bytes) -> bytes | None:
+    """The TIFF structure that holds the tags."""
+    if data[:2] == b"\xff\xd8":
+        return _find_in_jpeg(data)
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return _find_in_chunks(data, 8, b"eXIf", ">", length_first=True)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        block = _find_in_chunks(data, 12, b"EXIF", "<", length_first=False)
+        return block[6:] if block is not None and block[:6] == b"Exif\0\0" else block
+    return data if data[:4] in (b"II*\0", b"MM\0*") else None
+
+
+def _find_in_jpeg(data: bytes) -> bytes | None:
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if marker == 0xFF:  # fill byte
+            position += 1
+            continue
+        if marker in (0xD9, 0xDA):
+            return None
+        length = int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == 0xE1 and data[position + 4 : position + 10] == b"Exif\0\0":
+            return data[position + 10 : position + 2 + length]
+        position += 2 + length
+    return None
+
+
+def _find_in_chunks(data: bytes, position: int, wanted: bytes, order: str, *, length_first: bool) -> bytes | None:
+    while position + 8 <= len(data):
+        first, second = data[position : position + 4], data[position + 4 : position + 8]
+        name, size = (second, first) if length_first else (first, second)
+        (length,) = struct.unpack(order + "I", size)
+        if name == wanted:
+            return data[position + 8 : position + 8 + length]
+        position += 8 + length + (4 if length_first else length % 2)  # PNG: a checksum follows; RIFF: chunks are padded to even
+    return None
+
+
+def _read_tags(block: bytes) -> dict[str, str | int | float]:
+    order = {b"II": "<", b"MM": ">"}.get(block[:2])
+    tags: dict[str, str | int | float] = {}
+    if order is None or len(block) < 8:
+        return tags
+    (offset,) = struct.unpack_from(order + "I", block, 4)
+    _read_directory(block, order, offset, tags)
+    second = tags.get("exif_offset")
+    if isinstance(second, int):
+        _read_directory(block, order, second, tags)
+    return tags
+
+
+def _read_directory(block: bytes, order: str, offset: int, tags: dict[str, str | int | float]) -> None:
+    if offset < 8 or offset + 2 > len(block):
+        return
+    (count,) = struct.unpack_from(order + "H", block, offset)
+    for start in range(offset + 2, min(offset + 2 + 12 * count, len(block) - 11), 12):
+        tag, kind, number = struct.unpack_from(order + "HHI", block, start)
+        if tag not in _WANTED or kind not in _SIZES or number == 0:
+            continue
+        size = _SIZES[kind] * number
+        place = start + 8 if size <= 4 else struct.unpack_from(order + "I", block, start + 8)[0]
+        if place + size > len(block):
+            continue
+        if kind == 2:
+            raw = block[place : place + size].split(b"\0")[0]
+            tags[_WANTED[tag]] = "".join(c for c in raw.decode("utf-8", "replace") if c.isprintable()).strip()
+        elif kind in (5, 10):
+            above, below = struct.unpack_from(order + ("2I" if kind == 5 else "2i"), block, place)
+            if below:
+                tags[_WANTED[tag]] = above / below
+        elif kind in _INTEGERS:
+            tags[_WANTED[tag]] = struct.unpack_from(order + _INTEGERS[kind], block, place)[0]

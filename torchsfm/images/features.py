@@ -1,0 +1,97 @@
+"""Distinctive points with descriptors (SIFT), for matching photographs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from torchsfm.images.reading import Photograph
+
+
+@dataclass(frozen=True)
+class Features:
+    """Points of one image, each with a description of what is around it."""
+
+    x: Float[Tensor, "n 2"]
+    """Pixel positions; the centre of the top-left pixel is (0, 0)."""
+    scale: Float[Tensor, " n"]
+    """The standard deviation in pixels of the Gaussian at which the point stands out."""
+    angle: Float[Tensor, " n"]
+    """Orientation in radians from the x axis towards the y axis (clockwise on the screen), in [0, 2 pi)."""
+    response: Float[Tensor, " n"]
+    """Contrast of the point; larger is more distinct."""
+    descriptors: Shaped[Tensor, "n d"]
+    """RootSIFT times 512 as uint8 (d = 128), or unit vectors in floating point from another detector."""
+
+    def __len__(self) -> int:
+        return int(self.x.shape[0])
+
+
+def detect_features(
+    image: Photograph | Float[Tensor, "c h w"],
+    max_features: int = 8192,
+    *,
+    contrast: float = 0.02,
+    edge: float = 10.0,
+    max_size: int = 3200,
+) -> Features:
+    """SIFT points with RootSIFT descriptors (Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012).
+
+    Args:
+        image: A photograph, or pixels in [0, 1], grey or red, green, blue.
+        max_features: How many points are kept; those of the largest scale are, which are the most repeatable.
+        contrast: Smallest contrast, in the units of OpenCV's `contrastThreshold`.
+        edge: Points whose principal curvatures have a larger ratio than this lie on an edge and are dropped.
+        max_size: Larger images are scaled down to this longer side for the detection; positions are those of the image given.
+
+    Returns:
+        The points in descending order of scale, the same for the same image.
+
+    Raises:
+        ValueError: The shape of the image is wrong.
+    """
+    import cv2
+
+    pixels = image.pixels if isinstance(image, Photograph) else image
+    gray = _gray_bytes(pixels)
+    height, width = gray.shape
+    scale = min(1.0, max_size / max(height, width))
+    if scale < 1:
+        gray = cv2.resize(gray, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA)
+    # Without the precise option OpenCV's first octave, and so every point, is shifted by a quarter of a pixel.
+    sift = cv2.SIFT.create(0, 3, contrast, edge, 1.6, enable_precise_upscale=True)
+    keypoints = sift.detect(gray, None)
+    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
+    order = np.lexsort((table[:, 3], table[:, 0], table[:, 1], -table[:, 2]))[:max_features]
+    table = table[order]
+    if len(order):
+        keypoints, raw = sift.compute(gray, [keypoints[i] for i in order])
+    else:
+        raw = np.zeros((0, 128), np.float32)
+    zoom = np.array([width / gray.shape[1], height / gray.shape[0]])
+    x = (table[:, :2] + 0.5) * zoom - 0.5
+    return Features(
+        x=torch.from_numpy(x).float(),
+        scale=torch.from_numpy(table[:, 2] / 2 * zoom.mean()).float(),
+        angle=torch.from_numpy(np.deg2rad(table[:, 3])).float(),
+        response=torch.from_numpy(table[:, 4]).float(),
+        descriptors=_root_sift(torch.from_numpy(raw)),
+    )
+
+
+def _gray_bytes(pixels: Tensor) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+    if pixels.ndim != 3 or pixels.shape[0] not in (1, 3) or 0 in pixels.shape:
+        raise ValueError(f"image: wanted shape (1, h, w) or (3, h, w), got {tuple(pixels.shape)}")
+    pixels = pixels.detach().to("cpu", torch.float32)
+    gray = pixels[0]
+    if pixels.shape[0] == 3:  # the luma of ITU-R BT.601, as JPEG has it
+        gray = gray * 0.299 + pixels[1] * 0.587 + pixels[2] * 0.114
+    return gray.nan_to_num().clamp(0, 1).mul(255).round_().to(torch.uint8).numpy()
+
+
+def _root_sift(raw: Tensor) -> Tensor:
+    raw = raw.float()
+    root = (raw / raw.sum(-1, keepdim=True).clamp_min(1e-12)).sqrt()
+    return (root * 512).round_().clamp_(0, 255).to(torch.uint8)
