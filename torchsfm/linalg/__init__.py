@@ -1,0 +1,22 @@
+"""Numbers without geometry: null spaces, roots of polynomials, small systems, nearest matrices."""
+
+from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3, solve
+from torchsfm.linalg.nullspace import null_vector, orthonormal_nullspace
+from torchsfm.linalg.polynomial import companion_roots, evaluate, solve_cubic, solve_quadratic
+from torchsfm.linalg.projections import nearest_psd, nearest_rank, nearest_rotation
+
+__all__ = [
+    "adjugate_3x3",
+    "companion_roots",
+    "cross",
+    "determinant_3x3",
+    "evaluate",
+    "nearest_psd",
+    "nearest_rank",
+    "nearest_rotation",
+    "null_vector",
+    "orthonormal_nullspace",
+    "solve",
+    "solve_cubic",
+    "solve_quadratic",
+]

@@ -1,0 +1,44 @@
+"""Null spaces and null vectors of batched matrices, with derivatives where they exist."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
+    """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose."""
+    m = A.shape[-2]
+    Q, _ = torch.linalg.qr(A.mT, mode="complete")
+    return Q[..., m:]
+
+
+def null_vector(
+    A: Float[Tensor, "*batch m n"],
+) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
+    """The unit vector v that makes `|A v|` smallest, and its derivative.
+
+    The eigenvector of A'A (formed and solved in float64) is corrected by one Newton step of `A'(A v) = s v` with the residual
+    taken from A itself, which restores the accuracy that squaring loses. That step is differentiable in A, and its derivative
+    is the derivative of v. Where the two smallest singular values coincide v is not unique: the value is one such vector, the
+    derivative leaves out the directions in which it is not determined.
+
+    Args:
+        A: Matrices with m >= n - 1 rows, any scale.
+
+    Returns:
+        Unit vectors, and the mask of elements with finite input; the others get the first basis vector.
+    """
+    finite = torch.isfinite(A).all(-1).all(-1)
+    safe = torch.where(finite[..., None, None], A, 0).double()
+    with torch.no_grad():
+        values, vectors = torch.linalg.eigh(safe.mT @ safe)
+        v, value = vectors[..., :1], values[..., :1]
+        gaps = values[..., 1:] - value
+        inverse = torch.where(gaps > 1e-14 * values[..., -1:], 1 / gaps, 0)[..., None]
+        others = vectors[..., 1:]
+    residual = safe.mT @ (safe @ v) - value[..., None] * v
+    corrected = (v - others @ (inverse * (others.mT @ residual)))[..., 0]
+    unit = corrected / corrected.norm(dim=-1, keepdim=True)
+    first = torch.zeros_like(unit)
+    first[..., 0] = 1
+    return torch.where(finite[..., None], unit, first).to(A.dtype), finite

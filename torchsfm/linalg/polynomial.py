@@ -1,0 +1,130 @@
+"""Real roots of batched polynomials in fixed slots.
+
+Coefficients stand lowest power first along the last dimension. Every function returns `(roots, real)`: as many slots as the
+degree, and a mask that says which of them are real roots; the other slots hold finite numbers without meaning.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+Roots = tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]
+
+
+def evaluate(c: Float[Tensor, "*#batch m"], x: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
+    """The values of polynomials at k points each, by Horner's rule."""
+    value = c[..., -1:].expand(torch.broadcast_shapes(c.shape[:-1], x.shape[:-1]) + x.shape[-1:])
+    for i in range(c.shape[-1] - 2, -1, -1):
+        value = value * x + c[..., i : i + 1]
+    return value
+
+
+def quadratic_rows(c0: Tensor, c1: Tensor, c2: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    """The roots of c0 + c1 x + c2 x^2 with the coefficients as separate tensors: ((x0, x1), (real0, real1))."""
+    discriminant = c1 * c1 - 4 * c0 * c2
+    q = -0.5 * (c1 + torch.copysign(discriminant.clamp_min(0).sqrt(), c1))
+    has = discriminant >= 0
+    ok0, ok1 = has & (c2 != 0), has & (q != 0)
+    x0 = torch.where(ok0, q / c2, 0)
+    x1 = torch.where(ok1, c0 / q, 0)
+    # With q = 0 the double root is 0 and stands in the first slot.
+    fine0, fine1 = torch.isfinite(x0), torch.isfinite(x1)
+    return (torch.where(fine0, x0, 0), torch.where(fine1, x1, 0)), (ok0 & fine0, ok1 & fine1)
+
+
+def cubic_rows(
+    c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor
+) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+    """The roots of c0 + c1 x + c2 x^2 + c3 x^3 with the coefficients as separate tensors.
+
+    The root farthest from the inflection point is well separated from the other two. It is found by Newton's method from a
+    closed-form start; deflation leaves a quadratic (after Kahan, 1986). No trigonometric function is needed.
+    """
+    a, b, c = c2 / c3, c1 / c3, c0 / c3
+    shift = a / -3
+    Q = shift * shift - b / 3
+
+    R = 0.5 * (((shift + a) * shift + b) * shift + c)
+    # Depressed: y^3 - 3 Q y + 2 R = 0 with x = y + shift.
+    size = R.abs()
+    root_q = Q.clamp_min(0).sqrt()
+    inner = size * size - Q * Q * Q
+    outer = (size + inner.clamp_min(0).sqrt()) ** (1 / 3)
+    ratio = (size / (root_q * root_q * root_q)).clamp_max(1)
+    three = root_q * (1.7320508 + ratio * (0.3208 - 0.0529 * ratio))
+    y = torch.where(inner > 0, outer + Q / outer, three)
+    for _ in range(2):
+        y = y - (y * (y * y - 3 * Q) - 2 * size) / (3 * (y * y - Q))
+    y = torch.copysign(torch.where(torch.isfinite(y), y, 0), -R)
+    rest = 3 * (4 * Q - y * y)
+    half = 0.5 * rest.clamp_min(0).sqrt()
+    other = rest >= 0
+    roots = (y + shift, shift - 0.5 * y - half, shift - 0.5 * y + half)
+    reals = []
+    polished = []
+    for x, ok in zip(roots, (torch.ones_like(other), other, other), strict=True):
+        value = ((x + a) * x + b) * x + c
+        slope = (3 * x + 2 * a) * x + b
+        new = x - value / slope
+        better = (((new + a) * new + b) * new + c).abs() < value.abs()
+        new = torch.where(better, new, x)
+        fine = torch.isfinite(new)
+        polished.append(torch.where(fine, new, 0))
+        reals.append(ok & fine & (c3 != 0))
+    return (polished[0], polished[1], polished[2]), (reals[0], reals[1], reals[2])
+
+
+def solve_quadratic(c: Float[Tensor, "*batch 3"]) -> Roots:
+    """The real roots of quadratics, without cancellation. A linear polynomial (c[2] = 0) has one root.
+
+    Args:
+        c: Coefficients, lowest power first.
+
+    Returns:
+        Roots in two slots and the mask of real ones. A double root stands in both slots.
+    """
+    roots, real = quadratic_rows(*c.unbind(-1))
+    return torch.stack(roots, -1), torch.stack(real, -1)
+
+
+def solve_cubic(c: Float[Tensor, "*batch 4"]) -> Roots:
+    """The real roots of cubics, one or three. A cubic whose leading coefficient is zero has no valid slot.
+
+    Args:
+        c: Coefficients, lowest power first.
+
+    Returns:
+        Roots in three slots and the mask of real ones.
+    """
+    roots, real = cubic_rows(*c.unbind(-1))
+    return torch.stack(roots, -1), torch.stack(real, -1)
+
+
+def companion_roots(c: Float[Tensor, "*batch m"]) -> Roots:
+    """The real roots by the eigenvalues of the companion matrix (LAPACK), polished by Newton's method.
+
+    Args:
+        c: m = degree + 1 coefficients, lowest power first.
+
+    Returns:
+        Roots in `degree` slots and the mask of real ones.
+    """
+    degree = c.shape[-1] - 1
+    monic = -c[..., :-1] / c[..., -1:]
+    good = torch.isfinite(monic).all(-1)
+    companion = torch.zeros(*c.shape[:-1], degree, degree, dtype=c.dtype, device=c.device)
+    companion[..., -1] = torch.where(good[..., None], monic, 0)
+    companion[..., range(1, degree), range(degree - 1)] = 1
+    values = torch.linalg.eigvals(companion)
+    x = values.real.contiguous()
+    real = good[..., None] & (values.imag.abs() <= 1e-3 * (1 + x.abs()))
+    slope = c[..., 1:] * torch.arange(1, degree + 1, dtype=c.dtype, device=c.device)
+    p = evaluate(c, x)
+    for _ in range(3):
+        new = x - p / evaluate(slope, x)
+        q = evaluate(c, new)
+        better = q.abs() < p.abs()
+        x, p = torch.where(better, new, x), torch.where(better, q, p)
+    scale = evaluate(c.abs(), x.abs())
+    real = real & (p.abs() <= 1e3 * torch.finfo(c.dtype).eps * scale)
+    return x, real
