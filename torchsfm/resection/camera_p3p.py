@@ -1,0 +1,275 @@
+"""Pose of a calibrated camera from three rays to three known points.
+
+The depths along the unit rays satisfy three quadrics, `|l_i u_i - l_j u_j|^2 = |X_i - X_j|^2`. Eliminating the scale leaves two
+conics in the direction of `(l_0, l_1, l_2)`, whose at most four common points are found as Ding, Yang, Larsson, Olsson & Åström,
+"Revisiting the P3P problem" (CVPR 2023) do: one real root of a cubic gives a pencil member that is a pair of lines, and each line
+meets another member in at most two points. Here no direction of the pencil is special: the cubic is homogeneous, the pencil is
+turned until its leading coefficient is large, and lines are met with conics in homogeneous coordinates, so that right angles,
+isosceles triangles and a centre in the plane of the points lose no solution.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+
+SQRT2 = 2.0**0.5
+
+
+def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"]) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
+    """The up to four poses `[R | t]` that see three points along three rays, `d_i ~ R X_i + t` with positive depths.
+
+    Computed in float64 whatever comes in. Derivatives are those of the solutions (implicit function theorem on the depths), to
+    second order; empty slots have none.
+
+    No slot is valid where the points are collinear or coincide, or where anything is not finite. Where two solutions merge (the
+    centre on the danger cylinder through the points) both slots stay valid, and are as inaccurate as a double root is.
+
+    Args:
+        d: Rays in the camera frame, one per row, of any length, pointing from the camera towards the points.
+        X: The points in the world frame, one per row.
+
+    Returns:
+        Four slots of `cam_from_world` and which of them are solutions; rotations are orthonormal to rounding, in every slot.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not fit.
+    """
+    batch = check_tensors(d=(d, "3 3"), X=(X, "3 3"))
+    dtype = d.dtype
+    # Structure of arrays: (point, coordinate, problem).
+    rays = d.double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0).contiguous()
+    points = X.double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0).contiguous()
+    sound = _sound(rays.detach(), points.detach(), torch.finfo(dtype).eps)
+    rays = torch.where(sound, rays, rays.new_tensor(_SAFE)[..., None])
+    points = torch.where(sound, points, points.new_tensor(_SAFE)[..., None])
+
+    u = rays / (rays * rays).sum(1, keepdim=True).sqrt()
+    centroid = points.mean(0)
+    X0, X1, X2 = points.unbind(0)
+    with torch.no_grad():
+        shape = _Triangle(u.detach(), points.detach())
+        depths, valid = shape.depths()
+        depths, valid = shape.accept(shape.newton(shape.newton(depths)), valid & sound)
+    # Two Newton steps from the solution: no change of value, and derivatives exact to second order.
+    depths = torch.where(valid, depths, 1.0)
+    tracked = _Triangle(u, points)
+    depths = tracked.newton(tracked.newton(depths, valid), valid)
+
+    Y = torch.where(valid, depths[:, None] * u[:, :, None], u.new_tensor(_SAFE)[..., None, None])
+    Y0, Y1, Y2 = Y.unbind(0)
+    a1, a2, a3 = _triad(X1 - X0, X2 - X0)
+    b1, b2, b3 = _triad(Y1 - Y0, Y2 - Y0)
+    # (row, column, slot, problem)
+    R = b1[:, None] * a1[None, :, None] + b2[:, None] * a2[None, :, None] + b3[:, None] * a3[None, :, None]
+    t = Y.mean(0) - (R * centroid[None, :, None]).sum(1)
+    model = torch.cat((R, t[:, None]), 1).permute(3, 2, 0, 1)
+    return Solutions(model.to(dtype).reshape(*batch, 4, 3, 4), valid.T.reshape(*batch, 4))
+
+
+def equations(
+    model: Float[Tensor, "*#batch 3 4"], d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"]
+) -> Float[Tensor, "*batch 12"]:
+    """What a pose from three rays satisfies: twelve equations in the twelve entries of `[R | t]`, zero at a solution.
+
+    Six say `R'R = I`; two for each point say that `R X + t` has no component across its ray, relative to the point's size there.
+    """
+    R, t = model[..., :3], model[..., 3]
+    gram = R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)
+    rows, columns = torch.triu_indices(3, 3, device=R.device)
+    Y = X @ R.mT + t[..., None, :]
+    u = d / torch.linalg.vector_norm(d, dim=-1, keepdim=True)
+    across = [(Y * e).sum(-1) / torch.linalg.vector_norm(Y.detach(), dim=-1) for e in _across(u.unbind(-1), -1)]
+    shape = torch.broadcast_shapes(gram.shape[:-2], across[0].shape[:-1])
+    return torch.cat([g.expand(*shape, -1) for g in (gram[..., rows, columns], *across)], -1)
+
+
+_SAFE = ((1.0, 0.0, 1.0), (0.0, 1.0, 1.0), (-1.0, 0.0, 1.0))
+"""A harmless triangle, put where the data are not usable."""
+
+
+def _sound(rays: Tensor, points: Tensor, eps: float) -> Tensor:
+    """Finite data, rays with a direction, points not in a line; (problem)."""
+    finite = torch.isfinite(rays).all(0).all(0) & torch.isfinite(points).all(0).all(0)
+    X0, X1, X2 = points.unbind(0)
+    e1, e2, e3 = X1 - X0, X2 - X0, X2 - X1
+    normal = _cross(e1, e2)
+    longest = torch.maximum(torch.maximum((e1 * e1).sum(0), (e2 * e2).sum(0)), (e3 * e3).sum(0))
+    # Twice the area against the longest side squared; rounding of far coordinates also counts.
+    rounding = eps * points.abs().amax(0).amax(0) * longest.sqrt()
+    area = (normal * normal).sum(0).sqrt()
+    return finite & (area > 16 * eps * longest) & (area > 4 * rounding) & ((rays * rays).sum(1) > 0).all(0)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """The cross product along the first dimension."""
+    a0, a1, a2 = a.unbind(0)
+    b0, b1, b2 = b.unbind(0)
+    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0))
+
+
+def _triad(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The orthonormal frame of `a` and the normal of `a` and `b`, vectors along the first dimension."""
+    normal = _cross(a, b)
+    first = a * (a * a).sum(0).rsqrt()
+    third = normal * (normal * normal).sum(0).rsqrt()
+    return first, _cross(third, first), third
+
+
+def _across(u: tuple[Tensor, ...], dim: int) -> tuple[Tensor, Tensor]:
+    """Two unit vectors orthogonal to a unit vector given by components, and to each other (Duff et al. 2017)."""
+    x, y, z = u
+    s = torch.copysign(torch.ones_like(z), z)
+    a = -1 / (s + z)
+    b = x * y * a
+    return torch.stack((1 + s * x * x * a, s * b, -s * x), dim), torch.stack((b, s + y * y * a, -y), dim)
+
+
+class _Triangle:
+    """The three quadrics in the depths, for rays `u` and points `X` as (point, coordinate, problem).
+
+    Pairs of points come in the order 01, 02, 12. Every form is written with `1 - u_i'u_j` taken from the difference of
+    the rays: for narrow fields of view the scalar product itself has lost the angle.
+    """
+
+    def __init__(self, u: Tensor, X: Tensor) -> None:
+        edge = torch.stack((X[0] - X[1], X[0] - X[2], X[1] - X[2]))
+        chord = torch.stack((u[0] - u[1], u[0] - u[2], u[1] - u[2]))
+        self.u = u
+        self.a = (edge * edge).sum(1)
+        self.n = 0.5 * (chord * chord).sum(1)
+
+    def depths(self) -> tuple[Tensor, Tensor]:
+        """Candidates (point, slot, problem) for the depths and which of them are real and positive."""
+        a, n = self.a, self.n
+        total = a.sum(0)
+        a0, a1, a2 = (a / total).unbind(0)
+        # Orthonormal directions of the pencil: weights of the three forms that cancel the right-hand sides.
+        root = (a0 * a0 + a1 * a1).rsqrt()
+        p0, p1 = a1 * root, -a0 * root
+        q0, q1, q2 = -a2 * p1, a2 * p0, a0 * p1 - a1 * p0
+        root = (q0 * q0 + q1 * q1 + q2 * q2).rsqrt()
+        p = torch.stack((p0, p1, torch.zeros_like(p0)))
+        q = torch.stack((q0 * root, q1 * root, q2 * root))
+        turned = torch.stack((p, (p + q) / SQRT2, q, (q - p) / SQRT2), 1)
+
+        # The determinant of a member of the pencil, and its cubic along the pencil from four values.
+        s = n * (2 - n)
+        u0, u1, u2 = self.u.unbind(0)
+        volume = (u0 * _cross(u1, u2)).sum(0)
+        w0, w1, w2 = turned.unbind(0)
+        squares = turned * turned * s[:, None]
+        f = (w0 + w1) * squares[2] + (w0 + w2) * squares[1] + (w1 + w2) * squares[0]
+        f = f + w0 * w1 * w2 * (s.sum(0) - volume * volume)
+        pick = f.abs().argmax(0, keepdim=True)
+        g0, g1, g2, g3 = torch.cat((f, -f[:3])).gather(0, pick + torch.arange(4, device=f.device)[:, None]).unbind(0)
+        both = torch.cat((turned, -turned[:, :2]), 1)
+        at = pick.expand(3, -1)[:, None]
+        p, q = both.gather(1, at)[:, 0], both.gather(1, at + 2)[:, 0]
+        c1 = SQRT2 * (g1 - g3) - g0
+        c2 = SQRT2 * (g1 + g3) - g2
+        root = _separate_root(c2 / g0, c1 / g0, g2 / g0)
+        size = (1 + root * root).rsqrt()
+        w, other = (root * p + q) * size, (p - root * q) * size
+
+        lines = self._lines(w)
+        e1, e2 = _across(lines.unbind(0), 0)
+        # The other member on the line: q11 x^2 + 2 q12 x y + q22 y^2.
+        q11, q12, q22 = self._form(other, e1, e1), self._form(other, e1, e2), self._form(other, e2, e2)
+        discriminant = q12 * q12 - q11 * q22
+        slack = 1e-9 * (q12 * q12 + (q11 * q22).abs())
+        z = -(q12 + torch.copysign(discriminant.clamp_min(0).sqrt(), q12))
+        first, second = z * e1 + q11 * e2, q22 * e1 + z * e2
+        depths = torch.cat((first, second), 1)
+        real = discriminant >= -slack
+        depths = depths * torch.sign(depths.sum(0))
+        scale = (total / self._form(torch.ones_like(a), depths, depths)).sqrt()
+        depths = depths * scale
+        valid = torch.cat((real, real)) & (depths > 0).all(0) & torch.isfinite(depths).all(0)
+        return torch.where(valid, depths, 1.0), valid
+
+    def _lines(self, w: Tensor) -> Tensor:
+        """The two lines (coordinate, line, problem) of the member of the pencil with weights w, which must be degenerate."""
+        w0, w1, w2 = w.unbind(0)
+        k0, k1, k2 = ((self.n - 1) * w).unbind(0)
+        d0, d1, d2 = w0 + w1, w0 + w2, w1 + w2
+        # Minus the adjugate is v v' with v the common point of the lines; its diagonal without cancellation.
+        mixed = w0 * w1 + w0 * w2 + w1 * w2
+        diagonal = -(mixed + (self.n * (2 - self.n) * w * w).flip(0))
+        b01, b02, b12 = k0 * d2 - k1 * k2, k1 * d1 - k0 * k2, k2 * d0 - k0 * k1
+        columns = torch.stack((diagonal[0], b01, b02, b01, diagonal[1], b12, b02, b12, diagonal[2])).view(3, 3, -1)
+        pick = diagonal.argmax(0)
+        best = columns.gather(0, pick.expand(1, 3, -1))[0]
+        v0, v1, v2 = best * diagonal.amax(0).clamp_min(1e-300).rsqrt()
+        rank1 = torch.stack((d0, k0 - v2, k1 + v1, k0 + v2, d1, k2 - v0, k1 - v1, k2 + v0, d2)).view(3, 3, -1)
+        pick = (rank1 * rank1).sum(1).argmax(0)
+        row = rank1.gather(0, pick.expand(1, 3, -1))[0]
+        lines = torch.stack((row, (rank1 * row).sum(1)), 1)
+        return lines * (lines * lines).sum(0).clamp_min(1e-300).rsqrt()
+
+    def _form(self, w: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """The bilinear form with weights w of the three pairs, for x and y as (point, slot, problem)."""
+        x0, x1, x2 = x.unbind(0)
+        y0, y1, y2 = y.unbind(0)
+        n = self.n
+        f = w[0] * ((x0 - x1) * (y0 - y1) + n[0] * (x0 * y1 + x1 * y0))
+        f = f + w[1] * ((x0 - x2) * (y0 - y2) + n[1] * (x0 * y2 + x2 * y0))
+        return f + w[2] * ((x1 - x2) * (y1 - y2) + n[2] * (x1 * y2 + x2 * y1))
+
+    def residuals(self, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Half of each quadric's error."""
+        l0, l1, l2 = depths.unbind(0)
+        a, n = self.a, self.n
+        e0, e1, e2 = l0 - l1, l0 - l2, l1 - l2
+        return (
+            0.5 * (e0 * e0 - a[0]) + n[0] * l0 * l1,
+            0.5 * (e1 * e1 - a[1]) + n[1] * l0 * l2,
+            0.5 * (e2 * e2 - a[2]) + n[2] * l1 * l2,
+        )
+
+    def newton(self, depths: Tensor, valid: Tensor | None = None) -> Tensor:
+        """One Newton step on the three quadrics, where it is finite; slots that are not `valid` stay and have no derivative."""
+        l0, l1, l2 = depths.unbind(0)
+        n0, n1, n2 = self.n.unbind(0)
+        r0, r1, r2 = self.residuals(depths)
+        e0, e1, e2 = l0 - l1, l0 - l2, l1 - l2
+        a0, a1 = e0 + n0 * l1, n0 * l0 - e0
+        b0, b2 = e1 + n1 * l2, n1 * l0 - e1
+        c1, c2 = e2 + n2 * l2, n2 * l1 - e2
+        p, q, m = b2 * c1, b0 * c2, r1 * c2 - b2 * r2
+        det = -(a0 * p + a1 * q)
+        usable = det.detach() != 0 if valid is None else valid & (det.detach() != 0)
+        inverse = 1 / torch.where(usable, det, 1.0)
+        step = torch.stack((-r0 * p - a1 * m, a0 * m - r0 * q, (r0 * b0 - a0 * r1) * c1 - a1 * b0 * r2)) * inverse
+        small = usable & (step.detach().abs() < depths.detach().abs().amax(0)).all(0)
+        return depths - torch.where(small, step, 0.0)
+
+    def accept(self, depths: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Whether the quadrics are met, by positive depths."""
+        size = 1e-10 * self.a.amax(0) + 1e-14 * (depths * depths).amax(0)
+        met = torch.stack(self.residuals(depths)).abs().amax(0) <= size
+        return depths, valid & met & (depths > 0).all(0)
+
+
+def _separate_root(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """The real root of x^3 + a x^2 + b x + c that is farthest from the inflection point, so never one of a close pair.
+
+    For four real intersections every real root of the pencil's cubic gives real lines, for two there is only one real root.
+    """
+    shift = a / -3
+    Q = shift * shift - b / 3
+    R = 0.5 * (((shift + a) * shift + b) * shift + c)
+    # Depressed: y^3 - 3 Q y + 2 R = 0 with x = y + shift; the sign is taken out.
+    size = R.abs()
+    root_q = Q.clamp_min(0).sqrt()
+    inner = size * size - Q * Q * Q
+    outer = (size + inner.clamp_min(0).sqrt()).clamp_min(1e-300) ** (1 / 3)
+    ratio = (size / (root_q * root_q * root_q).clamp_min(1e-300)).clamp_max(1)
+    y = torch.where(inner > 0, outer + Q / outer, root_q * (1.7320508 + ratio * (0.3208 - 0.0529 * ratio)))
+    x = torch.copysign(y, -R) + shift
+    for _ in range(2):
+        slope = (3 * x + 2 * a) * x + b
+        step = (((x + a) * x + b) * x + c) / slope
+        x = x - torch.where(torch.isfinite(step), step, 0.0)
+    return x
