@@ -218,10 +218,7 @@ def main(arguments: list[str] | None = None) -> None:
             if not getattr(options, f"no_{program}"):
                 result = run_apart(program, name, options.data, options.threads, options.seed)
                 print(row(program, result, photographs), flush=True)
-    print()
-    print(
-        f"{options.threads} threads, seed {options.seed}. COLMAP verifies its matches as it matches. Mean error over observations."
-    )
+    print(f"\n{options.threads} threads, seed {options.seed}; mean error over observations. COLMAP verifies while it matches.")
     print(*remarks, sep="\n")
 
 

@@ -156,7 +156,7 @@ def test_a_batch_is_its_elements(generator: torch.Generator) -> None:
 def small_reconstruction(poses: Pose, X: Tensor) -> Reconstruction:
     views, points = poses.t.shape[0], X.shape[0]
     K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64)
-    model = Reconstruction(
+    return Reconstruction(
         names=tuple(f"{i}.png" for i in range(views)),
         image_size=torch.tensor([[640, 480]]).expand(views, 2),
         cameras=Camera(K[None]),
@@ -169,7 +169,6 @@ def small_reconstruction(poses: Pose, X: Tensor) -> Reconstruction:
         view=torch.arange(views).repeat(points),
         point=torch.arange(points).repeat_interleave(views),
     )
-    return model
 
 
 def test_a_reconstruction_is_carried_onto_the_truth(generator: torch.Generator) -> None:
