@@ -1,0 +1,20 @@
+"""What would the cameras see? Synthetic scenes, viewpoints, observations and images, with the truth known."""
+
+from torchsfm.simulation.observations import SimulatedImages, random_intrinsics, random_points, simulate_images
+from torchsfm.simulation.rendering import RenderedSequence, render_sequence
+from torchsfm.simulation.textured_scene import TexturedScene, courtyard_scene
+from torchsfm.simulation.viewpoints import look_at, orbit_poses, random_poses
+
+__all__ = [
+    "RenderedSequence",
+    "SimulatedImages",
+    "TexturedScene",
+    "courtyard_scene",
+    "look_at",
+    "orbit_poses",
+    "random_intrinsics",
+    "random_points",
+    "random_poses",
+    "render_sequence",
+    "simulate_images",
+]

@@ -1,0 +1,167 @@
+"""Simulated observations of points: projections with noise, outliers and missing data, batched over problems."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import check_tensors
+from torchsfm.geometry.cameras import Camera, intrinsics
+from torchsfm.geometry.poses import Pose
+
+
+@dataclass(frozen=True)
+class SimulatedImages:
+    """What the cameras measured, and what they would have measured without errors."""
+
+    x: Float[Tensor, "*batch v n 2"]
+    """Measured image points in pixels; zero where not visible."""
+    visible: Bool[Tensor, "*batch v n"]
+    """Which points were measured in which view."""
+    outlier: Bool[Tensor, "*batch v n"]
+    """Which of them are gross errors, drawn evenly over the image."""
+    x_true: Float[Tensor, "*batch v n 2"]
+    """Exact projections; finite but meaningless for points that are not in front of the camera."""
+    depth: Float[Tensor, "*batch v n"]
+    """Signed depth of every point in every view."""
+
+
+def simulate_images(
+    X: Float[Tensor, "*#batch n 3"],
+    poses: Pose,
+    cameras: Camera,
+    *,
+    image_size: tuple[int, int] | None = None,
+    noise: float = 0.0,
+    outliers: float = 0.0,
+    dropout: float = 0.0,
+    depth_range: tuple[float, float] = (0.0, float("inf")),
+    generator: torch.Generator | None = None,
+) -> SimulatedImages:
+    """Observe points in several views.
+
+    A point is visible where its depth is in `depth_range`, its projection is inside the image and the lens formula can see it
+    (no folding back), unless it is dropped. Points do not hide each other. Noise may carry an observation out of the image.
+
+    Args:
+        X: Points of each problem.
+        poses: World to camera, batch (*batch, v).
+        cameras: Intrinsics and distortion; the batch broadcasts against (*batch, v), so one camera for all has batch (), one
+            for each problem (*batch, 1).
+        image_size: Width and height in pixels; without it the field of view is unlimited.
+        noise: Standard deviation of each coordinate in pixels.
+        outliers: Probability that an observation is replaced by a random point of the image (without `image_size`: of the
+            bounding box of the view's visible projections).
+        dropout: Probability that a visible point is not measured.
+        depth_range: Least (exclusive) and largest depth at which points are seen.
+        generator: Source of randomness; torch's own where none is given.
+
+    Returns:
+        Observations and truth, with batch shape that of all arguments together.
+    """
+    check_tensors(X=(X, "n 3"), R=(poses.R, "3 3"), K=(cameras.K, "3 3"))
+    if len(poses.shape) < 1:
+        raise ValueError(f"poses: wanted batch shape (*batch, views), got {tuple(poses.shape)}")
+    for name, value in (("outliers", outliers), ("dropout", dropout)):
+        if not 0 <= value <= 1:
+            raise ValueError(f"{name}: wanted a probability in [0, 1], got {value}")
+    if noise < 0:
+        raise ValueError(f"noise: wanted a standard deviation >= 0, got {noise}")
+    X_cam = poses.transform(X[..., None, :, :])
+    depth = X_cam[..., 2]
+    x_true = cameras.project(X_cam)
+    if x_true.shape[:-1] != depth.shape:
+        depth = depth.expand(x_true.shape[:-1])
+        X_cam = X_cam.expand(*x_true.shape[:-1], 3)
+    near, far = depth_range
+    visible = (depth > near) & (depth <= far) & _seen(cameras, X_cam, x_true)
+    options = {"dtype": X.dtype, "device": X.device}
+    if image_size is not None:
+        size = X.new_tensor(image_size)
+        visible &= ((x_true >= -0.5) & (x_true < size - 0.5)).all(-1)
+        low, high = torch.full_like(size, -0.5), size - 0.5
+    else:
+        shown = visible[..., None]
+        low = torch.where(shown, x_true, float("inf")).amin(-2, keepdim=True) if X.shape[-2] else x_true
+        high = torch.where(shown, x_true, -float("inf")).amax(-2, keepdim=True) if X.shape[-2] else x_true
+        some = torch.isfinite(low) & torch.isfinite(high)
+        low, high = torch.where(some, low, 0.0), torch.where(some, high, 0.0)
+    visible &= torch.rand(depth.shape, generator=generator, **options) >= dropout  # type: ignore[call-overload]
+    x = x_true + noise * torch.randn(x_true.shape, generator=generator, **options)  # type: ignore[call-overload]
+    outlier = torch.rand(depth.shape, generator=generator, **options) < outliers  # type: ignore[call-overload]
+    wild = low + (high - low) * torch.rand(x_true.shape, generator=generator, **options)  # type: ignore[call-overload]
+    outlier &= visible
+    x = torch.where(outlier[..., None], wild, x)
+    return SimulatedImages(torch.where(visible[..., None], x, 0.0), visible, outlier, x_true, depth)
+
+
+def _seen(cameras: Camera, X_cam: Tensor, x: Tensor) -> Tensor:
+    """Whether the image point leads back along the ray it came from: false where the lens formula has folded back."""
+    d, valid = cameras.unproject(x)
+    along = (d * X_cam).sum(-1)
+    across = torch.linalg.cross(d, X_cam).norm(dim=-1)
+    return valid & (along > 0) & (across <= 1e-3 * along)
+
+
+def random_points(
+    *shape: int,
+    kind: str = "ball",
+    size: float = 1.0,
+    generator: torch.Generator | None = None,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
+) -> Float[Tensor, "*shape 3"]:
+    """Random points around the origin.
+
+    Args:
+        *shape: Batch shape and number of points, (*batch, n).
+        kind: "ball": evenly inside a ball; "cube": evenly inside a cube; "plane": evenly on a square in the plane z = 0;
+            "line": evenly on a segment of the x axis; "gauss": normally distributed.
+        size: Radius of the ball, half the side of the cube, square or segment, or the standard deviation.
+        generator: Source of randomness; torch's own where none is given.
+        dtype: Of the points.
+        device: Of the points.
+    """
+    options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
+    if kind == "gauss":
+        return size * torch.randn(*shape, 3, **options)  # type: ignore[call-overload, no-any-return]
+    if kind == "ball":
+        direction = torch.randn(*shape, 3, **options)  # type: ignore[call-overload]
+        radius = torch.rand(*shape, 1, **options) ** (1 / 3)  # type: ignore[call-overload]
+        return size * radius * direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-30)  # type: ignore[no-any-return]
+    used = {"cube": 3, "plane": 2, "line": 1}.get(kind)
+    if used is None:
+        raise ValueError(f"kind: wanted one of ball, cube, plane, line, gauss, got {kind!r}")
+    draw = size * (2 * torch.rand(*shape, 3, **options) - 1)  # type: ignore[call-overload]
+    draw[..., used:] = 0
+    return draw  # type: ignore[no-any-return]
+
+
+def random_intrinsics(
+    *shape: int,
+    image_size: tuple[int, int] = (1000, 750),
+    view_angle: tuple[float, float] = (0.7, 1.2),
+    wobble: float = 0.02,
+    generator: torch.Generator | None = None,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str | None = None,
+) -> Float[Tensor, "*shape 3 3"]:
+    """Random calibration matrices of cameras with square pixels.
+
+    Args:
+        *shape: Batch shape.
+        image_size: Width and height in pixels.
+        view_angle: Least and largest angle of view across the width, in radians, drawn evenly.
+        wobble: Standard deviation of the principal point about the middle of the image, as a share of the width.
+        generator: Source of randomness; torch's own where none is given.
+        dtype: Of the matrices.
+        device: Of the matrices.
+    """
+    options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
+    low, high = view_angle
+    angle = low + (high - low) * torch.rand(*shape, **options)  # type: ignore[call-overload]
+    width, height = image_size
+    middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=dtype, device=device)
+    c = middle + wobble * width * torch.randn(*shape, 2, **options)  # type: ignore[call-overload]
+    return intrinsics(width / 2 / (angle / 2).tan(), c)

@@ -1,0 +1,139 @@
+"""Ray casting: which surface each ray meets first, and the colour there, filtered to the footprint of a pixel."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from torchsfm.simulation.textured_scene import Textured, TexturedScene
+
+PROBES = (1, 2, 4, 8)
+"""How many texture lookups a footprint is cut into along its longer axis, as it is once, twice, ... as long as wide."""
+
+
+def cast(
+    scene: TexturedScene, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]
+) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+    """Distance to the first surface in multiples of d (infinity where there is none) and its index (-1 where there is none)."""
+    nearest = torch.full_like(d[0], math.inf)
+    index = torch.full(d.shape[1:], -1, dtype=torch.int16, device=d.device)
+    for i, thing in enumerate(scene.objects):
+        s = thing.surface.intersect(origin, d)
+        closer = s < nearest
+        nearest = torch.where(closer, s, nearest)
+        index = index.masked_fill(closer, i)
+    return nearest, index
+
+
+def lit(scene: TexturedScene, X: Float[Tensor, "3 n"]) -> Bool[Tensor, "n"]:
+    """Whether nothing stands between each point and the sun."""
+    sun = scene.sun.to(X)
+    sun = (sun / sun.norm())[:, None]
+    free = torch.ones(X.shape[1:], dtype=torch.bool, device=X.device)
+    for thing in scene.objects:
+        # Starting a little off the surface keeps a surface from shading itself.
+        free &= torch.isinf(thing.surface.intersect(X + 1e-3 * sun, sun.expand_as(X)))
+    return free
+
+
+def shade(
+    scene: TexturedScene,
+    origin: Float[Tensor, "3 1"],
+    d: Float[Tensor, "3 n"],
+    dx: Float[Tensor, "3 n"],
+    dy: Float[Tensor, "3 n"],
+    distance: Float[Tensor, "n"],
+    index: Int[Tensor, "n"],
+    sunny: Bool[Tensor, "n"],
+) -> Float[Tensor, "3 n"]:
+    """Colour of what each ray meets.
+
+    Args:
+        scene: The scene.
+        origin: Centre of projection.
+        d: Directions of the rays.
+        dx: Change of d from one sample of the image to the next in x.
+        dy: The same in y.
+        distance: From `cast`.
+        index: From `cast`.
+        sunny: From `lit`, at the points met.
+    """
+    up = d[2] / d.norm(dim=0)
+    sky = torch.stack((0.55 - 0.25 * up, 0.70 - 0.20 * up, 0.86 - 0.08 * up)).to(torch.float32)
+    color = sky.clamp(0, 1)
+    sun = scene.sun.to(d)
+    sun = sun / sun.norm()
+    for i, thing in enumerate(scene.objects):
+        chosen = (index == i).nonzero()[:, 0]
+        if not len(chosen):
+            continue
+        e, s = d[:, chosen], distance[chosen]
+        chart = thing.surface.chart(origin + s * e)
+        normal = chart.normal
+        facing = normal[0] * e[0] + normal[1] * e[1] + normal[2] * e[2]
+        steps = []
+        for step in (dx[:, chosen], dy[:, chosen]):
+            # Where the neighbouring ray meets the tangent plane.
+            slide = (normal[0] * step[0] + normal[1] * step[1] + normal[2] * step[2]) / facing
+            moved = s * (step - e * slide)
+            steps += [(g[0] * moved[0] + g[1] * moved[1] + g[2] * moved[2]) / thing.texel for g in (chart.du, chart.dv)]
+        footprint = torch.stack(steps).nan_to_num(0.0, 1e6, -1e6).to(torch.float32)
+        texture = lookup(thing, chart.layer, (chart.uv / thing.texel).to(torch.float32), footprint)
+        slope = (normal * sun[:, None]).sum(0) * -torch.sign(facing)
+        light = scene.ambient * (0.8 + 0.2 * normal[2] * -torch.sign(facing))
+        light = light + (1 - scene.ambient) * 1.25 * slope.clamp_min(0) * sunny[chosen]
+        color[:, chosen] = texture * light.to(torch.float32)
+    return color.clamp(0, 1)
+
+
+def lookup(
+    thing: Textured, layer: Int[Tensor, "n"], uv: Float[Tensor, "2 n"], footprint: Float[Tensor, "4 n"]
+) -> Float[Tensor, "3 n"]:
+    """Texture averaged over footprints, parallelograms with sides (du, dv) by a step in x and in y, all in texels.
+
+    The footprint is cut along its longer axis into nearly square pieces, each read from the two nearest mip levels.
+    """
+    ux, vx, uy, vy = footprint
+    long, short = ux.square() + vx.square(), uy.square() + vy.square()
+    turn = short > long
+    step = torch.stack((torch.where(turn, uy, ux), torch.where(turn, vy, vx)))
+    # Length of the longer side, and the width across it.
+    long = torch.maximum(long, short).sqrt().clamp_min(1e-6)
+    wide = (ux * vy - uy * vx).abs() / long
+    ratio = long / wide.clamp_min(1.0).minimum(long)
+    color = torch.zeros(3, uv.shape[1], device=uv.device)
+    wanted = torch.log2(ratio).round().clamp(0, len(PROBES) - 1)
+    for sheet, pyramid in enumerate(thing.sheets):
+        for power, probes in enumerate(PROBES):
+            chosen = ((layer == sheet) & (wanted == power)).nonzero()[:, 0]
+            if not len(chosen):
+                continue
+            at, along = uv[:, chosen], step[:, chosen]
+            level = torch.log2(torch.maximum(long[chosen] / probes, wide[chosen]).clamp_min(1.0))
+            total = torch.zeros(3, len(chosen), device=uv.device)
+            for k in range(probes):
+                total += _trilinear(pyramid, at + along * ((k + 0.5) / probes - 0.5), level)
+            color[:, chosen] = total / probes
+    return color
+
+
+def _trilinear(pyramid: tuple[Tensor, ...], uv: Tensor, level: Tensor) -> Tensor:
+    """Read each point between two mip levels; coordinates in texels of level 0 from the sheet's corner."""
+    level = level.clamp(0, len(pyramid) - 1)
+    lower = level.floor()
+    color = torch.zeros(3, uv.shape[1], device=uv.device)
+    for k in range(int(lower.min()), min(int(lower.max()) + 2, len(pyramid))):
+        weight = (1 - (level - k).abs()).clamp_min(0)
+        chosen = (weight > 0).nonzero()[:, 0]
+        if not len(chosen):
+            continue
+        image = pyramid[k]
+        size = torch.tensor([image.shape[2], image.shape[1]], device=uv.device)
+        grid = uv[:, chosen].T * (2.0 / 2**k / size) - 1
+        value = functional.grid_sample(
+            image[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+        )[0, :, 0]
+        color[:, chosen] += value * weight[chosen]
+    return color
