@@ -10,8 +10,29 @@ from torchsfm.linalg.polynomial import companion_roots
 from torchsfm.optim import attach_implicit, wants_derivative
 
 # Monomials of degree 3 in Nister's order, as exponents of (x, y, z, 1).
-_CUBICS = ("xxx yyy xxy xyy xxz xxw yyz yyw xyz xyw xzz xzw xww yzz yzw yww zzz zzw zww www").split()
-_QUADRICS = "xx yy zz ww xy xz xw yz yw zw".split()
+_CUBICS = [
+    "xxx",
+    "yyy",
+    "xxy",
+    "xyy",
+    "xxz",
+    "xxw",
+    "yyz",
+    "yyw",
+    "xyz",
+    "xyw",
+    "xzz",
+    "xzw",
+    "xww",
+    "yzz",
+    "yzw",
+    "yww",
+    "zzz",
+    "zzw",
+    "zww",
+    "www",
+]
+_QUADRICS = ["xx", "yy", "zz", "ww", "xy", "xz", "xw", "yz", "yw", "zw"]
 _LINEAR = "xyzw"
 _TIMES = [[_CUBICS.index("".join(sorted(q + v, key=_LINEAR.index))) for q in _QUADRICS] for v in _LINEAR]
 _I, _J = [0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3]
