@@ -23,7 +23,7 @@ class Features:
     response: Float[Tensor, " n"]
     """Contrast of the point; larger is more distinct."""
     descriptors: Shaped[Tensor, "n d"]
-    """RootSIFT times 512 as uint8 (d = 128), or unit vectors in floating point from another detector."""
+    """RootSIFT times 256 as uint8, at most 127 (d = 128), or unit vectors in floating point from another detector."""
 
     def __len__(self) -> int:
         return int(self.x.shape[0])
@@ -94,4 +94,4 @@ def _gray_bytes(pixels: Tensor) -> np.ndarray[tuple[int, int], np.dtype[np.uint8
 def _root_sift(raw: Tensor) -> Tensor:
     raw = raw.float()
     root = (raw / raw.sum(-1, keepdim=True).clamp_min(1e-12)).sqrt()
-    return (root * 512).round_().clamp_(0, 255).to(torch.uint8)
+    return (root * 256).round_().clamp_(0, 127).to(torch.uint8)

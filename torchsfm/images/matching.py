@@ -1,6 +1,7 @@
 """Which points of two images look alike."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import torch
 from jaxtyping import Int, Shaped
@@ -8,7 +9,8 @@ from torch import Tensor
 
 from torchsfm.images.features import Features
 
-_BLOCK = 2048
+_ROWS = 128
+"""Rows of one block of similarities: a block of 128 x 8192 integers stays in a processor's cache through all that is done with it."""
 
 
 def match_features(
@@ -25,15 +27,15 @@ def match_features(
         features: The features of every image.
         pairs: Which images to compare, as indices into `features`.
         ratio: The best distance must be below this share of the second best (Lowe's test); 1 switches the test off.
-        mutual: Keep a match only where each point is the other's best.
-        max_distance: The largest angle between unit descriptors that still makes a match, in radians.
+        mutual: Keep a match only where each point is the other's best, so that no point is matched twice.
+        max_distance: The largest angle between two descriptors that still makes a match, in radians.
 
     Returns:
-        One tensor for each pair: rows (index in the first image, index in the second), sorted by the first.
+        One tensor for each pair: rows (index in the first image, index in the second), sorted by the first. What a pair gets does
+        not depend on the other pairs.
     """
-    unit = [unit_descriptors(f.descriptors) for f in features]
-    options = {"ratio": ratio, "max_distance": max_distance}
-    return [match_descriptors(unit[i], unit[j], mutual=mutual, **options) for i, j in pairs.tolist()]
+    ready = {i: _prepare(features[i].descriptors) for i in sorted(set(pairs.flatten().tolist()))}
+    return [_match(ready[i], ready[j], ratio, mutual, max_distance) for i, j in pairs.tolist()]
 
 
 def match_descriptors(
@@ -44,36 +46,150 @@ def match_descriptors(
     mutual: bool = True,
     max_distance: float = 0.7,
 ) -> Int[Tensor, "k 2"]:
-    """Match two sets of descriptors by the angle between them; see `match_features`."""
-    unit1, unit2 = unit_descriptors(descriptors1), unit_descriptors(descriptors2)
-    n, m = unit1.shape[0], unit2.shape[0]
+    """Match two sets of descriptors by the angle between them, all against all.
+
+    Integer descriptors of values up to 127 (those of `detect_features`) are compared in exact integer arithmetic, so that the
+    answer is the same on every machine.
+
+    Args:
+        descriptors1: One row for each point of the first image, integer or floating point, of any length but zero.
+        descriptors2: The same for the second image.
+        ratio: The best distance must be below this share of the second best (Lowe's test); 1 switches the test off.
+        mutual: Keep a match only where each point is the other's best, so that no point is matched twice.
+        max_distance: The largest angle that still makes a match, in radians.
+
+    Returns:
+        Rows (index in the first set, index in the second), sorted by the first.
+
+    Raises:
+        ValueError: Descriptors of two lengths, or one set of integers and one of floating point numbers.
+    """
+    return _match(_prepare(descriptors1), _prepare(descriptors2), ratio, mutual, max_distance)
+
+
+def _prepare(descriptors: Tensor) -> tuple[Tensor, Tensor]:
+    """Descriptors as int8 with their norms, or as unit vectors with norms of one."""
+    if descriptors.ndim != 2:
+        raise ValueError(f"descriptors: wanted shape (n, d), got {tuple(descriptors.shape)}")
+    if not descriptors.is_floating_point():
+        if (
+            descriptors.numel() == 0
+            or int(descriptors.abs().max() if descriptors.dtype.is_signed else descriptors.max()) <= 127
+        ):
+            return descriptors.to(torch.int8), descriptors.double().norm(dim=-1).clamp_min(1e-12)
+        descriptors = descriptors.float()
+    unit = descriptors / descriptors.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    return unit.nan_to_num(), torch.ones(unit.shape[0], dtype=torch.float64, device=unit.device)
+
+
+def _match(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], ratio: float, mutual: bool, limit: float) -> Tensor:
+    (d1, norm1), (d2, norm2) = first, second
+    if d1.shape[1] != d2.shape[1] or d1.dtype != d2.dtype:
+        raise ValueError(f"descriptors2: wanted {d1.shape[1]} values of {d1.dtype}, got {d2.shape[1]} of {d2.dtype}")
+    n, m = d1.shape[0], d2.shape[0]
     if n == 0 or m == 0:
-        return torch.zeros(0, 2, dtype=torch.long, device=unit1.device)
-    best = torch.empty(n, dtype=unit1.dtype, device=unit1.device)
-    second = torch.full_like(best, -1)
-    match = torch.empty(n, dtype=torch.long, device=unit1.device)
-    back = torch.full((m,), -2.0, dtype=unit1.dtype, device=unit1.device)
-    back_index = torch.zeros(m, dtype=torch.long, device=unit1.device)
-    for start in range(0, n, _BLOCK):
-        similarity = unit1[start : start + _BLOCK] @ unit2.mT
-        column, index = similarity.max(0)
-        better = column > back
-        back = torch.where(better, column, back)
-        back_index = torch.where(better, index + start, back_index)
-        value, where = similarity.max(1)
-        best[start : start + _BLOCK] = value
-        match[start : start + _BLOCK] = where
-        if m > 1:
-            second[start : start + _BLOCK] = similarity.scatter_(1, where[:, None], -2).amax(1)
-    distance, runner_up = best.clamp(-1, 1).arccos(), second.clamp(-1, 1).arccos()
-    keep = (distance <= max_distance) & ((distance < ratio * runner_up) | (ratio >= 1))
-    rows = torch.arange(n, device=unit1.device)
+        return torch.zeros(0, 2, dtype=torch.long, device=d1.device)
+    value, index = _top_two(d1, d2)
+    cosine = value.double() / (norm1[:, None] * norm2[index])
+    angle = cosine.clamp(-1, 1).arccos()
+    keep = angle[:, 0] <= limit
+    if ratio < 1 and m > 1:
+        keep &= angle[:, 0] < ratio * angle[:, 1]
+    rows = keep.nonzero()[:, 0]
+    best = index[rows, 0]
     if mutual:
-        keep &= back_index[match] == rows
-    return torch.stack([rows, match], 1)[keep]
+        # Few rows pass the tests above: looking back from their partners alone is cheaper than a maximum of every column.
+        columns, where = best.unique(return_inverse=True)
+        back = _top_one(d2[columns], d1)
+        # Of rows that are equally near to a column the first is taken.
+        keep = value[rows, 0] >= back[where]
+        rows, best, where = rows[keep], best[keep], where[keep]
+        owner = torch.full_like(columns, n).scatter_reduce(0, where, rows, "amin")
+        keep = owner[where] == rows
+        rows, best = rows[keep], best[keep]
+    return torch.stack([rows, best], 1)
 
 
-def unit_descriptors(descriptors: Shaped[Tensor, "n d"]) -> Tensor:
-    """Descriptors as float unit vectors."""
-    values: Tensor = descriptors if descriptors.is_floating_point() else descriptors.float()
-    return values / values.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+def _top_two(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """The two largest products of each row of `a` with the rows of `b`, and which rows of `b` those are."""
+    if a.dtype != torch.int8:
+        return _top_two_float(a, b)
+    # A product and the index of its column share one 32 bit number, so that a plain maximum finds both: several times faster
+    # than a maximum with index. The number of columns that fit depends on the largest product, by Cauchy and Schwarz.
+    bound = int(a.float().norm(dim=-1).max().item() * b.float().norm(dim=-1).max().item()) + 1
+    bits = 30 - bound.bit_length()
+    width = 1 << bits
+    counter = torch.arange(width - 1, -1, -1, dtype=torch.int32, device=a.device)
+    values, indices = [], []
+    for left in range(0, b.shape[0], width):
+        part = b[left : left + width]
+        columns = part.shape[0]
+        packed = torch.empty(a.shape[0], min(2, columns), dtype=torch.int32, device=a.device)
+        for start in range(0, a.shape[0], _ROWS):
+            block = _products(a[start : start + _ROWS], part)
+            torch.add(counter[:columns], block, alpha=width, out=block)  # among equal products the first column is the largest
+            top = block.amax(1)
+            packed[start : start + _ROWS, 0] = top
+            if columns > 1:
+                block.scatter_(1, (width - 1 - (top & (width - 1))).long()[:, None], torch.iinfo(torch.int32).min)
+                packed[start : start + _ROWS, 1] = block.amax(1)
+        values.append(packed >> bits)
+        indices.append(width - 1 - (packed & (width - 1)).long() + left)
+    return _merge(values, indices)
+
+
+def _top_two_float(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    width = 1 << 14
+    values, indices = [], []
+    for left in range(0, b.shape[0], width):
+        part = b[left : left + width].mT
+        value, index = [], []
+        for start in range(0, a.shape[0], _ROWS):
+            block = a[start : start + _ROWS] @ part
+            first, where = block.max(1, keepdim=True)
+            value.append(first)
+            index.append(where)
+            if part.shape[1] > 1:
+                second, where = block.scatter_(1, where, -torch.inf).max(1, keepdim=True)
+                value[-1] = torch.cat([first, second], 1)
+                index[-1] = torch.cat([index[-1], where], 1)
+        values.append(torch.cat(value))
+        indices.append(torch.cat(index) + left)
+    return _merge(values, indices)
+
+
+def _merge(values: list[Tensor], indices: list[Tensor]) -> tuple[Tensor, Tensor]:
+    value, index = values[0], indices[0]
+    if len(values) > 1:
+        value, index = torch.cat(values, 1), torch.cat(indices, 1)
+        value, order = value.sort(dim=1, descending=True, stable=True)
+        value, index = value[:, :2], index.gather(1, order[:, :2])
+    return value, index
+
+
+def _top_one(a: Tensor, b: Tensor) -> Tensor:
+    """The largest product of each row of `a` with the rows of `b`."""
+    top = torch.empty(a.shape[0], dtype=torch.int32 if a.dtype == torch.int8 else a.dtype, device=a.device)
+    for start in range(0, a.shape[0], _ROWS):
+        top[start : start + _ROWS] = _products(a[start : start + _ROWS], b).amax(1)
+    return top
+
+
+def _products(a: Tensor, b: Tensor) -> Tensor:
+    if a.dtype != torch.int8:
+        return a @ b.mT
+    if a.device.type == "cpu" and _int8_products_are_exact():
+        return torch._int_mm(a, b.mT)
+    return (a.float() @ b.float().mT).to(torch.int32)  # exact: sums below 2^24 of integers
+
+
+@cache
+def _int8_products_are_exact() -> bool:
+    """Whether this processor multiplies bytes without saturating (those without VNNI may not)."""
+    a = torch.full((64, 128), 127, dtype=torch.int8)
+    a[::2, ::2] = -127
+    try:
+        product = torch._int_mm(a, a.mT)
+    except (AttributeError, RuntimeError):
+        return False
+    return bool((product == (a.float() @ a.float().mT)).all())
