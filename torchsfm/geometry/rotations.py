@@ -1,0 +1,180 @@
+"""Rotations of space: matrices outside, rotation vectors for tangents, quaternions and Euler angles at conversions."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import check_tensors
+
+SERIES = 1e-3
+"""Squared angle below which power series replace quotients; four terms are then exact to float64 rounding."""
+
+
+def cross_matrix(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Write the cross product with v as a matrix: `cross_matrix(v) @ a = v x a`."""
+    check_tensors(v=(v, "3"))
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return _matrix([zero, -z, y, z, zero, -x, -y, x, zero], 3)
+
+
+def rotation_from_rotvec(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotate by |w| radians about w (Rodrigues' formula, the exponential map of SO(3)).
+
+    Differentiable everywhere any number of times, also at zero.
+
+    Args:
+        w: Axis times angle, radians.
+
+    Returns:
+        Rotation matrices.
+    """
+    check_tensors(w=(w, "3"))
+    x, y, z = w.unbind(-1)
+    t = x * x + y * y + z * z
+    small = t < SERIES
+    angle = torch.where(small, 1.0, t).sqrt()
+    half = torch.sin(0.5 * angle) / (0.5 * angle)
+    a = torch.where(small, 1 - t / 6 * (1 - t / 20 * (1 - t / 42)), torch.sin(angle) / angle)
+    b = torch.where(small, 0.5 - t / 24 * (1 - t / 30 * (1 - t / 56)), 0.5 * half * half)
+    ax, ay, az = a * x, a * y, a * z
+    bx, by, bz = b * x, b * y, b * z
+    xy, xz, yz = bx * y, bx * z, by * z
+    xx, yy, zz = bx * x, by * y, bz * z
+    rows = [1 - (yy + zz), xy - az, xz + ay, xy + az, 1 - (xx + zz), yz - ax, xz - ay, yz + ax, 1 - (xx + yy)]
+    return _matrix(rows, 3)
+
+
+def rotvec_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Find axis times angle of a rotation (the logarithm of SO(3)).
+
+    Smooth for angles below pi. At pi, where axis and opposite axis are the same rotation, one of the two is returned, to full
+    accuracy, with the derivative of its own branch.
+
+    Args:
+        R: Rotation matrices.
+
+    Returns:
+        Rotation vectors, radians, of length at most pi.
+    """
+    q = quaternion_wxyz_from_rotation(R)
+    w, v = q[..., 0], q[..., 1:]
+    square = (v * v).sum(-1)
+    # For small |v| the scalar part is near 1: angle / sin(angle / 2) from the series of the arctangent.
+    small = square < SERIES * SERIES
+    ratio = square / torch.where(small, w * w, 1.0)
+    series = 2 / torch.where(small, w, 1.0) * (1 - ratio / 3 * (1 - 0.6 * ratio))
+    length = torch.where(small, 1.0, square).sqrt()
+    return torch.where(small, series, 2 * torch.atan2(length, w) / length)[..., None] * v
+
+
+def rotation_from_quaternion_wxyz(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Turn quaternions into rotation matrices.
+
+    Args:
+        q: Quaternions (w, x, y, z) of any length; the zero quaternion gives the identity.
+
+    Returns:
+        Rotation matrices.
+    """
+    check_tensors(q=(q, "4"))
+    w, x, y, z = q.unbind(-1)
+    square = (q * q).sum(-1)
+    s = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0)
+    sx, sy, sz = s * x, s * y, s * z
+    xx, yy, zz, xy, xz, yz = sx * x, sy * y, sz * z, sx * y, sx * z, sy * z
+    wx, wy, wz = sx * w, sy * w, sz * w
+    rows = [1 - (yy + zz), xy - wz, xz + wy, xy + wz, 1 - (xx + zz), yz - wx, xz - wy, yz + wx, 1 - (xx + yy)]
+    return _matrix(rows, 3)
+
+
+def quaternion_wxyz_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Turn rotation matrices into unit quaternions (w, x, y, z) with w >= 0.
+
+    Each row of the symmetric matrix 4 q q' is linear in R and proportional to q; the one with the largest diagonal is accurate
+    (Shepperd 1978). Accurate for every angle, also at pi.
+
+    Args:
+        R: Rotation matrices.
+
+    Returns:
+        Unit quaternions.
+    """
+    check_tensors(R=(R, "3 3"))
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.flatten(-2).unbind(-1)
+    wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
+    xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
+    ww, xx, yy, zz = 1 + r00 + r11 + r22, 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22
+    rows = _matrix([ww, wx, wy, wz, wx, xx, xy, xz, wy, xy, yy, yz, wz, xz, yz, zz], 4)
+    best = rows.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
+    row = torch.gather(rows, -2, best.expand(*best.shape[:-1], 4)).squeeze(-2)
+    sign = torch.where(row[..., :1] < 0, -1.0, 1.0).to(R.dtype)
+    q: Tensor = sign * row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+    return q
+
+
+def rotation_from_euler(angles: Float[Tensor, "*batch k"], axes: str) -> Float[Tensor, "*batch 3 3"]:
+    """Compose rotations about coordinate axes.
+
+    Lower-case axes stay fixed in space and rotations are applied in the order written ("xyz" is Rz Ry Rx); upper-case axes move
+    with the body ("XYZ" is Rx Ry Rz). This is SciPy's convention.
+
+    Args:
+        angles: One angle per axis, radians.
+        axes: Axis names, all lower-case or all upper-case, such as "xyz" or "ZYX".
+
+    Returns:
+        Rotation matrices.
+
+    Raises:
+        ValueError: `axes` is not such a string or its length is not the number of angles.
+    """
+    check_tensors(angles=(angles, "k"))
+    moving = axes.isupper()
+    if not axes or set(axes) - set("XYZ" if moving else "xyz"):
+        raise ValueError(f"axes: wanted letters of 'xyz' or of 'XYZ', got {axes!r}")
+    if angles.shape[-1] != len(axes):
+        raise ValueError(f"angles: wanted shape (*batch, {len(axes)}) for axes {axes!r}, got {tuple(angles.shape)}")
+    frame = torch.eye(3, dtype=angles.dtype, device=angles.device)
+    R = frame.expand(*angles.shape[:-1], 3, 3)
+    for angle, axis in zip(angles.unbind(-1), axes.lower(), strict=True):
+        turn = rotation_from_rotvec(angle[..., None] * frame["xyz".index(axis)])
+        R = R @ turn if moving else turn @ R
+    return R
+
+
+def random_rotation(
+    *shape: int,
+    generator: torch.Generator | None = None,
+    dtype: torch.dtype | None = None,
+    device: torch.device | str | None = None,
+) -> Float[Tensor, "*shape 3 3"]:
+    """Draw rotations uniformly (Haar measure), as normal quaternions.
+
+    Args:
+        *shape: Batch dimensions; none gives one rotation.
+        generator: Source of randomness.
+        dtype: Floating-point type; torch's default if not given.
+        device: Where the result lies; the generator's device if not given.
+
+    Returns:
+        Rotation matrices.
+    """
+    if device is None and generator is not None:
+        device = generator.device
+    return rotation_from_quaternion_wxyz(torch.randn(*shape, 4, generator=generator, dtype=dtype, device=device))
+
+
+def rotation_angle(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+    """Measure the angle of rotations, 0 to pi radians, accurate over the whole range.
+
+    The angle between two rotations is `rotation_angle(R1.mT @ R2)`. The derivative at angle 0, where there is none, is 0.
+    """
+    check_tensors(R=(R, "3 3"))
+    axis = torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    return torch.atan2(torch.linalg.vector_norm(axis, dim=-1), R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+
+
+def _matrix(entries: list[Tensor], size: int) -> Tensor:
+    """Stack entries, row after row, into square matrices."""
+    return torch.stack(entries, -1).reshape(*entries[0].shape, size, size)
