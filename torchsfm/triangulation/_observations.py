@@ -1,0 +1,163 @@
+"""How the solvers of this room see their data: rows over (view, problem, point), in float64, in a well-scaled world.
+
+Points are independent of each other, so the work is done in pieces that fit the cache. Within a piece every number of a formula is
+one contiguous tensor (view, problem, point) or (problem, point); cameras are (view, problem, 1) and broadcast over the points.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsfm._types import check_tensors
+
+PIECE = 32768
+"""Observations in one piece: some ten temporaries of it fit a second-level cache."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """One piece of a triangulation problem.
+
+    The world is moved and scaled so that the centres of the cameras in use have mean 0 and root-mean-square distance 1: the cameras
+    in `P` are those of this world. Absent observations have weight 0 and harmless numbers.
+    """
+
+    x: tuple[Tensor, Tensor]
+    """Image coordinates, (view, problem, point) each."""
+    P: tuple[tuple[Tensor, ...], ...]
+    """Camera entries, (view, problem, 1) each, three rows of four."""
+    w: Tensor
+    """Weights of squared distances, (view, problem, point)."""
+    centre: tuple[Tensor, ...]
+    """Homogeneous camera centres in the moved world, last entry 1 or 0, (view, problem, 1) each."""
+    handed: Tensor
+    """Sign of the determinant of each camera's left 3x3 part, 0 where singular, (view, problem, 1)."""
+    shift: Tensor
+    """Where the origin of the moved world lies, (3, problem, 1)."""
+    scale: Tensor
+    """The unit of length of the moved world, (problem, 1)."""
+    broken: Tensor
+    """Points of which a wanted observation is not finite, (problem, point)."""
+
+    def world(self, X: Tensor) -> Tensor:
+        """Homogeneous points (4, problem, point) of the moved world, in the caller's world."""
+        return torch.cat((X[:3] * self.scale + self.shift * X[3], X[3:]))
+
+    def depths(self, X: Tensor) -> Tensor:
+        """The third homogeneous image coordinate, (view, problem, point)."""
+        return row_dot(self.P[2], X)
+
+    def facing(self, X: Tensor) -> Tensor:
+        """The sign that puts homogeneous points in front of most of the cameras that see them, (problem, point)."""
+        votes = (torch.sign(self.depths(X)) * self.handed * (self.w > 0)).sum(0)
+        votes = torch.where(votes == 0, X[3], votes)
+        return torch.where(votes < 0, -1.0, 1.0).to(X.dtype)
+
+
+def row_dot(row: tuple[Tensor, ...], X: Tensor) -> Tensor:
+    """A row of every camera times homogeneous points (4, problem, point)."""
+    return row[0] * X[0] + row[1] * X[1] + row[2] * X[2] + row[3] * X[3]
+
+
+def check(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> tuple[torch.Size, int]:
+    """The batch shape and the number of points."""
+    batch = check_tensors(x=(x, "v n 2"), P=(P, "v 3 4"), visible=(visible, "v n: bool"), weights=(weights, "v n"))
+    return batch, x.shape[-2]
+
+
+def in_pieces(
+    solve: Callable[[Observations], tuple[Tensor, ...]],
+    x: Tensor,
+    P: Tensor,
+    visible: Tensor | None,
+    weights: Tensor | None,
+) -> tuple[Tensor, ...]:
+    """Call `solve` on pieces and join what it returns: tensors (..., problem, point) become (..., *batch, point)."""
+    batch, n = check(x, P, visible, weights)
+    v, size = x.shape[-3], batch.numel()
+    flat_x = x.expand(*batch, v, n, 2).reshape(size, v, n, 2)
+    flat_P = P.expand(*batch, v, 3, 4).reshape(size, v, 3, 4)
+    flat_w = None if weights is None else weights.expand(*batch, v, n).reshape(size, v, n)
+    flat_seen = None if visible is None else visible.expand(*batch, v, n).reshape(size, v, n)
+    strips = []
+    for problems in _ranges(size, max(1, PIECE // max(1, v * n))):
+        pieces = []
+        for points in _ranges(n, max(1, PIECE // max(1, v))):
+            seen = None if flat_seen is None else flat_seen[problems, :, points]
+            w = None if flat_w is None else flat_w[problems, :, points]
+            pieces.append(solve(_observe(flat_x[problems, :, points], flat_P[problems], seen, w)))
+        strips.append(tuple(torch.cat(parts, -1) if len(parts) > 1 else parts[0] for parts in zip(*pieces, strict=True)))
+    joined = (torch.cat(parts, -2) if len(parts) > 1 else parts[0] for parts in zip(*strips, strict=True))
+    return tuple(part.reshape(*part.shape[:-2], *batch, n) for part in joined)
+
+
+def _ranges(size: int, step: int) -> Iterator[slice]:
+    """Slices that cover `size`; one empty slice where there is nothing, so that shapes come out right."""
+    for start in range(0, max(size, 1), step):
+        yield slice(start, min(start + step, size))
+
+
+def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> Observations:
+    """Lay a piece out: x (problem, view, point, 2), P (problem, view, 3, 4), visible and weights (problem, view, point)."""
+    good_x = torch.isfinite(x).all(-1)
+    good_P = torch.isfinite(P).all(-1).all(-1)[..., None]
+    good = good_x & good_P
+    wanted = torch.ones_like(good) if visible is None else visible
+    if weights is not None:
+        wanted = wanted & (weights != 0)
+        good = good & torch.isfinite(weights) & (weights >= 0)
+    use = wanted & good
+    one = torch.ones((), dtype=torch.float64, device=x.device)
+    w = torch.where(use, one if weights is None else weights.double(), 0.0)
+    x = torch.where(use[..., None], x.double(), 0.0)
+    P = torch.where(good_P[..., None], P.double(), torch.eye(3, 4, dtype=torch.float64, device=P.device))
+    # The scale of a camera matrix is arbitrary, and products of its entries must not overflow.
+    size = P[..., :3].detach().abs().amax(-1).amax(-1)[..., None, None]
+    P = P / torch.where(size > 0, size, 1.0)
+
+    u, v = x.permute(3, 1, 0, 2).contiguous().unbind(0)
+    w = w.permute(1, 0, 2).contiguous()
+    entries = P.permute(2, 3, 1, 0).contiguous()[..., None]
+    used = (w.detach() > 0).any(-1, keepdim=True)
+    rows = tuple(row.unbind(0) for row in entries.unbind(0))
+    centre = _centres(rows)
+    finite = centre[3].detach() != 0
+    counted = used & finite
+    number = counted.sum(0).clamp_min(1)
+    shift = torch.stack([torch.where(counted, c, 0.0).sum(0) / number for c in centre[:3]])
+    offsets = [torch.where(finite, c - s, c) for c, s in zip(centre[:3], shift.unbind(0), strict=True)]
+    spread = sum(torch.where(counted, o * o, 0.0).sum(0) for o in offsets) / number
+    # One place for all centres: there is no unit but the world's own.
+    apart = spread.detach() > 1e-28 * (shift.detach() ** 2).sum(0).clamp_min(1e-200)
+    scale = torch.where(apart, spread, 1.0).sqrt()
+    moved = tuple(
+        (r[0] * scale, r[1] * scale, r[2] * scale, r[3] + r[0] * shift[0] + r[1] * shift[1] + r[2] * shift[2]) for r in rows
+    )
+    scaled = [torch.where(finite, o / scale, o) for o in offsets]
+    broken = (wanted & ~good).any(1)
+    handed = torch.where(finite, torch.sign(_determinant(rows)).detach(), 0.0)
+    return Observations((u, v), moved, w, (scaled[0], scaled[1], scaled[2], centre[3]), handed, shift, scale, broken)
+
+
+def _determinant(P: tuple[tuple[Tensor, ...], ...]) -> Tensor:
+    """The determinant of the left 3x3 parts."""
+    a, b, c = P
+    return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+
+
+def _centres(P: tuple[tuple[Tensor, ...], ...]) -> tuple[Tensor, ...]:
+    """Homogeneous camera centres with last entry 1, or a unit direction and 0 for a camera at infinity."""
+    a, b, c = P
+    m = {(i, j): a[i] * b[j] - a[j] * b[i] for i in range(4) for j in range(i + 1, 4)}
+    X = c[1] * m[2, 3] - c[2] * m[1, 3] + c[3] * m[1, 2]
+    Y = -(c[0] * m[2, 3] - c[2] * m[0, 3] + c[3] * m[0, 2])
+    Z = c[0] * m[1, 3] - c[1] * m[0, 3] + c[3] * m[0, 1]
+    W = -(c[0] * m[1, 2] - c[1] * m[0, 2] + c[2] * m[0, 1])
+    rows = [sum(e * e for e in row[:3]).sqrt() for row in P]
+    finite = W.detach().abs() > 1e-13 * (rows[0] * rows[1] * rows[2]).detach()
+    length = (X * X + Y * Y + Z * Z).sqrt()
+    divisor = torch.where(finite, W, torch.where(length.detach() > 0, length, 1.0))
+    divisor = torch.where(divisor.detach() == 0, 1.0, divisor)
+    return X / divisor, Y / divisor, Z / divisor, finite.to(W.dtype)

@@ -1,0 +1,242 @@
+"""Optimal triangulation: the point with the smallest sum of squared reprojection errors."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
+from torchsfm.triangulation._symmetric import inverse, tangent_step
+from torchsfm.triangulation.optimal_correction import fundamental_rows, lindstrom
+from torchsfm.triangulation.triangulate_points_dlt import differentiated, euclidean, linear_points
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Points and what is known about them."""
+
+    model: Float[Tensor, "*batch n 3"]
+    """The points, finite always; where `status` is not OK they may mean little."""
+    status: Int8[Tensor, "*batch n"]
+    """OK; NOT_FINITE: a wanted observation is not finite; TOO_FEW: fewer than two observations; DEGENERATE: the rays coincide or
+    are parallel (no baseline, a point at infinity); BEHIND: not in front of all views that see it; NOT_CONVERGED."""
+    in_front: Bool[Tensor, "*batch n"]
+    """In front of every camera that sees it."""
+    parallax: Float[Tensor, "*batch n"]
+    """The largest angle between two of its viewing rays, in radians."""
+    covariance: Float[Tensor, "*batch n 3 3"]
+    """Of the point, for independent noise of variance 1 / weight in every image coordinate (1 pixel where no weights are given);
+    zero where the data do not determine it."""
+    error: Float[Tensor, "*batch n"]
+    """Root-mean-square distance (weighted) between the observations and the point's images, in pixels."""
+
+
+def triangulate_points(
+    x: Float[Tensor, "*#batch v n 2"],
+    P: Float[Tensor, "*#batch v 3 4"],
+    *,
+    visible: Bool[Tensor, "*#batch v n"] | None = None,
+    weights: Float[Tensor, "*#batch v n"] | None = None,
+    max_iterations: int = 30,
+) -> Triangulation:
+    """Points from their images in known views, by least squares on reprojection errors.
+
+    From the linear start, every point is refined by Levenberg-Marquardt over the sphere of homogeneous points, in a world moved
+    and scaled to the cameras, so that far points are as well-behaved as near ones. With two views the start is the optimal
+    correction of Lindstrom ("Triangulation made easy", CVPR 2010, two iterations), which leads to the global optimum of
+    Hartley & Sturm. With more views the optimum is the local one next to the linear solution.
+
+    Computed in float64 whatever comes in. The derivative of `model` with respect to observations, cameras and weights is that of
+    the optimum (implicit function theorem with the exact Hessian); `parallax`, `covariance` and `error` follow from it.
+
+    Cameras per point (ragged tracks): let the points be the batch, `x (p, v, 1, 2)` and `P (p, v, 3, 4)`.
+
+    Args:
+        x: Image points, in the pixels of the cameras.
+        P: Cameras `K [R | t]` or projective ones, of any scale and sign.
+        visible: Which views see which point; all by default.
+        weights: Factors of the squared distances (inverse variances), 0 for absent.
+        max_iterations: Of Levenberg-Marquardt, for each point.
+
+    Returns:
+        The points with status, cheirality, parallax, covariance and error.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not fit.
+    """
+
+    def solve(data: Observations) -> tuple[Tensor, ...]:
+        return _solve(data, max_iterations)
+
+    model, status, in_front, parallax, covariance, error = in_pieces(solve, x, P, visible, weights)
+    return Triangulation(
+        model.movedim(0, -1).to(x.dtype),
+        status,
+        in_front,
+        parallax.to(x.dtype),
+        covariance.movedim((0, 1), (-2, -1)).to(x.dtype),
+        error.to(x.dtype),
+    )
+
+
+def _solve(data: Observations, max_iterations: int) -> tuple[Tensor, ...]:
+    """Model, status, in_front, parallax, covariance and error of one piece."""
+    with torch.no_grad():
+        fixed = _detached(data)
+        X = linear_points(_corrected(fixed))
+        X = X * fixed.facing(X)
+        X, converged = _minimise(fixed, X, max_iterations)
+        X = X * fixed.facing(X)
+        N, _, _ = _normal_equations(fixed, X, exact=True)
+        J, _, _ = _normal_equations(fixed, X)
+        determined = tangent_step(X, J, torch.zeros_like(X))[2] > 1e-14
+        determined = determined & (X[3].abs() > 1e-9)
+    if differentiated(*data.x, *data.P[0], *data.P[1], *data.P[2], data.w):
+        _, g, _ = _normal_equations(data, X)
+        # A Newton step from the optimum leaves it where it is and carries the derivative.
+        eye = torch.eye(4, dtype=X.dtype, device=X.device)[..., None, None]
+        moved, _, _ = tangent_step(X, torch.where(determined, N, eye), torch.where(determined, g, 0.0))
+        X = X + (moved - moved.detach())
+    model = euclidean(data, X)
+
+    depth = data.depths(X.detach()) * data.handed * torch.where(X.detach()[3] < 0, -1.0, 1.0)
+    seen = data.w.detach() > 0
+    in_front = ((depth > 0) | ~seen).all(0) & seen.any(0)
+    parallax = _parallax(data, X)
+    covariance = _covariance(data, X, determined)
+    weight = data.w.sum(0)
+    _, _, cost = _normal_equations(data, X)
+    some = weight > 0
+    mean = torch.where(some, cost, 1.0) / torch.where(some, weight, 1.0)
+    error = torch.where(some & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), 0.0)
+
+    status = torch.full(in_front.shape, int(Status.OK), dtype=torch.int8, device=X.device)
+    for condition, code in (
+        (~converged, Status.NOT_CONVERGED),
+        (~in_front, Status.BEHIND),
+        (~determined, Status.DEGENERATE),
+        (seen.sum(0) < 2, Status.TOO_FEW),
+        (data.broken, Status.NOT_FINITE),
+    ):
+        status = torch.where(condition, int(code), status)
+    return model, status, in_front, parallax, covariance, error
+
+
+def _detached(data: Observations) -> Observations:
+    rows = tuple(tuple(e.detach() for e in row) for row in data.P)
+    return Observations(
+        (data.x[0].detach(), data.x[1].detach()),
+        rows,
+        data.w.detach(),
+        tuple(c.detach() for c in data.centre),
+        data.handed,
+        data.shift.detach(),
+        data.scale.detach(),
+        data.broken,
+    )
+
+
+def _corrected(data: Observations) -> Observations:
+    """Two views: the image points moved as little as makes their rays meet."""
+    if data.w.shape[0] != 2:
+        return data
+    (u1, u2), (v1, v2) = data.x[0].unbind(0), data.x[1].unbind(0)
+    first = tuple(tuple(e[0] for e in row) for row in data.P)
+    second = tuple(tuple(e[1] for e in row) for row in data.P)
+    # The correction weighs both images alike; other weights start from the linear solution.
+    alike = data.w[0] == data.w[1]
+    a1, b1, a2, b2 = lindstrom(fundamental_rows(first, second), u1, v1, u2, v2)
+    use = alike & torch.isfinite(a1 + b1 + a2 + b2)
+    u = torch.stack((torch.where(use, a1, u1), torch.where(use, a2, u2)))
+    v = torch.stack((torch.where(use, b1, v1), torch.where(use, b2, v2)))
+    return Observations((u, v), data.P, data.w, data.centre, data.handed, data.shift, data.scale, data.broken)
+
+
+def _project(data: Observations, X: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Image coordinates and one over the depth."""
+    z = data.depths(X)
+    tiny = z.detach().abs() < 1e-14
+    inverse = 1 / torch.where(tiny, torch.where(z.detach() < 0, -1e-14, 1e-14), z)
+    return row_dot(data.P[0], X) * inverse, row_dot(data.P[1], X) * inverse, inverse
+
+
+def _cost(data: Observations, X: Tensor) -> Tensor:
+    """The weighted sum of squared reprojection errors, (problem, point)."""
+    u, v, _ = _project(data, X)
+    e, f = u - data.x[0], v - data.x[1]
+    return (data.w * (e * e + f * f)).sum(0)
+
+
+def _normal_equations(data: Observations, X: Tensor, exact: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    """J'WJ (or half the Hessian, if exact), J'Wr and r'Wr with respect to the homogeneous point."""
+    p1, p2, p3 = data.P
+    u, v, inverse = _project(data, X)
+    e, f = u - data.x[0], v - data.x[1]
+    ju = tuple((p - u * r) * inverse for p, r in zip(p1, p3, strict=True))
+    jv = tuple((p - v * r) * inverse for p, r in zip(p2, p3, strict=True))
+    we, wf = data.w * e, data.w * f
+    wju, wjv = tuple(data.w * j for j in ju), tuple(data.w * j for j in jv)
+    g = torch.stack([(we * j + wf * k).sum(0) for j, k in zip(ju, jv, strict=True)])
+    upper = {(i, j): (wju[i] * ju[j] + wjv[i] * jv[j]).sum(0) for i in range(4) for j in range(i, 4)}
+    if exact:
+        bend = tuple((we * j + wf * k) * inverse for j, k in zip(ju, jv, strict=True))
+        upper = {(i, j): n - (bend[i] * p3[j] + p3[i] * bend[j]).sum(0) for (i, j), n in upper.items()}
+    N = torch.stack([upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]).unflatten(0, (4, 4))
+    return N, g, (we * e + wf * f).sum(0)
+
+
+def _minimise(data: Observations, X: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:
+    """Levenberg-Marquardt on the sphere, every point with its own damping and its own stop."""
+    damping = torch.full_like(X[0], 1e-6)
+    done = torch.zeros_like(X[0], dtype=torch.bool)
+    for _ in range(max_iterations):
+        N, g, cost = _normal_equations(data, X)
+        new, decrease, _ = tangent_step(X, N, g, damping)
+        better = (_cost(data, new) <= cost) & ~done
+        # Converged when the step would move no image point by more than 1e-11 of what a unit of angle moves it by.
+        trace = N[0, 0] + N[1, 1] + N[2, 2] + N[3, 3]
+        small = (decrease <= 1e-22 * trace) & (damping < 1)
+        X = torch.where(better, new, X)
+        damping = torch.where(better, damping * 0.1, damping * 10).clamp(1e-12, 1e12)
+        # A step that is too small for the cost to tell is as good as one that lowers it.
+        rounding = (decrease <= 1e-15 * cost) & ~better & (damping < 1)
+        done = done | small | rounding
+        if bool(done.all()):
+            break
+    return X, done
+
+
+def _parallax(data: Observations, X: Tensor) -> Tensor:
+    """The largest angle between two viewing rays, from the longest chord between their directions."""
+    c = data.centre
+    rays = torch.stack([X[i] * c[3] - X[3] * c[i] for i in range(3)])
+    # A ray from a finite centre points to the point; X[3] < 0 turns all of them.
+    length2 = (rays * rays).sum(0)
+    seen = (data.w > 0) & (length2.detach() > 0)
+    rays = rays * torch.where(length2.detach() > 0, length2, 1.0).rsqrt()
+    longest = torch.zeros_like(X[0])
+    for i in range(1, rays.shape[1]):
+        chord = rays[:, i : i + 1] - rays[:, :i]
+        chord2 = torch.where(seen[i] & seen[:i], (chord * chord).sum(0), 0.0)
+        longest = torch.maximum(longest, chord2.amax(0))
+    positive = longest.detach() > 0
+    half = 0.5 * torch.where(positive, longest, 1.0).sqrt()
+    return torch.where(positive, 2 * torch.asin(half.clamp_max(1 - 1e-16)), 0.0)
+
+
+def _covariance(data: Observations, X: Tensor, determined: Tensor) -> Tensor:
+    """The covariance (3, 3, problem, point) of the Euclidean point, zero where not determined."""
+    N, _, _ = _normal_equations(data, X)
+    trace = torch.where(determined, N[0, 0] + N[1, 1] + N[2, 2] + N[3, 3], 1.0)
+    # N X = 0; a unit in that direction makes N regular and drops out again.
+    outer = X[:, None] * X[None]
+    eye = torch.eye(4, dtype=X.dtype, device=X.device)[..., None, None]
+    M = (inverse(torch.where(determined, N / trace + outer, eye)) - outer) / trace
+    # Through the derivative of X[:3] / X[3], with respect to the homogeneous point.
+    w = torch.where(determined, X[3], 1.0)
+    Y = X[:3] / w
+    C = M[:3, :3] - Y[:, None] * M[3, :3] - M[:3, 3][:, None] * Y[None] + Y[:, None] * Y[None] * M[3, 3]
+    factor = data.scale / w
+    return torch.where(determined, C * (factor * factor), 0.0)
