@@ -7,10 +7,11 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.optim import wants_derivative
 from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
 from torchsfm.triangulation._symmetric import inverse, tangent_step
 from torchsfm.triangulation.optimal_correction import fundamental_rows, lindstrom
-from torchsfm.triangulation.triangulate_points_dlt import differentiated, euclidean, linear_points
+from torchsfm.triangulation.triangulate_points_dlt import euclidean, linear_points
 
 
 @dataclass(frozen=True)
@@ -83,34 +84,35 @@ def triangulate_points(
 
 def _solve(data: Observations, max_iterations: int) -> tuple[Tensor, ...]:
     """Model, status, in_front, parallax, covariance and error of one piece."""
+    fixed = _detached(data)
     with torch.no_grad():
-        fixed = _detached(data)
         X = linear_points(_corrected(fixed))
         X = X * fixed.facing(X)
-        X, converged = _minimise(fixed, X, max_iterations)
+        X, found = _minimise(fixed, X, max_iterations)
         X = X * fixed.facing(X)
-        N, _, _ = _normal_equations(fixed, X, exact=True)
-        J, _, _ = _normal_equations(fixed, X)
-        determined = tangent_step(X, J, torch.zeros_like(X))[2] > 1e-14
-        determined = determined & (X[3].abs() > 1e-9)
-    if differentiated(*data.x, *data.P[0], *data.P[1], *data.P[2], data.w):
-        _, g, _ = _normal_equations(data, X)
+        system = _System(fixed, X)
+        trace = system.trace()
+        _, decrease, _ = tangent_step(X, system.hessian(), system.g)
+        converged = found & (decrease <= 1e-18 * trace)
+        _, _, smallest = tangent_step(X, system.N, system.g)
+        determined = (smallest > 1e-14) & (X[3].abs() > 1e-9)
+    if wants_derivative(*data.x, *(e for row in data.P for e in row), data.w):
+        hessian, system = system.hessian(), _System(data, X)
         # A Newton step from the optimum leaves it where it is and carries the derivative.
         eye = torch.eye(4, dtype=X.dtype, device=X.device)[..., None, None]
-        moved, _, _ = tangent_step(X, torch.where(determined, N, eye), torch.where(determined, g, 0.0))
+        moved, _, _ = tangent_step(X, torch.where(determined, hessian, eye), torch.where(determined, system.g, 0.0))
         X = X + (moved - moved.detach())
+        system = _System(data, X)
     model = euclidean(data, X)
 
     depth = data.depths(X.detach()) * data.handed * torch.where(X.detach()[3] < 0, -1.0, 1.0)
     seen = data.w.detach() > 0
     in_front = ((depth > 0) | ~seen).all(0) & seen.any(0)
-    parallax = _parallax(data, X)
-    covariance = _covariance(data, X, determined)
     weight = data.w.sum(0)
-    _, _, cost = _normal_equations(data, X)
     some = weight > 0
-    mean = torch.where(some, cost, 1.0) / torch.where(some, weight, 1.0)
-    error = torch.where(some & (mean > 0), torch.where(mean > 0, mean, 1.0).sqrt(), 0.0)
+    mean = torch.where(some, system.cost, 1.0) / torch.where(some, weight, 1.0)
+    positive = some & (mean > 0)
+    error = torch.where(positive, torch.where(positive, mean, 1.0).sqrt(), 0.0)
 
     status = torch.full(in_front.shape, int(Status.OK), dtype=torch.int8, device=X.device)
     for condition, code in (
@@ -121,7 +123,7 @@ def _solve(data: Observations, max_iterations: int) -> tuple[Tensor, ...]:
         (data.broken, Status.NOT_FINITE),
     ):
         status = torch.where(condition, int(code), status)
-    return model, status, in_front, parallax, covariance, error
+    return model, status, in_front, _parallax(data, X), _covariance(data, X, system.N, determined), error
 
 
 def _detached(data: Observations) -> Observations:
@@ -154,58 +156,69 @@ def _corrected(data: Observations) -> Observations:
     return Observations((u, v), data.P, data.w, data.centre, data.handed, data.shift, data.scale, data.broken)
 
 
-def _project(data: Observations, X: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Image coordinates and one over the depth."""
-    z = data.depths(X)
-    tiny = z.detach().abs() < 1e-14
-    inverse = 1 / torch.where(tiny, torch.where(z.detach() < 0, -1e-14, 1e-14), z)
-    return row_dot(data.P[0], X) * inverse, row_dot(data.P[1], X) * inverse, inverse
+class _System:
+    """Residuals and their derivatives at homogeneous points: J'WJ as `N`, J'Wr as `g`, r'Wr as `cost`."""
+
+    def __init__(self, data: Observations, X: Tensor) -> None:
+        p1, p2, p3 = data.P
+        z = row_dot(p3, X)
+        tiny = z.detach().abs() < 1e-14
+        inverse_z = 1 / torch.where(tiny, torch.where(z.detach() < 0, -1e-14, 1e-14), z)
+        u, v = row_dot(p1, X) * inverse_z, row_dot(p2, X) * inverse_z
+        e, f = u - data.x[0], v - data.x[1]
+        we, wf = data.w * e, data.w * f
+        ju = tuple((p - u * r) * inverse_z for p, r in zip(p1, p3, strict=True))
+        jv = tuple((p - v * r) * inverse_z for p, r in zip(p2, p3, strict=True))
+        wju, wjv = tuple(data.w * j for j in ju), tuple(data.w * j for j in jv)
+        self._bend = tuple((we * j + wf * k) * inverse_z for j, k in zip(ju, jv, strict=True))
+        self._p3 = p3
+        self.g = torch.stack([(we * j + wf * k).sum(0) for j, k in zip(ju, jv, strict=True)])
+        self.N = _symmetric({(i, j): (wju[i] * ju[j] + wjv[i] * jv[j]).sum(0) for i in range(4) for j in range(i, 4)})
+        self.cost = (we * e + wf * f).sum(0)
+        self.size = (data.w * (u * u + v * v)).sum(0)
+
+    def trace(self) -> Tensor:
+        """The trace of N."""
+        return self.N[0, 0] + self.N[1, 1] + self.N[2, 2] + self.N[3, 3]
+
+    def hessian(self) -> Tensor:
+        """Half the exact Hessian of the cost."""
+        b, p = self._bend, self._p3
+        return self.N - _symmetric({(i, j): (b[i] * p[j] + p[i] * b[j]).sum(0) for i in range(4) for j in range(i, 4)})
 
 
-def _cost(data: Observations, X: Tensor) -> Tensor:
-    """The weighted sum of squared reprojection errors, (problem, point)."""
-    u, v, _ = _project(data, X)
-    e, f = u - data.x[0], v - data.x[1]
-    return (data.w * (e * e + f * f)).sum(0)
-
-
-def _normal_equations(data: Observations, X: Tensor, exact: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-    """J'WJ (or half the Hessian, if exact), J'Wr and r'Wr with respect to the homogeneous point."""
-    p1, p2, p3 = data.P
-    u, v, inverse = _project(data, X)
-    e, f = u - data.x[0], v - data.x[1]
-    ju = tuple((p - u * r) * inverse for p, r in zip(p1, p3, strict=True))
-    jv = tuple((p - v * r) * inverse for p, r in zip(p2, p3, strict=True))
-    we, wf = data.w * e, data.w * f
-    wju, wjv = tuple(data.w * j for j in ju), tuple(data.w * j for j in jv)
-    g = torch.stack([(we * j + wf * k).sum(0) for j, k in zip(ju, jv, strict=True)])
-    upper = {(i, j): (wju[i] * ju[j] + wjv[i] * jv[j]).sum(0) for i in range(4) for j in range(i, 4)}
-    if exact:
-        bend = tuple((we * j + wf * k) * inverse for j, k in zip(ju, jv, strict=True))
-        upper = {(i, j): n - (bend[i] * p3[j] + p3[i] * bend[j]).sum(0) for (i, j), n in upper.items()}
-    N = torch.stack([upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]).unflatten(0, (4, 4))
-    return N, g, (we * e + wf * f).sum(0)
+def _symmetric(upper: dict[tuple[int, int], Tensor]) -> Tensor:
+    """A symmetric matrix (4, 4, problem, point) from its upper half."""
+    return torch.stack([upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]).unflatten(0, (4, 4))
 
 
 def _minimise(data: Observations, X: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:
-    """Levenberg-Marquardt on the sphere, every point with its own damping and its own stop."""
+    """Levenberg-Marquardt on the sphere, every point with its own damping and its own stop; then Newton's method."""
     damping = torch.full_like(X[0], 1e-6)
-    done = torch.zeros_like(X[0], dtype=torch.bool)
+    found = torch.zeros_like(X[0], dtype=torch.bool)
+    system = _System(data, X)
+    N, g, cost = system.N, system.g, system.cost
     for _ in range(max_iterations):
-        N, g, cost = _normal_equations(data, X)
         new, decrease, _ = tangent_step(X, N, g, damping)
-        better = (_cost(data, new) <= cost) & ~done
-        # Converged when the step would move no image point by more than 1e-11 of what a unit of angle moves it by.
+        # Near enough for Newton's method when the step moves the images by no more than 1e-6 of what a unit of angle does.
         trace = N[0, 0] + N[1, 1] + N[2, 2] + N[3, 3]
-        small = (decrease <= 1e-22 * trace) & (damping < 1)
-        X = torch.where(better, new, X)
-        damping = torch.where(better, damping * 0.1, damping * 10).clamp(1e-12, 1e12)
-        # A step that is too small for the cost to tell is as good as one that lowers it.
-        rounding = (decrease <= 1e-15 * cost) & ~better & (damping < 1)
-        done = done | small | rounding
-        if bool(done.all()):
+        found = found | ((decrease <= 1e-12 * trace) & (damping < 1))
+        if bool(found.all()):
             break
-    return X, done
+        system = _System(data, new)
+        # What the cost cannot tell from rounding is no reason to refuse a step.
+        rounding = 1e-15 * (cost * system.size).sqrt() + 1e-30 * system.size
+        better = (system.cost <= cost + rounding) & ~found
+        X = torch.where(better, new, X)
+        N, g = torch.where(better, system.N, N), torch.where(better, system.g, g)
+        cost = torch.where(better, system.cost, cost)
+        damping = torch.where(better, damping * 0.1, damping * 10).clamp(1e-12, 1e12)
+    for _ in range(2):
+        system = _System(data, X)
+        new, decrease, smallest = tangent_step(X, system.hessian(), system.g)
+        near = found & (smallest > 1e-12) & (decrease <= 1e-9 * system.trace())
+        X = torch.where(near, new, X)
+    return X, found
 
 
 def _parallax(data: Observations, X: Tensor) -> Tensor:
@@ -226,15 +239,14 @@ def _parallax(data: Observations, X: Tensor) -> Tensor:
     return torch.where(positive, 2 * torch.asin(half.clamp_max(1 - 1e-16)), 0.0)
 
 
-def _covariance(data: Observations, X: Tensor, determined: Tensor) -> Tensor:
+def _covariance(data: Observations, X: Tensor, N: Tensor, determined: Tensor) -> Tensor:
     """The covariance (3, 3, problem, point) of the Euclidean point, zero where not determined."""
-    N, _, _ = _normal_equations(data, X)
     trace = torch.where(determined, N[0, 0] + N[1, 1] + N[2, 2] + N[3, 3], 1.0)
     # N X = 0; a unit in that direction makes N regular and drops out again.
     outer = X[:, None] * X[None]
     eye = torch.eye(4, dtype=X.dtype, device=X.device)[..., None, None]
     M = (inverse(torch.where(determined, N / trace + outer, eye)) - outer) / trace
-    # Through the derivative of X[:3] / X[3], with respect to the homogeneous point.
+    # Through the derivative of X[:3] / X[3] with respect to the homogeneous point.
     w = torch.where(determined, X[3], 1.0)
     Y = X[:3] / w
     C = M[:3, :3] - Y[:, None] * M[3, :3] - M[:3, 3][:, None] * Y[None] + Y[:, None] * Y[None] * M[3, 3]

@@ -4,7 +4,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm.optim import wants_derivative
 from torchsfm.triangulation._observations import Observations, in_pieces
 from torchsfm.triangulation._symmetric import smallest_eigenvector, tangent_step
 
@@ -102,8 +101,3 @@ def _refine(X: Tensor, N: Tensor, a: tuple[Tensor, ...], b: tuple[Tensor, ...], 
     value = (X * g).sum(0).detach()
     diagonal = torch.eye(4, dtype=N.dtype, device=N.device)[..., None, None]
     return tangent_step(X, N - value * diagonal, g - value * X)[0]
-
-
-def differentiated(*tensors: Tensor | None) -> bool:
-    """Whether a derivative is wanted of any of them."""
-    return wants_derivative(*[t for t in tensors if t is not None])
