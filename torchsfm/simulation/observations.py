@@ -75,7 +75,7 @@ def simulate_images(
         depth = depth.expand(x_true.shape[:-1])
         X_cam = X_cam.expand(*x_true.shape[:-1], 3)
     near, far = depth_range
-    visible = (depth > near) & (depth <= far) & _seen(cameras, X_cam, x_true)
+    visible = (depth > near) & (depth <= far) & cameras.in_domain(X_cam)
     options = {"dtype": X.dtype, "device": X.device}
     if image_size is not None:
         size = X.new_tensor(image_size)
@@ -94,14 +94,6 @@ def simulate_images(
     outlier &= visible
     x = torch.where(outlier[..., None], wild, x)
     return SimulatedImages(torch.where(visible[..., None], x, 0.0), visible, outlier, x_true, depth)
-
-
-def _seen(cameras: Camera, X_cam: Tensor, x: Tensor) -> Tensor:
-    """Whether the image point leads back along the ray it came from: false where the lens formula has folded back."""
-    d, valid = cameras.unproject(x)
-    along = (d * X_cam).sum(-1)
-    across = torch.linalg.cross(d, X_cam).norm(dim=-1)
-    return valid & (along > 0) & (across <= 1e-3 * along)
 
 
 def random_points(

@@ -13,29 +13,49 @@ PROBES = (1, 2, 4, 8)
 """How many texture lookups a footprint is cut into along its longer axis, as it is once, twice, ... as long as wide."""
 
 
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 def cast(
     scene: TexturedScene, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]
 ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
     """Distance to the first surface in multiples of d (infinity where there is none) and its index (-1 where there is none)."""
     nearest = torch.full_like(d[0], math.inf)
     index = torch.full(d.shape[1:], -1, dtype=torch.int16, device=d.device)
+    square = _dot(d, d)
     for i, thing in enumerate(scene.objects):
-        s = thing.surface.intersect(origin, d)
-        closer = s < nearest
-        nearest = torch.where(closer, s, nearest)
-        index = index.masked_fill(closer, i)
+        chosen = _near(thing, origin, d, square)
+        s = thing.surface.intersect(origin[:, chosen] if origin.shape[1] > 1 else origin, d[:, chosen])
+        closer = s < nearest[chosen]
+        chosen = chosen[closer]
+        nearest[chosen] = s[closer]
+        index[chosen] = i
     return nearest, index
 
 
 def lit(scene: TexturedScene, X: Float[Tensor, "3 n"]) -> Bool[Tensor, "n"]:
     """Whether nothing stands between each point and the sun."""
     sun = scene.sun.to(X)
-    sun = (sun / sun.norm())[:, None]
+    sun = (sun / sun.norm())[:, None].expand_as(X)
+    # Starting a little off the surface keeps a surface from shading itself.
+    X = X + 1e-3 * sun
     free = torch.ones(X.shape[1:], dtype=torch.bool, device=X.device)
+    square = torch.ones_like(X[0])
     for thing in scene.objects:
-        # Starting a little off the surface keeps a surface from shading itself.
-        free &= torch.isinf(thing.surface.intersect(X + 1e-3 * sun, sun.expand_as(X)))
+        chosen = _near(thing, X, sun, square)
+        free[chosen] &= torch.isinf(thing.surface.intersect(X[:, chosen], sun[:, chosen]))
     return free
+
+
+def _near(thing: Textured, origin: Tensor, d: Tensor, square: Tensor) -> Tensor:
+    """Which rays come near enough to the surface to be worth intersecting: those that meet the ball around it."""
+    middle, radius = thing.surface.ball()
+    o = middle.to(d)[:, None] - origin
+    ahead = (o.T @ d)[0] if o.shape[1] == 1 else _dot(o, d)
+    beyond = _dot(o, o) - radius**2
+    inside = beyond <= 0
+    return (inside | ((ahead > 0) & (ahead.square() >= beyond * square))).nonzero()[:, 0]
 
 
 def shade(
@@ -60,9 +80,11 @@ def shade(
         index: From `cast`.
         sunny: From `lit`, at the points met.
     """
-    up = d[2] / d.norm(dim=0)
-    sky = torch.stack((0.55 - 0.25 * up, 0.70 - 0.20 * up, 0.86 - 0.08 * up)).to(torch.float32)
-    color = sky.clamp(0, 1)
+    color = torch.empty(d.shape, dtype=torch.float32, device=d.device)
+    missed = (index < 0).nonzero()[:, 0]
+    e = d[:, missed]
+    up = e[2] / _dot(e, e).sqrt()
+    color[:, missed] = torch.stack((0.55 - 0.25 * up, 0.70 - 0.20 * up, 0.86 - 0.08 * up)).to(torch.float32)
     sun = scene.sun.to(d)
     sun = sun / sun.norm()
     for i, thing in enumerate(scene.objects):
@@ -72,18 +94,17 @@ def shade(
         e, s = d[:, chosen], distance[chosen]
         chart = thing.surface.chart(origin + s * e)
         normal = chart.normal
-        facing = normal[0] * e[0] + normal[1] * e[1] + normal[2] * e[2]
+        facing = _dot(normal, e)
         steps = []
         for step in (dx[:, chosen], dy[:, chosen]):
             # Where the neighbouring ray meets the tangent plane.
-            slide = (normal[0] * step[0] + normal[1] * step[1] + normal[2] * step[2]) / facing
-            moved = s * (step - e * slide)
-            steps += [(g[0] * moved[0] + g[1] * moved[1] + g[2] * moved[2]) / thing.texel for g in (chart.du, chart.dv)]
+            moved = s * (step - e * (_dot(normal, step) / facing))
+            steps += [_dot(g, moved) / thing.texel for g in (chart.du, chart.dv)]
         footprint = torch.stack(steps).nan_to_num(0.0, 1e6, -1e6).to(torch.float32)
         texture = lookup(thing, chart.layer, (chart.uv / thing.texel).to(torch.float32), footprint)
-        slope = (normal * sun[:, None]).sum(0) * -torch.sign(facing)
-        light = scene.ambient * (0.8 + 0.2 * normal[2] * -torch.sign(facing))
-        light = light + (1 - scene.ambient) * 1.25 * slope.clamp_min(0) * sunny[chosen]
+        outside = -torch.sign(facing)
+        light = scene.ambient * (0.8 + 0.2 * normal[2] * outside)
+        light = light + (1 - scene.ambient) * 1.25 * ((sun @ normal) * outside).clamp_min(0) * sunny[chosen]
         color[:, chosen] = texture * light.to(torch.float32)
     return color.clamp(0, 1)
 
@@ -103,28 +124,24 @@ def lookup(
     long = torch.maximum(long, short).sqrt().clamp_min(1e-6)
     wide = (ux * vy - uy * vx).abs() / long
     ratio = long / wide.clamp_min(1.0).minimum(long)
-    color = torch.zeros(3, uv.shape[1], device=uv.device)
-    wanted = torch.log2(ratio).round().clamp(0, len(PROBES) - 1)
-    for sheet, pyramid in enumerate(thing.sheets):
-        for power, probes in enumerate(PROBES):
-            chosen = ((layer == sheet) & (wanted == power)).nonzero()[:, 0]
-            if not len(chosen):
-                continue
-            at, along = uv[:, chosen], step[:, chosen]
-            level = torch.log2(torch.maximum(long[chosen] / probes, wide[chosen]).clamp_min(1.0))
-            total = torch.zeros(3, len(chosen), device=uv.device)
-            for k in range(probes):
-                total += _trilinear(pyramid, at + along * ((k + 0.5) / probes - 0.5), level)
-            color[:, chosen] = total / probes
+    color = torch.empty(3, uv.shape[1], device=uv.device)
+    wanted = layer * len(PROBES) + torch.log2(ratio).round().clamp(0, len(PROBES) - 1).long()
+    for key in torch.bincount(wanted).nonzero()[:, 0].tolist():
+        pyramid, probes = thing.sheets[key // len(PROBES)], PROBES[key % len(PROBES)]
+        chosen = (wanted == key).nonzero()[:, 0]
+        at, along = uv[:, chosen], step[:, chosen]
+        level = torch.log2(torch.maximum(long[chosen] / probes, wide[chosen]).clamp_min(1.0))
+        shift = (torch.arange(probes, device=uv.device) + 0.5) / probes - 0.5
+        every = (at[:, None] + along[:, None] * shift[:, None]).reshape(2, -1)
+        color[:, chosen] = _trilinear(pyramid, every, level.repeat(probes)).reshape(3, probes, -1).mean(1)
     return color
 
 
 def _trilinear(pyramid: tuple[Tensor, ...], uv: Tensor, level: Tensor) -> Tensor:
     """Read each point between two mip levels; coordinates in texels of level 0 from the sheet's corner."""
-    level = level.clamp(0, len(pyramid) - 1)
-    lower = level.floor()
+    level = level.clamp_max(len(pyramid) - 1)
     color = torch.zeros(3, uv.shape[1], device=uv.device)
-    for k in range(int(lower.min()), min(int(lower.max()) + 2, len(pyramid))):
+    for k in range(int(level.min()), math.ceil(float(level.max())) + 1):
         weight = (1 - (level - k).abs()).clamp_min(0)
         chosen = (weight > 0).nonzero()[:, 0]
         if not len(chosen):

@@ -39,7 +39,9 @@ class RenderedSequence:
     """Which points are inside each image and not hidden by a surface."""
 
 
-def default_camera(width: int, height: int, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Camera:
+def default_camera(
+    width: int, height: int, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> Camera:
     """An ordinary camera: 57 degrees across, square pixels, a principal point off the middle, mild barrel distortion."""
     f = torch.tensor(0.92 * width, dtype=dtype, device=device)
     c = torch.tensor([0.507 * width - 0.5, 0.494 * height - 0.5], dtype=dtype, device=device)
@@ -160,15 +162,14 @@ def _render_view(
     edge[:-1] |= down
     if supersample > 1:
         chosen = (edge.reshape(-1) & rays.valid).nonzero()[:, 0]
-        total = torch.zeros(3, len(chosen), device=d.device)
-        offsets = ((torch.arange(supersample, device=d.device) + 0.5) / supersample - 0.5).tolist()
-        for oy in offsets:
-            for ox in offsets:
-                e = d[:, chosen] + ox * dx[:, chosen] + oy * dy[:, chosen]
-                s, i = cast(scene, origin, e)
-                small = (dx[:, chosen] / supersample, dy[:, chosen] / supersample)
-                total += shade(scene, origin, e, *small, s, i, _sunlight(scene, origin, e, s))
-        color[:, chosen] = total / supersample**2
+        step = ((torch.arange(supersample, device=d.device) + 0.5) / supersample - 0.5).to(d)
+        ex, ey = dx[:, None, chosen], dy[:, None, chosen]
+        e = d[:, None, chosen] + ex * step.repeat(supersample)[:, None] + ey * step.repeat_interleave(supersample)[:, None]
+        ex, ey = ((g / supersample).expand_as(e).reshape(3, -1) for g in (ex, ey))
+        e = e.reshape(3, -1)
+        s, i = cast(scene, origin, e)
+        fine = shade(scene, origin, e, ex, ey, s, i, _sunlight(scene, origin, e, s))
+        color[:, chosen] = fine.reshape(3, supersample**2, -1).mean(1)
     depth = (distance * rays.d[2]).to(pixels.dtype)
     return color.reshape(3, height, width), depth.reshape(height, width), index.reshape(height, width)
 
@@ -202,10 +203,8 @@ def _see_points(
     """Projections of the points into every view, and whether each view sees them."""
     X_cam = poses.transform(X)
     x = cameras.project(X_cam)
-    _, valid = cameras.unproject(x)
     size = x.new_tensor([width, height])
-    inside = ((x >= -0.5) & (x < size - 0.5)).all(-1) & (X_cam[..., 2] > 0) & valid
-    # Beyond the fold of the distortion a point may land inside the image without being seen there.
+    inside = ((x >= -0.5) & (x < size - 0.5)).all(-1) & cameras.in_domain(X_cam)
     for i in range(len(x)):
         origin = poses[i].centre[:, None]
         s, _ = cast(scene, origin, X.T - origin)

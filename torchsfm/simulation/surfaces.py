@@ -45,6 +45,11 @@ class Rectangle:
         u, v = self.edge_u / self.edge_u.norm(), self.edge_v / self.edge_v.norm()
         return torch.stack((u, v, torch.linalg.cross(u, v)))
 
+    def ball(self) -> tuple[Float[Tensor, "3"], float]:
+        """Centre and radius of a ball around the surface."""
+        half = (self.edge_u + self.edge_v) / 2
+        return self.corner + half, 1.001 * float(half.norm())
+
     def intersect(self, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
         """The smallest s > 0 for which origin + s d lies on the surface, infinity where there is none."""
         frame = self._frame().to(d)
@@ -66,6 +71,10 @@ class Rectangle:
         return Chart(torch.zeros_like(uv[0], dtype=torch.long), uv, du, dv, normal)
 
 
+_UPRIGHT = ((1, -1, 2, -1), (1, 1, 2, -1), (0, 1, 2, -1), (0, -1, 2, -1), (0, 1, 1, 1), (0, 1, 1, -1))
+"""For each side of a box (-x, +x, -y, ...) the axes and signs of u and v: seen from outside u runs right, v down."""
+
+
 @dataclass(frozen=True)
 class Box:
     """A box with its centre, its axes as the rows of a rotation, and half its length along each."""
@@ -78,6 +87,10 @@ class Box:
         """Width and height of each texture sheet: -x, +x, -y, +y, -z, +z."""
         a, b, c = (2 * float(h) for h in self.half)
         return ((b, c), (b, c), (a, c), (a, c), (a, b), (a, b))
+
+    def ball(self) -> tuple[Float[Tensor, "3"], float]:
+        """Centre and radius of a ball around the surface."""
+        return self.centre, 1.001 * float(self.half.norm())
 
     def intersect(self, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
         """The smallest s > 0 for which origin + s d lies on the surface, infinity where there is none."""
@@ -94,12 +107,13 @@ class Box:
         axes, half = self.axes.to(X), self.half.to(X)[:, None]
         p = axes @ (X - self.centre.to(X)[:, None])
         axis = (p.abs() / half).argmax(0)
-        first, second = torch.where(axis == 0, 1, 0), torch.where(axis == 2, 1, 2)
         side = p.gather(0, axis[None])[0] > 0
-        q = p + half
-        uv = torch.stack((q.gather(0, first[None])[0], q.gather(0, second[None])[0]))
+        sheet = 2 * axis + side.long()
+        u_axis, u_sign, v_axis, v_sign = torch.tensor(_UPRIGHT, device=X.device).T[:, sheet]
         rows = axes.T
-        return Chart(2 * axis + side.long(), uv, rows[:, first], rows[:, second], rows[:, axis])
+        u = half[u_axis, 0] + u_sign * p.gather(0, u_axis[None])[0]
+        v = half[v_axis, 0] + v_sign * p.gather(0, v_axis[None])[0]
+        return Chart(sheet, torch.stack((u, v)), u_sign * rows[:, u_axis], v_sign * rows[:, v_axis], rows[:, axis])
 
 
 @dataclass(frozen=True)
@@ -112,6 +126,10 @@ class Sphere:
     def sheets(self) -> tuple[tuple[float, float], ...]:
         """Width and height of each texture sheet: -x, +x, -y, +y, -z, +z."""
         return ((self.radius * math.pi / 2,) * 2,) * 6
+
+    def ball(self) -> tuple[Float[Tensor, "3"], float]:
+        """Centre and radius of a ball around the surface."""
+        return self.centre, 1.001 * self.radius
 
     def intersect(self, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
         """The smallest s > 0 for which origin + s d lies on the surface, infinity where there is none."""
@@ -147,6 +165,10 @@ class Cylinder:
     def sheets(self) -> tuple[tuple[float, float], ...]:
         """Width (the circumference) and height of the texture sheet."""
         return ((2 * math.pi * self.radius, self.height),)
+
+    def ball(self) -> tuple[Float[Tensor, "3"], float]:
+        """Centre and radius of a ball around the surface."""
+        return self.base + self.axes[2] * (self.height / 2), 1.001 * math.hypot(self.radius, self.height / 2)
 
     def intersect(self, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
         """The smallest s > 0 for which origin + s d lies on the surface, infinity where there is none."""

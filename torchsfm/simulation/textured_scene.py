@@ -31,9 +31,7 @@ class TexturedScene:
     """Light that reaches every surface, as a share of the light on a surface facing the sun."""
 
 
-def texture_surface(
-    surface: Surface, *styles: str, texel: float = 0.005, generator: torch.Generator | None = None
-) -> Textured:
+def texture_surface(surface: Surface, *styles: str, texel: float = 0.005, generator: torch.Generator | None = None) -> Textured:
     """Paint a surface.
 
     Args:
@@ -83,7 +81,10 @@ def courtyard_scene(*, texel: float = 0.006, generator: torch.Generator | None =
         (Rectangle(vector(-2.8, -6.5, 0.0), vector(9.3, 0.0, 0.0), vector(0.0, 9.3, 0.0)), ("ground",)),
         (Rectangle(vector(-2.8, 2.8, 3.2), vector(8.5, 0.0, 0.0), vector(0.0, 0.0, -3.2)), ("bricks",)),
         (Rectangle(vector(-2.8, -5.5, 3.2), vector(0.0, 8.3, 0.0), vector(0.0, 0.0, -3.2)), ("plaster",)),
-        (box(0.9 + 0.3 * a[5], 1.3 + 0.3 * a[6], 0.0, (1.3, 1.1, 1.2), 0.4 + a[7]), ("wood", "painted", "wood", "poster", "wood")),
+        (
+            box(0.9 + 0.3 * a[5], 1.3 + 0.3 * a[6], 0.0, (1.3, 1.1, 1.2), 0.4 + a[7]),
+            ("wood", "painted", "wood", "poster", "wood"),
+        ),
         (box(1.0 + 0.3 * a[5], 1.2 + 0.3 * a[6], 1.2, (0.7, 0.7, 0.6), 1.1 + a[8]), ("painted", "poster", "marble", "plaster")),
         (box(-0.9 + 0.3 * a[9], 0.9, 0.0, (0.9, 0.9, 1.7), 0.2 + a[10]), ("mosaic", "marble", "painted", "poster", "marble")),
         (box(1.4 + 0.3 * a[11], -0.9 + 0.3 * a[12], 0.0, (1.0, 0.6, 0.45), -0.5 + a[13]), ("poster", "wood", "painted")),
