@@ -1,0 +1,60 @@
+"""Train a network through a solver: learn how far to trust each match so that the eight-point algorithm gets F right.
+
+Half of the matches are wrong. Each comes with two numbers: how alike the two image patches looked, which is higher for right
+matches but not by much, and one that means nothing. The network turns them into weights, `fundamental_8pt` turns the weighted
+matches into F, and the loss is how well F fits points that took no part: its gradient reaches the network through the solver.
+
+    python examples/differentiable_geometry.py
+"""
+
+import torch
+from torch import Tensor, nn
+
+from torchsfm.geometry import Camera, intrinsics, sampson_distance
+from torchsfm.motion import fundamental_8pt
+from torchsfm.simulation import random_points, random_poses, simulate_images
+
+SIZE = (1000, 750)
+
+
+def problems(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Matches x1, x2 of many image pairs with two clues each, and exact matches y1, y2 of other points to learn from."""
+    X = random_points(count, 220, generator=generator)
+    poses = random_poses(count, 2, generator=generator)
+    camera = Camera(intrinsics(torch.tensor(900.0).double(), torch.tensor(SIZE).double() / 2))
+    images = simulate_images(X, poses, camera, image_size=SIZE, noise=0.5, outliers=0.3, generator=generator)
+    right = images.visible.all(1) & ~images.outlier.any(1)
+    alike = torch.randn(right.shape, generator=generator, dtype=torch.float64) + 2.5 * right
+    nothing = torch.randn(right.shape, generator=generator, dtype=torch.float64)
+    x1, x2 = images.x[:, 0, :200], images.x[:, 1, :200]
+    y1, y2 = images.x_true[:, 0, 200:], images.x_true[:, 1, 200:]
+    return x1, x2, torch.stack((alike, nothing), -1)[:, :200], y1, y2
+
+
+def main() -> None:
+    """Train for a few seconds, then compare on image pairs never seen."""
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(2, 16), nn.ReLU(), nn.Linear(16, 1), nn.Softplus()).double()
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.02)
+    for step in range(151):
+        x1, x2, clues, y1, y2 = problems(32, generator)
+        F = fundamental_8pt(x1, x2, network(clues)[..., 0])
+        loss = torch.log1p(sampson_distance(F, y1, y2)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if step % 30 == 0:
+            print(f"step {step:3d}: loss {loss.item():.3f}")
+    x1, x2, clues, y1, y2 = problems(200, generator)
+    with torch.no_grad():
+        for name, weights in {
+            "all matches alike": torch.ones_like(x1[..., 0]),
+            "weights of the network": network(clues)[..., 0],
+        }.items():
+            error = sampson_distance(fundamental_8pt(x1, x2, weights), y1, y2).mean(-1)
+            print(f"{name}: median error {error.median().item():.2f} px")
+
+
+if __name__ == "__main__":
+    main()

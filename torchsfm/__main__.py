@@ -1,0 +1,5 @@
+"""`python -m torchsfm` is the `torchsfm` command."""
+
+from torchsfm.cli import main
+
+main()

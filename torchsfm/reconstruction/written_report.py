@@ -1,0 +1,165 @@
+"""The report of a reconstruction as plain data for programs, and as a page of text for people."""
+
+from typing import Any
+
+import torch
+
+from torchsfm.geometry import DISTORTION_MODELS
+from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import ImageReport, SfmResult
+from torchsfm.reconstruction.view_graph import Verdict
+
+Record = dict[str, Any]
+
+VERDICTS = {
+    Verdict.UNRELATED: "unrelated",
+    Verdict.GENERAL: "general",
+    Verdict.PLANAR: "planar",
+    Verdict.ROTATION: "pure rotation",
+}
+
+
+def report_record(result: SfmResult, **more: Any) -> Record:
+    """Everything the report knows as dicts, lists, strings and numbers, ready for JSON.
+
+    Args:
+        result: What `reconstruct` returned.
+        **more: Further entries, such as the options of the run; `truth` is a dict that `report_markdown` shows as a table.
+
+    Returns:
+        `models`, `images`, `pairs`, `seconds`, `focal_source` and the further entries.
+    """
+    report = result.report
+    observed: dict[str, tuple[int, float]] = {}
+    for model in reversed(result.models):
+        counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
+        for i in model.registered.nonzero()[:, 0].tolist():
+            observed[model.names[i]] = (counts[i], float(model.view_errors()[i]))
+    images = []
+    for image in report.images:
+        count, error = observed.get(image.name, (0, 0.0)) if image.model is not None else (0, 0.0)
+        entry = {"name": image.name, "registered": image.model is not None, "model": image.model, "reason": image.reason}
+        images.append(entry | {"features": image.features, "observations": count, "mean_error_px": error})
+    names = [image.name for image in report.images if _readable(image)]
+    table = report.pairs
+    columns = (table.pairs, table.num_matches, table.fundamental_inliers, table.homography_inliers, table.verdict)
+    pairs = [
+        {
+            "images": [names[i], names[j]],
+            "matches": matches,
+            "fundamental_inliers": num_F,
+            "homography_inliers": num_H,
+            "verdict": VERDICTS[Verdict(verdict)],
+        }
+        for (i, j), matches, num_F, num_H, verdict in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+    return {
+        "models": [_model_record(model) for model in result.models],
+        "images": images,
+        "pairs": pairs,
+        "seconds": {stage: round(value, 3) for stage, value in report.seconds.items()},
+        "focal_source": list(report.focal_source),
+        **more,
+    }
+
+
+def report_markdown(record: Record) -> str:
+    """The record as a markdown page: models, cameras, images, pairs, and where the time went."""
+    lines = ["# Reconstruction", ""]
+    lines += _models_text(record)
+    if truth := record.get("truth"):
+        lines += ["## Against the truth", "", *_table(["", ""], [[key, value] for key, value in truth.items()]), ""]
+    lines += ["## Images", ""]
+    rows = [
+        [
+            image["name"],
+            "yes" if image["registered"] else "no",
+            "" if image["model"] is None else image["model"],
+            image["features"],
+            image["observations"],
+            f"{image['mean_error_px']:.3f}" if image["registered"] else "",
+            image["reason"],
+        ]
+        for image in record["images"]
+    ]
+    lines += _table(["image", "registered", "model", "features", "observations", "mean error, px", "reason"], rows)
+    related = [pair for pair in record["pairs"] if pair["verdict"] != "unrelated"]
+    lines += ["", "## Pairs", ""]
+    lines += [f"{len(record['pairs'])} pairs were compared, {len(record['pairs']) - len(related)} have too little in common."]
+    lines += ["Matches, and how many of them one fundamental matrix and one homography explain:", ""]
+    lines += _table(
+        ["image", "image", "matches", "F", "H", "verdict"],
+        [
+            [*pair["images"], pair["matches"], pair["fundamental_inliers"], pair["homography_inliers"], pair["verdict"]]
+            for pair in related
+        ],
+    )
+    lines += ["", "## Time and memory", ""]
+    seconds = record["seconds"]
+    lines += _table(["stage", "seconds"], [[stage, f"{value:.2f}"] for stage, value in seconds.items()])
+    lines += ["", f"{sum(seconds.values()):.1f} seconds in all."]
+    if memory := record.get("peak_memory_mb"):
+        lines += [f"The process held {memory:.0f} MB at most."]
+    return "\n".join(lines) + "\n"
+
+
+def _readable(image: ImageReport) -> bool:
+    """Whether the file could be read: pairs count only those that could."""
+    return image.model is not None or image.features > 0 or image.reason.startswith("only 0 features")
+
+
+def _model_record(model: Reconstruction) -> Record:
+    cameras = []
+    kind = next(name for name, cls in DISTORTION_MODELS.items() if type(model.cameras.distortion) is cls)
+    for index in torch.unique(model.camera_index[model.registered]).tolist():
+        camera = model.cameras[index]
+        K = camera.K.tolist()
+        names = camera.distortion.parameter_names
+        cameras.append(
+            {
+                "model": kind,
+                "images": int((model.registered & (model.camera_index == index)).sum()),
+                "focal": [K[0][0], K[1][1]],
+                "principal_point": [K[0][2], K[1][2]],
+                "distortion": dict(zip(names, camera.distortion.parameters().tolist(), strict=True)),
+            }
+        )
+    return {
+        "images": model.num_registered,
+        "points": model.num_points,
+        "observations": model.num_observations,
+        "mean_track_length": model.num_observations / max(model.num_points, 1),
+        "mean_error_px": float(model.residuals().mean()) if model.num_observations else 0.0,
+        "cameras": cameras,
+    }
+
+
+def _models_text(record: Record) -> list[str]:
+    if not record["models"]:
+        return [f"Nothing could be reconstructed: {record.get('failure', 'see the images below')}.", ""]
+    lines: list[str] = []
+    total = len(record["images"])
+    for number, model in enumerate(record["models"]):
+        lines += [f"## Model {number}" if len(record["models"]) > 1 else "## Model", ""]
+        rows = [
+            ["images", f"{model['images']} of {total}"],
+            ["points", f"{model['points']:,}"],
+            ["observations", f"{model['observations']:,}"],
+            ["mean track length", f"{model['mean_track_length']:.2f}"],
+            ["mean reprojection error", f"{model['mean_error_px']:.3f} px"],
+        ]
+        for camera in model["cameras"]:
+            fx, fy = camera["focal"]
+            cx, cy = camera["principal_point"]
+            text = f"f = {fx:.2f}" + ("" if abs(fx - fy) <= 1e-9 * fx else f", {fy:.2f}") + f", c = ({cx:.2f}, {cy:.2f}) px"
+            text += "".join(f", {name} = {value:.5f}" for name, value in camera["distortion"].items())
+            rows.append([f"camera of {camera['images']} images ({camera['model']})", text])
+        lines += [*_table(["", ""], rows), ""]
+    return lines
+
+
+def _table(header: list[str], rows: list[list[Any]]) -> list[str]:
+    def line(cells: list[Any]) -> str:
+        return "| " + " | ".join(str(cell).replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+
+    return [line(header), "|" + "---|" * len(header), *map(line, rows)]
