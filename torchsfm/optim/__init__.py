@@ -1,14 +1,16 @@
 """Which parameters make the residuals smallest, and how do they move when the data move? Engines that know no geometry."""
 
 from torchsfm.optim.implicit import attach_implicit, attach_optimum, wants_derivative
+from torchsfm.optim.levenberg_marquardt import LeastSquaresResult, levenberg_marquardt
 from torchsfm.optim.loss import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey, loss_slope
-from torchsfm.optim.manifold import Euclidean, Manifold, RigidMotion, Rotation, Subset, UnitSphere
+from torchsfm.optim.manifold import Euclidean, Manifold, RigidMotion, Rotation, Subset, UnitSphere, rotation_exponential
 
 __all__ = [
     "Cauchy",
     "Euclidean",
     "GemanMcClure",
     "Huber",
+    "LeastSquaresResult",
     "Loss",
     "Manifold",
     "RigidMotion",
@@ -20,6 +22,8 @@ __all__ = [
     "UnitSphere",
     "attach_implicit",
     "attach_optimum",
+    "levenberg_marquardt",
     "loss_slope",
+    "rotation_exponential",
     "wants_derivative",
 ]

@@ -18,11 +18,9 @@ def wants_derivative(*inputs: Tensor) -> bool:
     if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
         return True
     # Inside a level of forward mode only; unpacking outside one is an error in some versions.
-    return any(forward_ad.unpack_dual(x).tangent is not None for x in inputs) if _in_forward_mode() else False
-
-
-def _in_forward_mode() -> bool:
-    return getattr(forward_ad, "_current_level", -1) >= 0
+    if getattr(forward_ad, "_current_level", -1) < 0:
+        return False
+    return any(forward_ad.unpack_dual(x).tangent is not None for x in inputs)  # type: ignore[no-untyped-call]
 
 
 def attach_implicit(
@@ -34,16 +32,17 @@ def attach_implicit(
 ) -> Float[Tensor, "..."]:
     """Give a solution `y` of `equations(y, *inputs) = 0` its derivatives with respect to the inputs.
 
-    There must be at least as many equations as unknowns, and their Jacobian with respect to `y` must have full column rank at the
-    solution: fix scale and gauge by equations (`|F|^2 - 1`), and let redundant equations stand (they are met in the sense of
-    least squares). Where the Jacobian is singular or not finite, or `valid` is False, the derivative is exactly zero.
+    There must be at least as many equations as unknowns, and their Jacobian with respect to `y` must have full column rank at
+    the solution: fix scale and gauge by equations (`|F|^2 - 1`), and let redundant equations stand (they are met in the sense
+    of least squares). Where the Jacobian is singular or not finite, or `valid` is False, the derivative is exactly zero.
 
     Without an input that is being differentiated, `y` is returned as it came, and nothing is computed.
 
     Args:
         equations: A function of `(y, *inputs)` returning `(*batch, m)`, each element depending on its own element of the batch
             alone. It is called with inputs as they are given here.
-        y: The solution, `(*batch, ...)` with `dims` trailing dimensions that make up one solution. Its graph, if any, is dropped.
+        y: The solution, `(*batch, ...)` with `dims` trailing dimensions that make up one solution. Its graph, if any, is
+            dropped.
         *inputs: What the solution depends on. Each carries the batch dimensions of `y` in front, of size 1 where shared
             (`x[..., None, :, :]` for several solution slots).
         dims: How many trailing dimensions of `y` belong to one solution.
@@ -78,8 +77,8 @@ def attach_optimum(
 ) -> Float[Tensor, "..."]:
     """Give a stationary point `y` of `objective(y, *inputs)` its derivatives with respect to the inputs.
 
-    The equations are the vanishing of the gradient with respect to `y`, their Jacobian is the exact Hessian. A direction in which the
-    objective is flat (gauge, scale) makes it singular and the derivative zero: write the objective over a minimal
+    The equations are the vanishing of the gradient with respect to `y`, their Jacobian is the exact Hessian. A direction in
+    which the objective is flat (gauge, scale) makes it singular and the derivative zero: write the objective over a minimal
     parameterisation, or add a term that fixes the gauge.
 
     Args:
@@ -103,7 +102,7 @@ def attach_optimum(
 
 def _jacobian(function: Callable[[Tensor], Tensor], y: Tensor, dims: int) -> Tensor:
     """The Jacobian `(*batch, m, k)` of a function that treats the elements of the batch one by one."""
-    value, pull = torch.func.vjp(function, y)
+    value, pull = torch.func.vjp(function, y)[:2]
     rows = []
     for i in range(value.shape[-1]):
         seed = torch.zeros_like(value)

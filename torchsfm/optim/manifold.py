@@ -1,8 +1,8 @@
 """Retractions: how a step in a tangent space moves a parameter block.
 
-A `Manifold` says how many numbers a block holds (`ambient`), how many it is free in (`tangent`), and how a tangent step moves it.
-`retract(x, 0) == x`; to first order a step is the derivative of the curve. Optimisers take their steps through it, so that a
-rotation stays a rotation and a direction keeps its length. All functions broadcast over leading dimensions.
+A `Manifold` says how many numbers a block holds (`ambient`), how many it is free in (`tangent`), and how a tangent step
+moves it. `retract(x, 0) == x`; to first order a step is the derivative of the curve. Optimisers take their steps through it,
+so that a rotation stays a rotation and a direction keeps its length. All functions broadcast over leading dimensions.
 """
 
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ class RigidMotion:
     def retract(self, x: Float[Tensor, "*#b 12"], delta: Float[Tensor, "*#b 6"]) -> Float[Tensor, "*b 12"]:
         """The motion after the step."""
         step = rotation_exponential(delta[..., :3])
-        rotation = step @ x[..., :9].unflatten(-1, (3, 3))
+        rotation = step @ _square(x[..., :9])
         translation = (step @ x[..., 9:, None])[..., 0] + delta[..., 3:]
         return torch.cat((rotation.flatten(-2), translation), -1)
 
@@ -99,7 +99,7 @@ class Rotation:
 
     def retract(self, x: Float[Tensor, "*#b 9"], delta: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 9"]:
         """The rotation after the step."""
-        return (rotation_exponential(delta) @ x.unflatten(-1, (3, 3))).flatten(-2)
+        return (rotation_exponential(delta) @ _square(x)).flatten(-2)
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,8 @@ class UnitSphere:
         denominator = 1 + sign * unit[..., -1:]
         tangent = torch.cat((delta - head * (inner / denominator), -sign * inner * torch.ones_like(tail)), -1)
         square = (delta * delta).sum(-1, keepdim=True)
-        return length * (_cos_sqrt(square) * unit + _sinc_sqrt(square) * tangent)
+        moved: Tensor = length * (_cos_sqrt(square) * unit + _sinc_sqrt(square) * tangent)
+        return moved
 
 
 def rotation_exponential(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -138,9 +139,15 @@ def rotation_exponential(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     a, b = _sinc_sqrt(square), _cosc_sqrt(square)
     x, y, z = w.unbind(-1)
     zero = torch.zeros_like(x)
-    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    cross = _square(torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1))
     eye = torch.eye(3, dtype=w.dtype, device=w.device)
-    return eye + a * cross + b * (w[..., :, None] * w[..., None, :] - square * eye)
+    outer = w[..., :, None] * w[..., None, :]
+    rotation: Tensor = eye + a * cross + b * (outer - square * eye)
+    return rotation
+
+
+def _square(x: Tensor) -> Tensor:
+    return x.reshape(*x.shape[:-1], 3, 3)
 
 
 def _sinc_sqrt(s: Tensor) -> Tensor:
