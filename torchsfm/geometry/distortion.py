@@ -17,17 +17,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
-from torchsfm.geometry.radial import (
-    LARGEST_ANGLE,
-    brown,
-    even_polynomial,
-    first_fold,
-    fisheye_from_tangent,
-    flatten_ray,
-    invert_brown,
-    invert_radial,
-    tangent_from_fisheye,
-)
+from torchsfm.geometry.decentring import brown, invert_brown
+from torchsfm.geometry.fisheye import fisheye_from_tangent, tangent_from_fisheye
+from torchsfm.geometry.radial import even_polynomial, first_fold, flatten_ray, invert_radial
 
 
 class DistortionModel(ABC):
@@ -117,8 +109,8 @@ class NoDistortion(DistortionModel):
         return x, y
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        valid = torch.isfinite(u) & torch.isfinite(v)
-        return torch.where(valid, u, 0.0), torch.where(valid, v, 0.0), torch.ones_like(u), valid
+        u, v, valid = _finite_pairs(u, v)
+        return u, v, torch.ones_like(u), valid
 
     def valid_radius(self) -> Float[Tensor, ""]:
         """Return inf: a pinhole has no limit."""
@@ -145,11 +137,11 @@ class _Polynomial(DistortionModel):
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         k = self._columns()
-        good = torch.isfinite(u) & torch.isfinite(v)
-        u, v = torch.where(good, u, 0.0), torch.where(good, v, 0.0)
-        s, valid = invert_radial(u * u + v * v, k, self.valid_radius()[..., None])
+        u, v, good = _finite_pairs(u, v)
+        limit = self.valid_radius()[..., None]
+        s, valid = invert_radial(torch.addcmul(u * u, v, v), k, limit, torch.isfinite(limit))
         valid = valid & good
-        inverse = torch.where(valid, 1.0, 0.0) / torch.where(valid, even_polynomial(s, k), 1.0)
+        inverse = 1 / torch.where(valid, even_polynomial(s, k), torch.inf)
         return u * inverse, v * inverse, torch.ones_like(s), valid
 
     def valid_radius(self) -> Float[Tensor, "*batch"]:
@@ -200,8 +192,9 @@ class BrownConrady(DistortionModel):
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         k1, k2, p1, p2, k3 = self._columns()
+        u, v, good = _finite_pairs(u, v)
         x, y, valid = invert_brown(u, v, (k1, k2, k3), p1, p2, self.valid_radius()[..., None])
-        return x, y, torch.ones_like(x), valid
+        return x, y, torch.ones_like(x), valid & good
 
     def valid_radius(self) -> Float[Tensor, "*batch"]:
         """Find the tangent of the angle where the radial part stops increasing."""
@@ -233,18 +226,17 @@ class KannalaBrandt(DistortionModel):
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         k = self._columns()
-        good = torch.isfinite(u) & torch.isfinite(v)
-        u, v = torch.where(good, u, 0.0), torch.where(good, v, 0.0)
-        s, valid = invert_radial(u * u + v * v, k, self.valid_radius()[..., None])
+        u, v, good = _finite_pairs(u, v)
+        limit = self.valid_radius()[..., None]
+        s, valid = invert_radial(torch.addcmul(u * u, v, v), k, limit, limit < torch.pi)
         valid = valid & good
-        s = torch.where(valid, s, 0.0)
-        factor, z = tangent_from_fisheye(s)
-        factor = torch.where(valid, factor, 0.0) / torch.where(valid, even_polynomial(s, k), 1.0)
+        factor, z = tangent_from_fisheye(torch.where(valid, s, 0.0))
+        factor = factor / torch.where(valid, even_polynomial(s, k), torch.inf)
         return u * factor, v * factor, z, valid
 
     def valid_radius(self) -> Float[Tensor, "*batch"]:
         """Find the angle in radians where the radial function stops increasing, at most pi."""
-        return first_fold([self.k1, self.k2, self.k3, self.k4]).clamp(max=LARGEST_ANGLE)
+        return first_fold([self.k1, self.k2, self.k3, self.k4]).clamp(max=torch.pi)
 
     def in_domain(self, d: Float[Tensor, "*#batch n 3"]) -> Bool[Tensor, "*#batch n"]:
         """Tell which rays, forwards or backwards, lie within the valid radius."""
@@ -262,3 +254,9 @@ DISTORTION_MODELS: dict[str, type[DistortionModel]] = {
     "fisheye": KannalaBrandt,
 }
 """The models by the names used in files and on the command line."""
+
+
+def _finite_pairs(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Replace points by zero that are not finite, or whose squared distance from the origin is not."""
+    good = torch.isfinite(torch.addcmul(u * u, v, v).detach())
+    return torch.where(good, u, 0.0), torch.where(good, v, 0.0), good

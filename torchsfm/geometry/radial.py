@@ -1,28 +1,49 @@
 """Numbers behind lens distortion: radial polynomials, the radius where they fold back, and their inverses by Newton's method.
 
-Everything here works on separate coordinates of shape (*batch, n), with coefficients that broadcast against them.
+Everything here works on separate coordinates of shape (*batch, n), with coefficients that broadcast against them. The loops
+are written in few passes over memory, since that is all they cost.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-ITERATIONS = 10
-"""Newton steps on the radial function; from the start used here, six reach rounding error on all but wild parameters."""
-SERIES = 1e-3
-"""Squared angle or tangent below which power series replace quotients."""
-LARGEST_ANGLE = torch.pi
+GUARDED = 3
+"""Newton steps that narrow a bracket around the root; then the rest converges by itself on all but contrived functions."""
+PLAIN = 7
+"""Newton steps that only stay inside that bracket."""
+BLOCK = 16384
+"""Points worked on at once on a CPU, so that the many passes over them stay in its cache."""
+
+
+def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arrays: Tensor) -> tuple[Tensor, ...]:
+    """Call an elementwise function of broadcasting arrays block by block and join what it returns."""
+    shape = torch.broadcast_shapes(*(a.shape for a in arrays))  # type: ignore[no-untyped-call]
+    count = shape.numel()
+    if count <= BLOCK or any(a.is_cuda for a in arrays):
+        return function(*arrays)
+    arrays = tuple(a[(None,) * (len(shape) - a.ndim)] for a in arrays)
+    axis = next(i for i, size in enumerate(shape) if size > 1)
+    step = max(1, shape[axis] * BLOCK // count)
+    pieces = []
+    for start in range(0, shape[axis], step):
+        length = min(step, shape[axis] - start)
+        pieces.append(in_blocks(function, *(a.narrow(axis, start, length) if a.shape[axis] > 1 else a for a in arrays)))
+    return tuple(torch.cat(parts, axis) for parts in zip(*pieces, strict=True))
 
 
 def even_polynomial(s: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
     """Evaluate 1 + k1 s + k2 s^2 + ..."""
-    if not coefficients:
-        return torch.ones_like(s)
+    return torch.addcmul(torch.ones((), dtype=s.dtype, device=s.device), s, polynomial(s, coefficients))
+
+
+def polynomial(s: Tensor, coefficients: Sequence[Tensor]) -> Tensor:
+    """Evaluate k1 + k2 s + k3 s^2 + ..."""
     value = coefficients[-1]
     for k in reversed(coefficients[:-1]):
-        value = k + s * value
-    return 1 + s * value
+        value = torch.addcmul(k, s, value)
+    return value
 
 
 def slope_coefficients(coefficients: Sequence[Tensor]) -> list[Tensor]:
@@ -32,14 +53,12 @@ def slope_coefficients(coefficients: Sequence[Tensor]) -> list[Tensor]:
 
 def flatten_ray(X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Divide by Z, with |Z| held above the rounding error of X and Y; also return the squared radius, held finite."""
-    value = Z.detach()
-    floor = torch.finfo(Z.dtype).eps * torch.maximum(X.detach().abs(), Y.detach().abs())
-    replacement = torch.where(floor > 0, floor, 1.0)
-    replacement = torch.where(value < 0, -replacement, replacement)
-    inverse = 1 / torch.where(value.abs() > floor, Z, replacement)
+    eps = torch.finfo(Z.dtype).eps
+    floor = torch.maximum(X.detach().abs(), Y.detach().abs()) * eps + eps * eps
+    inverse = 1 / torch.copysign(torch.maximum(Z.abs(), floor), Z)
     x, y = X * inverse, Y * inverse
     # The bound keeps the eighth power of the radius finite in every dtype; no lens comes near it.
-    return x, y, (x * x + y * y).clamp(max=torch.finfo(Z.dtype).max ** (1 / 12))
+    return x, y, torch.addcmul(x * x, y, y).clamp(max=torch.finfo(Z.dtype).max ** (1 / 12))
 
 
 def first_fold(coefficients: Sequence[Tensor]) -> Tensor:
@@ -74,142 +93,66 @@ def first_fold(coefficients: Sequence[Tensor]) -> Tensor:
         return torch.where(finite, radius, 0.0).to(slopes.dtype)
 
 
-def solve_radial(rho: Tensor, coefficients: Sequence[Tensor], limit: Tensor) -> Tensor:
+def solve_radial(rho: Tensor, coefficients: Sequence[Tensor], limit: Tensor, folds: Tensor, plain: int = PLAIN) -> Tensor:
     """Solve r (1 + k1 r^2 + ...) = rho for r in [0, limit], where the left side increases. Not differentiated.
 
-    The start is exact to first order at both ends where `limit` is a fold (where r grows like a square root), and otherwise the
+    The start is exact to first order at both ends where `limit` is a fold (there r grows like a square root), and otherwise the
     least of the bounds that the single terms put on r.
     """
+    tiny, largest = torch.finfo(rho.dtype).tiny, torch.finfo(rho.dtype).max
     slopes = slope_coefficients(coefficients)
-    folds = torch.isfinite(limit)
-    bounded = torch.where(folds, limit, 1.0)
+    bounded = torch.where(folds, limit, 1.0).clamp(min=tiny)
     top = bounded * even_polynomial(bounded * bounded, coefficients)
     top = torch.where(folds & (top > 0), top, 1.0)
     t = (rho / top).clamp(max=1)
-    bend = (1 - 2 * top / bounded.clamp(min=torch.finfo(rho.dtype).tiny)).clamp(min=-1)
-    start = bounded * (1 - ((1 - t) * (1 + bend * t)).clamp(min=0).sqrt())
-    logarithm = rho.clamp(min=torch.finfo(rho.dtype).tiny).log()
+    bend = (1 - 2 * top / bounded).clamp(min=-1)
+    square = (1 - t) * (1 + bend * t)
+    start = bounded - bounded * square.clamp(min=0).sqrt()
+    logarithm = rho.clamp(min=tiny).log()
     bound = logarithm
     for i, k in enumerate(coefficients):
         power = torch.where(k > 0, 1 / (2 * i + 3), 0.0).to(rho.dtype)
-        shift = torch.where(k > 0, -power * k.clamp(min=torch.finfo(rho.dtype).tiny).log(), torch.inf)
+        shift = torch.where(k > 0, -power * k.clamp(min=tiny).log(), torch.inf)
         bound = torch.minimum(bound, torch.addcmul(shift, logarithm, power))
-    r = torch.where(folds, start, bound.exp())
-    for _ in range(ITERATIONS):
+    r = torch.minimum(torch.where(folds, start, bound.exp()), limit)
+    low, high = torch.zeros_like(r), limit
+    for i in range(GUARDED + plain):
         s = r * r
-        slope = even_polynomial(s, slopes)
-        step = (r * even_polynomial(s, coefficients) - rho) / torch.where(slope == 0, 1.0, slope)
-        r = (r - step).clamp(min=0).minimum(limit)
+        missing = torch.addcmul(rho, r, even_polynomial(s, coefficients), value=-1)
+        newton = torch.addcdiv(r, missing, even_polynomial(s, slopes).clamp(min=tiny))
+        if i < GUARDED:
+            # 1 where r is below the root, else 0; arithmetic, because `where` on a random mask costs ten times as much.
+            below = missing.sign().clamp(min=0)
+            low = torch.maximum(low, below * r)
+            high = torch.minimum(high, torch.add(r, below, alpha=largest))
+            # No step passes the middle of what is left, so that none can jump back and forth between the ends.
+            r = newton.clamp(torch.lerp(low, r, 0.5), 0.5 * (r + high))
+        else:
+            r = newton.clamp(low, high)
     return r
 
 
-def invert_radial(q: Tensor, coefficients: Sequence[Tensor], limit: Tensor) -> tuple[Tensor, Tensor]:
+def invert_radial(q: Tensor, coefficients: Sequence[Tensor], limit: Tensor, folds: Tensor) -> tuple[Tensor, Tensor]:
     """Solve s (1 + k1 s + ...)^2 = q for s = r^2, given q = rho^2; return s and where it is a solution within the limit.
 
     In s the equation is smooth at zero, so derivatives are too: the last Newton step is taken at the detached solution, which
     gives first derivatives by q and by the coefficients through the implicit function theorem.
     """
-    with torch.no_grad():
-        rho = q.detach()
-        rho = torch.where(torch.isfinite(rho), rho, 0.0).sqrt()
-        fixed = [torch.where(torch.isfinite(k), k, 0.0).detach() for k in coefficients]
-        r = solve_radial(rho, fixed, limit)
+
+    def solve(q: Tensor, limit: Tensor, folds: Tensor, *fixed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        rho = q.sqrt()
+        r = solve_radial(rho, fixed, limit, folds)
         s = r * r
         h, slope = even_polynomial(s, fixed), even_polynomial(s, slope_coefficients(fixed))
-        error = (r * h - rho).abs()
-        tolerance = 64 * torch.finfo(q.dtype).eps
-        valid = (error <= tolerance * rho) & (r <= limit) & (slope > 0) & torch.isfinite(q) & (limit > 0)
-        inverse = 1 / torch.where(valid, h * slope, 1.0)
-    step = inverse * (s * even_polynomial(s, coefficients).square() - q)
-    return torch.where(valid, s - step, s), valid
+        error = torch.addcmul(rho, r, h, value=-1).abs()
+        valid = (error <= 64 * torch.finfo(q.dtype).eps * rho) & (slope > 0) & (limit > 0)
+        return s, 1 / torch.where(valid, h * slope, torch.inf), valid
 
-
-def fisheye_from_tangent(X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute angle / radius and the squared angle of rays to the optical axis; smooth on the axis in front.
-
-    Rays may point backwards (up to the angle pi). Exactly behind there is no answer: the quotient is then 1.
-    """
-    q = X * X + Y * Y
-    front = (Z > 0) & (q < SERIES * Z * Z)
-    depth = torch.where(front, Z, 1.0)
-    t = torch.where(front, q, 0.0) / (depth * depth)
-    series = (1 - t * (1 / 3 - t * (1 / 5 - t * (1 / 7 - t / 9)))) / depth
-    rest = (~front) & (q > 0)
-    r = torch.where(rest, q, 1.0).sqrt()
-    quotient = torch.atan2(r, torch.where(rest, Z, 1.0)) / r
-    ratio = torch.where(front, series, torch.where(rest, quotient, 1.0))
-    return ratio, ratio * ratio * q
-
-
-def tangent_from_fisheye(s: Tensor) -> tuple[Tensor, Tensor]:
-    """From the squared angle, compute the factor of (x, y) by the angle and the z coordinate of a ray.
-
-    The ray has z = 1 up to about 89.9 degrees off the axis, and unit length beyond.
-    """
-    small = s < SERIES
-    angle = torch.where(small, 1.0, s).sqrt()
-    cosine = torch.cos(angle)
-    flat = small | (cosine > 2e-3)
-    sinc = torch.where(small, 1 - s / 6 * (1 - s / 20 * (1 - s / 42)), torch.sin(angle) / angle)
-    cosine = torch.where(small, 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56))), cosine)
-    factor = torch.where(flat, sinc / torch.where(flat, cosine, 1.0), sinc)
-    return factor, torch.where(flat, 1.0, cosine)
-
-
-def brown(x: Tensor, y: Tensor, s: Tensor, radial: Sequence[Tensor], p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:
-    """Distort flat coordinates by a radial polynomial and decentring terms."""
-    h = even_polynomial(s, radial)
-    xy = 2 * x * y
-    return x * h + p1 * xy + p2 * (s + 2 * x * x), y * h + p2 * xy + p1 * (s + 2 * y * y)
-
-
-def invert_brown(
-    u: Tensor, v: Tensor, radial: Sequence[Tensor], p1: Tensor, p2: Tensor, limit: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Solve the Brown-Conrady equations for the flat coordinates by Newton's method, from the radial solution.
-
-    The Jacobian is symmetric. Returns x, y and where they are a solution within the limit.
-    """
     with torch.no_grad():
-        good = torch.isfinite(u) & torch.isfinite(v)
-        good &= torch.isfinite(p1) & torch.isfinite(p2)
-        u0, v0 = torch.where(good, u, 0.0).detach(), torch.where(good, v, 0.0).detach()
-        fixed = [torch.where(torch.isfinite(k), k, 0.0).detach() for k in (*radial, p1, p2)]
-        k, a, b = fixed[:-2], fixed[-2], fixed[-1]
-        slopes = [(i + 1) * c for i, c in enumerate(k)]
-        rho = (u0 * u0 + v0 * v0).sqrt()
-        r = solve_radial(rho, k, limit)
-        factor = r / torch.where(rho > 0, rho, 1.0)
-        x, y = u0 * factor, v0 * factor
-        for last in (False, False, False, False, True):
-            s = x * x + y * y
-            h = even_polynomial(s, k)
-            # Half of dh/ds by x and y; the polynomial of slopes has constant term k1.
-            bend = slopes[-1]
-            for c in reversed(slopes[:-1]):
-                bend = c + s * bend
-            bend = 2 * bend
-            xy = 2 * x * y
-            ex, ey = brown(x, y, s, k, a, b)
-            ex, ey = ex - u0, ey - v0
-            jxx = h + bend * x * x + 2 * a * y + 6 * b * x
-            jyy = h + bend * y * y + 2 * b * x + 6 * a * y
-            jxy = 0.5 * bend * xy + 2 * a * x + 2 * b * y
-            determinant = jxx * jyy - jxy * jxy
-            regular = determinant > 0
-            inverse = 1 / torch.where(regular, determinant, 1.0)
-            if last:
-                break
-            dx, dy = inverse * (jyy * ex - jxy * ey), inverse * (jxx * ey - jxy * ex)
-            x, y = x - dx, y - dy
-            # Held inside the limit, so that no step runs over the fold.
-            shrink = (limit / (x * x + y * y).sqrt().clamp(min=torch.finfo(x.dtype).tiny)).clamp(max=1)
-            x, y = x * shrink, y * shrink
-        tolerance = 64 * torch.finfo(u.dtype).eps
-        valid = good & regular & (torch.maximum(ex.abs(), ey.abs()) <= tolerance * rho)
-        valid &= (s <= limit * limit) & (limit > 0)
-        inverse = torch.where(valid, inverse, 0.0)
-        jxx, jxy, jyy = inverse * jxx, inverse * jxy, inverse * jyy
-    ex, ey = brown(x, y, x * x + y * y, radial, p1, p2)
-    ex, ey = torch.where(valid, ex - u, 0.0), torch.where(valid, ey - v, 0.0)
-    return x - (jyy * ex - jxy * ey), y - (jxx * ey - jxy * ex), valid
+        s, inverse, valid = in_blocks(solve, q.detach(), limit, folds, *finite_constants(coefficients))
+    return s - inverse * torch.addcmul(-q, s, even_polynomial(s, coefficients).square()), valid
+
+
+def finite_constants(coefficients: Sequence[Tensor]) -> list[Tensor]:
+    """Detach coefficients; those that are not finite become zero (their limit is zero too, so no point is valid)."""
+    return [torch.where(torch.isfinite(k), k, 0.0).detach() for k in coefficients]
