@@ -1,0 +1,152 @@
+"""The commands and their options."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+
+from torchsfm.cli.inputs import prepare_folder, read_intrinsics, warn_about_intrinsics
+from torchsfm.cli.job import Job, UserError, told
+from torchsfm.cli.results import VERSION, compare, finish
+from torchsfm.images import save_image
+from torchsfm.reconstruction import Reconstruction
+from torchsfm.simulation import render_sequence
+
+app = typer.Typer(
+    name="torchsfm",
+    help="From photographs to calibrated cameras and 3D structure.",
+    epilog="Exit status: 0 all good, 1 nothing could be reconstructed, 2 wrong input or usage, 130 interrupted.",
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+class CameraModel(StrEnum):
+    """Lens distortion models of `--camera`."""
+
+    pinhole = "pinhole"
+    simple_radial = "simple_radial"
+    radial = "radial"
+    opencv = "opencv"
+    fisheye = "fisheye"
+
+
+Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")]
+Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
+
+
+def print_version(wanted: bool) -> None:
+    """Print the version and end."""
+    if wanted:
+        typer.echo(f"torchsfm {VERSION}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True, callback=print_version)
+    ] = False,
+) -> None:
+    """From photographs to calibrated cameras and 3D structure."""
+
+
+@app.command()
+def reconstruct(
+    images: Annotated[list[Path], typer.Argument(help="A folder of images, or image files.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the model, the page, the report and the finished stages.")],
+    sequence: Annotated[bool, typer.Option("--sequence", help="The images are frames of a video, in order.")] = False,
+    camera: Annotated[
+        CameraModel | None, typer.Option(help="Lens distortion; radial, or pinhole with --intrinsics.", show_default=False)
+    ] = None,
+    intrinsics: Annotated[
+        Path | None, typer.Option(help="Text file with the known 3x3 matrix K of all images, in pixels.", show_default=False)
+    ] = None,
+    shared_camera: Annotated[
+        bool | None,
+        typer.Option(
+            "--shared-camera/--own-cameras",
+            help="Whether one camera took all images of a size; by default as the files' Exif data suggest.",
+            show_default=False,
+        ),
+    ] = None,
+    free_principal_point: Annotated[
+        bool, typer.Option("--free-principal-point", help="Estimate the principal point too.")
+    ] = False,
+    max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
+    seed: Seed = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on where an earlier run into the same folder stopped.")] = False,
+    threads: Threads = None,
+) -> None:
+    """Turn photographs into calibrated cameras and coloured 3D points."""
+    with told(Job(out)) as job:
+        prepare_folder(out)
+        K = None if intrinsics is None else read_intrinsics(intrinsics)
+        source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
+        result = job.run(
+            source, threads, sequence=sequence, camera=camera.value if camera else None, K=K, shared_camera=shared_camera,
+            free_principal_point=free_principal_point, max_features=max_features, seed=seed, resume=resume,
+        )  # fmt: skip
+        if K is not None and result.models:
+            warn_about_intrinsics(K, result.models[0])
+        finish(job, result, {})
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the rendered images and all results.")] = Path("torchsfm-demo"),
+    views: Annotated[int, typer.Option(min=3, max=100, help="Number of photographs to render.")] = 12,
+    width: Annotated[int, typer.Option(min=320, max=4000, help="Their width in pixels.")] = 960,
+    seed: Seed = 0,
+    threads: Threads = None,
+) -> None:
+    """Photograph a synthetic scene, reconstruct it knowing nothing, and compare with the truth."""
+    with told(Job(out)) as job:
+        prepare_folder(out)
+        folder = out / "images"
+        prepare_folder(folder)
+        job.set_threads(threads)
+        generator = torch.Generator().manual_seed(seed)
+        # One image at a time would show progress, but the rays are shared by all of them.
+        job.progress("render", 0, views)
+        truth = render_sequence(views=views, width=width, height=3 * width // 4, generator=generator)
+        for old in folder.glob("view*.jpg"):
+            old.unlink()
+        names = [f"view{i:02d}.jpg" for i in range(views)]
+        for i, name in enumerate(names):
+            save_image(folder / name, truth.images[i])
+            job.progress("render", i + 1, views)
+        result = job.run(folder, threads, seed=seed, resume=False)
+        compared = {}
+        if result.models:
+            compared = compare(result.models[0], truth.poses, truth.cameras.K)
+        finish(job, result, compared)
+
+
+@app.command()
+def info(
+    folder: Annotated[Path, typer.Argument(help="Folder written by `torchsfm reconstruct`, or a saved model (.npz).")],
+) -> None:
+    """Describe saved models: cameras, points and how well each image fits."""
+    with told(Job(folder)):
+        if not folder.exists():
+            raise UserError(f"{folder}: no such folder")
+        files = sorted(folder.glob("model*.npz"), key=lambda path: (len(path.name), path.name)) if folder.is_dir() else [folder]
+        if not files:
+            raise UserError(f"{folder}: holds no model (no model.npz)")
+        for file in files:
+            try:
+                model = Reconstruction.load(file)
+            except ValueError as error:
+                raise UserError(" ".join(str(error).split())) from None
+            typer.echo(f"{file}\n{model.summary()}\n")
+            counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
+            errors = model.view_errors().tolist()
+            width = max(len("image"), *(len(name) for name in model.names))
+            typer.echo(f"{'image':<{width}}  observations  mean error, px")
+            for name, registered, count, mean in zip(model.names, model.registered.tolist(), counts, errors, strict=True):
+                typer.echo(f"{name:<{width}}  " + (f"{count:>12}  {mean:>14.3f}" if registered else "not registered"))
+            typer.echo("")

@@ -1,0 +1,65 @@
+"""What the user gives: a folder to write to, and a file with known intrinsics."""
+
+import tempfile
+from pathlib import Path
+
+import torch
+import typer
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm.cli.job import UserError
+from torchsfm.reconstruction import Reconstruction
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the folder and see that it can be written, before any work is done for it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror or error})") from None
+
+
+def read_intrinsics(path: Path) -> Float[Tensor, "3 3"]:
+    """Read the matrix K from a text file.
+
+    The file holds nine numbers, or lines of which the first three hold three numbers each, as in the camera files of multi-view
+    data sets. `#` starts a comment; commas count as spaces.
+
+    Raises:
+        UserError: The file cannot be read or holds no calibration matrix.
+    """
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: not a text file") from None
+    lines = [line.partition("#")[0].replace(",", " ").replace(";", " ").split() for line in text.splitlines()]
+    lines = [line for line in lines if line]
+    try:
+        numbers = [[float(word) for word in line] for line in lines]
+    except ValueError as error:
+        raise UserError(f"{path}: not a matrix of numbers ({error})") from None
+    flat = [number for line in numbers for number in line]
+    rows = [flat[0:3], flat[3:6], flat[6:9]] if len(flat) == 9 else numbers[:3]
+    if len(rows) != 3 or any(len(row) != 3 for row in rows):
+        raise UserError(f"{path}: wanted three lines of three numbers, the matrix K")
+    K = torch.tensor(rows, dtype=torch.float64)
+    if not (rows[0][0] > 0 and rows[1][1] > 0 and rows[1][0] == 0 and rows[2] == [0, 0, 1] and bool(K.isfinite().all())):
+        raise UserError(f"{path}: not a calibration matrix; wanted [fx s cx; 0 fy cy; 0 0 1] with fx, fy > 0")
+    return K
+
+
+def warn_about_intrinsics(K: Float[Tensor, "3 3"], model: Reconstruction) -> None:
+    """A matrix for another image size is the usual mistake: its principal point lies far from the middle."""
+    width, height = model.image_size[0].tolist()
+    cx, cy = K[0, 2].item(), K[1, 2].item()
+    if abs(cx - width / 2) > width / 4 or abs(cy - height / 2) > height / 4:
+        typer.echo(
+            f"torchsfm: warning: the principal point ({cx:g}, {cy:g}) is far from the middle of the {width} x {height} images; "
+            "was K made for another size?",
+            err=True,
+        )

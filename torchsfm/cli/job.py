@@ -1,0 +1,123 @@
+"""One run of a command: progress while it works, and an exit status with one line where it fails."""
+
+import shlex
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+
+from torchsfm.reconstruction import ReconstructionError, SfmResult, reconstruct
+
+WRONG, INTERRUPTED = 2, 130
+
+LABELS = {
+    "render": "rendering the scene",
+    "read": "reading images",
+    "features": "finding features",
+    "match": "matching pairs",
+    "track": "tracking corners",
+    "verify": "checking epipolar geometry",
+    "map": "building the model",
+    "refine": "refining the model",
+    "write": "writing results",
+}
+
+
+class UserError(Exception):
+    """Something the user can put right; the message is one line."""
+
+
+@dataclass
+class Job:
+    """One run of a command: where it writes, and what it shows meanwhile on stderr."""
+
+    out: Path
+    stage: str = ""
+    started: float = field(default_factory=time.time)
+    console: Console = field(default_factory=lambda: Console(stderr=True, highlight=False))
+    terminal: bool = field(default_factory=lambda: sys.stderr.isatty())
+    bars: Progress | None = None
+    tasks: dict[str, TaskID] = field(default_factory=dict)
+
+    def progress(self, stage: str, done: int, total: int) -> None:
+        """Show how far a stage is: a bar on a terminal, else one line as it begins."""
+        if stage != self.stage:
+            self.stage = stage
+            if not self.terminal:
+                typer.echo(f"{LABELS.get(stage, stage)} ...", err=True)
+        if not self.terminal:
+            return
+        if self.bars is None:
+            columns = (
+                SpinnerColumn(),
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+            )
+            self.bars = Progress(*columns, console=self.console)
+            self.bars.start()
+        if stage not in self.tasks:
+            self.tasks[stage] = self.bars.add_task(LABELS.get(stage, stage), total=total)
+        self.bars.update(self.tasks[stage], completed=done, total=total)
+
+    def close(self) -> None:
+        """Leave the bars as they are and give the terminal back."""
+        if self.bars is not None:
+            self.bars.stop()
+            self.bars = None
+
+    def complain(self, what: str) -> NoReturn:
+        """End for a fault that the user can put right."""
+        self.close()
+        typer.echo(f"torchsfm: {what}", err=True)
+        raise typer.Exit(WRONG) from None
+
+    def set_threads(self, threads: int | None) -> None:
+        """Limit the processor threads of the numerical work."""
+        if threads is not None:
+            torch.set_num_threads(threads)
+
+    def run(self, images: Path | list[Path], threads: int | None, **arguments: Any) -> SfmResult:
+        """Reconstruct, with faults of the input told as such."""
+        self.set_threads(threads)
+        try:
+            return reconstruct(images, out=self.out, progress=self.progress, **arguments)
+        except ReconstructionError as error:
+            raise UserError(" ".join(str(error).split())) from None
+
+
+@contextmanager
+def told(job: Job) -> Iterator[Job]:
+    """End in a line and an exit status instead of a traceback where the user can do something about it."""
+    try:
+        yield job
+    except KeyboardInterrupt:
+        job.close()
+        # Without --resume, what an earlier run left there is of no use.
+        since = 0 if "--resume" in sys.argv else job.started
+        saved = sorted(path.stem for path in job.out.glob("stages/*.npz") if path.stat().st_mtime >= since)
+        typer.echo(f"interrupted while {LABELS.get(job.stage, 'starting')}", err=True)
+        if saved and sys.argv[1:2] == ["reconstruct"]:
+            words = [word for word in sys.argv[1:] if word != "--resume"]
+            typer.echo(f"saved in {job.out / 'stages'}: {', '.join(saved)}; to go on from there:", err=True)
+            typer.echo(f"  torchsfm {shlex.join([*words, '--resume'])}", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    except UserError as error:
+        job.complain(str(error))
+    except OSError as error:
+        job.complain(f"{error.filename or job.out}: {error.strerror or error}")
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "allocate memory" not in str(error):
+            raise
+        job.complain(f"out of memory while {LABELS.get(job.stage, 'starting')}; use smaller images or --max-features")
+    finally:
+        job.close()

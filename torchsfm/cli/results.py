@@ -1,0 +1,110 @@
+"""What the user gets: models in all formats, the page, the report, and the true errors where the truth is known."""
+
+import json
+import math
+import shlex
+import sys
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+import typer
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm.cli.job import Job
+from torchsfm.formats import write_colmap, write_ply
+from torchsfm.geometry import Pose
+from torchsfm.plot import write_page
+from torchsfm.reconstruction import Reconstruction, SfmResult
+from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_rmse
+from torchsfm.reconstruction.written_report import report_markdown, report_record
+
+NOTHING = 1
+VERSION = metadata.version("torchsfm")
+
+
+def compare(model: Reconstruction, poses_true: Pose, K_true: Float[Tensor, "v 3 3"]) -> dict[str, str]:
+    """True errors of a model, in words; the images must be those of the truth, in its order."""
+    errors = pose_errors(model.poses, poses_true, model.registered)
+    known = model.registered
+    K = model.cameras.K[model.camera_index]
+    focal, focal_true = K[:, 0, 0][known], K_true[:, 0, 0][known]
+    rotation = errors.image_rotation[known]
+    both = torch.isfinite(errors.pose)
+    rmse = float(position_rmse(model.poses, poses_true, known))
+    distance = torch.pdist(poses_true.centre).max().item()
+    areas = ", ".join(f"{area:.3f}" for area in pose_auc(errors.pose).tolist())
+    words = {
+        "rotation error, mean / largest": f"{rotation.mean():.4f} / {rotation.max():.4f} deg",
+        "relative rotation of pairs, median": f"{errors.rotation[both].median():.4f} deg" if both.any() else "no pairs",
+        "direction of baselines, median": f"{errors.direction[both].median():.4f} deg" if both.any() else "no pairs",
+        "position error (RMS), of the largest distance between cameras": f"{100 * rmse / distance:.3f} %",
+        "focal length, found / true": f"{focal.mean():.2f} / {focal_true.mean():.2f} px",
+        "focal length error": f"{100 * ((focal - focal_true).abs() / focal_true).mean():.3f} %",
+        "pose AUC at 1, 2, 5 deg": areas,
+    }
+    return {key: value for key, value in words.items() if not math.isnan(rmse)}
+
+
+def finish(job: Job, result: SfmResult, truth: dict[str, str]) -> None:
+    """Write everything there is to `job.out`, and say in a few lines what came out and where to look."""
+    more: dict[str, Any] = {"version": VERSION, "command": shlex.join(sys.argv[1:])}
+    if not result.models:
+        more["failure"] = result.failure()
+    written = write_models(job, result)
+    record = report_record(result, peak_memory_mb=peak_memory(), truth=truth, **more)
+    (job.out / "report.json").write_text(json.dumps(record, indent=1))
+    (job.out / "report.md").write_text(report_markdown(record))
+    job.close()
+    for i, model in enumerate(result.models):
+        typer.echo(("" if len(result.models) == 1 else f"model {i}: ") + model.summary())
+    typer.echo(result.report.summary())
+    for key, value in truth.items():
+        typer.echo(f"{key}: {value}")
+    for name, what in [*written, ("report.md", "what happened to each image and pair (report.json: the same for programs)")]:
+        typer.echo(f"{job.out / name}  {what}")
+    if not result.models:
+        typer.echo(f"torchsfm: nothing could be reconstructed: {result.failure()}", err=True)
+        raise typer.Exit(NOTHING)
+
+
+def write_models(job: Job, result: SfmResult) -> list[tuple[str, str]]:
+    """Write each model in all formats whose packages are there; return what to look at."""
+
+    def npz(model: Reconstruction, path: Path) -> None:
+        model.save(path)
+
+    for stale in (path for pattern in ("model*.npz", "points*.ply", "page*.html") for path in job.out.glob(pattern)):
+        stale.unlink()
+    formats: list[tuple[str, str, Callable[[Reconstruction, Path], Any], str]] = [
+        ("page", ".html", write_page, "open it in a browser and turn the model with the mouse"),
+        ("model", ".npz", npz, "the model, for Reconstruction.load and torchsfm info"),
+        ("points", ".ply", write_ply, "coloured points and cameras for viewers"),
+        ("colmap", "", write_colmap, "the model for COLMAP"),
+    ]
+    written = []
+    for i, model in enumerate(result.models):
+        for k, (stem, suffix, write, what) in enumerate(formats):
+            job.progress("write", i * len(formats) + k, len(result.models) * len(formats))
+            name = f"{stem}{suffix}" if i == 0 else f"{stem}-{i}{suffix}"
+            try:
+                write(model, job.out / name)
+            except ImportError as error:
+                if i == 0:
+                    written.append((name, f"not written: the package {error.name} is not installed"))
+                continue
+            written.append((name, what if i == 0 else f"the same of model {i}"))
+    return written
+
+
+def peak_memory() -> float | None:
+    """The most memory this process ever held, in MB, where the system tells."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    # Linux counts in kilobytes, macOS in bytes.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
