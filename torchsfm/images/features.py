@@ -9,6 +9,9 @@ from torch import Tensor
 
 from torchsfm.images.reading import Photograph
 
+_SCALE = 0.5 * 2 ** (1 / 6)
+"""OpenCV gives twice the smaller of two Gaussians with a ratio of 2^(1/3); their difference answers most to what lies between."""
+
 
 @dataclass(frozen=True)
 class Features:
@@ -17,7 +20,7 @@ class Features:
     x: Float[Tensor, "n 2"]
     """Pixel positions; the centre of the top-left pixel is (0, 0)."""
     scale: Float[Tensor, " n"]
-    """The standard deviation in pixels of the Gaussian at which the point stands out."""
+    """Size in pixels: the standard deviation of a Gaussian blob that looks like the point."""
     angle: Float[Tensor, " n"]
     """Orientation in radians from the x axis towards the y axis (clockwise on the screen), in [0, 2 pi)."""
     response: Float[Tensor, " n"]
@@ -33,48 +36,49 @@ def detect_features(
     image: Photograph | Float[Tensor, "c h w"],
     max_features: int = 8192,
     *,
-    contrast: float = 0.02,
+    contrast: float = 0.01,
     edge: float = 10.0,
     max_size: int = 3200,
 ) -> Features:
     """SIFT points with RootSIFT descriptors (Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012).
 
+    A point with several strong gradient directions is given once for each of them, at the same position.
+
     Args:
         image: A photograph, or pixels in [0, 1], grey or red, green, blue.
-        max_features: How many points are kept; those of the largest scale are, which are the most repeatable.
+        max_features: How many points are kept at most: those of the highest contrast, which match best.
         contrast: Smallest contrast, in the units of OpenCV's `contrastThreshold`.
         edge: Points whose principal curvatures have a larger ratio than this lie on an edge and are dropped.
         max_size: Larger images are scaled down to this longer side for the detection; positions are those of the image given.
 
     Returns:
-        The points in descending order of scale, the same for the same image.
+        The points in descending order of contrast, on the CPU; always the same for the same image. An image without structure
+        has no points.
 
     Raises:
-        ValueError: The shape of the image is wrong.
+        ValueError: The shape of the image or an option is wrong.
     """
     import cv2
 
-    pixels = image.pixels if isinstance(image, Photograph) else image
-    gray = _gray_bytes(pixels)
+    if max_features < 1:
+        raise ValueError(f"max_features: wanted at least 1, got {max_features}")
+    gray = _gray_bytes(image.pixels if isinstance(image, Photograph) else image)
     height, width = gray.shape
-    scale = min(1.0, max_size / max(height, width))
-    if scale < 1:
-        gray = cv2.resize(gray, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA)
-    # Without the precise option OpenCV's first octave, and so every point, is shifted by a quarter of a pixel.
-    sift = cv2.SIFT.create(0, 3, contrast, edge, 1.6, enable_precise_upscale=True)
-    keypoints = sift.detect(gray, None)
+    shrink = min(1.0, max_size / max(height, width))
+    if shrink < 1:
+        gray = cv2.resize(gray, (max(1, round(width * shrink)), max(1, round(height * shrink))), interpolation=cv2.INTER_AREA)
+    # Without the precise option OpenCV's first octave, and with it every point, is shifted by a quarter of a pixel.
+    sift = cv2.SIFT.create(max_features, 3, contrast, edge, 1.6, enable_precise_upscale=True)
+    keypoints, raw = sift.detectAndCompute(gray, None)
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
-    order = np.lexsort((table[:, 3], table[:, 0], table[:, 1], -table[:, 2]))[:max_features]
-    table = table[order]
-    if len(order):
-        keypoints, raw = sift.compute(gray, [keypoints[i] for i in order])
-    else:
-        raw = np.zeros((0, 128), np.float32)
+    raw = np.zeros((0, 128), np.float32) if raw is None else raw
+    # OpenCV keeps every point that ties with the last.
+    order = np.lexsort((table[:, 3], table[:, 2], table[:, 0], table[:, 1], -table[:, 4]))[:max_features]
+    table, raw = table[order], raw[order]
     zoom = np.array([width / gray.shape[1], height / gray.shape[0]])
-    x = (table[:, :2] + 0.5) * zoom - 0.5
     return Features(
-        x=torch.from_numpy(x).float(),
-        scale=torch.from_numpy(table[:, 2] / 2 * zoom.mean()).float(),
+        x=torch.from_numpy((table[:, :2] + 0.5) * zoom - 0.5).float(),
+        scale=torch.from_numpy(table[:, 2] * (_SCALE * zoom.mean())).float(),
         angle=torch.from_numpy(np.deg2rad(table[:, 3])).float(),
         response=torch.from_numpy(table[:, 4]).float(),
         descriptors=_root_sift(torch.from_numpy(raw)),

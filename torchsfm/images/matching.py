@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsfm.images.features import Features
 
 _ROWS = 128
-"""Rows of one block of similarities: a block of 128 x 8192 integers stays in a processor's cache through all that is done with it."""
+"""Rows of one block of similarities: 128 x 8192 integers stay in a processor's cache through all that is done with them."""
 
 
 def match_features(
@@ -31,8 +31,8 @@ def match_features(
         max_distance: The largest angle between two descriptors that still makes a match, in radians.
 
     Returns:
-        One tensor for each pair: rows (index in the first image, index in the second), sorted by the first. What a pair gets does
-        not depend on the other pairs.
+        One tensor for each pair: rows (index in the first image, index in the second), sorted by the first. What a pair gets
+        does not depend on the other pairs.
     """
     ready = {i: _prepare(features[i].descriptors) for i in sorted(set(pairs.flatten().tolist()))}
     return [_match(ready[i], ready[j], ratio, mutual, max_distance) for i, j in pairs.tolist()]
@@ -99,7 +99,7 @@ def _match(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], ratio: f
     best = index[rows, 0]
     if mutual:
         # Few rows pass the tests above: looking back from their partners alone is cheaper than a maximum of every column.
-        columns, where = best.unique(return_inverse=True)
+        columns, where = torch.unique(best, return_inverse=True)
         back = _top_one(d2[columns], d1)
         # Of rows that are equally near to a column the first is taken.
         keep = value[rows, 0] >= back[where]
