@@ -1,9 +1,28 @@
 """From images alone: how did the camera move?"""
 
 from torchsfm.motion.essential_5pt import essential_5pt
+from torchsfm.motion.estimate_essential import EssentialEstimator, estimate_essential
+from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_fundamental
+from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.fundamental_8pt import fundamental_8pt
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.homography_dlt import homography_dlt
 
-__all__ = ["essential_5pt", "fundamental_7pt", "fundamental_8pt", "homography_4pt", "homography_dlt"]
+ESTIMATORS = (EssentialEstimator, FundamentalEstimator, HomographyEstimator)
+"""What `ransac` can estimate here; the contract tests and the benchmark run over them."""
+
+__all__ = [
+    "ESTIMATORS",
+    "EssentialEstimator",
+    "FundamentalEstimator",
+    "HomographyEstimator",
+    "essential_5pt",
+    "estimate_essential",
+    "estimate_fundamental",
+    "estimate_homography",
+    "fundamental_7pt",
+    "fundamental_8pt",
+    "homography_4pt",
+    "homography_dlt",
+]

@@ -1,0 +1,59 @@
+"""Bringing two images to a common moderate scale, so that a threshold stays a threshold."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+class CommonScale(NamedTuple):
+    """Points centred in each image, both divided by the same number.
+
+    Attributes:
+        x1: Points of the first image, between -1 and 1.
+        x2: Points of the second image.
+        T1: The similarity from the caller's first image to `x1`.
+        T2: The similarity from the caller's second image to `x2`.
+        scale: The common factor, by which distances are multiplied too.
+    """
+
+    x1: Float[Tensor, "*batch n 2"]
+    x2: Float[Tensor, "*batch n 2"]
+    T1: Float[Tensor, "*batch 3 3"]
+    T2: Float[Tensor, "*batch 3 3"]
+    scale: Float[Tensor, "*batch"]
+
+
+def common_scale(
+    x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"], mask: Bool[Tensor, "*#batch n"] | None
+) -> CommonScale:
+    """Centre the bounding boxes of both images' points, and divide by the larger half side.
+
+    Bounding boxes, because they do not depend on the order of the points or on how many absent ones surround them, bit for bit.
+    """
+    usable = torch.isfinite(x1).all(-1) & torch.isfinite(x2).all(-1)
+    if mask is not None:
+        usable = usable & mask
+    usable = usable[..., None]
+    some = usable.any(-2)
+    centres, halves = [], []
+    for x in (x1, x2):
+        if x.shape[-2] == 0:
+            low = high = torch.where(some, torch.zeros_like(x.sum(-2)), 0)
+        else:
+            low = torch.where(some, torch.where(usable, x, torch.inf).amin(-2), 0)
+            high = torch.where(some, torch.where(usable, x, -torch.inf).amax(-2), 0)
+        centres.append((low + high) / 2)
+        halves.append(((high - low) / 2).amax(-1))
+    size = torch.maximum(*halves)
+    scale = torch.where(torch.isfinite(size) & (size > 0), 1 / size, 1)
+    s = scale[..., None, None]
+    similarities = []
+    for centre in centres:
+        T = torch.zeros(*scale.shape, 3, 3, dtype=scale.dtype, device=scale.device)
+        T[..., 0, 0] = T[..., 1, 1] = scale
+        T[..., :2, 2] = -scale[..., None] * centre
+        T[..., 2, 2] = 1
+        similarities.append(T)
+    return CommonScale((x1 - centres[0][..., None, :]) * s, (x2 - centres[1][..., None, :]) * s, *similarities, scale)

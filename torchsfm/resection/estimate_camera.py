@@ -1,0 +1,183 @@
+"""The pose of a calibrated camera from correspondences with known points, of which many are wrong."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+from torchsfm.geometry import cross_matrix, rotation_from_rotvec
+from torchsfm.resection.camera_p3p import camera_p3p
+from torchsfm.robust import RobustResult, ransac
+
+
+@dataclass(frozen=True)
+class CameraEstimator:
+    """The pose [R | t] of a calibrated camera. Distances are reprojection errors in the unit of the image points.
+
+    Attributes:
+        K: Intrinsics of the camera of each problem; its last row is (0, 0, 1).
+    """
+
+    K: Float[Tensor, "*batch 3 3"]
+
+    model_name: ClassVar[str] = "camera"
+    data_names: ClassVar[tuple[str, ...]] = ("x", "X")
+    sample_size: ClassVar[int] = 3
+    max_solutions: ClassVar[int] = 4
+
+    def minimal(
+        self, x: Float[Tensor, "*#batch 3 2"], X: Float[Tensor, "*#batch 3 3"]
+    ) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
+        """The poses of three points."""
+        h = torch.cat((x, torch.ones_like(x[..., :1])), -1)
+        return camera_p3p(h @ torch.linalg.inv_ex(self.K)[0].mT, X)
+
+    def squared_residual(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Squared reprojection error; infinite behind the camera."""
+        P = self.K @ model
+        points = torch.cat((X.mT, torch.ones_like(X.mT[..., :1, :])), -2)
+        if P.ndim == X.ndim and P.ndim > 2 and X.shape[-3] == 1 and P.shape[-3] > 1:
+            points = points[..., 0, :, :]
+            y0, y1, y2 = P[..., 0, :] @ points, P[..., 1, :] @ points, P[..., 2, :] @ points
+        else:
+            y0, y1, y2 = (P @ points).unbind(-2)
+        inverse = 1 / y2
+        u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
+        return torch.where(y2 > 0, u * u + v * v, torch.inf)
+
+    def residual(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Reprojection error; infinite behind the camera."""
+        return self.squared_residual(model, x, X).sqrt()
+
+    def degenerate(self, x: Float[Tensor, "*#batch 3 2"], X: Float[Tensor, "*#batch 3 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether two image points coincide."""
+        a, b, c = x.unbind(-2)
+        return (a == b).all(-1) | (b == c).all(-1) | (c == a).all(-1)
+
+    def refine(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        weights: Float[Tensor, "*#batch n"],
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """A Gauss-Newton step on the reprojection error, the pose moving from the left: [R | t] <- exp(w) [R | t] + [0 | v]."""
+        Y = model[..., :3] @ X.mT + model[..., 3:]
+        y0, y1, y2 = Y.unbind(-2)
+        good = (weights > 0) & (y2 > 0)
+        inverse = torch.where(good, 1 / torch.where(good, y2, 1), 0)
+        a, b = y0 * inverse, y1 * inverse
+        k00, k01, k02, k10, k11, k12 = (self.K[..., i, j, None] for i in range(2) for j in range(3))
+        w = torch.where(good, weights, 0)
+        root = w.sqrt()
+        zero = torch.zeros_like(a)
+        # Derivatives of (a, b) over (w, v).
+        da = torch.stack((-a * b, 1 + a * a, -b, inverse, zero, -a * inverse), -2)
+        db = torch.stack((-1 - b * b, a * b, a, zero, inverse, -b * inverse), -2)
+        ru, rv = k00 * a + k01 * b + k02 - x[..., 0], k10 * a + k11 * b + k12 - x[..., 1]
+        ju = (k00[..., None] * da + k01[..., None] * db) * root[..., None, :]
+        jv = (k10[..., None] * da + k11[..., None] * db) * root[..., None, :]
+        J, r = torch.cat((ju, jv), -1), torch.cat((ru * root, rv * root), -1)
+        full = torch.cat((J, r[..., None, :]), -2)
+        moments = (full @ J.mT).double()
+        A, g = moments[..., :6, :], moments[..., 6, :]
+        step = -_solve(A, g)
+        pose = model.double()
+        R = rotation_from_rotvec(step[..., :3])
+        pose = R @ pose
+        pose = torch.cat((pose[..., :3], pose[..., 3:] + step[..., 3:, None]), -1)
+        return pose.to(x.dtype)
+
+
+def _solve(A: Tensor, b: Tensor) -> Tensor:
+    """Solve normal equations scaled to a unit diagonal; no step where that fails."""
+    scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+    eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
+    A = A * scale[..., :, None] * scale[..., None, :] + 1e-10 * eye
+    factor, info = torch.linalg.cholesky_ex(A)
+    good = (info == 0) & torch.isfinite(scale).all(-1)
+    factor = torch.where(good[..., None, None], factor, eye)
+    step = torch.cholesky_solve((b * scale)[..., None], factor)[..., 0] * scale
+    return torch.where(good[..., None] & torch.isfinite(step), step, 0)
+
+
+def estimate_camera(
+    x: Float[Tensor, "*#batch n 2"],
+    X: Float[Tensor, "*#batch n 3"],
+    K: Float[Tensor, "*#batch 3 3"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    scores: Float[Tensor, "*#batch n"] | None = None,
+    generator: torch.Generator | None = None,
+    confidence: float = 0.9999,
+    max_iterations: int = 10_000,
+) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
+    """The pose of each camera, from correspondences of image points with known points, of which many may be wrong.
+
+    LO-RANSAC over three-point samples, then a robust minimum of the reprojection error over the pose. Computed in float64, hypotheses
+    scored in float32 after centring and scaling the world.
+
+    Args:
+        x: Image points in pixels, without distortion.
+        X: The points in the world.
+        K: Intrinsics, upper triangular with last row (0, 0, 1).
+        threshold: Largest reprojection error of an inlier in pixels.
+        mask: Which correspondences exist. Rows that are not finite are left out too.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        generator: Source of randomness.
+        confidence: Wanted probability of having drawn a sample without outliers.
+        max_iterations: Most samples to draw.
+
+    Returns:
+        The pose `[R | t]`, `X_cam = R X + t`; inliers (in front of the camera), score, iterations, status.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    check_tensors(x=(x, "n 2"), X=(X, "n 3"), K=(K, "3 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    dtype = x.dtype
+    x, X, K = x.double(), X.double(), K.double()
+    usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
+    if mask is not None:
+        usable = usable & mask
+    centre, size = _middle(X, usable)
+    focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt()
+    focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
+    # Pixels from the principal point, in focal lengths.
+    y = (x - K[..., None, :2, 2]) / focal[..., None, None]
+    intrinsics = torch.cat((K[..., :2, :2] / focal[..., None, None], torch.zeros_like(K[..., :2, 2:])), -1)
+    intrinsics = torch.cat((intrinsics, torch.zeros_like(K[..., 2:, :])), -2)
+    intrinsics[..., 2, 2] = 1
+    Y = (X - centre[..., None, :]) / size[..., None, None]
+    batch = torch.broadcast_shapes(x.shape[:-2], X.shape[:-2], K.shape[:-2])
+    result = ransac(
+        CameraEstimator(intrinsics.expand(*batch, 3, 3)), y, Y, threshold=threshold / focal, mask=mask,
+        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        max_iterations=max_iterations, scoring_dtype=torch.float32,
+    )  # fmt: skip
+    R = result.model[..., :3]
+    t = result.model[..., 3] * size[..., None] - (R @ centre[..., None])[..., 0]
+    return replace(result, model=torch.cat((R, t[..., None]), -1).to(dtype), score=result.score.to(dtype))
+
+
+def _middle(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+    """Medians of the usable points and of their distances from it: points far away must not cost the others precision."""
+    some = usable.any(-1)[..., None]
+    if X.shape[-2] == 0:
+        centre = X.new_zeros(*usable.shape[:-1], 3)
+        return centre, torch.ones_like(centre[..., 0])
+    centre = torch.where(usable[..., None], X, torch.nan).nanmedian(dim=-2).values
+    centre = torch.where(some, centre, 0)
+    distance = torch.where(usable, (X - centre[..., None, :]).abs().amax(-1), torch.nan)
+    size = distance.nanmedian(dim=-1).values
+    return centre, torch.where(torch.isfinite(size) & (size > 0), size, 1)

@@ -1,0 +1,58 @@
+"""From a model through a noisy sample to the optimum near it."""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.scoring import squared_residual
+
+M = TypeVar("M")
+
+LOCAL_STEPS = (9.0, 4.0, 1.5, 1.0)
+"""Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
+LOCAL_DATA = 512
+"""Local optimisation looks at this many data at most."""
+
+
+def optimise_locally(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    limit: Float[Tensor, "g"],
+    inside: Bool[Tensor, "g n"],
+) -> M:
+    """Gauss-Newton on the truncated squared distance with a shrinking threshold (Chum, Matas & Kittler 2003).
+
+    Args:
+        estimator: The problem.
+        model: `k` models of each problem, `(g, k, ...)`.
+        data: The data, each `(g, 1, n, d)`.
+        limit: Squared threshold.
+        inside: Which slots hold data.
+    """
+    for factor in LOCAL_STEPS:
+        squared = squared_residual(estimator, model, *data)
+        weights = ((squared < (factor * limit)[:, None, None]) & inside[:, None]).to(squared.dtype)
+        model = estimator.refine(model, *data, weights=weights)
+    return model
+
+
+def polish(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    limit: Float[Tensor, "g"],
+    inside: Bool[Tensor, "g n"],
+    steps: int,
+) -> M:
+    """Iteratively reweighted Gauss-Newton on a Cauchy loss at half the threshold, cut off at twice the threshold."""
+    for _ in range(steps):
+        squared = squared_residual(estimator, model, *data)
+        ratio = squared / limit[:, None, None]
+        weights = torch.where((ratio < 4) & inside[:, None], 1 / (1 + 4 * ratio), 0)
+        model = estimator.refine(model, *data, weights=weights)
+    return model

@@ -1,0 +1,78 @@
+"""How well models are supported: the truncated squared distance (MSAC), on more and more data for fewer and fewer models."""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.robust.estimator import Estimator
+
+M = TypeVar("M")
+
+PREFIXES = (64, 256)
+"""Numbers of data on which hypotheses are judged before all data are looked at."""
+
+
+def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#batch n _"]) -> Float[Tensor, "*batch n"]:
+    """The squared distance of data to models; infinite where it is not a number."""
+    direct = getattr(estimator, "squared_residual", None)
+    if direct is None:
+        residual = estimator.residual(model, *data)
+        squared = residual * residual
+    else:
+        squared = direct(model, *data)
+    return squared
+
+
+def truncated_loss(
+    squared: Float[Tensor, "g s n"], limit: Float[Tensor, "g"], inside: Bool[Tensor, "g n"] | None = None
+) -> Float[Tensor, "g s"]:
+    """The MSAC score: squared distance over squared threshold, at most 1, summed over the data (Torr & Zisserman 2000).
+
+    Models with a distance that is not a number get an infinite score.
+
+    Args:
+        squared: Squared distances.
+        limit: Squared threshold.
+        inside: Which slots hold data; all of them if not given.
+    """
+    loss = (squared * (1 / limit)[:, None, None]).clamp_(max=1)
+    if inside is not None:
+        loss *= inside[:, None]
+    return loss.sum(-1).nan_to_num_(nan=torch.inf)
+
+
+def stages(width: int, slots: int, kept: int) -> list[tuple[int, int]]:
+    """On how many data `slots` models are scored, stage by stage, and how many of the models are kept each time."""
+    prefixes = [prefix for prefix in PREFIXES if 2 * prefix <= width]
+    plan = []
+    for level, prefix in enumerate(prefixes):
+        keep = max(24, slots // 12) if level == 0 and len(prefixes) > 1 else max(2 * kept, 16)
+        if keep < slots:
+            plan.append((prefix, keep))
+            slots = keep
+    return [*plan, (width, kept)]
+
+
+def smallest(score: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]:
+    """The models with the smallest scores, best first."""
+    return score.topk(min(number, score.shape[-1]), dim=-1, largest=False).indices
+
+
+def gather_valid(valid: Bool[Tensor, "g s"]) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:
+    """Where the valid slots of each row are, in as few columns as the fullest row needs, and which columns are filled."""
+    g, slots = valid.shape
+    rank = valid.cumsum(-1)
+    columns = max(int(rank[:, -1].max()) if valid.numel() else 0, 1)
+    index = torch.zeros(g, columns + 1, dtype=torch.long, device=valid.device)
+    position = torch.where(valid, rank - 1, columns)
+    index.scatter_(1, position, torch.arange(slots, device=valid.device).expand(g, slots))
+    filled = torch.arange(columns, device=valid.device) < rank[:, -1:]
+    return index[:, :columns], filled
+
+
+def first_data(data: Sequence[Tensor], number: int) -> list[Tensor]:
+    """The first data of each problem, ready to broadcast against several models per problem."""
+    return [d[:, None, :number] for d in data]
