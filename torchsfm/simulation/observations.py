@@ -60,9 +60,10 @@ def simulate_images(
     Returns:
         Observations and truth, with batch shape that of all arguments together.
     """
-    check_tensors(X=(X, "n 3"), R=(poses.R, "3 3"), K=(cameras.K, "3 3"))
+    check_tensors(X=(X, "n 3"))
     if len(poses.shape) < 1:
         raise ValueError(f"poses: wanted batch shape (*batch, views), got {tuple(poses.shape)}")
+    check_tensors(X=(X[..., None, :, :], "n 3"), R=(poses.R, "3 3"), K=(cameras.K, "3 3"))
     for name, value in (("outliers", outliers), ("dropout", dropout)):
         if not 0 <= value <= 1:
             raise ValueError(f"{name}: wanted a probability in [0, 1], got {value}")
@@ -79,19 +80,20 @@ def simulate_images(
     options = {"dtype": X.dtype, "device": X.device}
     if image_size is not None:
         size = X.new_tensor(image_size)
-        visible &= ((x_true >= -0.5) & (x_true < size - 0.5)).all(-1)
+        visible = visible & ((x_true >= -0.5) & (x_true < size - 0.5)).all(-1)
         low, high = torch.full_like(size, -0.5), size - 0.5
     else:
         shown = visible[..., None]
-        low = torch.where(shown, x_true, float("inf")).amin(-2, keepdim=True) if X.shape[-2] else x_true
-        high = torch.where(shown, x_true, -float("inf")).amax(-2, keepdim=True) if X.shape[-2] else x_true
+        exact = x_true.detach()
+        low = torch.where(shown, exact, float("inf")).amin(-2, keepdim=True) if X.shape[-2] else exact
+        high = torch.where(shown, exact, -float("inf")).amax(-2, keepdim=True) if X.shape[-2] else exact
         some = torch.isfinite(low) & torch.isfinite(high)
         low, high = torch.where(some, low, 0.0), torch.where(some, high, 0.0)
-    visible &= torch.rand(depth.shape, generator=generator, **options) >= dropout  # type: ignore[call-overload]
+    visible = visible & (torch.rand(depth.shape, generator=generator, **options) >= dropout)  # type: ignore[call-overload]
     x = x_true + noise * torch.randn(x_true.shape, generator=generator, **options)  # type: ignore[call-overload]
     outlier = torch.rand(depth.shape, generator=generator, **options) < outliers  # type: ignore[call-overload]
     wild = low + (high - low) * torch.rand(x_true.shape, generator=generator, **options)  # type: ignore[call-overload]
-    outlier &= visible
+    outlier = outlier & visible
     x = torch.where(outlier[..., None], wild, x)
     return SimulatedImages(torch.where(visible[..., None], x, 0.0), visible, outlier, x_true, depth)
 

@@ -48,7 +48,8 @@ class Rectangle:
     def ball(self) -> tuple[Float[Tensor, "3"], float]:
         """Centre and radius of a ball around the surface."""
         half = (self.edge_u + self.edge_v) / 2
-        return self.corner + half, 1.001 * float(half.norm())
+        reach = torch.maximum(self.edge_u.norm(), self.edge_v.norm()) / 2 if self.round else half.norm()
+        return self.corner + half, 1.001 * float(reach)
 
     def intersect(self, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
         """The smallest s > 0 for which origin + s d lies on the surface, infinity where there is none."""
@@ -57,10 +58,8 @@ class Rectangle:
         s = -o[2] / e[2]
         u = (o[0] + s * e[0]) / self.edge_u.norm().to(d)
         v = (o[1] + s * e[1]) / self.edge_v.norm().to(d)
-        if self.round:
-            inside = (u - 0.5).square() + (v - 0.5).square() <= 0.25
-        else:
-            inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        box = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        inside = (u - 0.5).square() + (v - 0.5).square() <= 0.25 if self.round else box
         return torch.where(inside & (s > 0), s, math.inf)
 
     def chart(self, X: Float[Tensor, "3 n"]) -> Chart:

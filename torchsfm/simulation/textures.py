@@ -1,7 +1,7 @@
 """Procedural textures: rich at every scale, never repeating, all from a generator.
 
-A texture is a bitmap (3, h, w) in [0, 1] made once per surface; `mip_pyramid` stacks its halvings for band-limited lookup. The bitmap
-is the truth of the scene: what is sharp in it is a sharp mark painted on the surface.
+A texture is a bitmap (3, h, w) in [0, 1] made once per surface; `mip_pyramid` adds its halvings for band-limited lookup.
+The bitmap is the truth of the scene: what is sharp in it is a sharp mark painted on the surface.
 """
 
 import math
@@ -276,7 +276,8 @@ def _poster(h: int, w: int, unit: float, generator: Generator) -> Tensor:
         on &= ((y >= 0) & (y < 7))[:, None] & ((x >= 0) & (x % 6 < 5) & (x < (w - 0.06 * unit) / dot - 2))[None]
         image = torch.where(on, ink[:, None, None], image)
         top += (8 + 4 * _uniform(0, 1, generator)) * dot
-    return image * (1 + 0.06 * fractal_noise(h, w, 0.05 * unit, gain=0.9, generator=generator))
+    result: Tensor = image * (1 + 0.06 * fractal_noise(h, w, 0.05 * unit, gain=0.9, generator=generator))
+    return result
 
 
 def _posters(image: Tensor, unit: float, count: int, generator: Generator) -> Tensor:

@@ -30,7 +30,8 @@ def look_at(
     if up is None:
         up = centre.new_tensor([0.0, 0.0, 1.0])
     check_tensors(centre=(centre, "3"), target=(target, "3"), up=(up, "3"))
-    centre, target, up = torch.broadcast_tensors(centre, target, up)
+    shape = torch.broadcast_shapes(centre.shape, target.shape, up.shape)  # type: ignore[no-untyped-call]
+    centre, target, up = centre.expand(shape), target.expand(shape), up.expand(shape)
     z_axis, x_axis = centre.new_tensor([0.0, 0.0, 1.0]), centre.new_tensor([1.0, 0.0, 0.0])
     forward = target - centre
     length = forward.norm(dim=-1, keepdim=True)
