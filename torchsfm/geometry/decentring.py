@@ -24,8 +24,8 @@ def invert_brown(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Solve the Brown-Conrady equations for the flat coordinates by Newton's method, from the radial solution.
 
-    The last step is taken at the detached solution, which gives first derivatives by the points and by the parameters through the
-    implicit function theorem. Returns x, y and where they are a solution within the limit.
+    The last step is taken at the detached solution, which gives first derivatives by the points and by the parameters through
+    the implicit function theorem. Returns x, y and where they are a solution within the limit.
     """
     with torch.no_grad():
         x, y, jxx, jxy, jyy, valid = in_blocks(

@@ -10,7 +10,7 @@ each coordinate as one long row.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Self, TypeAlias
+from typing import ClassVar, TypeAlias, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +20,8 @@ from torchsfm._types import check_tensors
 from torchsfm.geometry.decentring import brown, invert_brown
 from torchsfm.geometry.fisheye import fisheye_from_tangent, tangent_from_fisheye
 from torchsfm.geometry.radial import even_polynomial, first_fold, flatten_ray, invert_radial
+
+D = TypeVar("D", bound="DistortionModel")
 
 
 class DistortionModel(ABC):
@@ -85,7 +87,7 @@ class DistortionModel(ABC):
         return torch.stack([getattr(self, name) for name in self.parameter_names], -1)
 
     @classmethod
-    def from_parameters(cls, p: Float[Tensor, "*batch p"]) -> Self:
+    def from_parameters(cls: type[D], p: Float[Tensor, "*batch p"]) -> D:
         """Make the model from its parameters in the order of `parameter_names`."""
         if p.shape[-1] != cls.num_parameters:
             raise ValueError(f"p: wanted shape (*batch, {cls.num_parameters}) for {cls.__name__}, got {tuple(p.shape)}")

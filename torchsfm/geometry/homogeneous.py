@@ -97,7 +97,7 @@ def normalizing_similarity(
     return torch.cat([top, bottom], -2)
 
 
-def transform_points(H: Float[Tensor, "*#batch d+1 d+1"], x: Float[Tensor, "*#batch n d"]) -> Float[Tensor, "*batch n d"]:
+def transform_points(H: Float[Tensor, "*#batch h h"], x: Float[Tensor, "*#batch n d"]) -> Float[Tensor, "*batch n d"]:
     """Apply a projective transformation to points.
 
     Args:

@@ -13,7 +13,7 @@ GUARDED = 3
 """Newton steps that narrow a bracket around the root; then the rest converges by itself on all but contrived functions."""
 PLAIN = 7
 """Newton steps that only stay inside that bracket."""
-BLOCK = 16384
+BLOCK = 32768
 """Points worked on at once on a CPU, so that the many passes over them stay in its cache."""
 
 
@@ -150,7 +150,8 @@ def invert_radial(q: Tensor, coefficients: Sequence[Tensor], limit: Tensor, fold
 
     with torch.no_grad():
         s, inverse, valid = in_blocks(solve, q.detach(), limit, folds, *finite_constants(coefficients))
-    return s - inverse * torch.addcmul(-q, s, even_polynomial(s, coefficients).square()), valid
+    h = even_polynomial(s, coefficients)
+    return s - inverse * torch.addcmul(-q, s, h * h), valid
 
 
 def finite_constants(coefficients: Sequence[Tensor]) -> list[Tensor]:

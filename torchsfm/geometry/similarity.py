@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry.poses import Pose
+from torchsfm.linalg import nearest_rotation
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,14 @@ def similarity_from_points(
     x_mean, y_mean = (w * X).sum(-2, keepdim=True), (w * Y).sum(-2, keepdim=True)
     x, y = torch.where(used, X - x_mean, 0.0), torch.where(used, Y - y_mean, 0.0)
     covariance = (w * y).mT @ x
-    U, s, Vh = torch.linalg.svd(covariance)
-    sign = torch.where(torch.linalg.det(U.detach()) * torch.linalg.det(Vh.detach()) < 0, -1.0, 1.0).to(X.dtype)
-    flip = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    R = (U * flip[..., None, :]) @ Vh
+    R = nearest_rotation(covariance)
     variance = (w * x.square()).sum((-2, -1))
     spread = variance > 0
-    scale = (s * flip).sum(-1) / torch.where(spread, variance, 1.0)
+    scale = (R * covariance).sum((-2, -1)) / torch.where(spread, variance, 1.0)
     scale = torch.where(spread & (scale > 0), scale, 1.0)
     t = y_mean.squeeze(-2) - scale[..., None] * (R @ x_mean.mT).squeeze(-1)
-    degenerate = ~(s[..., 1] > 64 * torch.finfo(X.dtype).eps * s[..., 0])
+    singular = torch.linalg.svdvals(covariance.detach())
+    degenerate = ~(singular[..., 1] > 64 * torch.finfo(X.dtype).eps * singular[..., 0])
     status = torch.where(degenerate, int(Status.DEGENERATE), int(Status.OK))
     status = torch.where(used.squeeze(-1).sum(-1) < 3, int(Status.TOO_FEW), status).to(torch.int8)
     return Similarity(scale, R, t, status)
