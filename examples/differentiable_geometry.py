@@ -35,11 +35,11 @@ def main() -> None:
     """Train for a few seconds, then compare on image pairs never seen."""
     generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(2, 16), nn.ReLU(), nn.Linear(16, 1), nn.Softplus()).double()
-    optimizer = torch.optim.Adam(network.parameters(), lr=0.02)
+    network = nn.Sequential(nn.Linear(2, 16), nn.ReLU(), nn.Linear(16, 1)).double()
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.1)
     for step in range(151):
         x1, x2, clues, y1, y2 = problems(32, generator)
-        F = fundamental_8pt(x1, x2, network(clues)[..., 0])
+        F = fundamental_8pt(x1, x2, network(clues)[..., 0].softmax(-1))
         loss = torch.log1p(sampson_distance(F, y1, y2)).mean()
         optimizer.zero_grad()
         loss.backward()
@@ -50,7 +50,7 @@ def main() -> None:
     with torch.no_grad():
         for name, weights in {
             "all matches alike": torch.ones_like(x1[..., 0]),
-            "weights of the network": network(clues)[..., 0],
+            "weights of the network": network(clues)[..., 0].softmax(-1),
         }.items():
             error = sampson_distance(fundamental_8pt(x1, x2, weights), y1, y2).mean(-1)
             print(f"{name}: median error {error.median().item():.2f} px")

@@ -1,0 +1,51 @@
+"""The examples run, and what they print about themselves is true."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def run(name: str, folder: Path) -> str:
+    command = [sys.executable, str(EXAMPLES / name)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def number(pattern: str, text: str) -> float:
+    found = re.search(pattern, text)
+    assert found is not None, text
+    return float(found[1])
+
+
+def test_photographs_to_model(tmp_path: Path) -> None:
+    text = run("photographs_to_model.py", tmp_path)
+    assert "8 of 8 images registered" in text
+    assert number(r"median error: ([\d.]+) deg", text) < 0.5
+    found, true = re.search(r"focal length: ([\d.]+) px, true ([\d.]+) px", text).groups()  # type: ignore[union-attr]
+    assert float(found) == pytest.approx(float(true), rel=0.03)
+    assert (tmp_path / "model.npz").exists()
+
+
+def test_batched_ransac(tmp_path: Path) -> None:
+    text = run("batched_ransac.py", tmp_path)
+    assert number(r"from F: median ([\d.]+) px", text) < 0.5
+    assert "the first pair alone gives the same F: True" in text
+
+
+def test_differentiable_geometry(tmp_path: Path) -> None:
+    text = run("differentiable_geometry.py", tmp_path)
+    assert number(r"all matches alike: median error ([\d.]+) px", text) > 20
+    assert number(r"weights of the network: median error ([\d.]+) px", text) < 3
+
+
+def test_no_example_is_forgotten() -> None:
+    tested = set(re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text()))
+    assert tested == {path.name for path in EXAMPLES.glob("*.py")}
