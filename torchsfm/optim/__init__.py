@@ -4,8 +4,11 @@ from torchsfm.optim.implicit import attach_implicit, attach_optimum, wants_deriv
 from torchsfm.optim.levenberg_marquardt import LeastSquaresResult, levenberg_marquardt
 from torchsfm.optim.loss import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey, loss_slope
 from torchsfm.optim.manifold import Euclidean, Manifold, RigidMotion, Rotation, Subset, UnitSphere, rotation_exponential
+from torchsfm.optim.sparse_levenberg_marquardt import SparseResult, sparse_levenberg_marquardt
+from torchsfm.optim.terms import Block, Term
 
 __all__ = [
+    "Block",
     "Cauchy",
     "Euclidean",
     "GemanMcClure",
@@ -16,7 +19,9 @@ __all__ = [
     "RigidMotion",
     "Rotation",
     "SoftL1",
+    "SparseResult",
     "Subset",
+    "Term",
     "Truncated",
     "Tukey",
     "UnitSphere",
@@ -25,5 +30,6 @@ __all__ = [
     "levenberg_marquardt",
     "loss_slope",
     "rotation_exponential",
+    "sparse_levenberg_marquardt",
     "wants_derivative",
 ]
