@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsfm.images.reading import Photograph
 
 _SCALE = 0.5 * 2 ** (1 / 6)
-"""OpenCV gives twice the smaller of two Gaussians with a ratio of 2^(1/3); their difference answers most to what lies between."""
+"""OpenCV gives twice the smaller of two Gaussians, of ratio 2^(1/3), whose difference answers most to what lies between."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def detect_features(
     )
 
 
-def _gray_bytes(pixels: Tensor) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+def _gray_bytes(pixels: Tensor) -> NDArray[np.uint8]:
     if pixels.ndim != 3 or pixels.shape[0] not in (1, 3) or 0 in pixels.shape:
         raise ValueError(f"image: wanted shape (1, h, w) or (3, h, w), got {tuple(pixels.shape)}")
     pixels = pixels.detach().to("cpu", torch.float32)

@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsfm.images.exif import parse_exif
+from torchsfm.images.netpbm import decode_netpbm, is_netpbm
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".pbm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
 """The file names that `list_images` takes for images."""
 
-_TURNS: dict[int, Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]] = {
+_TURNS: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
     1: lambda a: a,
     2: lambda a: a[:, ::-1],
     3: lambda a: a[::-1, ::-1],
@@ -98,7 +100,7 @@ def read_image(path: str | os.PathLike[str], *, gray: bool = False, max_size: in
     """
     path = Path(path)
     data = _read_bytes(path)
-    array, largest = _decode(data, path, gray=gray)
+    array, white = _decode(data, path, gray=gray)
     exif = parse_exif(data)
     focal = exif.focal(array.shape[1], array.shape[0])
     array = _TURNS[exif.orientation](array)
@@ -110,8 +112,8 @@ def read_image(path: str | os.PathLike[str], *, gray: bool = False, max_size: in
         small = (max(1, round(size[0] * scale)), max(1, round(size[1] * scale)))
         array = cv2.resize(np.ascontiguousarray(array), small, interpolation=cv2.INTER_AREA)
         focal = None if focal is None else focal * scale
-    array = array[:, :, None] if array.ndim == 2 else array[:, :, ::-1]
-    pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1))).to(torch.float32).div_(largest)
+    array = array[None] if array.ndim == 2 else array.transpose(2, 0, 1)
+    pixels = torch.from_numpy(np.ascontiguousarray(array)).to(torch.float32).div_(white)
     return Photograph(pixels=pixels, name=path.name, focal=focal, make=exif.make, model=exif.model, size=size)
 
 
@@ -138,8 +140,12 @@ def save_image(
     if bits not in (8, 16):
         raise ValueError(f"bits: wanted 8 or 16, got {bits}")
     suffix = path.suffix.lower()
-    if bits == 16 and suffix not in (".png", ".pgm", ".ppm", ".pnm", ".tif", ".tiff"):
+    if bits == 16 and suffix not in (".png", ".pgm", ".ppm", ".pbm", ".pnm", ".tif", ".tiff"):
         raise ValueError(f"bits: {suffix or 'this format'} does not hold 16 bits")
+    if suffix == ".pgm" and image.ndim == 3 and image.shape[0] == 3:
+        raise ValueError(f"image: .pgm holds one channel, got shape {tuple(image.shape)}")
+    if suffix == ".ppm":
+        image = image.reshape(-1, *image.shape[-2:]).expand(3, *image.shape[-2:])
     values = image.detach().to("cpu", torch.float64).nan_to_num().clamp(0, 1).mul(2**bits - 1).round().numpy()
     array = values.astype(np.uint8 if bits == 8 else np.uint16)
     if array.ndim == 3:
@@ -189,10 +195,18 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def _decode(data: bytes, path: Path, *, gray: bool) -> tuple[np.ndarray[Any, Any], float]:
-    """Pixels (h, w) or (h, w, 3) in blue, green, red order as stored, and the value that stands for white."""
+def _decode(data: bytes, path: Path, *, gray: bool) -> tuple[NDArray[Any], float]:
+    """Pixels (h, w) or (h, w, 3) in red, green, blue order as stored, and the value that stands for white."""
     import cv2
 
+    if is_netpbm(data):
+        try:
+            values, white = decode_netpbm(data)
+        except ValueError as error:
+            raise ImageError(f"{path}: {error}") from None
+        if gray:
+            return cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if values.ndim == 3 else values, white
+        return values if values.ndim == 3 else np.repeat(values[:, :, None], 3, 2), white
     complete = _is_complete(data)
     if complete is None:
         raise ImageError(f"{path}: not an image of a known kind ({_guess(data)})")
@@ -205,20 +219,9 @@ def _decode(data: bytes, path: Path, *, gray: bool) -> tuple[np.ndarray[Any, Any
         raise ImageError(f"{path}: cannot be decoded ({' '.join(str(error).split())[:200]})") from None
     if array is None or array.size == 0:
         raise ImageError(f"{path}: damaged, cannot be decoded")
-    if array.dtype == np.uint8:
-        return array, _netpbm_white(data, 255.0)
-    if array.dtype == np.uint16:
-        return array, _netpbm_white(data, 65535.0)
-    raise ImageError(f"{path}: pixels of type {array.dtype}; 8 or 16 bit integers are wanted")
-
-
-def _netpbm_white(data: bytes, otherwise: float) -> float:
-    header = _NETPBM.match(data)
-    return float(header[4]) if header is not None and header[4] is not None else otherwise
-
-
-_GAP = rb"(?:\s|#[^\n]*\n)+"
-_NETPBM = re.compile(rb"P([1-6])" + _GAP + rb"(\d+)" + _GAP + rb"(\d+)(?:" + _GAP + rb"(\d+))?\s")
+    if array.dtype not in (np.uint8, np.uint16):
+        raise ImageError(f"{path}: pixels of type {array.dtype}; 8 or 16 bit integers are wanted")
+    return array if gray else array[:, :, ::-1], 255.0 if array.dtype == np.uint8 else 65535.0
 
 
 def _is_complete(data: bytes) -> bool | None:
@@ -236,14 +239,6 @@ def _is_complete(data: bytes) -> bool | None:
                 return True
             position += 12 + int.from_bytes(data[position : position + 4], "big")
         return False
-    if (header := _NETPBM.match(data)) is not None:
-        kind, width, height = int(header[1]), int(header[2]), int(header[3])
-        samples = width * height * (3 if kind in (3, 6) else 1)
-        rest = len(data) - header.end()
-        if kind in (1, 4):
-            return True if kind == 1 else len(data) - header.end(3) > height * ((width + 7) // 8)
-        deep = header[4] is not None and int(header[4]) > 255
-        return rest >= samples * (2 if deep else 1) if kind in (5, 6) else len(data[header.end() :].split()) >= samples
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return len(data) >= 8 + int.from_bytes(data[4:8], "little")
     if data[:4] in (b"II*\0", b"MM\0*"):

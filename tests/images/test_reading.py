@@ -1,0 +1,344 @@
+import struct
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchsfm.images import Exif, ImageError, list_images, parse_exif, read_image, save_image, scale_image
+from torchsfm.images.netpbm import decode_netpbm, is_netpbm
+
+MAKE, MODEL, ORIENTATION, EXIF_OFFSET = 0x010F, 0x0110, 0x0112, 0x8769
+FOCAL, FOCAL_35MM, WIDTH, HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
+X_RESOLUTION, UNIT = 0xA20E, 0xA210
+
+Value = int | str | tuple[int, int]
+
+
+def directory(tags: dict[int, Value], order: str, offset: int) -> bytes:
+    """One TIFF directory at `offset`, its longer values right after it."""
+    body = struct.pack(order + "H", len(tags))
+    extra, place = b"", offset + 2 + 12 * len(tags) + 4
+    for tag, value in sorted(tags.items()):
+        if isinstance(value, str):
+            raw, kind, count = value.encode() + b"\0", 2, len(value.encode()) + 1
+        elif isinstance(value, tuple):
+            raw, kind, count = struct.pack(order + "2I", *value), 5, 1
+        elif tag == EXIF_OFFSET:
+            raw, kind, count = struct.pack(order + "I", value), 4, 1
+        else:
+            raw, kind, count = struct.pack(order + "H", value), 3, 1
+        if len(raw) > 4:
+            body += struct.pack(order + "HHII", tag, kind, count, place + len(extra))
+            extra += raw + b"\0" * (len(raw) % 2)
+        else:
+            body += struct.pack(order + "HHI", tag, kind, count) + raw.ljust(4, b"\0")
+    return body + b"\0\0\0\0" + extra
+
+
+def tiff_block(first: dict[int, Value], second: dict[int, Value], order: str = "<") -> bytes:
+    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
+    size = len(directory({**first, EXIF_OFFSET: 0}, order, 8))
+    start = directory({**first, EXIF_OFFSET: 8 + size}, order, 8)
+    return head + start + directory(second, order, 8 + size)
+
+
+def into_jpeg(jpeg: bytes, block: bytes) -> bytes:
+    payload = b"Exif\0\0" + block
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + jpeg[2:]
+
+
+def into_png(png: bytes, block: bytes) -> bytes:
+    chunk = struct.pack(">I", len(block)) + b"eXIf" + block + struct.pack(">I", zlib.crc32(b"eXIf" + block))
+    return png[:33] + chunk + png[33:]  # after IHDR
+
+
+def encode(array: np.ndarray, suffix: str) -> bytes:
+    done, data = cv2.imencode(suffix, array)
+    assert done
+    return bytes(data.tobytes())
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    """Smooth enough to survive JPEG, without any symmetry; blue, green, red."""
+    y, x = np.mgrid[:48, :80] / 80
+    return np.stack([255 * x, 200 * y + 40 * x, 255 * (1 - x) * (1 - y)], 2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".ppm"])
+def test_lossless_formats_give_the_exact_pixels(tmp_path: Path, picture: np.ndarray, suffix: str) -> None:
+    (tmp_path / f"a{suffix}").write_bytes(encode(picture, suffix))
+    photo = read_image(tmp_path / f"a{suffix}")
+    assert photo.pixels.dtype == torch.float32
+    assert photo.pixels.is_contiguous()
+    expected = torch.from_numpy(picture[:, :, ::-1].copy()).permute(2, 0, 1)
+    torch.testing.assert_close(photo.pixels, expected.float() / 255, rtol=0, atol=0)
+    assert (photo.width, photo.height, photo.size, photo.name) == (80, 48, (80, 48), f"a{suffix}")
+    assert photo.focal is None
+
+
+def test_jpeg_and_webp_come_close(tmp_path: Path, picture: np.ndarray) -> None:
+    expected = torch.from_numpy(picture[:, :, ::-1].copy()).permute(2, 0, 1).float() / 255
+    for suffix in (".jpg", ".webp"):
+        (tmp_path / f"a{suffix}").write_bytes(encode(picture, suffix))
+        assert (read_image(tmp_path / f"a{suffix}").pixels - expected).abs().max() < 0.06
+
+
+def test_gray_is_one_channel_of_luma(tmp_path: Path, picture: np.ndarray) -> None:
+    for suffix in (".png", ".ppm"):
+        (tmp_path / f"a{suffix}").write_bytes(encode(picture, suffix))
+        gray = read_image(tmp_path / f"a{suffix}", gray=True).pixels
+        r, g, b = read_image(tmp_path / f"a{suffix}").pixels
+        assert gray.shape == (1, 48, 80)
+        assert (gray[0] - (0.299 * r + 0.587 * g + 0.114 * b)).abs().max() < 1.01 / 255
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pgm", ".tif"])
+def test_sixteen_bits_are_kept(tmp_path: Path, suffix: str) -> None:
+    ramp = torch.linspace(0, 1, 5000, dtype=torch.float64).reshape(1, 50, 100)
+    save_image(tmp_path / f"a{suffix}", ramp, bits=16)
+    read = read_image(tmp_path / f"a{suffix}", gray=True).pixels
+    assert (read.double() - ramp).abs().max() < 0.51 / 65535 + 1e-7
+    assert read_image(tmp_path / f"a{suffix}").pixels.shape == (3, 50, 100)
+
+
+@pytest.mark.parametrize(
+    ("data", "white", "values"),
+    [
+        (b"P5\n4 1\n15\n\x00\x05\x0a\x0f", 15, [0, 5, 10, 15]),
+        (b"P5 # a comment\n# and another\n 4 1 15\n\x00\x05\x0a\x0f", 15, [0, 5, 10, 15]),
+        (b"P5\n4 1\n255\n \n#!", 255, [32, 10, 35, 33]),  # pixels that look like spaces and comments
+        (b"P2\n4 1\n15\n0 5\n10 15\n", 15, [0, 5, 10, 15]),
+        (b"P5\n2 1\n1023\n\x01\x00\x03\xff", 1023, [256, 1023]),
+        (b"P5\n2 1\n100\n\x64\xff", 100, [100, 100]),  # above the largest value
+        (b"P4\n10 1\n\xaa\x40", 1, [0, 1, 0, 1, 0, 1, 0, 1, 1, 0]),
+        (b"P1\n# x\n4 1\n1 0\n10", 1, [0, 1, 0, 1]),
+        (b"P3\n1 1\n255\n1 2 3\n", 255, [1, 2, 3]),
+        (b"P6\n1 1\n255\n\x01\x02\x03", 255, [1, 2, 3]),
+    ],
+)
+def test_portable_maps(data: bytes, white: int, values: list[int]) -> None:
+    assert is_netpbm(data)
+    array, largest = decode_netpbm(data)
+    assert array.flatten().tolist() == values
+    assert largest == white
+
+
+def write_oriented(array: np.ndarray, orientation: int) -> np.ndarray:
+    """The array as a camera held that way stores it, from Exif's words for what row 0 and column 0 of the stored array are."""
+    row0, column0 = {
+        1: ("top", "left"),
+        2: ("top", "right"),
+        3: ("bottom", "right"),
+        4: ("bottom", "left"),
+        5: ("left", "top"),
+        6: ("right", "top"),
+        7: ("right", "bottom"),
+        8: ("left", "bottom"),
+    }[orientation]
+    if row0 in ("left", "right"):
+        array = array.swapaxes(0, 1)
+    if row0 in ("right", "bottom"):
+        array = array[::-1]
+    if column0 in ("right", "bottom"):
+        array = array[:, ::-1]
+    return np.ascontiguousarray(array)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_every_orientation_is_turned_upright(tmp_path: Path, picture: np.ndarray, orientation: int, order: str) -> None:
+    stored = write_oriented(picture, orientation)
+    block = tiff_block({ORIENTATION: orientation}, {FOCAL_35MM: 28}, order)
+    expected = torch.from_numpy(picture[:, :, ::-1].copy()).permute(2, 0, 1).float() / 255
+    for name, data in (
+        ("a.jpg", into_jpeg(encode(stored, ".jpg"), block)),
+        ("a.png", into_png(encode(stored, ".png"), block)),
+    ):
+        (tmp_path / name).write_bytes(data)
+        photo = read_image(tmp_path / name)
+        assert photo.size == (80, 48)
+        assert (photo.pixels - expected).abs().max() < (0.06 if name == "a.jpg" else 1e-6)
+        assert (read_image(tmp_path / name, gray=True).pixels[0].shape) == (48, 80)
+        assert photo.focal == pytest.approx(28 / np.hypot(36, 24) * np.hypot(80, 48))
+
+
+def test_the_tags_of_a_camera(picture: np.ndarray) -> None:
+    block = tiff_block({MAKE: "Acme ", MODEL: "Ix 1"}, {FOCAL: (50, 10), WIDTH: 4000, HEIGHT: 3000})
+    exif = parse_exif(into_jpeg(encode(picture, ".jpg"), block))
+    assert exif == Exif(make="Acme", model="Ix 1", focal_mm=5.0, width=4000, height=3000)
+    assert exif.focal(4000, 3000) is None  # millimetres alone do not give pixels
+
+
+@pytest.mark.parametrize(("unit", "millimetres"), [(2, 25.4), (3, 10.0), (4, 1.0)])
+def test_focal_from_the_sensor_resolution(unit: int, millimetres: float) -> None:
+    # A 6 mm wide sensor of 4000 pixels behind a 7.5 mm lens: f = 5000 pixels.
+    per_unit = round(4000 / 6 * millimetres * 1000)
+    tags: dict[int, Value] = {FOCAL: (75, 10), X_RESOLUTION: (per_unit, 1000), UNIT: unit, WIDTH: 4000, HEIGHT: 3000}
+    exif = parse_exif(tiff_block({}, tags))
+    assert exif.focal(4000, 3000) == pytest.approx(5000, rel=1e-4)
+    assert exif.focal(1000, 750) == pytest.approx(1250, rel=1e-4)  # scaled by a program
+    assert exif.focal(750, 1000) == pytest.approx(1250, rel=1e-4)  # and turned
+    assert exif.focal(1000, 500) is None  # cropped
+
+
+def test_focal_follows_max_size(tmp_path: Path, picture: np.ndarray) -> None:
+    (tmp_path / "a.jpg").write_bytes(into_jpeg(encode(picture, ".jpg"), tiff_block({}, {FOCAL_35MM: 28})))
+    whole, small = read_image(tmp_path / "a.jpg"), read_image(tmp_path / "a.jpg", max_size=40)
+    assert small.pixels.shape == (3, 24, 40)
+    assert small.size == (80, 48)
+    assert whole.focal is not None
+    assert small.focal == pytest.approx(whole.focal / 2)
+    averaged = torch.nn.functional.avg_pool2d(whole.pixels, 2)
+    assert (small.pixels - averaged).abs().max() < 1 / 255
+    assert read_image(tmp_path / "a.jpg", max_size=100).pixels.shape == (3, 48, 80)
+
+
+@pytest.mark.parametrize("tags", [{FOCAL_35MM: 0}, {FOCAL_35MM: 65535}, {FOCAL: (5, 0)}, {FOCAL: (5, 1), X_RESOLUTION: (0, 1)}])
+def test_senseless_tags_are_absent(tags: dict[int, Value]) -> None:
+    assert parse_exif(tiff_block({ORIENTATION: 77}, tags)).focal(4000, 3000) is None
+    assert parse_exif(tiff_block({ORIENTATION: 77}, tags)).orientation == 1
+
+
+GOOD = tiff_block({MAKE: "Acme", ORIENTATION: 6}, {FOCAL: (50, 10), FOCAL_35MM: 35, WIDTH: 40})
+
+
+@given(
+    st.binary(max_size=200),
+    st.integers(0, len(GOOD)),
+    st.sampled_from([b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*"]),
+)
+def test_damaged_metadata_never_raises(noise: bytes, cut: int, head: bytes) -> None:
+    for data in (
+        head + noise,
+        GOOD[:cut],
+        GOOD[:cut] + noise + GOOD[cut + len(noise) :],
+        into_jpeg(b"\xff\xd8" + noise, GOOD[:cut]),
+    ):
+        exif = parse_exif(data)
+        assert 1 <= exif.orientation <= 8
+        focal = exif.focal(640, 480)
+        assert focal is None or 0 < focal < 1e5
+
+
+@given(st.binary(max_size=60), st.sampled_from([b"P%d 3 2 255\n", b"P%d\n3 2\n", b"P%d 3"]), st.integers(1, 6))
+def test_damaged_maps_raise_only_value_errors(noise: bytes, head: bytes, kind: int) -> None:
+    data = head % kind + noise
+    if is_netpbm(data):
+        with suppress(ValueError):
+            array, white = decode_netpbm(data)
+            assert array.size > 0
+            assert array.max() <= white
+
+
+def test_phone_photographs(data: Path) -> None:
+    photo = read_image(data / "images" / "opensfm_berlin" / "images" / "01.jpg")
+    assert photo.size == (3264, 2448)
+    # These tags say 35 mm; another program's estimate from the images is 0.87 of the longer side.
+    assert photo.focal == pytest.approx(35 / np.hypot(36, 24) * 4080)
+
+
+def test_bad_files_say_why_in_one_line(tmp_path: Path, picture: np.ndarray, capfd: pytest.CaptureFixture[str]) -> None:
+    whole = {suffix: encode(picture, suffix) for suffix in (".jpg", ".png", ".ppm", ".webp", ".bmp", ".tif")}
+    files = {
+        "empty.jpg": (b"", "empty"),
+        "text.jpg": (b"not an image at all\n" * 5, "looks like text"),
+        "noise.png": (bytes(range(128, 256)) * 3, "unknown"),
+        "phone.heic": (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "HEIC"),
+        "float.tif": (encode(picture.astype(np.float32), ".tif"), "float32"),
+        **{f"half{suffix}": (data[: len(data) // 2], "cut short|damaged") for suffix, data in whole.items()},
+        **{f"most{suffix}": (data[:-5], "cut short|damaged") for suffix, data in whole.items() if suffix != ".tif"},
+        "header.png": (whole[".png"][:20], "cut short"),
+        "middle.png": (whole[".png"][:60] + b"\0" * 40 + whole[".png"][100:], "damaged"),
+        "huge.pgm": (b"P5 999999999 999999999 255\n0", "cut short"),
+    }
+    for name, (data, reason) in files.items():
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(ImageError, match=reason) as caught:
+            read_image(tmp_path / name)
+        assert str(caught.value).startswith(str(tmp_path / name))
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ImageError, match="no such file"):
+        read_image(tmp_path / "missing.jpg")
+    with pytest.raises(ImageError, match="folder"):
+        read_image(tmp_path)
+    capfd.readouterr()  # the decoders' own complaints
+
+
+def test_forbidden_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(ImageError, match="cannot be read .Permission denied"):
+        read_image(tmp_path / "a.png")
+
+
+def test_a_thumbnail_does_not_hide_a_cut(tmp_path: Path, picture: np.ndarray) -> None:
+    jpeg = encode(picture, ".jpg")
+    with_thumbnail = into_jpeg(jpeg, GOOD + jpeg)
+    (tmp_path / "a.jpg").write_bytes(with_thumbnail)
+    assert read_image(tmp_path / "a.jpg").size == (48, 80)
+    (tmp_path / "b.jpg").write_bytes(with_thumbnail[:-30])
+    with pytest.raises(ImageError, match="cut short"):
+        read_image(tmp_path / "b.jpg")
+
+
+def test_a_large_photograph(tmp_path: Path) -> None:
+    row = torch.linspace(0, 1, 8000).expand(6000, 8000)
+    save_image(tmp_path / "large.jpg", row)
+    photo = read_image(tmp_path / "large.jpg", gray=True)
+    assert photo.pixels.shape == (1, 6000, 8000)
+    assert (photo.pixels[0, 3000] - row[0]).abs().max() < 0.02
+    assert read_image(tmp_path / "large.jpg", max_size=1600).pixels.shape == (3, 1200, 1600)
+
+
+def test_list_images_in_natural_order(tmp_path: Path) -> None:
+    for name in ("v10.jpg", "v2.JPG", "v1.png", "a.PGM", "notes.txt", ".hidden.jpg", "V3.jpeg"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "folder.jpg").mkdir()
+    assert [path.name for path in list_images(tmp_path)] == ["a.PGM", "v1.png", "v2.JPG", "V3.jpeg", "v10.jpg"]
+    with pytest.raises(ImageError, match="no such folder"):
+        list_images(tmp_path / "missing")
+    with pytest.raises(ImageError, match="not a folder"):
+        list_images(tmp_path / "v1.png")
+
+
+def test_save_image(tmp_path: Path) -> None:
+    values = torch.tensor([[-1.0, 0.0, 0.2], [1.0, 2.0, torch.nan]])
+    for suffix in (".png", ".pgm", ".bmp", ".tif"):
+        save_image(tmp_path / f"a{suffix}", values)
+        expected = torch.tensor([[[0.0, 0.0, 0.2], [1.0, 1.0, 0.0]]])
+        torch.testing.assert_close(read_image(tmp_path / f"a{suffix}", gray=True).pixels, expected)
+    color = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(1))
+    save_image(tmp_path / "b.png", color)
+    assert (read_image(tmp_path / "b.png").pixels - color).abs().max() < 0.51 / 255
+    save_image(tmp_path / "b.ppm", values)
+    torch.testing.assert_close(read_image(tmp_path / "b.ppm").pixels, expected.expand(3, 2, 3))
+    with pytest.raises(ValueError, match=r"\.pgm holds one channel"):
+        save_image(tmp_path / "b.pgm", color)
+    with pytest.raises(ImageError, match="kind"):
+        save_image(tmp_path / "a.nothing", color)
+    with pytest.raises(ImageError, match="cannot be written"):
+        save_image(tmp_path / "missing" / "a.png", color)
+    with pytest.raises(ValueError, match="16 bits"):
+        save_image(tmp_path / "a.jpg", color, bits=16)
+    with pytest.raises(ValueError, match="wanted 8 or 16"):
+        save_image(tmp_path / "a.png", color, bits=12)
+    with pytest.raises(ValueError, match="wanted shape"):
+        save_image(tmp_path / "a.png", torch.zeros(2, 5, 7))
+
+
+def test_scale_image() -> None:
+    images = torch.tensor([[[1.0, 2.0], [3.0, 5.0]], [[7.0, 7.0], [7.0, 7.0]]], dtype=torch.float64)
+    scaled = scale_image(images)
+    assert scaled[0].tolist() == [[0, 0.25], [0.5, 1]]
+    assert scaled[1].tolist() == [[0, 0], [0, 0]]
+    assert scale_image(images[0], low=2.0, high=4.0).tolist() == [[0, 0], [0.5, 1]]
+    assert scale_image(images[:0]).shape == (0, 2, 2)
