@@ -16,7 +16,7 @@ def test_from_homogeneous_undoes_to_homogeneous_at_any_scale(rows, scale, negati
     x = torch.tensor(rows, dtype=torch.float64)
     back, finite = from_homogeneous(to_homogeneous(x) * (-scale if negative else scale))
     assert finite.all()
-    torch.testing.assert_close(back, x, rtol=1e-14, atol=0)
+    torch.testing.assert_close(back, x, rtol=1e-14, atol=1e-250)
 
 
 def test_points_at_infinity_are_masked_with_finite_values_and_gradients():

@@ -9,8 +9,8 @@ from torchsfm.geometry.radial import even_polynomial, finite_constants, in_block
 
 RADIAL = 3
 """Newton steps on the radial function after the guarded ones; what they leave is far below the decentring terms."""
-DECENTRING = 4
-"""Newton steps in the plane from the radial solution."""
+DECENTRING = 7
+"""Newton steps in the plane from the radial solution; three do inside, near the fold they are slower."""
 
 
 def brown(x: Tensor, y: Tensor, s: Tensor, radial: Sequence[Tensor], p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:
@@ -37,9 +37,22 @@ def invert_brown(
     return x - (jyy * ex - jxy * ey), y - (jxx * ey - jxy * ex), valid
 
 
+def brown_jacobian(
+    x: Tensor, y: Tensor, s: Tensor, radial: Sequence[Tensor], p1: Tensor, p2: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return L of `brown`, the entries xx, xy, yy of its symmetric Jacobian, and the determinant."""
+    L = torch.addcmul(torch.addcmul(even_polynomial(s, radial), p1, y, value=2), p2, x, value=2)
+    # `bend` x and `bend` y are the derivatives of the radial polynomial.
+    bend = polynomial(s, [2 * (i + 1) * k for i, k in enumerate(radial)])
+    bend_x = bend * x
+    jxx = torch.addcmul(L, x, bend_x + 4 * p2)
+    jyy = torch.addcmul(L, y, torch.addcmul(4 * p1, bend, y))
+    jxy = torch.addcmul(y * (bend_x + 2 * p2), p1, x, value=2)
+    return L, jxx, jxy, jyy, torch.addcmul(jxx * jyy, jxy, jxy, value=-1)
+
+
 def _solve(u: Tensor, v: Tensor, limit: Tensor, p1: Tensor, p2: Tensor, *radial: Tensor) -> tuple[Tensor, ...]:
     """Iterate; return x, y, the entries of the Jacobian divided by its determinant, and validity."""
-    bends = [2 * (i + 1) * k for i, k in enumerate(radial)]
     rho = torch.addcmul(u * u, v, v).sqrt()
     r = solve_radial(rho, radial, limit, torch.isfinite(limit), plain=RADIAL)
     factor = r / rho.clamp(min=torch.finfo(rho.dtype).tiny)
@@ -47,17 +60,10 @@ def _solve(u: Tensor, v: Tensor, limit: Tensor, p1: Tensor, p2: Tensor, *radial:
     x, y = x0, y0
     for i in range(DECENTRING + 1):
         s = torch.addcmul(x * x, y, y)
-        L = torch.addcmul(torch.addcmul(even_polynomial(s, radial), p1, y, value=2), p2, x, value=2)
+        L, jxx, jxy, jyy, determinant = brown_jacobian(x, y, s, radial, p1, p2)
         # What is missing from the equations at x, y.
         ex = torch.addcmul(torch.addcmul(u, x, L, value=-1), p2, s, value=-1)
         ey = torch.addcmul(torch.addcmul(v, y, L, value=-1), p1, s, value=-1)
-        # The Jacobian is symmetric; `bend` x and `bend` y are the derivatives of the radial polynomial.
-        bend = polynomial(s, bends)
-        bend_x = bend * x
-        jxx = torch.addcmul(L, x, bend_x + 4 * p2)
-        jyy = torch.addcmul(L, y, torch.addcmul(4 * p1, bend, y))
-        jxy = torch.addcmul(y * (bend_x + 2 * p2), p1, x, value=2)
-        determinant = torch.addcmul(jxx * jyy, jxy, jxy, value=-1)
         if i < DECENTRING:
             x = torch.addcdiv(x, torch.addcmul(jyy * ex, jxy, ey, value=-1), determinant)
             y = torch.addcdiv(y, torch.addcmul(jxx * ey, jxy, ex, value=-1), determinant)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
-from torchsfm.geometry.decentring import brown, invert_brown
+from torchsfm.geometry.decentring import brown, brown_jacobian, invert_brown
 from torchsfm.geometry.fisheye import fisheye_from_tangent, tangent_from_fisheye
 from torchsfm.geometry.radial import even_polynomial, first_fold, flatten_ray, invert_radial
 
@@ -199,8 +199,15 @@ class BrownConrady(DistortionModel):
         return x, y, torch.ones_like(x), valid & good
 
     def valid_radius(self) -> Float[Tensor, "*batch"]:
-        """Find the tangent of the angle where the radial part stops increasing."""
+        """Find the tangent of the angle where the radial part stops increasing; decentring may fold a little earlier."""
         return first_fold([self.k1, self.k2, self.k3])
+
+    def in_domain(self, d: Float[Tensor, "*#batch n 3"]) -> Bool[Tensor, "*#batch n"]:
+        """Tell which rays point forwards, lie within the valid radius and where decentring does not fold either."""
+        inside = super().in_domain(d)
+        with torch.no_grad():
+            k1, k2, p1, p2, k3 = self._columns()
+            return inside & (brown_jacobian(*flatten_ray(*d.unbind(-1)), (k1, k2, k3), p1, p2)[-1] > 0)
 
 
 @dataclass(frozen=True)
