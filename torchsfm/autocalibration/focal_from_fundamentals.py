@@ -1,9 +1,10 @@
 """One focal length from many fundamental matrices.
 
-With the principal point known and pixels square, `E = K2' F K1` must be an essential matrix: rank 2 with two equal singular values.
-`k(f) = (s1 - s2) / (s1 + s2)` measures how far it is from one (Mendonca & Cipolla, "A simple technique for self-calibration",
-CVPR 1999). Both s1^2 + s2^2 and s1 s2 are polynomials in f^2, so that a whole grid of focal lengths costs no decomposition. One
-unknown makes a search over the grid exact, and robust against any number of pairs that disagree without agreeing among themselves.
+With the principal point known and pixels square, `E = K2' F K1` must be an essential matrix: rank 2 with two equal
+singular values. `k(f) = (s1 - s2) / (s1 + s2)` measures how far it is from one (Mendonca & Cipolla, "A simple technique
+for self-calibration", CVPR 1999). Both s1^2 + s2^2 and s1 s2 are polynomials in f^2, so that a whole grid of focal
+lengths costs no decomposition. One unknown makes a search over the grid exact, and robust against any number of pairs
+that disagree without agreeing among themselves.
 """
 
 from dataclasses import dataclass
@@ -38,7 +39,8 @@ class FocalEstimate:
     """OK; DEGENERATE: very different focal lengths explain the pairs as well, or the best is at an end of the search range;
     NO_CONSENSUS: hardly two pairs agree; TOO_FEW: no pair has weight; NOT_FINITE: no pair with weight is finite."""
     uncertainty: Float[Tensor, "*batch"]
-    """Standard deviation of the logarithm of the focal length, from the disagreement among the pairs; 1 where nothing is known."""
+    """Standard deviation of the logarithm of the focal length, from the disagreement among the pairs; 1 where nothing
+    is known."""
     candidates: Float[Tensor, "*batch k"]
     """Focal lengths searched, in pixels."""
     cost: Float[Tensor, "*batch k"]
@@ -57,13 +59,14 @@ def focal_from_fundamentals(
     focal_range: tuple[float, float] | None = None,
     num_candidates: int = 320,
 ) -> FocalEstimate:
-    """The focal length shared by the two cameras of every one of p pairs, known principal points, square pixels, no distortion.
+    """The focal length that both cameras of every one of p pairs have: principal points known, square pixels, no distortion.
 
-    The robust mean of the squared asymmetries of all pairs is evaluated on a logarithmic grid, and its lowest place refined by
-    Newton's method. A pair whose optical axes meet at equal distances from both centres, as on a turntable, and a pair without
-    rotation say nothing (Sturm 2001): their asymmetry hardly changes along the grid and they do no harm; if all pairs are such,
-    the status is DEGENERATE. A pair that sees one plane has no fundamental matrix to speak of; leave such pairs out, or let them
-    be outvoted. A single pair of that kind can pass for a good one; several cannot, and give NO_CONSENSUS.
+    The robust mean of the squared asymmetries of all pairs is evaluated on a logarithmic grid, and its lowest place
+    refined by Newton's method. A pair whose optical axes meet at equal distances from both centres, as on a turntable,
+    and a pair without rotation say nothing (Sturm 2001): their asymmetry hardly changes along the grid and they do no
+    harm; if all pairs are such, the status is DEGENERATE. A pair that sees one plane has no fundamental matrix to speak
+    of; leave such pairs out, or let them be outvoted. A single pair of that kind can pass for a good one; several
+    cannot, and give NO_CONSENSUS.
 
     The derivative with respect to F, principal points and weights is that of the optimum.
 
@@ -215,7 +218,8 @@ def _polish(curves: _Curves, w: Tensor, start: Tensor, step: Tensor) -> Tensor:
         return result
 
     for _ in range(3):
-        first, second = torch.func.jvp(slope, (x,), (torch.ones_like(x),))
+        first = slope(x)
+        second = torch.func.grad(lambda t: slope(t).sum())(x)
         move = first / torch.where(second > 0, second, 1.0)
         x = torch.where((second > 0) & (move.abs() < 1e-4), x - move, x)
     return x

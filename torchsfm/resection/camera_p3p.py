@@ -1,11 +1,12 @@
 """Pose of a calibrated camera from three rays to three known points.
 
-The depths along the unit rays satisfy three quadrics, `|l_i u_i - l_j u_j|^2 = |X_i - X_j|^2`. Eliminating the scale leaves two
-conics in the direction of `(l_0, l_1, l_2)`, whose at most four common points are found as Ding, Yang, Larsson, Olsson & Åström,
-"Revisiting the P3P problem" (CVPR 2023) do: one real root of a cubic gives a pencil member that is a pair of lines, and each line
-meets another member in at most two points. Here no direction of the pencil is special: the cubic is homogeneous, the pencil is
-turned until its leading coefficient is large, and lines are met with conics in homogeneous coordinates, so that right angles,
-isosceles triangles and a centre in the plane of the points lose no solution.
+The depths along the unit rays satisfy three quadrics, `|l_i u_i - l_j u_j|^2 = |X_i - X_j|^2`. Eliminating the scale
+leaves two conics in the direction of `(l_0, l_1, l_2)`, whose at most four common points are found as Ding, Yang,
+Larsson, Olsson & Åström, "Revisiting the P3P problem" (CVPR 2023) do: one real root of a cubic gives a pencil member
+that is a pair of lines, and each line meets another member in at most two points. Here no direction of the pencil is
+special: the cubic is homogeneous, the pencil is turned until its leading coefficient is large, and lines are met with
+conics in homogeneous coordinates, so that right angles, isosceles triangles and a centre in the plane of the points
+lose no solution.
 """
 
 import torch
@@ -20,11 +21,12 @@ SQRT2 = 2.0**0.5
 def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"]) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
     """The up to four poses `[R | t]` that see three points along three rays, `d_i ~ R X_i + t` with positive depths.
 
-    Computed in float64 whatever comes in. Derivatives are those of the solutions (implicit function theorem on the depths), to
-    second order; empty slots have none.
+    Computed in float64 whatever comes in. Derivatives are those of the solutions (implicit function theorem on the
+    depths), to second order; empty slots have none.
 
-    No slot is valid where the points are collinear or coincide, or where anything is not finite. Where two solutions merge (the
-    centre on the danger cylinder through the points) both slots stay valid, and are as inaccurate as a double root is.
+    No slot is valid where the points are collinear or coincide, or where anything is not finite. Where two solutions
+    merge (the centre on the danger cylinder through the points) both slots stay valid, and are as inaccurate as a
+    double root is.
 
     Args:
         d: Rays in the camera frame, one per row, of any length, pointing from the camera towards the points.
@@ -73,7 +75,8 @@ def equations(
 ) -> Float[Tensor, "*batch 12"]:
     """What a pose from three rays satisfies: twelve equations in the twelve entries of `[R | t]`, zero at a solution.
 
-    Six say `R'R = I`; two for each point say that `R X + t` has no component across its ray, relative to the point's size there.
+    Six say `R'R = I`; two for each point say that `R X + t` has no component across its ray, relative to the point's
+    size there.
     """
     R, t = model[..., :3], model[..., 3]
     gram = R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)
@@ -81,7 +84,7 @@ def equations(
     Y = X @ R.mT + t[..., None, :]
     u = d / torch.linalg.vector_norm(d, dim=-1, keepdim=True)
     across = [(Y * e).sum(-1) / torch.linalg.vector_norm(Y.detach(), dim=-1) for e in _across(u.unbind(-1), -1)]
-    shape = torch.broadcast_shapes(gram.shape[:-2], across[0].shape[:-1])
+    shape = torch.broadcast_shapes(gram.shape[:-2], across[0].shape[:-1])  # type: ignore[no-untyped-call]
     return torch.cat([g.expand(*shape, -1) for g in (gram[..., rows, columns], *across)], -1)
 
 
@@ -229,7 +232,7 @@ class _Triangle:
         )
 
     def newton(self, depths: Tensor, valid: Tensor | None = None) -> Tensor:
-        """One Newton step on the three quadrics, where it is finite; slots that are not `valid` stay and have no derivative."""
+        """One Newton step on the three quadrics, where it is finite; slots not `valid` stay, without derivative."""
         l0, l1, l2 = depths.unbind(0)
         n0, n1, n2 = self.n.unbind(0)
         r0, r1, r2 = self.residuals(depths)

@@ -1,7 +1,8 @@
 """How the solvers of this room see their data: rows over (view, problem, point), in float64, in a well-scaled world.
 
-Points are independent of each other, so the work is done in pieces that fit the cache. Within a piece every number of a formula is
-one contiguous tensor (view, problem, point) or (problem, point); cameras are (view, problem, 1) and broadcast over the points.
+Points are independent of each other, so the work is done in pieces that fit the cache. Within a piece every number of a
+formula is one contiguous tensor (view, problem, point) or (problem, point); cameras are (view, problem, 1) and
+broadcast over the points.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,8 +21,8 @@ PIECE = 32768
 class Observations:
     """One piece of a triangulation problem.
 
-    The world is moved and scaled so that the centres of the cameras in use have mean 0 and root-mean-square distance 1: the cameras
-    in `P` are those of this world. Absent observations have weight 0 and harmless numbers.
+    The world is moved and scaled so that the centres of the cameras in use have mean 0 and root-mean-square distance 1:
+    the cameras in `P` are those of this world. Absent observations have weight 0 and harmless numbers.
     """
 
     x: tuple[Tensor, Tensor]
@@ -128,7 +129,7 @@ def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | Non
     number = counted.sum(0).clamp_min(1)
     shift = torch.stack([torch.where(counted, c, 0.0).sum(0) / number for c in centre[:3]])
     offsets = [torch.where(finite, c - s, c) for c, s in zip(centre[:3], shift.unbind(0), strict=True)]
-    spread = sum(torch.where(counted, o * o, 0.0).sum(0) for o in offsets) / number
+    spread = torch.stack([torch.where(counted, o * o, 0.0).sum(0) for o in offsets]).sum(0) / number
     # One place for all centres: there is no unit but the world's own.
     apart = spread.detach() > 1e-28 * (shift.detach() ** 2).sum(0).clamp_min(1e-200)
     scale = torch.where(apart, spread, 1.0).sqrt()
@@ -155,7 +156,7 @@ def _centres(P: tuple[tuple[Tensor, ...], ...]) -> tuple[Tensor, ...]:
     Y = -(c[0] * m[2, 3] - c[2] * m[0, 3] + c[3] * m[0, 2])
     Z = c[0] * m[1, 3] - c[1] * m[0, 3] + c[3] * m[0, 1]
     W = -(c[0] * m[1, 2] - c[1] * m[0, 2] + c[2] * m[0, 1])
-    rows = [sum(e * e for e in row[:3]).sqrt() for row in P]
+    rows = [(row[0] * row[0] + row[1] * row[1] + row[2] * row[2]).sqrt() for row in P]
     finite = W.detach().abs() > 1e-13 * (rows[0] * rows[1] * rows[2]).detach()
     length = (X * X + Y * Y + Z * Z).sqrt()
     divisor = torch.where(finite, W, torch.where(length.detach() > 0, length, 1.0))

@@ -1,4 +1,4 @@
-"""Smallest eigenvectors of 4x4 matrices and steps on the unit sphere, with the batch in the last dimensions and no LAPACK call."""
+"""Smallest eigenvectors of 4x4 matrices and steps on the unit sphere, the batch in the last dimensions, without LAPACK."""
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ def smallest_eigenvector(N: Tensor) -> Tensor:
         M = M / (M[0, 0] + M[1, 1] + M[2, 2] + M[3, 3])
     diagonal = torch.stack((M[0, 0], M[1, 1], M[2, 2], M[3, 3]))
     pick = diagonal.argmax(0)
-    x = M.gather(0, pick.expand(1, 4, *pick.shape))[0]
+    x: Tensor = M.gather(0, pick.expand(1, 4, *pick.shape))[0]
     return x * (x * x).sum(0).rsqrt()
 
 
@@ -67,7 +67,7 @@ def tangent_step(x: Tensor, N: Tensor, g: Tensor, damping: Tensor | None = None)
 
 
 def inverse(N: Tensor, shift: float = 0.0) -> Tensor:
-    """The inverse of N + shift I, N about 1, by L D L', which is backward stable without pivoting for positive definite matrices."""
+    """The inverse of positive definite N + shift I, N about 1, by L D L', which needs no pivoting there."""
     floor = 1e-17
     d0 = (N[0, 0] + shift).clamp_min(floor)
     l1, l2, l3 = N[0, 1] / d0, N[0, 2] / d0, N[0, 3] / d0
@@ -91,3 +91,9 @@ def inverse(N: Tensor, shift: float = 0.0) -> Tensor:
     )
     K = torch.stack(rows)
     return (K[:, :, None] * K[:, None]).sum(0)
+
+
+def symmetric(upper: dict[tuple[int, int], Tensor]) -> Tensor:
+    """A symmetric matrix (4, 4, *b) from its upper half."""
+    rows = [torch.stack([upper[min(i, j), max(i, j)] for j in range(4)]) for i in range(4)]
+    return torch.stack(rows)

@@ -15,7 +15,8 @@ def correct_matches(
     """The nearest pairs of image points that satisfy the epipolar constraint, by sum of squared distances.
 
     Two iterations of Lindstrom ("Triangulation made easy", CVPR 2010, `niter2`); they meet the optimum of Hartley & Sturm to
-    many digits more than pixels have. Computed in float64. A pair at both epipoles, and data that are not finite, stay as they are.
+    many digits more than pixels have. Computed in float64. A pair at both epipoles, and data that are not finite, stay
+    as they are.
 
     Args:
         F: Fundamental matrices, `x2' F x1 = 0`, of any scale.
@@ -45,7 +46,7 @@ def correct_matches(
 
 def lindstrom(F: tuple[Row, ...], u1: Tensor, v1: Tensor, u2: Tensor, v2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The corrected coordinates, in the order of the arguments; F given by its entries."""
-    size = sum(e * e for row in F for e in row).clamp_min(1e-300).rsqrt()
+    size = torch.stack([e * e for row in F for e in row]).sum(0).clamp_min(1e-300).rsqrt()
     F = tuple(tuple(e * size for e in row) for row in F)
     (f00, f01, _), (f10, f11, _) = F[0], F[1]
 
@@ -79,7 +80,7 @@ def fundamental_rows(first: tuple[Row, ...], second: tuple[Row, ...]) -> tuple[R
         row = []
         for i in range(3):
             terms = [s * one[i][p, q] * two[j][tuple(k for k in range(4) if k not in (p, q))] for (p, q), s in signs.items()]
-            row.append(torch.stack(torch.broadcast_tensors(*terms)).sum(0))
+            row.append(torch.stack(terms).sum(0))
         rows.append(tuple(row))
     return tuple(rows)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.optim import wants_derivative
 from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
-from torchsfm.triangulation._symmetric import inverse, tangent_step
+from torchsfm.triangulation._symmetric import inverse, symmetric, tangent_step
 from torchsfm.triangulation.optimal_correction import fundamental_rows, lindstrom
 from torchsfm.triangulation.triangulate_points_dlt import euclidean, linear_points
 
@@ -21,15 +21,16 @@ class Triangulation:
     model: Float[Tensor, "*batch n 3"]
     """The points, finite always; where `status` is not OK they may mean little."""
     status: Int8[Tensor, "*batch n"]
-    """OK; NOT_FINITE: a wanted observation is not finite; TOO_FEW: fewer than two observations; DEGENERATE: the rays coincide or
-    are parallel (no baseline, a point at infinity); BEHIND: not in front of all views that see it; NOT_CONVERGED."""
+    """OK; NOT_FINITE: a wanted observation is not finite; TOO_FEW: fewer than two observations; DEGENERATE: the rays
+    coincide or are parallel (no baseline, a point at infinity); BEHIND: not in front of all views that see it;
+    NOT_CONVERGED."""
     in_front: Bool[Tensor, "*batch n"]
     """In front of every camera that sees it."""
     parallax: Float[Tensor, "*batch n"]
     """The largest angle between two of its viewing rays, in radians."""
     covariance: Float[Tensor, "*batch n 3 3"]
-    """Of the point, for independent noise of variance 1 / weight in every image coordinate (1 pixel where no weights are given);
-    zero where the data do not determine it."""
+    """Of the point, for independent noise of variance 1 / weight in every image coordinate (1 pixel where no weights
+    are given); zero where the data do not determine it."""
     error: Float[Tensor, "*batch n"]
     """Root-mean-square distance (weighted) between the observations and the point's images, in pixels."""
 
@@ -44,13 +45,14 @@ def triangulate_points(
 ) -> Triangulation:
     """Points from their images in known views, by least squares on reprojection errors.
 
-    From the linear start, every point is refined by Levenberg-Marquardt over the sphere of homogeneous points, in a world moved
-    and scaled to the cameras, so that far points are as well-behaved as near ones. With two views the start is the optimal
-    correction of Lindstrom ("Triangulation made easy", CVPR 2010, two iterations), which leads to the global optimum of
-    Hartley & Sturm. With more views the optimum is the local one next to the linear solution.
+    From the linear start, every point is refined by Levenberg-Marquardt over the sphere of homogeneous points, in a
+    world moved and scaled to the cameras, so that far points are as well-behaved as near ones. With two views the start
+    is the optimal correction of Lindstrom ("Triangulation made easy", CVPR 2010, two iterations), which leads to the
+    global optimum of Hartley & Sturm. With more views the optimum is the local one next to the linear solution.
 
-    Computed in float64 whatever comes in. The derivative of `model` with respect to observations, cameras and weights is that of
-    the optimum (implicit function theorem with the exact Hessian); `parallax`, `covariance` and `error` follow from it.
+    Computed in float64 whatever comes in. The derivative of `model` with respect to observations, cameras and weights
+    is that of the optimum (implicit function theorem with the exact Hessian); `parallax`, `covariance` and `error`
+    follow from it.
 
     Cameras per point (ragged tracks): let the points be the batch, `x (p, v, 1, 2)` and `P (p, v, 3, 4)`.
 
@@ -173,7 +175,7 @@ class _System:
         self._bend = tuple((we * j + wf * k) * inverse_z for j, k in zip(ju, jv, strict=True))
         self._p3 = p3
         self.g = torch.stack([(we * j + wf * k).sum(0) for j, k in zip(ju, jv, strict=True)])
-        self.N = _symmetric({(i, j): (wju[i] * ju[j] + wjv[i] * jv[j]).sum(0) for i in range(4) for j in range(i, 4)})
+        self.N = symmetric({(i, j): (wju[i] * ju[j] + wjv[i] * jv[j]).sum(0) for i in range(4) for j in range(i, 4)})
         self.cost = (we * e + wf * f).sum(0)
         self.size = (data.w * (u * u + v * v)).sum(0)
 
@@ -184,12 +186,7 @@ class _System:
     def hessian(self) -> Tensor:
         """Half the exact Hessian of the cost."""
         b, p = self._bend, self._p3
-        return self.N - _symmetric({(i, j): (b[i] * p[j] + p[i] * b[j]).sum(0) for i in range(4) for j in range(i, 4)})
-
-
-def _symmetric(upper: dict[tuple[int, int], Tensor]) -> Tensor:
-    """A symmetric matrix (4, 4, problem, point) from its upper half."""
-    return torch.stack([upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]).unflatten(0, (4, 4))
+        return self.N - symmetric({(i, j): (b[i] * p[j] + p[i] * b[j]).sum(0) for i in range(4) for j in range(i, 4)})
 
 
 def _minimise(data: Observations, X: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:

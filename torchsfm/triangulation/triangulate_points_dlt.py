@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.triangulation._observations import Observations, in_pieces
-from torchsfm.triangulation._symmetric import smallest_eigenvector, tangent_step
+from torchsfm.triangulation._symmetric import smallest_eigenvector, symmetric, tangent_step
 
 
 def triangulate_points_dlt(
@@ -18,11 +18,11 @@ def triangulate_points_dlt(
 ) -> Float[Tensor, "*batch n _"]:
     """Points from their images in any number of known views, by linear least squares.
 
-    Every observation gives two planes through its camera's centre, `x p3 - p1` and `y p3 - p2`; the homogeneous point is the unit
-    vector with the smallest sum of squared products with them (Hartley & Zisserman, 2nd edition, section 12.2). The planes are
-    scaled to unit vectors in a world moved and scaled to the cameras (their centres have mean 0 and root-mean-square distance 1),
-    so that the answer does not depend on the scale of the camera matrices or on the similarity frame of the world. Computed in
-    float64 whatever comes in; the derivative is that of the solution.
+    Every observation gives two planes through its camera's centre, `x p3 - p1` and `y p3 - p2`; the homogeneous point
+    is the unit vector with the smallest sum of squared products with them (Hartley & Zisserman, 2nd edition, section
+    12.2). The planes are scaled to unit vectors in a world moved and scaled to the cameras (their centres have mean 0
+    and root-mean-square distance 1), so that the answer does not depend on the scale of the camera matrices or on the
+    similarity frame of the world. Computed in float64 whatever comes in; the derivative is that of the solution.
 
     The result is always finite. It means nothing for a point with fewer than two observations or whose rays coincide;
     `triangulate_points` reports such things. An observation that is not finite, or of a camera that is not, counts as absent.
@@ -34,8 +34,8 @@ def triangulate_points_dlt(
         P: Cameras, finite or not, of any scale and sign.
         visible: Which views see which point; all by default.
         weights: Factors of the squared distances, 0 for absent; negative or non-finite ones count as absent.
-        homogeneous: Return unit homogeneous 4-vectors instead, which hold points at infinity. Their sign puts the point in front
-            of most of the cameras.
+        homogeneous: Return unit homogeneous 4-vectors instead, which hold points at infinity. Their sign puts the point
+            in front of most of the cameras.
 
     Returns:
         Points `(*batch, n, 3)`, or `(*batch, n, 4)`. Without `homogeneous` a point at infinity comes back very far away.
@@ -89,8 +89,7 @@ def _planes(data: Observations) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...],
 def _normal_matrix(a: tuple[Tensor, ...], b: tuple[Tensor, ...], s: Tensor, t: Tensor) -> Tensor:
     """The 4x4 sums of squares, (4, 4, problem, point)."""
     sa, tb = tuple(s * e for e in a), tuple(t * e for e in b)
-    upper = {(i, j): (sa[i] * a[j] + tb[i] * b[j]).sum(0) for i in range(4) for j in range(i, 4)}
-    return torch.stack([upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]).unflatten(0, (4, 4))
+    return symmetric({(i, j): (sa[i] * a[j] + tb[i] * b[j]).sum(0) for i in range(4) for j in range(i, 4)})
 
 
 def _refine(X: Tensor, N: Tensor, a: tuple[Tensor, ...], b: tuple[Tensor, ...], s: Tensor, t: Tensor) -> Tensor:

@@ -1,0 +1,182 @@
+"""An uncalibrated camera from points and lines, by linear least squares (Hartley & Zisserman, 2nd edition, 7.1-7.2)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int8
+from torch import Tensor
+
+from torchsfm._types import Status, check_tensors
+from torchsfm.geometry import normalizing_similarity
+from torchsfm.linalg import cross
+
+FLAT = 1e-6
+"""Singular value, over the largest, at which a second null vector is taken for exact (a plane, in float32 coordinates)."""
+BLURRED = 3.0
+"""How much larger than the smallest singular value, which is noise, the second smallest must be."""
+
+
+@dataclass(frozen=True)
+class CameraEstimate:
+    """Cameras and whether the data determine them."""
+
+    model: Float[Tensor, "*batch 3 4"]
+    """P, finite always. |(P31, P32, P33)| = 1, and most of the structure has positive depth if det P[:, :3] > 0."""
+    status: Int8[Tensor, "*batch"]
+    """OK; NOT_FINITE: data with weight are not finite; TOO_FEW: fewer than 11 equations; DEGENERATE: the equations have more
+    than one solution, or nearly so for their noise (coplanar structure, a twisted cubic through the centre)."""
+
+
+def camera_dlt(
+    x: Float[Tensor, "*#batch n 2"],
+    X: Float[Tensor, "*#batch n 3"],
+    l: Float[Tensor, "*#batch k 3"] | None = None,  # noqa: E741
+    L: Float[Tensor, "*#batch k 6"] | None = None,
+    *,
+    weights: Float[Tensor, "*#batch n _"] | Float[Tensor, "*#batch n"] | None = None,
+    line_weights: Float[Tensor, "*#batch k"] | None = None,
+) -> CameraEstimate:
+    """The 3x4 camera from n points and k lines with 2 n + 2 k >= 11 equations, normalised in the image and in the world.
+
+    A point gives the two rows of `x ~ P X`, a line says of two of its points that they are seen on the image line.
+    Least squares in algebraic error: the start for a refinement, not its replacement. Computed in float64; the
+    derivative is that of the solution. The minimal case of 5 1/2 points is six points with the weight of one coordinate
+    0.
+
+    Args:
+        x: Image points in pixels.
+        X: The points in the world.
+        l: Image lines as homogeneous 3-vectors, `l'x = 0`, of any scale.
+        L: The lines in the world, Pluecker vectors (d, m), direction and moment `m = p x d`.
+        weights: Of the points' squared errors, `(*batch, n)` or for each coordinate `(*batch, n, 2)`; 0 for absent.
+        line_weights: Of the lines' squared errors.
+
+    Returns:
+        The cameras and their status.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not fit; only one of `l` and `L` is given; or fewer than 11 equations in all.
+    """
+    if (l is None) != (L is None):
+        raise ValueError("l, L: wanted both or neither")
+    n = x.shape[-2] if x.ndim > 1 else 0
+    per_coordinate = weights is not None and weights.ndim > 1 and weights.shape[-1] == 2 and n != 2
+    batch = check_tensors(
+        x=(x, "n 2"),
+        X=(X, "n 3"),
+        l=(l, "k 3"),
+        L=(L, "k 6"),
+        weights=(weights, "n 2" if per_coordinate else "n"),
+        line_weights=(line_weights, "k"),
+    )
+    k = 0 if l is None else l.shape[-2]
+    if 2 * (n + k) < 11:
+        raise ValueError(f"x: wanted at least 11 equations (six points or lines), got {n} points and {k} lines")
+    dtype = x.dtype
+    w = torch.ones(n, dtype=dtype, device=x.device) if weights is None else weights
+    w = w if per_coordinate else w[..., None].expand(*w.shape, 2)
+    x, X, w, bad = _clean(batch, x, X, w)
+
+    present = w.amax(-1)
+    everything, both = X, present
+    rows = []
+    T = normalizing_similarity(x, present)
+    if l is not None and L is not None:
+        v = torch.ones(k, dtype=dtype, device=x.device) if line_weights is None else line_weights
+        lines, space, v, bad_lines = _clean(batch, l, L, v[..., None])
+        bad = bad | bad_lines
+        directions = _unit(space[..., :3])
+        feet = cross(directions, space[..., 3:] / _norm(space[..., :3]))
+        both = torch.cat((present, v[..., 0]), -1)
+        # The feet of the perpendiculars from the origin say where the lines are only if the origin is near them.
+        middle = (torch.cat((X, feet), -2) * both[..., None]).sum(-2) / both.sum(-1, keepdim=True).clamp_min(1e-300)
+        feet = feet + ((middle[..., None, :] - feet) * directions).sum(-1, keepdim=True) * directions
+        everything = torch.cat((X, feet), -2)
+        S = normalizing_similarity(everything, both)
+        flat = lines @ torch.linalg.inv_ex(T)[0]
+        rows.append(_line_rows(flat / _norm(flat[..., :2]), _apply(S, feet), directions, v))
+    else:
+        S = normalizing_similarity(X, present)
+    rows.append(_point_rows(_apply(T, x), _apply(S, X), w))
+    A = torch.cat(rows, -2)
+    p, singular = _null_vector(A)
+    equations = (A.detach() != 0).any(-1).sum(-1)
+    degenerate = (singular[..., 1] <= FLAT * singular[..., -1]) | (singular[..., 1] <= BLURRED * singular[..., 0])
+    P = torch.linalg.solve_ex(T, p.reshape(*batch, 3, 4) @ S)[0]
+    P = _scaled(P, everything, both)
+
+    status = torch.full(batch, int(Status.OK), dtype=torch.int8, device=x.device)
+    for condition, code in ((degenerate, Status.DEGENERATE), (equations < 11, Status.TOO_FEW), (bad, Status.NOT_FINITE)):
+        status = torch.where(condition, int(code), status)
+    return CameraEstimate(P.to(dtype), status)
+
+
+def _clean(batch: torch.Size, a: Tensor, b: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """In float64 and full batch shape, absent rows zero; and which elements have rows with weight that are not finite."""
+    a, b, w = (t.double().expand(*batch, *t.shape[-2:]) for t in (a, b, w.expand(*w.shape[:-2], a.shape[-2], w.shape[-1])))
+    good = torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1) & torch.isfinite(w).all(-1) & (w >= 0).all(-1)
+    wanted = (w != 0).any(-1)
+    use = (wanted & good)[..., None]
+    return torch.where(use, a, 0.0), torch.where(use, b, 0.0), torch.where(use, w, 0.0), (wanted & ~good).any(-1)
+
+
+def _norm(v: Tensor) -> Tensor:
+    square = (v * v).sum(-1, keepdim=True)
+    return torch.where(square > 0, square, 1.0).sqrt()
+
+
+def _unit(v: Tensor) -> Tensor:
+    return v / _norm(v)
+
+
+def _apply(T: Tensor, x: Tensor) -> Tensor:
+    """A similarity applied to points."""
+    return x @ T[..., :-1, :-1].mT + T[..., None, :-1, -1]
+
+
+def _homogeneous(X: Tensor) -> Tensor:
+    return torch.cat((X, torch.ones_like(X[..., :1])), -1)
+
+
+def _point_rows(x: Tensor, X: Tensor, w: Tensor) -> Tensor:
+    """The two equations of each point, (*batch, 2 n, 12)."""
+    h, u, v = _homogeneous(X), x[..., :1], x[..., 1:]
+    zero = torch.zeros_like(h)
+    # A zero weight must not meet the derivative of the square root at 0.
+    root = torch.where(w > 0, torch.where(w > 0, w, 1.0).sqrt(), 0.0)
+    first = torch.cat((h, zero, -u * h), -1) * root[..., :1]
+    second = torch.cat((zero, h, -v * h), -1) * root[..., 1:]
+    return torch.cat((first, second), -2)
+
+
+def _line_rows(line: Tensor, feet: Tensor, directions: Tensor, w: Tensor) -> Tensor:
+    """The two equations of each line, for a point and the direction, (*batch, 2 k, 12)."""
+    root = torch.where(w > 0, torch.where(w > 0, w, 1.0).sqrt(), 0.0)
+    ends = (_homogeneous(feet), torch.cat((directions, torch.zeros_like(directions[..., :1])), -1))
+    return torch.cat([(line[..., :, None] * end[..., None, :]).flatten(-2) * root for end in ends], -2)
+
+
+def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
+    """The unit vector with the smallest |A p|, with its derivative, and the singular values from the smallest up."""
+    with torch.no_grad():
+        values, vectors = torch.linalg.eigh(A.mT @ A)
+        p, others = vectors[..., :1], vectors[..., 1:]
+        gaps = values[..., 1:] - values[..., :1]
+        inverse = torch.where(gaps > 1e-15 * values[..., -1:], 1 / gaps, 0.0)[..., None]
+    # One Newton step with residuals from A itself restores the precision that squaring has lost, and carries the derivative.
+    gradient = A.mT @ (A @ p)
+    p = (p - others @ (inverse * (others.mT @ gradient)))[..., 0]
+    p = p / torch.linalg.vector_norm(p, dim=-1, keepdim=True)
+    # Eigenvalues know small singular values only to the square root of rounding; products with A know them better.
+    singular = torch.linalg.vector_norm(A.detach() @ torch.cat((p.detach()[..., None], others), -1), dim=-2)
+    return p, torch.cat((singular[..., :1], singular[..., 1:].sort(-1).values), -1)
+
+
+def _scaled(P: Tensor, X: Tensor, w: Tensor) -> Tensor:
+    """|third row of the left part| = 1 (|P| = 1 for affine cameras), and most points at positive third coordinates."""
+    third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
+    whole = torch.linalg.vector_norm(P, dim=(-2, -1), keepdim=True)
+    size = torch.where(third.detach() > 1e-12 * whole.detach(), third, torch.where(whole.detach() > 0, whole, 1.0))
+    depth = (X.detach() @ P.detach()[..., 2, :3, None])[..., 0] + P.detach()[..., 2, 3:]
+    votes = (torch.sign(depth) * w.detach()).sum(-1)
+    return P / size * torch.where(votes < 0, -1.0, 1.0)[..., None, None]
