@@ -300,7 +300,7 @@ def test_two_scenes_are_two_models(courtyard: Path, tmp_path: Path) -> None:
     assert {image["model"] for name, image in images.items() if name.startswith("view")} == {0}
     assert {image["model"] for name, image in images.items() if name.startswith("other")} == {1}
     assert Reconstruction.load(out / "model-1.npz").num_registered == 4
-    assert (out / "page-1.html").exists()
+    assert (out / "page.html").exists()
     assert "model 1: 4 of 9 images registered" in text
 
 

@@ -92,7 +92,8 @@ def reconstruct(
         )  # fmt: skip
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
-        finish(job, result, {})
+        folders = {path.parent for path in images} if isinstance(source, list) else {source}
+        finish(job, result, folders.pop() if len(folders) == 1 else None, {})
 
 
 @app.command()
@@ -123,7 +124,7 @@ def demo(
         compared = {}
         if result.models:
             compared = compare(result.models[0], truth.poses, truth.cameras.K)
-        finish(job, result, compared)
+        finish(job, result, folder, compared)
 
 
 @app.command()

@@ -49,12 +49,19 @@ def compare(model: Reconstruction, poses_true: Pose, K_true: Float[Tensor, "v 3 
     return {key: value for key, value in words.items() if not math.isnan(rmse)}
 
 
-def finish(job: Job, result: SfmResult, truth: dict[str, str]) -> None:
-    """Write everything there is to `job.out`, and say in a few lines what came out and where to look."""
+def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, str]) -> None:
+    """Write everything there is to `job.out`, and say in a few lines what came out and where to look.
+
+    Args:
+        job: The run.
+        result: What it found.
+        folder: Where the photographs lie, for the page; None where they do not lie together.
+        truth: True errors, if known.
+    """
     more: dict[str, Any] = {"version": VERSION, "command": shlex.join(sys.argv[1:])}
     if not result.models:
         more["failure"] = result.failure()
-    written = write_models(job, result)
+    written = write_models(job, result, folder)
     record = report_record(result, peak_memory_mb=peak_memory(), truth=truth, **more)
     (job.out / "report.json").write_text(json.dumps(record, indent=1))
     (job.out / "report.md").write_text(report_markdown(record))
@@ -71,24 +78,25 @@ def finish(job: Job, result: SfmResult, truth: dict[str, str]) -> None:
         raise typer.Exit(NOTHING)
 
 
-def write_models(job: Job, result: SfmResult) -> list[tuple[str, str]]:
-    """Write each model in all formats whose packages are there; return what to look at."""
-
-    def npz(model: Reconstruction, path: Path) -> None:
-        model.save(path)
-
-    for stale in (path for pattern in ("model*.npz", "points*.ply", "page*.html") for path in job.out.glob(pattern)):
-        stale.unlink()
+def write_models(job: Job, result: SfmResult, folder: Path | None) -> list[tuple[str, str]]:
+    """Write the page of all models, and each model in all formats whose packages are there; return what to look at."""
+    for pattern in ("model*.npz", "points*.ply", "page.html"):
+        for stale in job.out.glob(pattern):
+            stale.unlink()
+    if not result.models:
+        return []
+    total = 1 + 3 * len(result.models)
+    job.progress("write", 0, total)
+    write_page(result.models, job.out / "page.html", report=result.report, images=folder)
+    written = [("page.html", "open it in a browser and turn the model with the mouse")]
     formats: list[tuple[str, str, Callable[[Reconstruction, Path], Any], str]] = [
-        ("page", ".html", write_page, "open it in a browser and turn the model with the mouse"),
-        ("model", ".npz", npz, "the model, for Reconstruction.load and torchsfm info"),
+        ("model", ".npz", Reconstruction.save, "the model, for Reconstruction.load and torchsfm info"),
         ("points", ".ply", write_ply, "coloured points and cameras for viewers"),
         ("colmap", "", write_colmap, "the model for COLMAP"),
     ]
-    written = []
     for i, model in enumerate(result.models):
         for k, (stem, suffix, write, what) in enumerate(formats):
-            job.progress("write", i * len(formats) + k, len(result.models) * len(formats))
+            job.progress("write", 1 + 3 * i + k, total)
             name = f"{stem}{suffix}" if i == 0 else f"{stem}-{i}{suffix}"
             try:
                 write(model, job.out / name)
@@ -97,6 +105,7 @@ def write_models(job: Job, result: SfmResult) -> list[tuple[str, str]]:
                     written.append((name, f"not written: the package {error.name} is not installed"))
                 continue
             written.append((name, what if i == 0 else f"the same of model {i}"))
+    job.progress("write", total, total)
     return written
 
 
