@@ -114,13 +114,11 @@ def demo(
         # One image at a time would show progress, but the rays are shared by all of them.
         job.progress("render", 0, views)
         truth = render_sequence(views=views, width=width, height=3 * width // 4, generator=generator)
-        for old in folder.glob("view*.jpg"):
-            old.unlink()
         names = [f"view{i:02d}.jpg" for i in range(views)]
         for i, name in enumerate(names):
             save_image(folder / name, truth.images[i])
             job.progress("render", i + 1, views)
-        result = job.run(folder, threads, seed=seed, resume=False)
+        result = job.run([folder / name for name in names], threads, seed=seed, resume=False)
         compared = {}
         if result.models:
             compared = compare(result.models[0], truth.poses, truth.cameras.K)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shlex
 import sys
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_r
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 
 NOTHING = 1
+OWN_FILES = re.compile(r"page\.html|(model|points)(-\d+)?\.(npz|ply)")
 VERSION = metadata.version("torchsfm")
 
 
@@ -80,9 +82,10 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
 
 def write_models(job: Job, result: SfmResult, folder: Path | None) -> list[tuple[str, str]]:
     """Write the page of all models, and each model in all formats whose packages are there; return what to look at."""
-    for pattern in ("model*.npz", "points*.ply", "page.html"):
-        for stale in job.out.glob(pattern):
-            stale.unlink()
+    for path in list(job.out.iterdir()):
+        # What an earlier run wrote would pass for results of this one.
+        if OWN_FILES.fullmatch(path.name):
+            path.unlink()
     if not result.models:
         return []
     total = 1 + 3 * len(result.models)
