@@ -203,6 +203,7 @@ def test_beyond_the_fold_is_masked_and_finite(name, dtype):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_awkward_rays_project_to_finite_points_with_finite_gradients(name, dtype):
     d = [[0, 0, 1], [0, 0, 0], [1, 2, 0], [1, -2, 1e-30], [1, 2, -3], [0, 0, -1], [1e-6, 0, 1e-6], [1e3, -1e4, 1e-4]]
+    d += [[math.nan, 1, 1], [1, math.inf, 2], [1, 1, -math.inf]]
     d = torch.tensor(d, dtype=dtype, requires_grad=True)
     p = torch.tensor(REAL[name], dtype=dtype, requires_grad=True)
     u = DISTORTION_MODELS[name].from_parameters(p).project(d)

@@ -45,7 +45,7 @@ class Camera:
             X_cam: Points in camera coordinates, or rays.
 
         Returns:
-            Pixels, finite for finite points; see `in_domain` for which of them a real camera could show.
+            Pixels, finite always; see `in_domain` for which of the points a real camera could show.
         """
         u = self.distortion.project(X_cam)
         return u @ self.K[..., :2, :2].mT + self.K[..., None, :2, 2]
@@ -68,10 +68,12 @@ class Camera:
         fx, fy = torch.where(regular, fx, 1.0), torch.where(regular, fy, 1.0)
         skew = torch.where(regular, skew, 0.0)
         centre = torch.where(regular[..., None], K[..., :2, 2], 0.0)
+        known = torch.isfinite(x.detach()).all(-1)
+        x = finite_or_zero(x)
         v = (x[..., 1] - centre[..., None, 1]) / fy[..., None]
         u = (x[..., 0] - centre[..., None, 0] - skew[..., None] * v) / fx[..., None]
         d, valid = self.distortion.unproject(torch.stack([u, v], -1))
-        return d, valid & regular[..., None]
+        return d, valid & regular[..., None] & known
 
     def in_domain(self, X_cam: Float[Tensor, "*#batch n 3"]) -> Bool[Tensor, "*#batch n"]:
         """Tell which points lie in front of the camera and within the valid radius of its distortion."""

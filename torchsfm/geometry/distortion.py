@@ -19,6 +19,7 @@ from torch import Tensor
 from torchsfm._types import check_tensors
 from torchsfm.geometry.decentring import brown, brown_jacobian, invert_brown
 from torchsfm.geometry.fisheye import fisheye_from_tangent, tangent_from_fisheye
+from torchsfm.geometry.homogeneous import finite_or_zero
 from torchsfm.geometry.radial import even_polynomial, first_fold, flatten_ray, invert_radial
 
 D = TypeVar("D", bound="DistortionModel")
@@ -60,11 +61,11 @@ class DistortionModel(ABC):
             d: Rays or points in camera coordinates, of any length.
 
         Returns:
-            What multiplies K. Finite for finite rays: a ray with no depth is sent very far away in its own direction; rays
-            behind the camera follow the formula (a pinhole shows them mirrored), so look at the sign of the depth as well.
+            What multiplies K, finite always: a ray with no depth is sent very far away in its own direction, one with NaN or
+            inf to the centre. Rays behind the camera follow the formula (a pinhole shows them mirrored): see `in_domain`.
         """
         check_tensors(d=(d, "n 3"))
-        return torch.stack(self.project_rows(*d.unbind(-1), *self._columns()), -1)
+        return torch.stack(self.project_rows(*finite_or_zero(d).unbind(-1), *self._columns()), -1)
 
     def unproject(self, u: Float[Tensor, "*#batch n 2"]) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
         """Find the ray of each distorted point, by Newton's method.

@@ -116,7 +116,8 @@ def transform_points(H: Float[Tensor, "*#batch h h"], x: Float[Tensor, "*#batch 
 
 def finite_or_zero(x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
     """Replace the rows that have NaN or inf by zero, so that they reach neither values nor gradients of others."""
-    return torch.where(torch.isfinite(x).all(-1, keepdim=True), x, 0.0)
+    # The sum is finite where all entries are (those that overflow it are past any use); it is cheaper than a mask over entries.
+    return torch.where(torch.isfinite(x.detach().sum(-1, keepdim=True)), x, 0.0)
 
 
 def divide_safely(y: Float[Tensor, "*batch d"], w: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch d"]:
