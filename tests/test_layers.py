@@ -27,7 +27,7 @@ ALLOWED: dict[str, set[str]] = {
         "triangulation", "resection", "motion", "autocalibration", "bundle",
     },
     "formats": {"geometry", "reconstruction"},
-    "plot": {"geometry", "tensors", "reconstruction"},
+    "plot": {"geometry", "tensors", "images", "reconstruction"},
 }  # fmt: skip
 FREE = {"__init__", "cli", "__main__"}
 LAZY = {"kornia", "cv2", "matplotlib", "plotly", "pycolmap"}

@@ -1,0 +1,88 @@
+"""How to hold a reconstruction: which way is up, where its bulk is, and from where to look at it first."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm.reconstruction.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True)
+class Framing:
+    """A frame for showing: z is up, and a ball holds what matters."""
+
+    R: Float[Tensor, "3 3"]
+    """Rotation from the world of the model to that of the picture."""
+    centre: Float[Tensor, "3"]
+    """Middle of the bulk of the points, in the picture's world."""
+    radius: float
+    """Radius of the bulk and of the cameras near it; 1 where there is nothing to see."""
+    direction: Float[Tensor, "3"]
+    """From the centre to a good first viewpoint, in the picture's world; unit length."""
+
+
+def up_direction(reconstruction: Reconstruction) -> Float[Tensor, "3"]:
+    """Which way is up, judging by how people hold cameras; the world's z axis where nothing can be said.
+
+    The mean of the cameras' up directions, made perpendicular to their horizontal axes where these span a plane (then it
+    does not matter how far the cameras look down). Where the up directions cancel but the cameras look the same way, as
+    from an aeroplane, up is against the view.
+    """
+    rows = reconstruction.poses.R[reconstruction.registered].to(torch.float64)
+    z_axis = rows.new_tensor([0.0, 0.0, 1.0])
+    if not len(rows):
+        return z_axis
+    right, up, forward = rows[:, 0], -rows[:, 1], rows[:, 2]
+    mean, view = up.mean(0), forward.mean(0)
+    # Singular value decomposition of the axes: the direction they avoid.
+    values, vectors = torch.linalg.eigh(right.mT @ right / len(right))
+    if float(mean.norm()) < 0.3:
+        if float(view.norm()) > 0.7:
+            return -view / view.norm()
+        return vectors[:, 0] * torch.sign(vectors[:, 0] @ mean + 1e-12)
+    mean = mean / mean.norm()
+    avoided = vectors[:, 0] * torch.sign(vectors[:, 0] @ mean)
+    spanned = float(values[1]) > 0.02 and float(values[0]) < 0.1 * float(values[1])
+    return avoided if spanned and float(avoided @ mean) > 0.8 else mean
+
+
+def frame(reconstruction: Reconstruction) -> Framing:
+    """Choose a frame: up is up, the bulk of the points in the middle, seen from the side of the cameras, a little from above."""
+    up = up_direction(reconstruction)
+    device = up.device
+    X = reconstruction.X.to(torch.float64)
+    X = X[torch.isfinite(X).all(-1)]
+    centres = reconstruction.poses.centre[reconstruction.registered].to(torch.float64)
+    # An arbitrary horizontal axis, then the first camera's right if that is usable.
+    spare = torch.eye(3, dtype=torch.float64, device=device)[int(up.abs().argmin())]
+    x_axis = torch.linalg.cross(up, spare)
+    x_axis = x_axis / x_axis.norm()
+    R = torch.stack((x_axis, torch.linalg.cross(up, x_axis), up))
+    X, centres = X @ R.mT, centres @ R.mT
+    sample = X[:: max(1, len(X) // 100_000)]
+    if len(sample):
+        centre = sample.median(0).values
+        distance = (sample - centre).norm(dim=-1)
+        radius = float(distance.quantile(0.85)) * 1.15
+    elif len(centres):
+        centre = centres.mean(0)
+        radius = float((centres - centre).norm(dim=-1).max())
+    else:
+        centre, radius = torch.zeros(3, dtype=torch.float64, device=device), 1.0
+    away = centres - centre
+    if len(away) and radius > 0:
+        reach = away.norm(dim=-1).quantile(0.9)
+        radius = max(radius, min(float(reach), 2.5 * radius))
+    direction = away.mean(0) if len(away) else centre.new_tensor([0.0, -1.0, 0.5])
+    flat = direction[:2].norm()
+    if len(away) and float(flat) < 0.2 * float(away[:, :2].norm(dim=-1).mean()):
+        # Cameras all round (or right above): take the side of the first one.
+        direction = away[0]
+        flat = direction[:2].norm()
+    if float(flat) < 1e-9 * max(radius, 1e-300):
+        direction, flat = centre.new_tensor([0.0, -1.0, 0.0]), centre.new_tensor(1.0)
+    rise = (direction[2] / flat).clamp(0.35, 1.2)
+    direction = torch.cat((direction[:2] / flat, rise[None]))
+    return Framing(R, centre, radius if radius > 0 else 1.0, direction / direction.norm())
