@@ -6,148 +6,34 @@ With the eliminated variables (points) last, the normal equations of a problem o
     [ W'  V ] [ b ] = - [ h ],    V block diagonal,
 
 and `S = U - W V^-1 W'` is a system in the retained variables (cameras) alone (Brown 1958; Triggs et al. 2000, 6.1; HZ A6.3).
-Work comes in three tiers: once per problem (`Elimination`: who meets whom), once per linearisation (`linearize`), once per
+Work comes in three tiers: once per problem (`layout`: who meets whom), once per linearisation (`linearize`), once per
 damping (`solve`), so that a rejected step costs only the last.
-
-Residuals are sorted by slot. A slot is a combination of retained variables that occurs (pose 3 with camera 0), so camera-side
-sums are products of contiguous matrices, and variables shared between slots are tied by adding up columns.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.terms import Block, Term, gather, lift_of, linearize
 
 
 @dataclass(frozen=True)
-class Piece:
-    """Residuals of one term that have the same kinds of free variables, sorted by slot."""
+class _Part:
+    """Residuals linearised at once."""
 
     term: Term
-    rows: Tensor
-    """Which residuals of the original term."""
     wanted: tuple[bool, ...]
-    slots: Tensor
-    """Slot of each residual (m)."""
-    ends: list[int]
-    """Where each slot's residuals end."""
-    columns: Tensor
-    """Column of each tangent coordinate of each slot, then that of the residual: (slots, c + 1)."""
+    width: int
+    """Tangent coordinates of a slot."""
+    segments: list[tuple[int, int]]
+    """Where runs of one slot begin and end."""
+    places: Tensor
+    """Where the entries of each run's square go in U."""
+    target: Tensor | None
     point: Tensor | None
-    """Number of each residual's eliminated variable among the free ones, (m)."""
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Which variables are free and where they stand in the systems."""
-
-    free: dict[str, Tensor]
-    """Free and observed variables of each block."""
-    first: dict[str, int]
-    """First column of each retained block."""
-    size: int
-    """Number of columns of the reduced system."""
-    eliminated: str | None
-    points: int
-    point_size: int
-    pieces: list[Piece]
-
-
-def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | None) -> Layout:
-    """Decide which variables move, drop residuals without any, and sort the others.
-
-    Args:
-        blocks: The variables.
-        terms: The residuals; those with weight 0 are dropped.
-        eliminate: The block to eliminate, if any; no residual may depend on two of its variables.
-    """
-    observed = {name: torch.zeros(b.x.shape[0], dtype=torch.bool, device=b.x.device) for name, b in blocks.items()}
-    for term in terms:
-        for name, index in zip(term.blocks, term.index, strict=True):
-            observed[name][index if term.weights is None else index[term.weights > 0]] = True
-    free: dict[str, Tensor] = {}
-    number: dict[str, Tensor] = {}
-    first: dict[str, int] = {}
-    size = 0
-    for name, block in blocks.items():
-        moves = observed[name] if block.fixed is None else observed[name] & ~block.fixed
-        if block.tangent == 0:
-            moves = torch.zeros_like(moves)
-        free[name] = moves.nonzero()[:, 0]
-        number[name] = torch.full(moves.shape, -1, device=moves.device)
-        number[name][free[name]] = torch.arange(free[name].numel(), device=moves.device)
-        if name != eliminate:
-            first[name] = size
-            size += free[name].numel() * block.tangent
-    points = 0 if eliminate is None else free[eliminate].numel()
-    pieces: list[Piece] = []
-    for term in terms:
-        pieces += _cut(term, blocks, number, first, size, eliminate)
-    point_size = 0 if eliminate is None else blocks[eliminate].tangent
-    return Layout(free, first, size, eliminate, points, point_size, pieces)
-
-
-def _cut(
-    term: Term, blocks: dict[str, Block], number: dict[str, Tensor], first: dict[str, int], size: int, eliminate: str | None
-) -> list[Piece]:
-    """The pieces of a term: residuals with a free point, without one, and with nothing free but the point."""
-    if term.blocks.count(eliminate or "") > 1:
-        raise ValueError(f"eliminate: a residual depends on two variables of {eliminate!r}; they cannot be eliminated singly")
-    places = [number[name][index] for name, index in zip(term.blocks, term.index, strict=True)]
-    has_point = torch.zeros_like(places[0], dtype=torch.bool)
-    has_camera = torch.zeros_like(has_point)
-    for name, place in zip(term.blocks, places, strict=True):
-        if name == eliminate:
-            has_point = has_point | (place >= 0)
-        else:
-            has_camera = has_camera | (place >= 0)
-    counts = torch.ones_like(has_point) if term.weights is None else term.weights > 0
-    pieces = []
-    for camera, point in ((True, True), (True, False), (False, True)):
-        rows = (counts & (has_camera == camera) & (has_point == point)).nonzero()[:, 0]
-        if rows.numel() > 0:
-            pieces.append(_sort(term, rows, places, (camera, point), blocks, first, size, eliminate))
-    return pieces
-
-
-def _sort(
-    term: Term,
-    rows: Tensor,
-    places: list[Tensor],
-    kind: tuple[bool, bool],
-    blocks: dict[str, Block],
-    first: dict[str, int],
-    size: int,
-    eliminate: str | None,
-) -> Piece:
-    camera, with_point = kind
-    places = [place[rows] for place in places]
-    wanted = tuple(
-        (with_point if name == eliminate else camera and bool((place >= 0).any()))
-        for name, place in zip(term.blocks, places, strict=True)
-    )
-    retained = [(n, p) for n, p, w in zip(term.blocks, places, wanted, strict=True) if w and n != eliminate]
-    point = next((p for n, p in zip(term.blocks, places, strict=True) if n == eliminate), None) if with_point else None
-    # Slots in the order of the first retained block, then the second, ...; -1 (fixed) is a value like any other.
-    key = torch.zeros_like(rows)
-    for _, place in retained:
-        key = key * (int(place.max()) + 2) + place + 1
-    values, slots = torch.unique(key, return_inverse=True)
-    order = slots if point is None else slots * (int(point.max()) + 1) + point
-    order = torch.argsort(order, stable=True)
-    rows, slots = rows[order], slots[order]
-    columns = torch.full((values.numel(), 1), size, device=rows.device)
-    for name, place in reversed(retained):
-        mine = torch.empty_like(values).index_copy_(0, slots, place[order])[:, None]
-        width = blocks[name].tangent
-        step = torch.arange(width, device=rows.device)
-        # Column size is the residual's, size + 1 collects what belongs to fixed variables.
-        columns = torch.cat((torch.where(mine >= 0, first[name] + mine * width + step, size + 1), columns), 1)
-    ends = torch.bincount(slots, minlength=values.numel()).cumsum(0).tolist()
-    return Piece(term.select(rows), rows, wanted, slots, ends, columns, None if point is None else point[order])
 
 
 class Elimination:
@@ -156,131 +42,202 @@ class Elimination:
     def __init__(self, blocks: dict[str, Block], layout: Layout) -> None:
         self.blocks = blocks
         self.layout = layout
-        q, n = layout.point_size, layout.points
-        self._targets: list[Tensor | None] = []
-        for piece in layout.pieces:
-            if piece.point is None or piece.columns.shape[1] == 1:
-                self._targets.append(None)
-            else:
-                # Where the residual's camera-point block goes in W (size + 2, q, n); c + 1 rows of m.
-                self._targets.append((piece.columns * (q * n))[piece.slots].mT + piece.point)
+        self.parts = [
+            part
+            for piece, target in zip(layout.pieces, layout.targets, strict=True)
+            for part in _parts(piece, target, layout.size)
+        ]
+        some = next(iter(blocks.values())).x
+        q, n, size = layout.point_size, layout.points, layout.size
+        total = sum((g.end - g.start) * g.columns.numel() for g in layout.groups)
+        # These live as long as the problem: memory that is new costs more than the arithmetic on it.
+        self.U = some.new_empty((size + 2, size + 2))
+        self.V = some.new_empty((q * (q + 1) // 2, n))
+        self.W = some.new_empty((q, total))
+        self._scratch = some.new_empty((max((g.end - g.start) * g.columns.numel() for g in layout.groups), q) if q else (0,))
+        self._work: dict[tuple[str, int, int], Tensor] = {}
 
     def linearize(self, x: dict[str, Tensor]) -> "Linearized":
-        """The blocks of the normal equations at `x`."""
-        layout = self.layout
-        size, q, n = layout.size, layout.point_size, layout.points
-        some = next(iter(x.values()))
-        lifts = {name: lift_of(b, x[name]) for name, b in self.blocks.items()}
-        U = some.new_zeros((size + 2, size + 2))
-        W = some.new_zeros((size + 2, q, n))
-        V = some.new_zeros((q * (q + 1) // 2, n))
-        for piece, target in zip(layout.pieces, self._targets, strict=True):
-            r, jacobians = linearize(piece.term, x, lifts, piece.wanted)
-            cameras = [
-                j for name, j in zip(piece.term.blocks, jacobians, strict=True) if j is not None and name != layout.eliminated
-            ]
-            points = [
-                j for name, j in zip(piece.term.blocks, jacobians, strict=True) if j is not None and name == layout.eliminated
-            ]
-            J = torch.cat((*cameras, r[:, None]), 1)
-            if cameras:
-                _add_squares(U, J, piece)
-            if points:
-                assert piece.point is not None
-                P = points[0]
-                for k, (a, b) in enumerate(_pairs(q)):
-                    V[k].index_add_(0, piece.point, (P[:, a] * P[:, b]).sum(0))
-                if target is None:
-                    target = ((size * q * n) + piece.point)[None]
-                for a in range(q):
-                    W.view(-1).scatter_add_(0, (target + a * n).flatten(), (J * P[:, a, None]).sum(0).flatten())
-        return Linearized(layout, U, V, W)
+        """The blocks of the normal equations at `x`; they are overwritten by the next call."""
+        needed = {
+            name
+            for part in self.parts
+            if part.term.linearize is None
+            for name, w in zip(part.term.blocks, part.wanted, strict=True)
+            if w
+        }
+        lifts = {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
+        for buffer in (self.U, self.V, self.W):
+            buffer.zero_()
+        for part in self.parts:
+            self._add(part, *linearize(part.term, x, lifts, part.wanted))
+        return Linearized(self.layout, self.U, self.V, self.W, self._scratch.view(-1))
+
+    def _add(self, part: _Part, r: Tensor, jacobians: list[Tensor | None]) -> None:
+        """Add squares and products of a part's Jacobians to the system."""
+        q, eliminated = self.layout.point_size, self.layout.eliminated
+        d, m = r.shape
+        J = self._buffer("J", d * (part.width + 1), m).view(d, part.width + 1, m)
+        start, P = 0, None
+        for name, j in zip(part.term.blocks, jacobians, strict=True):
+            if j is None:
+                continue
+            if name == eliminated:
+                P = j
+            else:
+                J[:, start : start + j.shape[1]] = j
+                start += j.shape[1]
+        J[:, start] = r
+        if start:
+            squares = torch.stack([torch.bmm(J[:, :, a:b], J[:, :, a:b].mT) for a, b in part.segments]).sum(1)
+            self.U.view(-1).index_add_(0, part.places, squares.flatten())
+        if P is None or part.point is None or part.target is None:
+            return
+        squares = self._buffer("V", self.V.shape[0], m)
+        for row, (a, b) in zip(squares, _pairs(q), strict=True):
+            torch.mul(P[0, a], P[0, b], out=row)
+            for k in range(1, d):
+                row.addcmul_(P[k, a], P[k, b])
+        self.V.index_add_(1, part.point, squares)
+        product = self._buffer("W", part.width + 1, m)
+        for a in range(q):
+            torch.mul(J[0], P[0, a], out=product)
+            for k in range(1, d):
+                product.addcmul_(J[k], P[k, a])
+            self.W[a].scatter_add_(0, part.target, product.view(-1))
+
+    def _buffer(self, name: str, rows: int, columns: int) -> Tensor:
+        key = (name, rows, columns)
+        if key not in self._work:
+            self._work[key] = self.U.new_empty((rows, columns))
+        return self._work[key]
 
 
 @dataclass(frozen=True)
 class Linearized:
-    """`U` and `W` with the gradient as their column (row) `size`, and `V` as its distinct entries."""
+    """The normal equations: `U` with the gradient as column `size`, `V` as its distinct entries, `W` group by group."""
 
     layout: Layout
     U: Tensor
     V: Tensor
     W: Tensor
+    scratch: Tensor
 
     def solve(self, damping: float) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """The step for `damping` times the diagonal, the decrease the model promises, and whether the system was solved."""
         layout = self.layout
-        size, q, n = layout.size, layout.point_size, layout.points
+        size, q = layout.size, layout.point_size
         pairs = _pairs(q)
-        diagonal = torch.stack([self.V[pairs.index((a, a))] for a in range(q)]) if q else self.V
-        diagonal = _floor(diagonal, 0)
+        diagonal = _floor(torch.stack([self.V[pairs.index((a, a))] for a in range(q)])) if q else self.V
         L = _factor(self.V, damping * diagonal, q)
-        rows: list[Tensor] = []
-        Y = torch.empty_like(self.W[: size + 1])
-        for a in range(q):
-            row = self.W[: size + 1, a]
-            for b in range(a):
-                row = row - L[a][b] * rows[b]
-            rows.append(torch.mul(row, L[a][a], out=Y[:, a]))
-        flat = Y.view(size + 1, q * n)
-        S = self.U[: size + 1, : size + 1] - flat @ flat.mT
-        weight = _floor(self.U.diagonal()[:size], 0)
-        matrix = S[:size, :size] + torch.diag(damping * weight)
-        factor, info = torch.linalg.cholesky_ex(matrix)
-        camera = -torch.cholesky_solve(S[:size, size:], factor)[:, 0] if size else matrix.new_zeros(0)
+        S = self.U.clone()
+        for group in layout.groups:
+            W, span = self._coupling(group.offset, group.start, group.end, group.columns.numel()), slice(group.start, group.end)
+            Y = self.scratch[: W.numel()].view(W.shape)
+            for a in range(q):
+                row = W[a]
+                for b in range(a):
+                    torch.addcmul(row, L[a][b][span], Y[b], value=-1, out=Y[a])
+                    row = Y[a]
+                torch.mul(row, L[a][a][span], out=Y[a])
+            square = Y[0] @ Y[0].mT
+            for a in range(1, q):
+                square.addmm_(Y[a], Y[a].mT)
+            if len(layout.groups) == 1 and group.columns.numel() == size + 1 and int(group.columns[-1]) == size:
+                S[: size + 1, : size + 1] -= square
+            else:
+                S[group.columns[:, None], group.columns] -= square
+        weight = _floor(self.U.diagonal()[:size]) * damping
+        factor, info = torch.linalg.cholesky_ex(S[:size, :size] + torch.diag(weight))
+        camera = -torch.cholesky_solve(S[:size, size, None], factor)[:, 0] if size else S.new_zeros(0)
         solved = (info == 0) & camera.isfinite().all()
-        gradient = self.U[:size, size]
-        promise = camera @ (damping * weight * camera - gradient)
+        promise = camera @ (weight * camera - self.U[:size, size])
         step = self._split(camera)
         if layout.eliminated is not None:
-            z = flat[size] + camera @ flat[:size]
-            point = _back_substitute(L, z.view(q, n))
-            promise = promise + (point * (damping * diagonal * point - self.W[size])).sum()
+            h, z = self._gradient_and_product(camera)
+            point = _substitute(L, z)
+            promise = promise + (point * (damping * diagonal * point - h)).sum()
             step[layout.eliminated] = point.mT
         return step, promise / 2, solved
 
     def gradient(self) -> Tensor:
         """Largest absolute derivative of the cost."""
         size = self.layout.size
-        both = torch.cat((self.U[:size, size], self.W[size].flatten(), self.U.new_zeros(1)))
-        return both.abs().max()
+        largest = [self.U[:size, size].abs().amax()] if size else []
+        for group in self.layout.groups:
+            W = self._coupling(group.offset, group.start, group.end, group.columns.numel())
+            largest.append(W[:, self._gradient_row(group.columns)].abs().amax())
+        return torch.stack(largest).amax()
+
+    def _gradient_row(self, columns: Tensor) -> int:
+        # Columns are sorted; only that of fixed variables comes after the gradient's.
+        return columns.numel() - 1 - int(columns[-1] > self.layout.size)
+
+    def _coupling(self, offset: int, start: int, end: int, columns: int) -> Tensor:
+        return self.W[:, offset : offset + columns * (end - start)].view(-1, columns, end - start)
+
+    def _gradient_and_product(self, camera: Tensor) -> tuple[Tensor, Tensor]:
+        """The points' gradient h and `h + W'a`."""
+        q, n = self.layout.point_size, self.layout.points
+        h, z = camera.new_empty((q, n)), camera.new_empty((q, n))
+        extended = torch.cat((camera, camera.new_tensor([1.0, 0.0])))
+        for group in self.layout.groups:
+            W, span = self._coupling(group.offset, group.start, group.end, group.columns.numel()), slice(group.start, group.end)
+            h[:, span] = W[:, self._gradient_row(group.columns)]
+            z[:, span] = extended[group.columns] @ W
+        return h, z
 
     def _split(self, camera: Tensor) -> dict[str, Tensor]:
-        layout = self.layout
+        """The columns of each block."""
+        ends = [*list(self.layout.first.values())[1:], self.layout.size]
         return {
-            name: camera[start : start + layout.free[name].numel() * self.tangent(name)].view(layout.free[name].numel(), -1)
-            for name, start in layout.first.items()
-            if layout.free[name].numel()
+            name: camera[start:end].view(self.layout.free[name].numel(), -1)
+            for (name, start), end in zip(self.layout.first.items(), ends, strict=True)
         }
 
-    def tangent(self, name: str) -> int:
-        """Degrees of freedom of one variable of a retained block."""
-        starts = sorted({*self.layout.first.values(), self.layout.size})
-        start = self.layout.first[name]
-        end = min(s for s in starts if s > start)
-        return (end - start) // self.layout.free[name].numel()
 
-
-def _add_squares(U: Tensor, J: Tensor, piece: Piece) -> None:
-    """Add J'J of every slot at its columns."""
-    start = 0
-    squares = []
-    for end in piece.ends:
-        part = J[:, :, start:end]
-        squares.append(torch.bmm(part, part.mT).sum(0))
-        start = end
-    place = piece.columns[:, :, None] * U.shape[1] + piece.columns[:, None]
-    U.view(-1).index_add_(0, place.flatten(), torch.stack(squares).flatten())
+def _parts(piece: Piece, target: Tensor | None, size: int) -> list[_Part]:
+    """Cut a piece where the residuals linearised at once become too many."""
+    m, width = piece.slots.numel(), piece.columns.shape[1] - 1
+    ends = torch.bincount(piece.slots, minlength=piece.columns.shape[0]).cumsum(0).tolist()
+    parts = []
+    count = -(-m // CHUNK)
+    bounds = [m * k // count for k in range(count + 1)]
+    slot = 0
+    for first, last in pairwise(bounds):
+        segments, slots = [], []
+        at = first
+        while at < last:
+            while ends[slot] <= at:
+                slot += 1
+            stop = min(ends[slot], last)
+            segments.append((at - first, stop - first))
+            slots.append(slot)
+            at = stop
+        columns = piece.columns[slots]
+        places = (columns[:, :, None] * (size + 2) + columns[:, None]).flatten()
+        rows = slice(first, last)
+        term = replace(
+            piece.term,
+            index=tuple(i[rows] for i in piece.term.index),
+            data=tuple(d[rows] for d in piece.term.data),
+            weights=None if piece.term.weights is None else piece.term.weights[rows],
+        )
+        point = None if piece.point is None else piece.point[rows]
+        goal = None if target is None else target[:, rows].flatten()
+        parts.append(_Part(term, piece.wanted, width, segments, places, goal, point))
+    return parts
 
 
 def _pairs(q: int) -> list[tuple[int, int]]:
     return [(a, b) for a in range(q) for b in range(a + 1)]
 
 
-def _floor(diagonal: Tensor, dim: int) -> Tensor:
+def _floor(diagonal: Tensor) -> Tensor:
     """A variable that nothing depends on in some direction gets a damping of its own, and does not move."""
     if diagonal.numel() == 0:
         return diagonal
-    least = 1e-12 * diagonal.amax(dim, keepdim=True)
+    least = 1e-12 * diagonal.amax(0, keepdim=True)
     return torch.where(least > 0, torch.maximum(diagonal, least), torch.ones_like(diagonal))
 
 
@@ -306,12 +263,18 @@ def _factor(V: Tensor, damping: Tensor, q: int) -> list[list[Tensor]]:
     return L
 
 
-def _back_substitute(L: list[list[Tensor]], z: Tensor) -> Tensor:
-    """`-L'^-1 z`."""
+def _substitute(L: list[list[Tensor]], z: Tensor) -> Tensor:
+    """`-L'^-1 L^-1 z`."""
     q = len(L)
+    forward: list[Tensor] = []
+    for a in range(q):
+        value = z[a]
+        for b in range(a):
+            value = value - L[a][b] * forward[b]
+        forward.append(value * L[a][a])
     solution: list[Tensor] = [z[0]] * q
     for a in reversed(range(q)):
-        value = -z[a]
+        value = -forward[a]
         for b in range(a + 1, q):
             value = value - L[b][a] * solution[b]
         solution[a] = value * L[a][a]
@@ -323,10 +286,6 @@ def move(blocks: dict[str, Block], layout: Layout, x: dict[str, Tensor], step: d
     moved = dict(x)
     for name, delta in step.items():
         index = layout.free[name]
-        if index.numel() == x[name].shape[0]:
-            moved[name] = blocks[name].retract(x[name], delta).mT.contiguous().mT
-        else:
-            columns = x[name].mT.clone()
-            columns[:, index] = blocks[name].retract(gather(x[name], index), delta).mT
-            moved[name] = columns.mT
+        columns = blocks[name].retract(gather(x[name], index), delta).mT
+        moved[name] = x[name].mT.contiguous().index_copy(1, index, columns).mT
     return moved

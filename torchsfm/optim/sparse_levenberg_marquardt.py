@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.optim.schur import Elimination, lay_out, move
+from torchsfm.optim.layout import lay_out
+from torchsfm.optim.schur import Elimination, move
 from torchsfm.optim.terms import Block, Term, term_cost, term_residual
 
 

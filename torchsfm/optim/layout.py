@@ -1,0 +1,273 @@
+"""Who meets whom in a problem of terms: which variables are free, and in which order residuals and variables are worked off.
+
+Residuals are sorted by slot. A slot is a combination of retained variables that occurs (pose 3 with camera 0), so sums over a
+slot are products of contiguous matrices, and variables shared between slots are tied by adding up columns. Eliminated variables
+are sorted into groups that see about the same slots: within a group their coupling to the retained ones is a dense matrix, and
+dense products are so much faster than sparse ones that a few zeros are welcome.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsfm.optim.terms import Block, Term
+
+CHUNK = 4096
+"""Residuals linearised at once: few enough for temporaries to stay in the cache (and below malloc's mmap threshold)."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Residuals of one term that have the same kinds of free variables, sorted by slot."""
+
+    term: Term
+    wanted: tuple[bool, ...]
+    """The blocks of the term by which derivatives are needed."""
+    slots: Tensor
+    """Slot of each residual (m)."""
+    columns: Tensor
+    """Column of each tangent coordinate of each slot, then that of the residual: (slots, c + 1)."""
+    point: Tensor | None
+    """Number of each residual's eliminated variable, (m)."""
+
+    @property
+    def coupled(self) -> bool:
+        """Whether retained and eliminated variables meet here."""
+        return self.point is not None and self.columns.shape[1] > 1
+
+
+@dataclass(frozen=True)
+class Group:
+    """Eliminated variables `start` to `end`, and the columns of the reduced system they meet, the gradient's among them."""
+
+    start: int
+    end: int
+    offset: int
+    columns: Tensor
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which variables are free and where they stand in the systems."""
+
+    free: dict[str, Tensor]
+    """Free and observed variables of each block, the eliminated ones in the order of their groups."""
+    first: dict[str, int]
+    """First column of each retained block with free variables."""
+    size: int
+    """Number of columns of the reduced system; the gradient is column `size`, column `size + 1` belongs to fixed variables."""
+    eliminated: str | None
+    point_size: int
+    pieces: list[Piece]
+    groups: list[Group]
+    targets: list[Tensor | None]
+    """Where each piece's residuals go in the coupling matrices: (c + 1, m), None where nothing is coupled."""
+
+    @property
+    def points(self) -> int:
+        """Number of free eliminated variables."""
+        return 0 if self.eliminated is None else self.free[self.eliminated].numel()
+
+
+def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | None) -> Layout:
+    """Decide which variables move, drop residuals without any, and sort the others.
+
+    Args:
+        blocks: The variables.
+        terms: The residuals; those with weight 0 are dropped.
+        eliminate: The block to eliminate, if any; no residual may depend on two of its variables.
+    """
+    free: dict[str, Tensor] = {}
+    number: dict[str, Tensor] = {}
+    first: dict[str, int] = {}
+    size = 0
+    for name, block in blocks.items():
+        moves = torch.zeros(block.x.shape[0], dtype=torch.bool, device=block.x.device)
+        for term in terms:
+            for other, index in zip(term.blocks, term.index, strict=True):
+                if other == name and block.tangent > 0:
+                    moves[index if term.weights is None else index[term.weights > 0]] = True
+        if block.fixed is not None:
+            moves &= ~block.fixed
+        free[name] = moves.nonzero()[:, 0]
+        number[name] = torch.full(moves.shape, -1, device=moves.device)
+        number[name][free[name]] = torch.arange(free[name].numel(), device=moves.device)
+        if name != eliminate and free[name].numel():
+            first[name] = size
+            size += free[name].numel() * block.tangent
+    pieces = [piece for term in terms for piece in _cut(term, blocks, number, first, size, eliminate)]
+    if eliminate is None or not free[eliminate].numel():
+        return Layout(free, first, size, None, 0, pieces, [], [None] * len(pieces))
+    count = free[eliminate].numel()
+    order = _order_points(pieces, count)
+    free[eliminate] = free[eliminate][order]
+    rank = torch.empty_like(order).index_copy_(0, order, torch.arange(count, device=order.device))
+    pieces = [_renumber(piece, rank) for piece in pieces]
+    groups, targets = _group(pieces, count, size)
+    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, pieces, groups, targets)
+
+
+def _cut(
+    term: Term, blocks: dict[str, Block], number: dict[str, Tensor], first: dict[str, int], size: int, eliminate: str | None
+) -> list[Piece]:
+    """The pieces of a term: residuals with a free point, without one, and with nothing free but the point."""
+    if term.blocks.count(eliminate or "") > 1:
+        raise ValueError(f"eliminate: a residual depends on two variables of {eliminate!r}; they cannot be eliminated singly")
+    places = [number[name][index] for name, index in zip(term.blocks, term.index, strict=True)]
+    has_point = torch.zeros_like(places[0], dtype=torch.bool)
+    has_camera = torch.zeros_like(has_point)
+    for name, place in zip(term.blocks, places, strict=True):
+        if name == eliminate:
+            has_point |= place >= 0
+        else:
+            has_camera |= place >= 0
+    counts = torch.ones_like(has_point) if term.weights is None else term.weights > 0
+    pieces = []
+    for camera, point in ((True, True), (True, False), (False, True)):
+        rows = (counts & (has_camera == camera) & (has_point == point)).nonzero()[:, 0]
+        if rows.numel() > 0:
+            pieces.append(_sort(term, rows, places, (camera, point), blocks, first, size, eliminate))
+    return pieces
+
+
+def _sort(
+    term: Term,
+    rows: Tensor,
+    places: list[Tensor],
+    kind: tuple[bool, bool],
+    blocks: dict[str, Block],
+    first: dict[str, int],
+    size: int,
+    eliminate: str | None,
+) -> Piece:
+    camera, with_point = kind
+    places = [place[rows] for place in places]
+    wanted = tuple(
+        with_point if name == eliminate else camera and bool((place >= 0).any())
+        for name, place in zip(term.blocks, places, strict=True)
+    )
+    retained = [(n, p) for n, p, w in zip(term.blocks, places, wanted, strict=True) if w and n != eliminate]
+    point = next((p for n, p in zip(term.blocks, places, strict=True) if n == eliminate), None) if with_point else None
+    # Slots in the order of the first retained block, then the second, ...; -1 (fixed) is a value like any other.
+    key = torch.zeros_like(rows)
+    for _, place in retained:
+        key = key * (int(place.max()) + 2) + place + 1
+    values, slots = torch.unique(key, return_inverse=True)
+    order = torch.argsort(slots if point is None else slots * (int(point.max()) + 1) + point)
+    rows, slots = rows[order], slots[order]
+    columns = torch.full((values.numel(), 1), size, device=rows.device)
+    for name, place in reversed(retained):
+        mine = torch.empty_like(values).index_copy_(0, slots, place[order])[:, None]
+        width = blocks[name].tangent
+        step = torch.arange(width, device=rows.device)
+        columns = torch.cat((torch.where(mine >= 0, first[name] + mine * width + step, size + 1), columns), 1)
+    return Piece(term.select(rows), wanted, slots, columns, None if point is None else point[order])
+
+
+def _renumber(piece: Piece, rank: Tensor) -> Piece:
+    if piece.point is None:
+        return piece
+    return Piece(piece.term, piece.wanted, piece.slots, piece.columns, rank[piece.point])
+
+
+def _order_points(pieces: list[Piece], count: int) -> Tensor:
+    """Points with the same slots next to each other, in lexicographic order of their slots as far as 60 bits reach."""
+    device = pieces[0].slots.device
+    key = torch.zeros(count, dtype=torch.int64, device=device)
+    total = sum(piece.columns.shape[0] for piece in pieces if piece.coupled)
+    start = 0
+    if total <= 60:
+        for piece in pieces:
+            if piece.coupled and piece.point is not None:
+                # A point twice in a slot spoils the order a little, never the result.
+                key.index_add_(0, piece.point, torch.ones_like(piece.slots) << (59 - start - piece.slots))
+                start += piece.columns.shape[0]
+        return torch.argsort(key, descending=True, stable=True)
+    low = torch.full((count,), total, dtype=torch.int64, device=device)
+    high = torch.full((count,), -1, dtype=torch.int64, device=device)
+    for piece in pieces:
+        if piece.coupled and piece.point is not None:
+            low.scatter_reduce_(0, piece.point, piece.slots + start, "amin")
+            high.scatter_reduce_(0, piece.point, piece.slots + start, "amax")
+            start += piece.columns.shape[0]
+    return torch.argsort(low * (total + 1) + high, stable=True)
+
+
+ATOM = 64
+"""Points that stay together when groups are formed."""
+PRODUCT = 6.0 / 25e9
+"""Seconds per column squared and point (three coordinates) of a dense product."""
+VISIT = 6e-5
+"""Seconds that a group costs, whatever its size."""
+ENTRY = 5e-9
+"""Seconds to add one entry of a group's product into the system."""
+
+
+def _group(pieces: list[Piece], count: int, size: int) -> tuple[list[Group], list[Tensor | None]]:
+    """Cut the sorted points into groups, and find each residual's place in its group's coupling matrix."""
+    atoms = -(-count // ATOM)
+    coupled = [piece for piece in pieces if piece.coupled and piece.point is not None]
+    touched = []
+    for piece in coupled:
+        assert piece.point is not None
+        slots = piece.columns.shape[0]
+        pairs = torch.unique(torch.div(piece.point, ATOM, rounding_mode="floor") * slots + piece.slots)
+        atom = torch.div(pairs, slots, rounding_mode="floor")
+        touched.append(((atom * (size + 2))[:, None] + piece.columns[pairs % slots]).flatten())
+    # The gradient's column is in every group, coupled or not.
+    device = pieces[0].slots.device
+    touched.append(torch.arange(atoms, device=device) * (size + 2) + size)
+    keys = torch.unique(torch.cat(touched))
+    sets: list[set[int]] = [set() for _ in range(atoms)]
+    for atom, column in zip((keys // (size + 2)).tolist(), (keys % (size + 2)).tolist(), strict=True):
+        sets[atom].add(column)
+    spans = _merge(sets, count)
+    number = torch.empty(count, dtype=torch.int64, device=device)
+    table = torch.full((len(spans), size + 2), -1, device=device)
+    groups: list[Group] = []
+    offset = 0
+    for g, (start, end, columns) in enumerate(spans):
+        number[start:end] = g
+        listed = torch.tensor(sorted(columns), device=device)
+        table[g, listed] = torch.arange(listed.numel(), device=device)
+        groups.append(Group(start, end, offset, listed))
+        offset += listed.numel() * (end - start)
+    starts = torch.tensor([g.start for g in groups], device=device)
+    widths = torch.tensor([g.end - g.start for g in groups], device=device)
+    offsets = torch.tensor([g.offset for g in groups], device=device)
+    targets: list[Tensor | None] = []
+    for piece in pieces:
+        if piece.point is None:
+            targets.append(None)
+            continue
+        group = number[piece.point]
+        base = offsets[group] + piece.point - starts[group]
+        width = widths[group]
+        target = base.new_empty((piece.columns.shape[1], base.numel()))
+        for row, column in zip(target, piece.columns.unbind(1), strict=True):
+            torch.addcmul(base, table[group, column[piece.slots]], width, out=row)
+        targets.append(target)
+    return groups, targets
+
+
+def _merge(sets: list[set[int]], count: int) -> list[tuple[int, int, set[int]]]:
+    """Join neighbouring atoms while that is estimated to save time."""
+
+    def seconds(columns: int, points: int) -> float:
+        return columns * columns * (points * PRODUCT + ENTRY) + VISIT
+
+    spans: list[tuple[int, int, set[int]]] = []
+    for atom, columns in enumerate(sets):
+        start, end = atom * ATOM, min((atom + 1) * ATOM, count)
+        while spans:
+            before_start, before_end, before = spans[-1]
+            union = before | columns
+            apart = seconds(len(before), before_end - before_start) + seconds(len(columns), end - start)
+            if seconds(len(union), end - before_start) > apart:
+                break
+            spans.pop()
+            start, columns = before_start, union
+        spans.append((start, end, columns))
+    return spans
