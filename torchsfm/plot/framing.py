@@ -36,20 +36,20 @@ def up_direction(reconstruction: Reconstruction) -> Float[Tensor, "3"]:
         return z_axis
     right, up, forward = rows[:, 0], -rows[:, 1], rows[:, 2]
     mean, view = up.mean(0), forward.mean(0)
-    # Singular value decomposition of the axes: the direction they avoid.
+    # The direction that the horizontal axes avoid.
     values, vectors = torch.linalg.eigh(right.mT @ right / len(right))
-    if float(mean.norm()) < 0.3:
-        if float(view.norm()) > 0.7:
-            return -view / view.norm()
-        return vectors[:, 0] * torch.sign(vectors[:, 0] @ mean + 1e-12)
-    mean = mean / mean.norm()
-    avoided = vectors[:, 0] * torch.sign(vectors[:, 0] @ mean)
-    spanned = float(values[1]) > 0.02 and float(values[0]) < 0.1 * float(values[1])
-    return avoided if spanned and float(avoided @ mean) > 0.8 else mean
+    avoided: Tensor = vectors[:, 0] * torch.sign(vectors[:, 0] @ mean + 1e-12)
+    if float(mean.norm()) >= 0.3:
+        mean = mean / mean.norm()
+        spanned = float(values[1]) > 0.02 and float(values[0]) < 0.1 * float(values[1])
+        best = avoided if spanned and float(avoided @ mean) > 0.8 else mean
+    else:
+        best = -view / view.norm() if float(view.norm()) > 0.7 else avoided
+    return best
 
 
 def frame(reconstruction: Reconstruction) -> Framing:
-    """Choose a frame: up is up, the bulk of the points in the middle, seen from the side of the cameras, a little from above."""
+    """Choose a frame: up is up, the bulk of the points in the middle, seen from the cameras' side, a little from above."""
     up = up_direction(reconstruction)
     device = up.device
     X = reconstruction.X.to(torch.float64)

@@ -1,0 +1,241 @@
+"""The interactive page holds the model, tells the truth about it, and lets no text become code."""
+
+import base64
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Pose
+from torchsfm.geometry.rotations import random_rotation
+from torchsfm.geometry.similarity import Similarity
+from torchsfm.images import save_image
+from torchsfm.plot import up_direction, write_page
+from torchsfm.plot.framing import frame
+from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import ImageReport, PairReport, Report
+from torchsfm.simulation import look_at, orbit_poses
+
+
+def content(path: Path) -> dict[str, Any]:
+    text = path.read_text(encoding="utf-8")
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert found is not None
+    loaded: dict[str, Any] = json.loads(found.group(1))
+    return loaded
+
+
+def unpack(text: str, dtype: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), dtype=dtype)
+
+
+def test_the_page_holds_the_model(model: Reconstruction, tmp_path: Path) -> None:
+    path = write_page(model, tmp_path / "new" / "page.html", title="A model")
+    data = content(path)
+    assert data["title"] == "A model"
+    (shown,) = data["models"]
+    assert shown["summary"].startswith("4 of 5 images, 200 points\n")
+    positions = unpack(shown["positions"], "<f4").reshape(-1, 3)
+    assert positions.shape == (200, 3)
+    # A rotation and a shift: distances stay.
+    expected = torch.cdist(model.X, model.X).numpy()
+    assert np.allclose(torch.cdist(*(torch.from_numpy(positions.copy()).double(),) * 2).numpy(), expected, atol=1e-5)
+    assert np.array_equal(unpack(shown["colors"], "u1").reshape(-1, 3), (model.color * 255).round().numpy().astype("u1"))
+    tracks, views = unpack(shown["tracks"], "<u2"), unpack(shown["views"], "<u2")
+    assert np.array_equal(tracks, model.track_lengths().numpy())
+    assert np.allclose(unpack(shown["errors"], "<f4"), model.point_errors().numpy(), rtol=1e-6)
+    assert np.array_equal(views, model.view.numpy())
+
+
+def test_the_table_has_every_image(model: Reconstruction, tmp_path: Path) -> None:
+    rows = content(write_page(model, tmp_path / "page.html"))["models"][0]["images"]
+    assert [row["name"] for row in rows] == list(model.names)
+    errors = model.view_errors()
+    for i, row in enumerate(rows):
+        assert row["points"] == int((model.view == i).sum())
+        assert row["mean"] == pytest.approx(float(errors[i]), rel=1e-3)
+        assert (row["pose"] is not None) == bool(model.registered[i])
+    assert rows[3]["status"] == "not registered"
+    assert rows[0]["focal"] == 500
+
+
+def test_cameras_see_the_points_where_they_were_observed(model: Reconstruction, tmp_path: Path) -> None:
+    shown = content(write_page(model, tmp_path / "page.html"))["models"][0]
+    positions = unpack(shown["positions"], "<f4").reshape(-1, 3).astype(float)
+    for i, row in enumerate(shown["images"]):
+        if row["pose"] is None:
+            continue
+        centre, axes = np.array(row["pose"][:3]), np.array(row["pose"][3:]).reshape(3, 3)
+        p = (positions - centre) @ axes.T
+        X_cam = model.poses[i].transform(model.X).numpy()
+        assert np.allclose(p, X_cam, atol=1e-5)
+        # The corners are those of the undistorted image.
+        d, _ = model.cameras[0].unproject(torch.tensor([[-0.5, -0.5], [639.5, 479.5]], dtype=torch.float64))
+        assert np.allclose(np.array(row["corners"])[[0, 2]], d[:, :2].numpy(), atol=1e-6)
+        own = X_cam[model.point[model.view == i].numpy(), 2]
+        assert abs(row["depth"] - np.median(own)) < 0.1
+
+
+class Elements(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+
+def test_names_and_titles_stay_text(model: Reconstruction, tmp_path: Path) -> None:
+    evil = ("</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", '"><b>', "$data ${script} $$", "naïve 図.png")
+    wild = replace(model, names=evil)
+    title = "<script>alert(2)</script> $script & </title>"
+    path = write_page(wild, tmp_path / "page.html", title=title)
+    data = content(path)
+    assert data["title"] == title
+    assert [row["name"] for row in data["models"][0]["images"]] == list(evil)
+    plain = Elements()
+    plain.feed(write_page(model, tmp_path / "plain.html").read_text(encoding="utf-8"))
+    parsed = Elements()
+    parsed.feed(path.read_text(encoding="utf-8"))
+    assert parsed.found == plain.found, "no name adds an element or an attribute"
+
+
+def test_the_page_asks_the_network_for_nothing(model: Reconstruction, tmp_path: Path) -> None:
+    text = write_page(model, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "default-src 'none'" in text
+    assert not re.search(r"https?://|//cdn|\bfetch\(|XMLHttpRequest|@import|url\(", text)
+    # Names reach the document as text only.
+    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(", text)
+    parsed = Elements()
+    parsed.feed(text)
+    for tag, attributes in parsed.found:
+        assert "src" not in attributes, tag
+        assert "href" not in attributes, tag
+
+
+def test_several_models_and_a_report(model: Reconstruction, tmp_path: Path) -> None:
+    entries = [
+        *(ImageReport(name, 0) for name in ("view_0.png", "view_1.png")),
+        ImageReport("view_2.png", 1),
+        ImageReport("view_3.png", None, "too few matches"),
+        ImageReport("view_4.png", 0),
+        ImageReport("broken.jpg", None, "cut short"),
+    ]
+    none = torch.zeros(0, dtype=torch.long)
+    report = Report(tuple(entries), PairReport(none.reshape(0, 2), none, none, none, none), {})
+    first = replace(model, registered=torch.tensor([True, True, False, False, True]))
+    data = content(write_page([first, model], tmp_path / "page.html", report=report))
+    one, two = data["models"]
+    assert one["label"].startswith("1 of 2: 3 images")
+    assert two["label"].startswith("2 of 2: 4 images")
+    status = {row["name"]: row.get("status") for row in one["images"]}
+    assert status["view_2.png"] == "in model 2"
+    assert status["view_3.png"] == "too few matches"
+    assert status["broken.jpg"] == "cut short"
+    assert "3 of 6 images" in one["summary"]
+
+
+def test_photographs_are_put_in_small(model: Reconstruction, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for name in model.names[:2]:
+        save_image(folder / name, torch.rand(3, 48, 64))
+    (folder / model.names[2]).write_text("no image")
+    rows = content(write_page(model, tmp_path / "page.html", images=folder, thumbnail=32))["models"][0]["images"]
+    for row in rows[:2]:
+        head, _, body = row["photo"].partition(",")
+        assert head == "data:image/jpeg;base64"
+        assert base64.b64decode(body)[:3] == b"\xff\xd8\xff"
+    assert all("photo" not in row for row in rows[2:])
+
+
+def test_empty_and_broken_models_still_make_a_page(model: Reconstruction, tmp_path: Path) -> None:
+    empty = replace(
+        model, X=model.X[:0], color=model.color[:0], x=model.x[:0], view=model.view[:0], point=model.point[:0],
+        registered=torch.zeros(5, dtype=torch.bool),
+    )  # fmt: skip
+    shown = content(write_page(empty, tmp_path / "empty.html"))["models"][0]
+    assert shown["positions"] == ""
+    assert shown["radius"] == 1
+    X = model.X.clone()
+    X[7, 1], X[9, 0] = math.nan, math.inf
+    shown = content(write_page(replace(model, X=X), tmp_path / "broken.html"))["models"][0]
+    positions = unpack(shown["positions"], "<f4")
+    assert len(positions) == 3 * 198
+    assert np.isfinite(positions).all()
+    keep = (model.point != 7) & (model.point != 9)
+    assert np.array_equal(unpack(shown["views"], "<u2"), model.view[keep].numpy())
+
+
+def test_single_precision_models_are_welcome(model: Reconstruction, tmp_path: Path) -> None:
+    assert content(write_page(model.to(torch.float32), tmp_path / "page.html"))["models"][0]["images"][0]["focal"] == 500
+
+
+def test_wrong_arguments(model: Reconstruction, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="wanted at least one model"):
+        write_page([], tmp_path / "page.html")
+    with pytest.raises(ValueError, match="thumbnail"):
+        write_page(model, tmp_path / "page.html", thumbnail=0)
+    (tmp_path / "page").write_text("a file, not a folder")
+    with pytest.raises(OSError, match="page"):
+        write_page(model, tmp_path / "page" / "page.html")
+
+
+def turned(model: Reconstruction, R: Tensor) -> Reconstruction:
+    return model.transform(Similarity(torch.ones((), dtype=torch.float64), R, torch.zeros(3, dtype=torch.float64)))
+
+
+def with_poses(model: Reconstruction, poses: Pose) -> Reconstruction:
+    count = len(poses.t)
+    return replace(
+        model, names=tuple(map(str, range(count))), poses=poses, registered=torch.ones(count, dtype=torch.bool),
+        image_size=model.image_size[:1].repeat(count, 1), camera_index=torch.zeros(count, dtype=torch.long),
+    )  # fmt: skip
+
+
+def test_up_is_up_whatever_the_frame(model: Reconstruction, generator: torch.Generator) -> None:
+    R = random_rotation(generator=generator, dtype=torch.float64)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    assert torch.allclose(up_direction(model), up, atol=1e-6)
+    assert torch.allclose(up_direction(turned(model, R)), R @ up, atol=1e-6)
+    # All the way round, looking steeply down, the mean of the cameras' up directions still finds it.
+    orbit = with_poses(model, orbit_poses(9, radius=2.0, height=(2.0, 5.0), sweep=2 * math.pi))
+    assert torch.allclose(up_direction(orbit), up, atol=1e-6)
+
+
+def test_up_of_aerial_images_is_against_the_view(model: Reconstruction) -> None:
+    angle = torch.arange(6, dtype=torch.float64) * math.pi / 3
+    centre = torch.stack((angle.cos(), angle.sin(), torch.full_like(angle, 5.0)), -1)
+    held = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)
+    aerial = with_poses(model, look_at(centre, centre - torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), held))
+    assert torch.allclose(up_direction(aerial), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=1e-6)
+
+
+def test_one_camera_and_none_have_an_up(model: Reconstruction) -> None:
+    one = with_poses(model, orbit_poses(1, radius=4.0, height=(0.0, 0.0)))
+    assert torch.allclose(up_direction(one), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=1e-6)
+    none = replace(model, registered=torch.zeros(5, dtype=torch.bool))
+    assert torch.allclose(up_direction(none), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+
+
+def test_framing_ignores_wild_points(model: Reconstruction) -> None:
+    clean = frame(model)
+    X = model.X.clone()
+    X[::20] = 1e5 * torch.randn(10, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    wild = frame(replace(model, X=X))
+    assert wild.radius == pytest.approx(clean.radius, rel=0.1)
+    assert torch.allclose(wild.centre, clean.centre, atol=0.1)
+    # Seen from the side of the cameras, from above.
+    side = (model.poses.centre[model.registered] @ clean.R.mT).mean(0)
+    assert float(clean.direction[:2] @ side[:2]) > 0.5 * float(side[:2].norm())
+    assert clean.direction[2] > 0.2
+    assert torch.allclose(clean.R @ clean.R.mT, torch.eye(3, dtype=torch.float64))
+    assert float(torch.linalg.det(clean.R)) == pytest.approx(1)
