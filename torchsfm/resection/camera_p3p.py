@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.optim import wants_derivative
 
 SQRT2 = 2.0**0.5
 
@@ -33,7 +34,7 @@ def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"])
         X: The points in the world frame, one per row.
 
     Returns:
-        Four slots of `cam_from_world` and which of them are solutions; rotations are orthonormal to rounding, in every slot.
+        Four slots of `cam_from_world`, rotations orthonormal to rounding, and which of them are solutions.
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
@@ -44,30 +45,36 @@ def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"])
     rays = d.double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0).contiguous()
     points = X.double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0).contiguous()
     sound = _sound(rays.detach(), points.detach(), torch.finfo(dtype).eps)
-    rays = torch.where(sound, rays, rays.new_tensor(_SAFE)[..., None])
-    points = torch.where(sound, points, points.new_tensor(_SAFE)[..., None])
+    safe = rays.new_tensor(_SAFE)[..., None]
+    rays, points = torch.where(sound, rays, safe), torch.where(sound, points, safe)
 
-    u = rays / (rays * rays).sum(1, keepdim=True).sqrt()
-    centroid = points.mean(0)
-    X0, X1, X2 = points.unbind(0)
+    u = rays * (rays * rays).sum(1, keepdim=True).rsqrt()
     with torch.no_grad():
-        shape = _Triangle(u.detach(), points.detach())
-        depths, valid = shape.depths()
-        depths, valid = shape.accept(shape.newton(shape.newton(depths)), valid & sound)
-    # Two Newton steps from the solution: no change of value, and derivatives exact to second order.
-    depths = torch.where(valid, depths, 1.0)
-    tracked = _Triangle(u, points)
-    depths = tracked.newton(tracked.newton(depths, valid), valid)
+        triangle = _Triangle(u.detach(), points.detach())
+        depths, valid = triangle.depths()
+        depths = triangle.newton(triangle.newton(depths))
+        valid = valid & sound & triangle.met(depths)
+        depths = torch.where(valid, depths, 1.0)
+    differentiable = wants_derivative(d, X)
+    if differentiable:
+        # Two Newton steps from the solution: no change of value, and derivatives exact to second order.
+        triangle = _Triangle(u, points)
+        depths = triangle.newton(triangle.newton(depths, valid), valid)
 
-    Y = torch.where(valid, depths[:, None] * u[:, :, None], u.new_tensor(_SAFE)[..., None, None])
-    Y0, Y1, Y2 = Y.unbind(0)
-    a1, a2, a3 = _triad(X1 - X0, X2 - X0)
-    b1, b2, b3 = _triad(Y1 - Y0, Y2 - Y0)
-    # (row, column, slot, problem)
-    R = b1[:, None] * a1[None, :, None] + b2[:, None] * a2[None, :, None] + b3[:, None] * a3[None, :, None]
-    t = Y.mean(0) - (R * centroid[None, :, None]).sum(1)
-    model = torch.cat((R, t[:, None]), 1).permute(3, 2, 0, 1)
-    return Solutions(model.to(dtype).reshape(*batch, 4, 3, 4), valid.T.reshape(*batch, 4))
+    # (slot, point, coordinate, problem)
+    Y = depths.transpose(0, 1)[:, :, None] * u
+    if differentiable:
+        Y = torch.where(valid[:, None, None], Y, Y.detach())
+    X0, X1, X2 = points.unbind(0)
+    Y0, Y1, Y2 = Y.unbind(1)
+    a1, a2, a3 = _triad(X1 - X0, X2 - X0, 0)
+    b1, b2, b3 = _triad(Y1 - Y0, Y2 - Y0, 1)
+    R = torch.addcmul(torch.addcmul(b1[:, :, None] * a1, b2[:, :, None], a2), b3[:, :, None], a3)
+    m = X0 + X1 + X2
+    moved = torch.addcmul(torch.addcmul(b1 * (a1 * m).sum(0), b2, (a2 * m).sum(0)), b3, (a3 * m).sum(0))
+    t = (Y0 + Y1 + Y2 - moved) / 3
+    model = torch.cat((R, t[:, :, None]), 2).reshape(48, -1).t()
+    return Solutions(model.to(dtype).reshape(*batch, 4, 3, 4), valid.t().reshape(*batch, 4))
 
 
 def equations(
@@ -94,30 +101,32 @@ _SAFE = ((1.0, 0.0, 1.0), (0.0, 1.0, 1.0), (-1.0, 0.0, 1.0))
 
 def _sound(rays: Tensor, points: Tensor, eps: float) -> Tensor:
     """Finite data, rays with a direction, points not in a line; (problem)."""
-    finite = torch.isfinite(rays).all(0).all(0) & torch.isfinite(points).all(0).all(0)
+    # What is not finite is not equal to itself when subtracted from itself.
+    zero = (rays - rays).sum((0, 1)) + (points - points).sum((0, 1))
     X0, X1, X2 = points.unbind(0)
     e1, e2, e3 = X1 - X0, X2 - X0, X2 - X1
-    normal = _cross(e1, e2)
+    normal = _cross(e1, e2, 0)
     longest = torch.maximum(torch.maximum((e1 * e1).sum(0), (e2 * e2).sum(0)), (e3 * e3).sum(0))
     # Twice the area against the longest side squared; rounding of far coordinates also counts.
-    rounding = eps * points.abs().amax(0).amax(0) * longest.sqrt()
+    rounding = eps * points.abs().amax((0, 1)) * longest.sqrt()
     area = (normal * normal).sum(0).sqrt()
-    return finite & (area > 16 * eps * longest) & (area > 4 * rounding) & ((rays * rays).sum(1) > 0).all(0)
+    pointed = (rays * rays).sum(1).amin(0) > 1e-200
+    return (zero == 0) & (area > 16 * eps * longest) & (area > 4 * rounding) & pointed
 
 
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """The cross product along the first dimension."""
-    a0, a1, a2 = a.unbind(0)
-    b0, b1, b2 = b.unbind(0)
-    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0))
+def _cross(a: Tensor, b: Tensor, dim: int) -> Tensor:
+    """The cross product along a dimension."""
+    a0, a1, a2 = a.unbind(dim)
+    b0, b1, b2 = b.unbind(dim)
+    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0), dim)
 
 
-def _triad(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The orthonormal frame of `a` and the normal of `a` and `b`, vectors along the first dimension."""
-    normal = _cross(a, b)
-    first = a * (a * a).sum(0).rsqrt()
-    third = normal * (normal * normal).sum(0).rsqrt()
-    return first, _cross(third, first), third
+def _triad(a: Tensor, b: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The orthonormal frame of `a` and the normal of `a` and `b`, vectors along a dimension."""
+    normal = _cross(a, b, dim)
+    first = a * (a * a).sum(dim, keepdim=True).clamp_min(1e-300).rsqrt()
+    third = normal * (normal * normal).sum(dim, keepdim=True).clamp_min(1e-300).rsqrt()
+    return first, _cross(third, first, dim), third
 
 
 def _across(u: tuple[Tensor, ...], dim: int) -> tuple[Tensor, Tensor]:
@@ -160,12 +169,12 @@ class _Triangle:
         # The determinant of a member of the pencil, and its cubic along the pencil from four values.
         s = n * (2 - n)
         u0, u1, u2 = self.u.unbind(0)
-        volume = (u0 * _cross(u1, u2)).sum(0)
+        volume = (u0 * _cross(u1, u2, 0)).sum(0)
         w0, w1, w2 = turned.unbind(0)
         squares = turned * turned * s[:, None]
         f = (w0 + w1) * squares[2] + (w0 + w2) * squares[1] + (w1 + w2) * squares[0]
         f = f + w0 * w1 * w2 * (s.sum(0) - volume * volume)
-        pick = f.abs().argmax(0, keepdim=True)
+        pick = f.abs().max(0, keepdim=True).indices
         g0, g1, g2, g3 = torch.cat((f, -f[:3])).gather(0, pick + torch.arange(4, device=f.device)[:, None]).unbind(0)
         both = torch.cat((turned, -turned[:, :2]), 1)
         at = pick.expand(3, -1)[:, None]
@@ -189,7 +198,8 @@ class _Triangle:
         depths = depths * torch.sign(depths.sum(0))
         scale = (total / self._form(torch.ones_like(a), depths, depths)).sqrt()
         depths = depths * scale
-        valid = torch.cat((real, real)) & (depths > 0).all(0) & torch.isfinite(depths).all(0)
+        # False for NaN too.
+        valid = torch.cat((real, real)) & (depths.amin(0) > 0) & (depths.amax(0) < torch.inf)
         return torch.where(valid, depths, 1.0), valid
 
     def _lines(self, w: Tensor) -> Tensor:
@@ -202,11 +212,11 @@ class _Triangle:
         diagonal = -(mixed + (self.n * (2 - self.n) * w * w).flip(0))
         b01, b02, b12 = k0 * d2 - k1 * k2, k1 * d1 - k0 * k2, k2 * d0 - k0 * k1
         columns = torch.stack((diagonal[0], b01, b02, b01, diagonal[1], b12, b02, b12, diagonal[2])).view(3, 3, -1)
-        pick = diagonal.argmax(0)
+        largest, pick = diagonal.max(0)
         best = columns.gather(0, pick.expand(1, 3, -1))[0]
-        v0, v1, v2 = best * diagonal.amax(0).clamp_min(1e-300).rsqrt()
+        v0, v1, v2 = best * largest.clamp_min(1e-300).rsqrt()
         rank1 = torch.stack((d0, k0 - v2, k1 + v1, k0 + v2, d1, k2 - v0, k1 - v1, k2 + v0, d2)).view(3, 3, -1)
-        pick = (rank1 * rank1).sum(1).argmax(0)
+        pick = (rank1 * rank1).sum(1).max(0).indices
         row = rank1.gather(0, pick.expand(1, 3, -1))[0]
         lines = torch.stack((row, (rank1 * row).sum(1)), 1)
         return lines * (lines * lines).sum(0).clamp_min(1e-300).rsqrt()
@@ -244,15 +254,14 @@ class _Triangle:
         det = -(a0 * p + a1 * q)
         usable = det.detach() != 0 if valid is None else valid & (det.detach() != 0)
         inverse = 1 / torch.where(usable, det, 1.0)
-        step = torch.stack((-r0 * p - a1 * m, a0 * m - r0 * q, (r0 * b0 - a0 * r1) * c1 - a1 * b0 * r2)) * inverse
-        small = usable & (step.detach().abs() < depths.detach().abs().amax(0)).all(0)
-        return depths - torch.where(small, step, 0.0)
+        step = torch.stack((-r0 * p - a1 * m, a0 * m - r0 * q, (r0 * b0 - a0 * r1) * c1 - a1 * b0 * r2))
+        size = step.detach().abs().amax(0) * inverse.detach().abs()
+        return depths - step * torch.where(usable & (size < depths.detach().amax(0)), inverse, 0.0)
 
-    def accept(self, depths: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    def met(self, depths: Tensor) -> Tensor:
         """Whether the quadrics are met, by positive depths."""
         size = 1e-10 * self.a.amax(0) + 1e-14 * (depths * depths).amax(0)
-        met = torch.stack(self.residuals(depths)).abs().amax(0) <= size
-        return depths, valid & met & (depths > 0).all(0)
+        return (torch.stack(self.residuals(depths)).abs().amax(0) <= size) & (depths.amin(0) > 0)
 
 
 def _separate_root(a: Tensor, b: Tensor, c: Tensor) -> Tensor:

@@ -82,16 +82,62 @@ def in_pieces(
     flat_P = P.expand(*batch, v, 3, 4).reshape(size, v, 3, 4)
     flat_w = None if weights is None else weights.expand(*batch, v, n).reshape(size, v, n)
     flat_seen = None if visible is None else visible.expand(*batch, v, n).reshape(size, v, n)
+    if v > 2 and size * n > 0 and not (flat_w is None and flat_seen is None):
+        joined = _solve_ragged(solve, flat_x, flat_P, flat_seen, flat_w)
+    else:
+        joined = _solve_dense(solve, flat_x, flat_P, flat_seen, flat_w)
+    return tuple(part.reshape(*part.shape[:-2], *batch, n) for part in joined)
+
+
+def _solve_dense(
+    solve: Callable[[Observations], tuple[Tensor, ...]], x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None
+) -> list[Tensor]:
+    """Results (..., problem, point) for x (problem, view, point, 2), P (problem, view, 3, 4)."""
+    size, v, n = x.shape[:3]
     strips = []
     for problems in _ranges(size, max(1, PIECE // max(1, v * n))):
         pieces = []
         for points in _ranges(n, max(1, PIECE // max(1, v))):
-            seen = None if flat_seen is None else flat_seen[problems, :, points]
-            w = None if flat_w is None else flat_w[problems, :, points]
-            pieces.append(solve(_observe(flat_x[problems, :, points], flat_P[problems], seen, w)))
-        strips.append(tuple(torch.cat(parts, -1) if len(parts) > 1 else parts[0] for parts in zip(*pieces, strict=True)))
-    joined = (torch.cat(parts, -2) if len(parts) > 1 else parts[0] for parts in zip(*strips, strict=True))
-    return tuple(part.reshape(*part.shape[:-2], *batch, n) for part in joined)
+            seen = None if visible is None else visible[problems, :, points]
+            w = None if weights is None else weights[problems, :, points]
+            pieces.append(solve(_observe(x[problems, :, points], P[problems], seen, w)))
+        strips.append([torch.cat(parts, -1) if len(parts) > 1 else parts[0] for parts in zip(*pieces, strict=True)])
+    return [torch.cat(parts, -2) if len(parts) > 1 else parts[0] for parts in zip(*strips, strict=True)]
+
+
+def _solve_ragged(
+    solve: Callable[[Observations], tuple[Tensor, ...]], x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None
+) -> list[Tensor]:
+    """The same, for points seen in some of the views only: each becomes a problem of as many views as see it.
+
+    Points are sorted by their number of views, rounded up to a power of two; what becomes of a point depends on its own number alone.
+    """
+    size, v, n = x.shape[:3]
+    wanted = torch.ones_like(x[..., 0], dtype=torch.bool) if visible is None else visible
+    if weights is not None:
+        wanted = wanted & (weights != 0)
+    wanted = wanted.permute(0, 2, 1).reshape(size * n, v)
+    slot = wanted.cumsum(-1)
+    count = slot[:, -1].clamp_min(2)
+    # The exponent of the power of two, exactly.
+    level = torch.frexp((count - 1).double()).exponent
+    results, places = [], []
+    for k in level.unique().tolist():
+        place = (level == k).nonzero()[:, 0]
+        m = min(2**k, v)
+        row, view = wanted[place].nonzero().unbind(-1)
+        views = torch.zeros(len(place), m, dtype=torch.long, device=x.device)
+        present = torch.zeros(len(place), m, dtype=torch.bool, device=x.device)
+        position = slot[place][row, view] - 1
+        views[row, position] = view
+        present[row, position] = True
+        problem, point = (place // n)[:, None], (place % n)[:, None]
+        w = None if weights is None else weights[problem, views, point][..., None]
+        results.append(_solve_dense(solve, x[problem, views, point][:, :, None], P[problem, views], present[..., None], w))
+        places.append(place)
+    order = torch.cat(places).argsort()
+    joined = (torch.cat(parts, -2) for parts in zip(*results, strict=True))
+    return [part.index_select(-2, order).reshape(*part.shape[:-2], size, n) for part in joined]
 
 
 def _ranges(size: int, step: int) -> Iterator[slice]:
