@@ -34,7 +34,7 @@ def test_a_texture_does_not_repeat(generator: torch.Generator) -> None:
 
 
 def test_noise_has_about_unit_deviation(generator: torch.Generator) -> None:
-    noise = fractal_noise(400, 500, 20, generator=generator)
+    noise = fractal_noise(400, 500, 20.0, generator=generator)
     assert 0.6 < noise.std() < 1.6
     assert noise.mean().abs() < 0.2
 

@@ -114,7 +114,7 @@ def _resize(grid: Tensor, size: tuple[int, int], h: int, w: int) -> Tensor:
 def _cells(h: int, w: int, cell: float, generator: Generator) -> tuple[Tensor, Tensor, Tensor, int]:
     """Cut the sheet into square cells of a randomly turned lattice: position in the cell (-0.5..0.5), index, count."""
     device = generator.device if generator is not None else None
-    angle = _uniform(0, 2 * math.pi, generator)
+    angle = _uniform(0.0, 2 * math.pi, generator)
     y, x = torch.arange(h, device=device)[:, None] / cell, torch.arange(w, device=device)[None] / cell
     a, b = math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y
     i, j = a.floor(), b.floor()
@@ -223,7 +223,7 @@ def _wood(h: int, w: int, unit: float, generator: Generator) -> Tensor:
     wide = 0.14 * unit
     column = (torch.arange(w, device=device) / wide).floor().long()
     count = int(column.max()) + 1
-    grain = fractal_noise(h, w, 0.05 * unit, gain=0.8, stretch=6, generator=generator)
+    grain = fractal_noise(h, w, 0.05 * unit, gain=0.8, stretch=6.0, generator=generator)
     color = _pick(WOOD + PAINT[:3], count, 0.25, generator)
     image = color[column].T[:, None, :] * (1 + 0.2 * grain + 0.1 * fractal_noise(h, w, 0.5 * unit, generator=generator))
     seam = (torch.arange(w, device=device) - column * wide) < 0.01 * unit
@@ -275,7 +275,7 @@ def _poster(h: int, w: int, unit: float, generator: Generator) -> Tensor:
         on = dots[letter[None], y.clamp(0, 6)[:, None], (x % 6).clamp(0, 4)[None]] > 0
         on &= ((y >= 0) & (y < 7))[:, None] & ((x >= 0) & (x % 6 < 5) & (x < (w - 0.06 * unit) / dot - 2))[None]
         image = torch.where(on, ink[:, None, None], image)
-        top += (8 + 4 * _uniform(0, 1, generator)) * dot
+        top += (8 + 4 * _uniform(0.0, 1.0, generator)) * dot
     result: Tensor = image * (1 + 0.06 * fractal_noise(h, w, 0.05 * unit, gain=0.9, generator=generator))
     return result
 
@@ -286,7 +286,7 @@ def _posters(image: Tensor, unit: float, count: int, generator: Generator) -> Te
     for _ in range(count):
         tall = min(int(_uniform(0.5, 1.1, generator) * unit), int(0.6 * h))
         wide = min(int(_uniform(0.5, 1.3, generator) * unit), int(0.6 * w))
-        top, left = int(_uniform(0, h - tall, generator)), int(_uniform(0, w - wide, generator))
+        top, left = int(_uniform(0.0, float(h - tall), generator)), int(_uniform(0.0, float(w - wide), generator))
         image[:, top : top + tall, left : left + wide] = _poster(tall, wide, unit, generator)
     return image
 
