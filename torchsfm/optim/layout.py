@@ -1,9 +1,7 @@
 """Who meets whom in a problem of terms: which variables are free, and in which order residuals and variables are worked off.
 
 Residuals are sorted by slot. A slot is a combination of retained variables that occurs (pose 3 with camera 0), so sums over a
-slot are products of contiguous matrices, and variables shared between slots are tied by adding up columns. Eliminated variables
-are sorted into groups that see about the same slots: within a group their coupling to the retained ones is a dense matrix, and
-dense products are so much faster than sparse ones that a few zeros are welcome.
+slot are products of contiguous matrices, and variables shared between slots are tied by adding up columns.
 """
 
 from collections.abc import Sequence
@@ -28,24 +26,14 @@ class Piece:
     slots: Tensor
     """Slot of each residual (m)."""
     columns: Tensor
-    """Column of each tangent coordinate of each slot, then that of the residual: (slots, c + 1)."""
+    """Column of each tangent coordinate of each slot: (slots, c)."""
     point: Tensor | None
     """Number of each residual's eliminated variable, (m)."""
 
     @property
     def coupled(self) -> bool:
         """Whether retained and eliminated variables meet here."""
-        return self.point is not None and self.columns.shape[1] > 1
-
-
-@dataclass(frozen=True)
-class Group:
-    """Eliminated variables `start` to `end`, and the columns of the reduced system they meet, the gradient's among them."""
-
-    start: int
-    end: int
-    offset: int
-    columns: Tensor
+        return self.point is not None and self.columns.shape[1] > 0
 
 
 @dataclass(frozen=True)
@@ -53,7 +41,7 @@ class Layout:
     """Which variables are free and where they stand in the systems."""
 
     free: dict[str, Tensor]
-    """Free and observed variables of each block, the eliminated ones in the order of their groups."""
+    """Free and observed variables of each block; the eliminated ones in an order that brings like together."""
     first: dict[str, int]
     """First column of each retained block with free variables."""
     size: int
@@ -61,9 +49,6 @@ class Layout:
     eliminated: str | None
     point_size: int
     pieces: list[Piece]
-    groups: list[Group]
-    targets: list[Tensor | None]
-    """Where each piece's residuals go in the coupling matrices: (c + 1, m), None where nothing is coupled."""
 
     @property
     def points(self) -> int:
@@ -99,14 +84,13 @@ def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | No
             size += free[name].numel() * block.tangent
     pieces = [piece for term in terms for piece in _cut(term, blocks, number, first, size, eliminate)]
     if eliminate is None or not free[eliminate].numel():
-        return Layout(free, first, size, None, 0, pieces, [], [None] * len(pieces))
+        return Layout(free, first, size, None, 0, pieces)
     count = free[eliminate].numel()
     order = _order_points(pieces, count)
     free[eliminate] = free[eliminate][order]
     rank = torch.empty_like(order).index_copy_(0, order, torch.arange(count, device=order.device))
     pieces = [_renumber(piece, rank) for piece in pieces]
-    groups, targets = _group(pieces, count, size)
-    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, pieces, groups, targets)
+    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, pieces)
 
 
 def _cut(
@@ -157,7 +141,7 @@ def _sort(
     values, slots = torch.unique(key, return_inverse=True)
     order = torch.argsort(slots if point is None else slots * (int(point.max()) + 1) + point)
     rows, slots = rows[order], slots[order]
-    columns = torch.full((values.numel(), 1), size, device=rows.device)
+    columns = rows.new_empty((values.numel(), 0))
     for name, place in reversed(retained):
         mine = torch.empty_like(values).index_copy_(0, slots, place[order])[:, None]
         width = blocks[name].tangent
@@ -193,81 +177,3 @@ def _order_points(pieces: list[Piece], count: int) -> Tensor:
             high.scatter_reduce_(0, piece.point, piece.slots + start, "amax")
             start += piece.columns.shape[0]
     return torch.argsort(low * (total + 1) + high, stable=True)
-
-
-ATOM = 64
-"""Points that stay together when groups are formed."""
-PRODUCT = 6.0 / 25e9
-"""Seconds per column squared and point (three coordinates) of a dense product."""
-VISIT = 6e-5
-"""Seconds that a group costs, whatever its size."""
-ENTRY = 5e-9
-"""Seconds to add one entry of a group's product into the system."""
-
-
-def _group(pieces: list[Piece], count: int, size: int) -> tuple[list[Group], list[Tensor | None]]:
-    """Cut the sorted points into groups, and find each residual's place in its group's coupling matrix."""
-    atoms = -(-count // ATOM)
-    coupled = [piece for piece in pieces if piece.coupled and piece.point is not None]
-    touched = []
-    for piece in coupled:
-        assert piece.point is not None
-        slots = piece.columns.shape[0]
-        pairs = torch.unique(torch.div(piece.point, ATOM, rounding_mode="floor") * slots + piece.slots)
-        atom = torch.div(pairs, slots, rounding_mode="floor")
-        touched.append(((atom * (size + 2))[:, None] + piece.columns[pairs % slots]).flatten())
-    # The gradient's column is in every group, coupled or not.
-    device = pieces[0].slots.device
-    touched.append(torch.arange(atoms, device=device) * (size + 2) + size)
-    keys = torch.unique(torch.cat(touched))
-    sets: list[set[int]] = [set() for _ in range(atoms)]
-    for atom, column in zip((keys // (size + 2)).tolist(), (keys % (size + 2)).tolist(), strict=True):
-        sets[atom].add(column)
-    spans = _merge(sets, count)
-    number = torch.empty(count, dtype=torch.int64, device=device)
-    table = torch.full((len(spans), size + 2), -1, device=device)
-    groups: list[Group] = []
-    offset = 0
-    for g, (start, end, columns) in enumerate(spans):
-        number[start:end] = g
-        listed = torch.tensor(sorted(columns), device=device)
-        table[g, listed] = torch.arange(listed.numel(), device=device)
-        groups.append(Group(start, end, offset, listed))
-        offset += listed.numel() * (end - start)
-    starts = torch.tensor([g.start for g in groups], device=device)
-    widths = torch.tensor([g.end - g.start for g in groups], device=device)
-    offsets = torch.tensor([g.offset for g in groups], device=device)
-    targets: list[Tensor | None] = []
-    for piece in pieces:
-        if piece.point is None:
-            targets.append(None)
-            continue
-        group = number[piece.point]
-        base = offsets[group] + piece.point - starts[group]
-        width = widths[group]
-        target = base.new_empty((piece.columns.shape[1], base.numel()))
-        for row, column in zip(target, piece.columns.unbind(1), strict=True):
-            torch.addcmul(base, table[group, column[piece.slots]], width, out=row)
-        targets.append(target)
-    return groups, targets
-
-
-def _merge(sets: list[set[int]], count: int) -> list[tuple[int, int, set[int]]]:
-    """Join neighbouring atoms while that is estimated to save time."""
-
-    def seconds(columns: int, points: int) -> float:
-        return columns * columns * (points * PRODUCT + ENTRY) + VISIT
-
-    spans: list[tuple[int, int, set[int]]] = []
-    for atom, columns in enumerate(sets):
-        start, end = atom * ATOM, min((atom + 1) * ATOM, count)
-        while spans:
-            before_start, before_end, before = spans[-1]
-            union = before | columns
-            apart = seconds(len(before), before_end - before_start) + seconds(len(columns), end - start)
-            if seconds(len(union), end - before_start) > apart:
-                break
-            spans.pop()
-            start, columns = before_start, union
-        spans.append((start, end, columns))
-    return spans

@@ -16,6 +16,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from torchsfm.optim.coupling_groups import GroupCoupling, plan_groups
+from torchsfm.optim.coupling_pairs import PairCoupling, estimate_pairs
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.terms import Block, Term, gather, lift_of, linearize
 
@@ -24,6 +26,9 @@ from torchsfm.optim.terms import Block, Term, gather, lift_of, linearize
 class _Part:
     """Residuals linearised at once."""
 
+    piece: int
+    start: int
+    """The first one's place in its piece."""
     term: Term
     wanted: tuple[bool, ...]
     width: int
@@ -32,7 +37,6 @@ class _Part:
     """Where runs of one slot begin and end."""
     places: Tensor
     """Where the entries of each run's square go in U."""
-    target: Tensor | None
     point: Tensor | None
 
 
@@ -42,19 +46,17 @@ class Elimination:
     def __init__(self, blocks: dict[str, Block], layout: Layout) -> None:
         self.blocks = blocks
         self.layout = layout
-        self.parts = [
-            part
-            for piece, target in zip(layout.pieces, layout.targets, strict=True)
-            for part in _parts(piece, target, layout.size)
-        ]
+        self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, layout.size)]
         some = next(iter(blocks.values())).x
         q, n, size = layout.point_size, layout.points, layout.size
-        total = sum((g.end - g.start) * g.columns.numel() for g in layout.groups)
-        # These live as long as the problem: memory that is new costs more than the arithmetic on it.
+        self.coupling: GroupCoupling | PairCoupling | None = None
+        if any(piece.coupled for piece in layout.pieces):
+            spans, seconds = plan_groups(layout)
+            dense = seconds <= estimate_pairs(layout)
+            self.coupling = GroupCoupling(layout, spans, some) if dense else PairCoupling(layout, some)
         self.U = some.new_empty((size + 2, size + 2))
         self.V = some.new_empty((q * (q + 1) // 2, n))
-        self.W = some.new_empty((q, total))
-        self._scratch = some.new_empty((max((g.end - g.start) * g.columns.numel() for g in layout.groups), q) if q else (0,))
+        self.h = some.new_empty((q, n))
         self._work: dict[tuple[str, int, int], Tensor] = {}
 
     def linearize(self, x: dict[str, Tensor]) -> "Linearized":
@@ -67,11 +69,13 @@ class Elimination:
             if w
         }
         lifts = {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
-        for buffer in (self.U, self.V, self.W):
+        for buffer in (self.U, self.V, self.h):
             buffer.zero_()
+        if self.coupling is not None:
+            self.coupling.clear()
         for part in self.parts:
             self._add(part, *linearize(part.term, x, lifts, part.wanted))
-        return Linearized(self.layout, self.U, self.V, self.W, self._scratch.view(-1))
+        return Linearized(self.layout, self.coupling, self.U, self.V, self.h)
 
     def _add(self, part: _Part, r: Tensor, jacobians: list[Tensor | None]) -> None:
         """Add squares and products of a part's Jacobians to the system."""
@@ -91,20 +95,20 @@ class Elimination:
         if start:
             squares = torch.stack([torch.bmm(J[:, :, a:b], J[:, :, a:b].mT) for a, b in part.segments]).sum(1)
             self.U.view(-1).index_add_(0, part.places, squares.flatten())
-        if P is None or part.point is None or part.target is None:
+        if P is None or part.point is None:
             return
-        squares = self._buffer("V", self.V.shape[0], m)
-        for row, (a, b) in zip(squares, _pairs(q), strict=True):
+        squares = self._buffer("V", self.V.shape[0] + q, m)
+        for row, (a, b) in zip(squares, _pairs(q), strict=False):
             torch.mul(P[0, a], P[0, b], out=row)
             for k in range(1, d):
                 row.addcmul_(P[k, a], P[k, b])
-        self.V.index_add_(1, part.point, squares)
-        product = self._buffer("W", part.width + 1, m)
-        for a in range(q):
-            torch.mul(J[0], P[0, a], out=product)
-            for k in range(1, d):
-                product.addcmul_(J[k], P[k, a])
-            self.W[a].scatter_add_(0, part.target, product.view(-1))
+        torch.mul(P[0], r[0], out=squares[-q:])
+        for k in range(1, d):
+            squares[-q:].addcmul_(P[k], r[k])
+        self.V.index_add_(1, part.point, squares[:-q])
+        self.h.index_add_(1, part.point, squares[-q:])
+        if start and self.coupling is not None:
+            self.coupling.add(part.piece, part.start, J[:, :start], P)
 
     def _buffer(self, name: str, rows: int, columns: int) -> Tensor:
         key = (name, rows, columns)
@@ -115,77 +119,48 @@ class Elimination:
 
 @dataclass(frozen=True)
 class Linearized:
-    """The normal equations: `U` with the gradient as column `size`, `V` as its distinct entries, `W` group by group."""
+    """The normal equations: `U` with the gradient as column `size`, `V` as its distinct entries, `h`, and the coupling `W`."""
 
     layout: Layout
+    coupling: GroupCoupling | PairCoupling | None
     U: Tensor
     V: Tensor
-    W: Tensor
-    scratch: Tensor
+    h: Tensor
 
     def solve(self, damping: float) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """The step for `damping` times the diagonal, the decrease the model promises, and whether the system was solved."""
         layout = self.layout
         size, q = layout.size, layout.point_size
         pairs = _pairs(q)
-        diagonal = _floor(torch.stack([self.V[pairs.index((a, a))] for a in range(q)])) if q else self.V
-        L = _factor(self.V, damping * diagonal, q)
-        S = self.U.clone()
-        for group in layout.groups:
-            W, span = self._coupling(group.offset, group.start, group.end, group.columns.numel()), slice(group.start, group.end)
-            Y = self.scratch[: W.numel()].view(W.shape)
-            for a in range(q):
-                row = W[a]
-                for b in range(a):
-                    torch.addcmul(row, L[a][b][span], Y[b], value=-1, out=Y[a])
-                    row = Y[a]
-                torch.mul(row, L[a][a][span], out=Y[a])
-            square = Y[0] @ Y[0].mT
-            for a in range(1, q):
-                square.addmm_(Y[a], Y[a].mT)
-            if len(layout.groups) == 1 and group.columns.numel() == size + 1 and int(group.columns[-1]) == size:
-                S[: size + 1, : size + 1] -= square
-            else:
-                S[group.columns[:, None], group.columns] -= square
-        weight = _floor(self.U.diagonal()[:size]) * damping
-        factor, info = torch.linalg.cholesky_ex(S[:size, :size] + torch.diag(weight))
-        camera = -torch.cholesky_solve(S[:size, size, None], factor)[:, 0] if size else S.new_zeros(0)
+        weight = damping * _floor(self.U.diagonal()[:size])
+        S, right = self.U.clone(), self.U[:size, size].clone()
+        S.diagonal()[:size] += weight
+        point_weight = self.V
+        L: list[list[Tensor]] = []
+        z = self.h
+        if q:
+            point_weight = damping * _floor(torch.stack([self.V[pairs.index((a, a))] for a in range(q)]))
+            L = _factor(self.V, point_weight, q)
+            z = _forward(L, self.h)
+            if self.coupling is not None:
+                right -= self.coupling.reduce(S, L, z)[:size]
+        factor, info = torch.linalg.cholesky_ex(S[:size, :size])
+        camera = -torch.cholesky_solve(right[:, None], factor)[:, 0] if size else right
         solved = (info == 0) & camera.isfinite().all()
         promise = camera @ (weight * camera - self.U[:size, size])
         step = self._split(camera)
         if layout.eliminated is not None:
-            h, z = self._gradient_and_product(camera)
-            point = _substitute(L, z)
-            promise = promise + (point * (damping * diagonal * point - h)).sum()
+            if self.coupling is not None:
+                z = z + _forward(L, self.coupling.product(torch.cat((camera, camera.new_zeros(2)))))
+            point = _backward(L, z)
+            promise = promise + (point * (point_weight * point - self.h)).sum()
             step[layout.eliminated] = point.mT
         return step, promise / 2, solved
 
     def gradient(self) -> Tensor:
         """Largest absolute derivative of the cost."""
         size = self.layout.size
-        largest = [self.U[:size, size].abs().amax()] if size else []
-        for group in self.layout.groups:
-            W = self._coupling(group.offset, group.start, group.end, group.columns.numel())
-            largest.append(W[:, self._gradient_row(group.columns)].abs().amax())
-        return torch.stack(largest).amax()
-
-    def _gradient_row(self, columns: Tensor) -> int:
-        # Columns are sorted; only that of fixed variables comes after the gradient's.
-        return columns.numel() - 1 - int(columns[-1] > self.layout.size)
-
-    def _coupling(self, offset: int, start: int, end: int, columns: int) -> Tensor:
-        return self.W[:, offset : offset + columns * (end - start)].view(-1, columns, end - start)
-
-    def _gradient_and_product(self, camera: Tensor) -> tuple[Tensor, Tensor]:
-        """The points' gradient h and `h + W'a`."""
-        q, n = self.layout.point_size, self.layout.points
-        h, z = camera.new_empty((q, n)), camera.new_empty((q, n))
-        extended = torch.cat((camera, camera.new_tensor([1.0, 0.0])))
-        for group in self.layout.groups:
-            W, span = self._coupling(group.offset, group.start, group.end, group.columns.numel()), slice(group.start, group.end)
-            h[:, span] = W[:, self._gradient_row(group.columns)]
-            z[:, span] = extended[group.columns] @ W
-        return h, z
+        return torch.cat((self.U[:size, size], self.h.flatten())).abs().amax()
 
     def _split(self, camera: Tensor) -> dict[str, Tensor]:
         """The columns of each block."""
@@ -196,15 +171,16 @@ class Linearized:
         }
 
 
-def _parts(piece: Piece, target: Tensor | None, size: int) -> list[_Part]:
+def _parts(number: int, piece: Piece, size: int) -> list[_Part]:
     """Cut a piece where the residuals linearised at once become too many."""
-    m, width = piece.slots.numel(), piece.columns.shape[1] - 1
+    m, width = piece.slots.numel(), piece.columns.shape[1]
     ends = torch.bincount(piece.slots, minlength=piece.columns.shape[0]).cumsum(0).tolist()
+    # The residual is one more column, the gradient's.
+    extended = torch.cat((piece.columns, torch.full_like(piece.columns[:, :1], size).expand(-1, 1)), 1) if width else None
     parts = []
     count = -(-m // CHUNK)
-    bounds = [m * k // count for k in range(count + 1)]
     slot = 0
-    for first, last in pairwise(bounds):
+    for first, last in pairwise([m * k // count for k in range(count + 1)]):
         segments, slots = [], []
         at = first
         while at < last:
@@ -214,8 +190,10 @@ def _parts(piece: Piece, target: Tensor | None, size: int) -> list[_Part]:
             segments.append((at - first, stop - first))
             slots.append(slot)
             at = stop
-        columns = piece.columns[slots]
-        places = (columns[:, :, None] * (size + 2) + columns[:, None]).flatten()
+        places = piece.slots[:0]
+        if extended is not None:
+            columns = extended[slots]
+            places = (columns[:, :, None] * (size + 2) + columns[:, None]).flatten()
         rows = slice(first, last)
         term = replace(
             piece.term,
@@ -224,8 +202,7 @@ def _parts(piece: Piece, target: Tensor | None, size: int) -> list[_Part]:
             weights=None if piece.term.weights is None else piece.term.weights[rows],
         )
         point = None if piece.point is None else piece.point[rows]
-        goal = None if target is None else target[:, rows].flatten()
-        parts.append(_Part(term, piece.wanted, width, segments, places, goal, point))
+        parts.append(_Part(number, first, term, piece.wanted, width, segments, places, point))
     return parts
 
 
@@ -263,22 +240,26 @@ def _factor(V: Tensor, damping: Tensor, q: int) -> list[list[Tensor]]:
     return L
 
 
-def _substitute(L: list[list[Tensor]], z: Tensor) -> Tensor:
-    """`-L'^-1 L^-1 z`."""
-    q = len(L)
-    forward: list[Tensor] = []
-    for a in range(q):
-        value = z[a]
+def _forward(L: list[list[Tensor]], z: Tensor) -> Tensor:
+    """`L^-1 z`."""
+    rows: list[Tensor] = []
+    for a, value in enumerate(z.unbind(0)):
         for b in range(a):
-            value = value - L[a][b] * forward[b]
-        forward.append(value * L[a][a])
-    solution: list[Tensor] = [z[0]] * q
+            value = value - L[a][b] * rows[b]
+        rows.append(value * L[a][a])
+    return torch.stack(rows)
+
+
+def _backward(L: list[list[Tensor]], z: Tensor) -> Tensor:
+    """`-L'^-1 z`."""
+    q = len(L)
+    rows: list[Tensor] = [z[0]] * q
     for a in reversed(range(q)):
-        value = -forward[a]
+        value = -z[a]
         for b in range(a + 1, q):
-            value = value - L[b][a] * solution[b]
-        solution[a] = value * L[a][a]
-    return torch.stack(solution)
+            value = value - L[b][a] * rows[b]
+        rows[a] = value * L[a][a]
+    return torch.stack(rows)
 
 
 def move(blocks: dict[str, Block], layout: Layout, x: dict[str, Tensor], step: dict[str, Tensor]) -> dict[str, Tensor]:

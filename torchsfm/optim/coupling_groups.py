@@ -1,0 +1,177 @@
+"""The coupling of eliminated and retained variables as dense matrices, one for each group of variables that see the same.
+
+Dense products are so much faster than sparse ones that a few zeros are welcome. Best where retained variables are few or where
+neighbours in the order of the layout see about the same of them.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsfm.optim.layout import Layout, Piece
+
+ATOM = 64
+"""Points that stay together when groups are formed."""
+PRODUCT = 6.0 / 25e9
+"""Seconds per column squared and point (of three coordinates) of a dense product, on a usual core."""
+VISIT = 6e-5
+"""Seconds that a group costs, whatever its size."""
+ENTRY = 5e-9
+"""Seconds to add one entry of a group's product into the system."""
+
+Span = tuple[int, int, int]
+"""First point, end, and the slots seen as bits."""
+
+
+@dataclass(frozen=True)
+class _Group:
+    start: int
+    end: int
+    offset: int
+    columns: Tensor
+    everything: bool
+    """Whether the columns are all there are, in order."""
+
+
+class GroupCoupling:
+    """`W` as one dense matrix (q, columns, points) for each group."""
+
+    def __init__(self, layout: Layout, spans: list[Span], some: Tensor) -> None:
+        self.size, self.q, self.points = layout.size, layout.point_size, layout.points
+        self.groups, self.targets = _lay_groups(layout, spans)
+        largest = max(g.columns.numel() * (g.end - g.start) for g in self.groups)
+        total = sum(g.columns.numel() * (g.end - g.start) for g in self.groups)
+        # These live as long as the problem: memory that is new costs more than the arithmetic on it.
+        self._W = some.new_empty((self.q, total))
+        self._scratch = some.new_empty(self.q * largest)
+        self._product = some.new_empty(0)
+
+    def clear(self) -> None:
+        """Start a linearisation."""
+        self._W.zero_()
+
+    def add(self, piece: int, start: int, J: Tensor, P: Tensor) -> None:
+        """Add the products of Jacobians J (d, c, m) and P (d, q, m), those of a piece's residuals from `start` on."""
+        d, c, m = J.shape
+        target = self.targets[piece][:, start : start + m].reshape(-1)
+        if self._product.numel() < c * m:
+            self._product = J.new_empty(c * m)
+        product = self._product[: c * m].view(c, m)
+        for a in range(self.q):
+            torch.mul(J[0], P[0, a], out=product)
+            for k in range(1, d):
+                product.addcmul_(J[k], P[k, a])
+            self._W[a].scatter_add_(0, target, product.view(-1))
+
+    def reduce(self, S: Tensor, L: list[list[Tensor]], z: Tensor) -> Tensor:
+        """Subtract `W V^-1 W'` from S, with `V = L L'`; return `W L'^-1 z`."""
+        right = S.new_zeros(S.shape[0])
+        for group in self.groups:
+            W, span = self._matrix(group), slice(group.start, group.end)
+            Y = self._scratch[: W.numel()].view(W.shape)
+            for a in range(self.q):
+                row = W[a]
+                for b in range(a):
+                    torch.addcmul(row, L[a][b][span], Y[b], value=-1, out=Y[a])
+                    row = Y[a]
+                torch.mul(row, L[a][a][span], out=Y[a])
+            square, part = Y[0] @ Y[0].mT, Y[0] @ z[0, span]
+            for a in range(1, self.q):
+                square.addmm_(Y[a], Y[a].mT)
+                part.addmv_(Y[a], z[a, span])
+            if group.everything:
+                S[: self.size, : self.size] -= square
+                right[: self.size] += part
+            else:
+                S[group.columns[:, None], group.columns] -= square
+                right[group.columns] += part
+        return right
+
+    def product(self, camera: Tensor) -> Tensor:
+        """`W' camera`."""
+        out = camera.new_empty((self.q, self.points))
+        for group in self.groups:
+            out[:, group.start : group.end] = camera[group.columns] @ self._matrix(group)
+        return out
+
+    def _matrix(self, group: _Group) -> Tensor:
+        columns, points = group.columns.numel(), group.end - group.start
+        return self._W[:, group.offset : group.offset + columns * points].view(-1, columns, points)
+
+
+def plan_groups(layout: Layout) -> tuple[list[Span], float]:
+    """Cut the points into groups, joining neighbours while that saves time; return them and the estimated seconds."""
+    count = layout.points
+    sets = [0] * -(-count // ATOM)
+    first, widest = 0, 1
+    for piece in layout.pieces:
+        if piece.coupled and piece.point is not None:
+            slots = piece.columns.shape[0]
+            pairs = torch.unique(torch.div(piece.point, ATOM, rounding_mode="floor") * slots + piece.slots)
+            for pair in pairs.tolist():
+                sets[pair // slots] |= 1 << (first + pair % slots)
+            first += slots
+            widest = max(widest, piece.columns.shape[1])
+
+    def seconds(slots: int, points: int) -> float:
+        columns = min(slots.bit_count() * widest, layout.size)
+        return columns * columns * (points * PRODUCT + ENTRY) + VISIT
+
+    spans: list[Span] = []
+    for atom, slots in enumerate(sets):
+        start, end = atom * ATOM, min((atom + 1) * ATOM, count)
+        while spans:
+            before_start, before_end, before = spans[-1]
+            apart = seconds(before, before_end - before_start) + seconds(slots, end - start)
+            if seconds(before | slots, end - before_start) > apart:
+                break
+            spans.pop()
+            start, slots = before_start, before | slots
+        spans.append((start, end, slots))
+    return spans, sum(seconds(slots, end - start) for start, end, slots in spans)
+
+
+def _lay_groups(layout: Layout, spans: list[Span]) -> tuple[list[_Group], list[Tensor]]:
+    """The columns of each group, and where in the groups' matrices each piece's residuals go: (c, m)."""
+    device = layout.pieces[0].slots.device
+    number = torch.empty(layout.points, dtype=torch.int64, device=device)
+    for g, (start, end, _) in enumerate(spans):
+        number[start:end] = g
+    wide = layout.size + 2
+    seen = [_seen(piece, number, wide) for piece in layout.pieces if piece.coupled]
+    keys = torch.unique(torch.cat(seen))
+    table = torch.full((len(spans) * wide,), -1, device=device)
+    sizes = torch.bincount(torch.div(keys, wide, rounding_mode="floor"), minlength=len(spans))
+    table[keys] = torch.arange(keys.numel(), device=device) - (sizes.cumsum(0) - sizes).repeat_interleave(sizes)
+    groups: list[_Group] = []
+    offset = 0
+    for (start, end, _), columns in zip(spans, (keys % wide).split(sizes.tolist()), strict=True):
+        everything = columns.numel() == layout.size and (layout.size == 0 or int(columns[-1]) < layout.size)
+        groups.append(_Group(start, end, offset, columns, everything))
+        offset += columns.numel() * (end - start)
+    starts, widths, offsets = (
+        torch.tensor(values, device=device)
+        for values in ([g.start for g in groups], [g.end - g.start for g in groups], [g.offset for g in groups])
+    )
+    targets: list[Tensor] = []
+    for piece in layout.pieces:
+        if not piece.coupled or piece.point is None:
+            targets.append(number.new_empty((0, 0)))
+            continue
+        group = number[piece.point]
+        base, width, key = offsets[group] + piece.point - starts[group], widths[group], group * wide
+        target = base.new_empty((piece.columns.shape[1], base.numel()))
+        for row, column in zip(target, piece.columns.unbind(1), strict=True):
+            torch.addcmul(base, table[key + column[piece.slots]], width, out=row)
+        targets.append(target)
+    return groups, targets
+
+
+def _seen(piece: Piece, number: Tensor, wide: int) -> Tensor:
+    """Groups and columns that meet in a piece, as one number each."""
+    assert piece.point is not None
+    slots = piece.columns.shape[0]
+    pairs = torch.unique(number[piece.point] * slots + piece.slots)
+    group = torch.div(pairs, slots, rounding_mode="floor")
+    return ((group * wide)[:, None] + piece.columns[pairs % slots]).flatten()
