@@ -12,6 +12,39 @@ def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*bat
     return Q[..., m:]
 
 
+def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n batch"], Float[Tensor, " batch"]]:
+    """The same for a batch in the last dimension, by unrolled Householder reflections: many small matrices, few operations.
+
+    Args:
+        a: Matrices of m < n rows, the batch in the last dimension, of size 2 or more so that sums always run in the same order.
+
+    Returns:
+        An orthonormal basis as k = n - m rows, and the smallest pivot: the distance of a row from the span of those before it,
+        which is 0 where the rows are dependent (the basis is then still orthonormal, or not finite).
+    """
+    m, n, batch = a.shape
+    a = a.clone()
+    reflections = []
+    smallest = None
+    for i in range(m):
+        v = a[i, i:].clone()
+        length = (v * v).sum(0).sqrt()
+        smallest = length if smallest is None else torch.minimum(smallest, length)
+        signed = torch.copysign(length, v[0])
+        v[0] += signed
+        beta = 1 / (signed * v[0])
+        reflections.append((v, beta))
+        if i + 1 < m:
+            rest = a[i + 1 :, i:]
+            rest -= ((rest * v).sum(1) * beta)[:, None] * v
+    basis = torch.eye(n - m, n, dtype=a.dtype, device=a.device).roll(m, 1)[..., None].repeat(1, 1, batch)
+    for i in range(m - 1, -1, -1):
+        v, beta = reflections[i]
+        basis[:, i:] -= ((basis[:, i + 1 :] * v[1:]).sum(1) * beta)[:, None] * v
+    assert smallest is not None
+    return basis, smallest
+
+
 def null_vector(
     A: Float[Tensor, "*batch m n"],
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:

@@ -1,41 +1,45 @@
-"""Five rays in two calibrated cameras: E with d2' E d1 = 0 and 2 E E' E = tr(E E') E (Nister 2004)."""
+"""Five rays in two calibrated cameras: E with d2' E d1 = 0 and 2 E E' E = tr(E E') E (Nister 2004).
+
+E is x X + y Y + z Z + w W in an orthonormal basis of the null space of the five linear equations; ten cubic equations in
+(x, y, z, w) remain, whose elimination leaves three that are linear in (x, y) and polynomial in z, and their determinant, of
+degree ten. The basis is taken such that z : w is about the direction of the baseline in the image plane: over it the solutions
+are spread, while over an arbitrary coordinate they crowd where the rotation, the baseline or the field of view is small. Every solution is polished on the manifold of essential matrices. All arithmetic has the batch in the last dimension.
+"""
+
+from collections.abc import Sequence
+from itertools import product
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg import orthonormal_nullspace
-from torchsfm.linalg.polynomial import companion_roots
+from torchsfm.linalg.nullspace import nullspace_rows
+from torchsfm.linalg.real_roots import real_root_rows
 from torchsfm.optim import attach_implicit, wants_derivative
 
-# Monomials of degree 3 in Nister's order, as exponents of (x, y, z, 1).
-_CUBICS = [
-    "xxx",
-    "yyy",
-    "xxy",
-    "xyy",
-    "xxz",
-    "xxw",
-    "yyz",
-    "yyw",
-    "xyz",
-    "xyw",
-    "xzz",
-    "xzw",
-    "xww",
-    "yzz",
-    "yzw",
-    "yww",
-    "zzz",
-    "zzw",
-    "zww",
-    "www",
+_CHUNK = 1024
+"""Problems at a time: their matrices fit the cache."""
+_INDEPENDENT = 1e-13
+_CONVERGED = 1e-6
+
+# Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w); quadratic ones as pairs, squares first.
+_CUBICS = [(0, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 1), (0, 0, 2), (0, 0, 3), (1, 1, 2), (1, 1, 3), (0, 1, 2), (0, 1, 3)]
+_CUBICS += [(0, 2, 2), (0, 2, 3), (0, 3, 3), (1, 2, 2), (1, 2, 3), (1, 3, 3), (2, 2, 2), (2, 2, 3), (2, 3, 3), (3, 3, 3)]
+_SQUARES = [(0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+_I, _J = [i for i, _ in _SQUARES], [j for _, j in _SQUARES]
+# The ways to write a monomial as a square times a variable; monomials with most ways first, so that each round is a prefix.
+_WAYS = {m: [(q, v) for q, v in product(_SQUARES, range(4)) if tuple(sorted((*q, v))) == m] for m in _CUBICS}
+_ORDER = sorted(_CUBICS, key=lambda m: -len(_WAYS[m]))
+_ROUNDS = [
+    (
+        [_SQUARES.index(_WAYS[m][r][0]) for m in _ORDER if len(_WAYS[m]) > r],
+        [_WAYS[m][r][1] for m in _ORDER if len(_WAYS[m]) > r],
+    )
+    for r in range(3)
 ]
-_QUADRICS = ["xx", "yy", "zz", "ww", "xy", "xz", "xw", "yz", "yw", "zw"]
-_LINEAR = "xyzw"
-_TIMES = [[_CUBICS.index("".join(sorted(q + v, key=_LINEAR.index))) for q in _QUADRICS] for v in _LINEAR]
-_I, _J = [0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3]
+_TO_NISTER = [_ORDER.index(m) for m in _CUBICS]
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
 
 
 def equations(
@@ -61,139 +65,185 @@ def essential_5pt(
         d2: The corresponding rays of the second camera.
 
     Returns:
-        Ten slots. None is valid where the rays do not determine E (coinciding rays, a pure rotation) or are not finite. Computed
-        in float64 whatever the dtype. Differentiable in both arguments.
+        Ten slots. None is valid where the linear equations are dependent (coinciding rays) or a ray is zero or not finite.
+        Without baseline E is not determined: whatever is valid there has the right epipolar lines and no meaning. Computed in
+        float64 whatever the dtype. Differentiable in both arguments.
 
     Raises:
         ValueError: Wrong shape, dtype or device.
     """
-    check_tensors(d1=(d1, "5 3"), d2=(d2, "5 3"))
-    E, valid = _solve(d1.detach(), d2.detach())
+    batch = check_tensors(d1=(d1, "5 3"), d2=(d2, "5 3"))
+    with torch.no_grad():
+        rows1, rows2 = (d.detach().double().expand(*batch, 5, 3).reshape(-1, 5, 3).permute(1, 2, 0) for d in (d1, d2))
+        chunks = [_solve(a, b) for a, b in zip(rows1.split(_CHUNK, -1), rows2.split(_CHUNK, -1), strict=True)]
+        rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
+        E = rows.permute(2, 1, 0).reshape(*batch, 10, 3, 3).to(d1.dtype)
+        valid = good.mT.reshape(*batch, 10)
     if wants_derivative(d1, d2):
         E = attach_implicit(equations, E, d1[..., None, :, :], d2[..., None, :, :], dims=2, valid=valid)
     return Solutions(E, valid)
 
 
-def _times_linear(q: Tensor, p: Tensor) -> Tensor:
-    out = q.new_zeros(20, *torch.broadcast_shapes(q.shape[1:], p.shape[1:]))
-    for k in range(4):
-        out[_TIMES[k]] += q * p[k]
+def _solve(d1: Float[Tensor, "5 3 batch"], d2: Float[Tensor, "5 3 batch"]) -> tuple[Tensor, Tensor]:
+    """E as (9, 10, batch) and valid as (10, batch)."""
+    count = d1.shape[-1]
+    if count == 1:
+        d1, d2 = d1.repeat(1, 1, 2), d2.repeat(1, 1, 2)
+    d1, fine1 = _unit(d1)
+    d2, fine2 = _unit(d2)
+    basis, pivot = _basis(d1, d2)
+    fine = fine1 & fine2 & (pivot > _INDEPENDENT)
+    x, y, w = _three_rows(_eliminate(_constraints(basis.unflatten(1, (3, 3)))))
+    n = _convolve(y[:, _NEXT], w[:, _AFTER]) - _convolve(y[:, _AFTER], w[:, _NEXT])
+    s, c, real = real_root_rows(_convolve(x, n).sum(1))
+    u = _back_substitute(x, y, w, s, c)
+    u, _ = _polish(u, basis)
+    u, error = _polish(u, basis)
+    E = _combine(u, basis)
+    valid = real & fine & (error < _CONVERGED) & torch.isfinite(E).all(0)
+    # An empty slot holds diag(1, 1, 0).
+    empty = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=E.dtype, device=E.device)[:, None, None]
+    E = torch.where(valid, E * 2**0.5, empty)
+    return E[..., :count], valid[..., :count]
+
+
+def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
+    largest = d.abs().amax((0, 1))
+    fine = torch.isfinite(largest) & (largest > 0)
+    d = torch.where(fine, d / torch.where(fine, largest, 1), 1)
+    norm = (d * d).sum(1, keepdim=True)
+    return d / torch.where(norm > 0, norm, 1).sqrt(), fine & (norm > 0).all(0)[0]
+
+
+def _basis(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
+    """An orthonormal basis (4, 9, batch) of the matrices with d2' E d1 = 0, in which the last two follow the skew part."""
+    P = d2[:, :, None] * d1[:, None]
+    half = 0.5**0.5
+    T = P.transpose(1, 2)
+    S, D = (P + T) * half, (P - T) * half
+    # Orthonormal coordinates: what is eliminated first, then trace, and the skew part by z, x, y.
+    rows = (P[:, 2, 2], S[:, 0, 2], S[:, 1, 2], (P[:, 0, 0] - P[:, 1, 1]) * half, S[:, 0, 1])
+    rows += ((P[:, 0, 0] + P[:, 1, 1]) * half, D[:, 1, 0], D[:, 2, 1], D[:, 0, 2])
+    N, pivot = nullspace_rows(torch.stack(rows, 1))
+    e33, s13, s23, minus, s12, plus, a3, a1, a2 = N.unbind(1)
+    entries = (plus + minus, s12 - a3, s13 + a2, s12 + a3, plus - minus, s23 - a1, s13 - a2, s23 + a1)
+    return torch.stack((*(e * half for e in entries), e33), 1), pivot
+
+
+def _constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"]:
+    """Coefficients of the monomials in (E E' - tr(E E') / 2) E = 0 and det E = 0."""
+    a, b = E[_I], E[_J]
+    S = _weighted(a.permute(2, 0, 1, 3)[:, :, :, None], b.permute(2, 0, 1, 3)[:, :, None])
+    S[4:] = S[4:] + S[4:].transpose(1, 2)
+    half = 0.5 * (S[:, 0, 0] + S[:, 1, 1] + S[:, 2, 2])
+    for i in range(3):
+        S[:, i, i] -= half
+    minors = a[:, 1, _NEXT] * b[:, 2, _AFTER] - a[:, 1, _AFTER] * b[:, 2, _NEXT]
+    minors[4:] += b[4:, 1, _NEXT] * a[4:, 2, _AFTER] - b[4:, 1, _AFTER] * a[4:, 2, _NEXT]
+    out = torch.zeros(20, 10, E.shape[-1], dtype=E.dtype, device=E.device)
+    for squares, variables in _ROUNDS:
+        s, e, m = S[squares], E[variables], minors[squares]
+        rows = out[: len(squares)]
+        trace = rows[:, :9].unflatten(1, (3, 3))
+        for j in range(3):
+            trace.addcmul_(s[:, :, j, None], e[:, j, None])
+            rows[:, 9].addcmul_(m[:, j], e[:, 0, j])
+    return out[_TO_NISTER]
+
+
+def _eliminate(A: Float[Tensor, "20 10 batch"]) -> Float[Tensor, "10 6 batch"]:
+    """Rows 5 to 10 of the reduced row echelon form, without pivoting: an orthonormal basis makes that accurate enough."""
+    for k in range(9):
+        A[k + 1 :, k + 1 :].addcmul_(A[k + 1 :, k, None], A[k, k + 1 :] / A[k, k], value=-1)
+    for k in range(9, 4, -1):
+        A[10:, 4:k].addcmul_(A[10:, k, None], A[k, 4:k] / A[k, k], value=-1)
+    return A[10:, 4:] / torch.stack([A[k, k] for k in range(4, 10)])
+
+
+def _three_rows(C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Polynomials in z (power, row, batch) that multiply x, y and 1: rows x^2 z - z x^2, y^2 z - z y^2, xyz - z xy."""
+    a, b = C[:, 0::2], C[:, 1::2]
+    x = torch.stack((a[2], a[1] - b[2], a[0] - b[1], -b[0]))
+    y = torch.stack((a[5], a[4] - b[5], a[3] - b[4], -b[3]))
+    return x, y, torch.stack((a[9], a[8] - b[9], a[7] - b[8], a[6] - b[7], -b[6]))
+
+
+def _convolve(p: Tensor, q: Tensor) -> Tensor:
+    out = torch.zeros(p.shape[0] + q.shape[0] - 1, *q.shape[1:], dtype=q.dtype, device=q.device)
+    for i in range(p.shape[0]):
+        out[i : i + q.shape[0]].addcmul_(p[i], q)
     return out
 
 
-def _product(p: Tensor, q: Tensor) -> Tensor:
-    return torch.cat((p * q, p[_I] * q[_J] + p[_J] * q[_I]))
+def _back_substitute(x: Tensor, y: Tensor, w: Tensor, s: Tensor, c: Tensor) -> Tensor:
+    """The unit (x, y, z, w) for every root z = s / c: a null vector of the three rows, from the best-conditioned pair."""
+    cc, ss = c * c, s * s
+    powers = (cc * c, cc * s, ss * c, ss * s)
+    X, Y, W = (_weighted(p[:4, :, None], powers) for p in (x, y, w))
+    W = (W * c).addcmul_(w[4][:, None], ss * ss)
+    pairs = [_cross((X[i], Y[i], W[i]), (X[j], Y[j], W[j])) for i, j in ((1, 2), (2, 0), (0, 1))]
+    n = torch.stack(pairs)
+    best = (n * n).sum(1).max(0).indices
+    n0, n1, n2 = n.gather(0, best[None, None].expand(1, 3, *best.shape))[0]
+    return _normalised(torch.stack((n0, n1, s * n2, c * n2)))
 
 
-def _constraints(basis: Tensor) -> Tensor:
-    """The ten cubics (20 monomials, 10 equations, batch) of the basis (4, 3, 3, batch)."""
-    S = [[_product(basis[:, i, 0], basis[:, j, 0]) for j in range(3)] for i in range(3)]
-    for i in range(3):
-        for j in range(i, 3):
-            for m in (1, 2):
-                S[i][j] = S[i][j] + _product(basis[:, i, m], basis[:, j, m])
-            S[j][i] = S[i][j]
-    half = 0.5 * (S[0][0] + S[1][1] + S[2][2])
-    for i in range(3):
-        S[i][i] = S[i][i] - half
-    rows = []
-    for i in range(3):
-        for j in range(3):
-            rows.append(sum(_times_linear(S[i][m], basis[:, m, j]) for m in range(3)))
-    minor = [
-        _product(basis[:, 1, j], basis[:, 2, k]) - _product(basis[:, 1, k], basis[:, 2, j]) for j, k in ((1, 2), (2, 0), (0, 1))
-    ]
-    rows.append(sum(_times_linear(minor[j], basis[:, 0, j]) for j in range(3)))
-    return torch.stack(rows, 1)
+def _weighted(rows: Tensor, weights: Sequence[Tensor] | Tensor) -> Tensor:
+    """The sum of rows times weights over the first dimension."""
+    out = rows[0] * weights[0]
+    for row, weight in zip(rows[1:], weights[1:], strict=True):
+        out.addcmul_(row, weight)
+    return out
 
 
-def _solve(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
-    dtype = d1.dtype
-    d1, d2 = torch.broadcast_tensors(d1.double(), d2.double())
-    batch = d1.shape[:-2]
-    d1, d2 = d1.reshape(-1, 5, 3), d2.reshape(-1, 5, 3)
-    count = d1.shape[0]
-    finite = torch.isfinite(d1).all(-1).all(-1) & torch.isfinite(d2).all(-1).all(-1)
-    rays = []
-    for d in (d1, d2):
-        d = torch.where(finite[:, None, None], d, 0)
-        norm = (d * d).sum(-1, keepdim=True).sqrt()
-        finite = finite & (norm > 0).all(-1).all(-1)
-        rays.append(d / torch.where(norm > 0, norm, 1))
-    A = (rays[1][..., :, None] * rays[0][..., None, :]).flatten(-2)
-    basis = orthonormal_nullspace(A).permute(2, 1, 0).reshape(4, 3, 3, count)
-    M = _constraints(basis).permute(2, 1, 0)
-    C, info = torch.linalg.solve_ex(M[..., :10], M[..., 10:])
-    regular = (info == 0) & torch.isfinite(C).all(-1).all(-1) & finite
-    C = torch.where(regular[:, None, None], C, 0)
-    # Rows x^2 z - z x^2, y^2 z - z y^2, xyz - z xy: three equations linear in (x, y, 1), polynomials in z.
-    rows = []
-    for top in (4, 6, 8):
-        a, b = C[:, top], C[:, top + 1]
-        px = torch.stack((a[:, 2], a[:, 1] - b[:, 2], a[:, 0] - b[:, 1], -b[:, 0]), -1)
-        py = torch.stack((a[:, 5], a[:, 4] - b[:, 5], a[:, 3] - b[:, 4], -b[:, 3]), -1)
-        pw = torch.stack((a[:, 9], a[:, 8] - b[:, 9], a[:, 7] - b[:, 8], a[:, 6] - b[:, 7], -b[:, 6]), -1)
-        rows.append((px, py, pw))
-
-    def times(p: Tensor, q: Tensor) -> Tensor:
-        out = p.new_zeros(count, p.shape[1] + q.shape[1] - 1)
-        for i in range(p.shape[1]):
-            out[:, i : i + q.shape[1]] += p[:, i : i + 1] * q
-        return out
-
-    (a0, a1, a2), (b0, b1, b2), (c0, c1, c2) = rows
-    n0 = times(b1, c2) - times(b2, c1)
-    n1 = times(b2, c0) - times(b0, c2)
-    n2 = times(b0, c1) - times(b1, c0)
-    poly = times(a0, n0) + times(a1, n1) + times(a2, n2)
-    z, real = companion_roots(poly)
-    z = z.contiguous()
-    powers = torch.stack([torch.ones_like(z), z, z * z, z * z * z, z * z * z * z], -1)
-    B = torch.stack([torch.stack([powers[..., : p.shape[-1]] @ p[:, :, None] for p in row], -1)[..., 0, :] for row in rows], -2)
-    # The null vector (x, y, 1): the largest of the cross products of two rows.
-    n = torch.stack([torch.linalg.cross(B[..., i, :], B[..., j, :]) for i, j in ((0, 1), (1, 2), (2, 0))], -2)
-    best = (n * n).sum(-1).argmax(-1)
-    n = n.gather(-2, best[..., None, None].expand(*best.shape, 1, 3))[..., 0, :]
-    u = torch.stack((n[..., 0], n[..., 1], z * n[..., 2], n[..., 2]), -1)
-    u = u / (u * u).sum(-1, keepdim=True).sqrt()
-    u = torch.where(torch.isfinite(u), u, 0)
-    u, error = _polish(M, u)
-    E = (
-        u @ basis.permute(2, 0, 1, 3).reshape(4, 9, count).permute(2, 0, 1)
-        if False
-        else torch.einsum("bsk,kijb->bsij", u, basis)
-    )
-    norm = (E * E).sum((-2, -1), keepdim=True)
-    E = E * (2 / norm).sqrt()
-    valid = real & regular[:, None] & (error < 1e-9) & torch.isfinite(E).all(-1).all(-1)
-    E = torch.where(valid[..., None, None], E, torch.eye(3, dtype=E.dtype, device=E.device))
-    return E.to(dtype).reshape(*batch, 10, 3, 3), valid.reshape(*batch, 10)
+def _normalised(u: Tensor) -> Tensor:
+    return u * _weighted(u, u).rsqrt()
 
 
-def _monomials(u: Tensor) -> tuple[Tensor, Tensor]:
-    """Values (..., 20) and gradients (..., 20, 4) of the cubic monomials at u (..., 4)."""
-    index = torch.tensor([[_LINEAR.index(v) for v in m] for m in _CUBICS], device=u.device)
-    f = u[..., index]
-    value = f.prod(-1)
-    gradient = torch.zeros(*u.shape[:-1], 20, 4, dtype=u.dtype, device=u.device)
-    for k in range(3):
-        part = f[..., (k + 1) % 3] * f[..., (k + 2) % 3]
-        gradient = gradient.scatter_add(-1, index[:, k : k + 1].expand(*u.shape[:-1], 20, 1), part[..., None])
-    return value, gradient
+def _combine(u: Float[Tensor, "4 slots batch"], basis: Float[Tensor, "4 9 batch"]) -> Float[Tensor, "9 slots batch"]:
+    return _weighted(basis[:, :, None], u)
 
 
-def _polish(M: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Gauss-Newton on the ten cubics over the unit sphere; the residual at the end."""
-    for _ in range(3):
-        value, gradient = _monomials(u)
-        r = value @ M.mT
-        J = M[:, None] @ gradient
-        # |u| stays 1: the row u' du = 0 makes the normal matrix regular.
-        N = J.mT @ J + u[..., :, None] * u[..., None, :]
-        step, info = torch.linalg.solve_ex(N, J.mT @ r[..., None])
-        new = u - step[..., 0]
-        new = new / (new * new).sum(-1, keepdim=True).sqrt()
-        error_new = (_monomials(new)[0] @ M.mT).abs().amax(-1)
-        better = error_new < r.abs().amax(-1)
-        u = torch.where(better[..., None], new, u)
-    return u, (_monomials(u)[0] @ M.mT).abs().amax(-1)
+def _cross(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Tensor:
+    a0, a1, a2 = a
+    b0, b1, b2 = b
+    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0))
+
+
+def _polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+    """One Newton step on the essential manifold within the null space, and how far the start was from the manifold.
+
+    Around E = U diag(1, 1, 0) V' the manifold's normal space is spanned by u3 v3', u1 v1' - u2 v2' and u1 v2' + u2 v1', for any
+    u1, u2 and v1 = E' u1, v2 = E' u2. Three linear equations in (x, y, z, w) remain: the solution is their 4D cross product.
+    """
+    e = _combine(u, basis)
+    cofactors = torch.stack((_cross(e[3:6], e[6:]), _cross(e[6:], e[:3]), _cross(e[:3], e[3:6])))
+    squares = cofactors * cofactors
+    i, j = squares.sum(1).max(0).indices, squares.sum(0).max(0).indices
+    v3 = _normalised(cofactors.gather(0, i[None, None].expand(1, 3, *i.shape))[0])
+    u3 = _normalised(cofactors.gather(1, j[None, None].expand(3, 1, *j.shape))[:, 0])
+    # A frame around u3 without branches (Duff et al. 2017).
+    sign = torch.copysign(torch.ones_like(u3[2]), u3[2])
+    a = -1 / (sign + u3[2])
+    b = u3[0] * u3[1] * a
+    u1 = (1 + sign * u3[0] * u3[0] * a, sign * b, -sign * u3[0])
+    u2 = (b, sign + u3[1] * u3[1] * a, -u3[1])
+    rows = e.unflatten(0, (3, 3))
+    v1 = _weighted(rows, u1)
+    v1 = _normalised(v1 - v3 * _weighted(v1, v3))
+    v2 = _cross(v3, v1)
+    v2 = v2 * torch.copysign(torch.ones_like(sign), _weighted(_weighted(rows, u2), v2))
+    # The normals' products with the basis, by rows of the basis matrices: B v, then u' B v.
+    columns = basis.unflatten(1, (3, 3)).permute(2, 1, 0, 3)[..., None, :]
+    Bv1, Bv2, Bv3 = (_weighted(columns, v) for v in (v1, v2, v3))
+    p = _weighted(Bv3, u3)
+    q = _weighted(Bv1, u1) - _weighted(Bv2, u2)
+    r = _weighted(Bv2, u1) + _weighted(Bv1, u2)
+    error = torch.stack([_weighted(f, u).abs() for f in (p, q, r)]).amax(0)
+    p0, p1, p2, p3 = p
+    q0, q1, q2, q3 = q
+    r0, r1, r2, r3 = r
+    m01, m02, m03 = p0 * q1 - p1 * q0, p0 * q2 - p2 * q0, p0 * q3 - p3 * q0
+    m12, m13, m23 = p1 * q2 - p2 * q1, p1 * q3 - p3 * q1, p2 * q3 - p3 * q2
+    x, y, z = m12 * r3 - m13 * r2 + m23 * r1, m03 * r2 - m02 * r3 - m23 * r0, m01 * r3 - m03 * r1 + m13 * r0
+    return _normalised(torch.stack((x, y, z, m02 * r1 - m01 * r2 - m12 * r0))), error
