@@ -256,7 +256,7 @@ class KannalaBrandt(DistortionModel):
 
 
 Distortion: TypeAlias = NoDistortion | SimpleRadial | Radial | BrownConrady | KannalaBrandt
-DISTORTION_MODELS: dict[str, type[DistortionModel]] = {
+DISTORTION_MODELS: dict[str, type[Distortion]] = {
     "pinhole": NoDistortion,
     "simple_radial": SimpleRadial,
     "radial": Radial,

@@ -1,0 +1,145 @@
+"""From image points with known correspondence to a metric model, nothing known of the camera."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Pose, Radial, intrinsics
+from torchsfm.reconstruction import SfmResult, Verdict, reconstruct_tracks
+from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.simulation import orbit_poses, random_points, simulate_images
+
+SIZE = (1000, 750)
+
+
+@dataclass(frozen=True)
+class Scene:
+    x: Tensor
+    view: Tensor
+    track: Tensor
+    poses: Pose
+    image_size: Tensor
+    focal: float = 1100.0
+
+
+def make_scene(
+    poses: Pose | None = None,
+    *,
+    points: int = 400,
+    noise: float = 0.5,
+    outliers: float = 0.05,
+    seed: int = 0,
+    kind: str = "ball",
+) -> Scene:
+    g = torch.Generator().manual_seed(seed)
+    poses = orbit_poses(8, radius=5.0, sweep=1.6) if poses is None else poses
+    X = random_points(points, kind=kind, size=1.6, generator=g)
+    v = len(poses.R)
+    k1 = torch.tensor(-0.08, dtype=torch.float64)
+    camera = Camera(intrinsics(torch.tensor(Scene.focal), torch.tensor([499.5, 374.5])).double(), Radial(k1, 0 * k1))
+    cameras = Camera(camera.K.expand(v, 3, 3), Radial(k1.expand(v), (0 * k1).expand(v)))
+    seen = simulate_images(X, poses, cameras, image_size=SIZE, noise=noise, outliers=outliers, dropout=0.2, generator=g)
+    view, track = seen.visible.nonzero(as_tuple=True)
+    return Scene(seen.x[view, track], view, track, poses, torch.tensor([SIZE] * v))
+
+
+def run(scene: Scene, **options: object) -> SfmResult:
+    return reconstruct_tracks(scene.x, scene.view, scene.track, scene.image_size, **options)  # type: ignore[arg-type]
+
+
+def test_noisy_tracks_with_outliers() -> None:
+    scene = make_scene()
+    model = run(scene).model
+    assert bool(model.registered.all())
+    errors = pose_errors(model.poses, scene.poses)
+    assert float(errors.pose.max()) < 0.5
+    assert abs(float(model.cameras.K[0, 0, 0]) / scene.focal - 1) < 0.01
+    assert abs(float(model.cameras.distortion.parameters()[0, 0]) + 0.08) < 0.02
+    # Half a pixel of noise in each coordinate is 0.63 px of mean distance; outliers are gone.
+    assert float(model.residuals().mean()) < 0.75
+    assert float(model.residuals().max()) < 4.0
+    assert model.num_points > 350
+
+
+def test_known_intrinsics_are_kept() -> None:
+    scene = make_scene()
+    K = torch.tensor([[1100.0, 0, 499.5], [0, 1100.0, 374.5], [0, 0, 1]], dtype=torch.float64)
+    model = run(scene, K=K, camera="radial").model
+    assert torch.equal(model.cameras.K[0], K)
+    assert float(pose_errors(model.poses, scene.poses).pose.max()) < 0.3
+
+
+def test_the_same_seed_gives_the_same_model() -> None:
+    scene = make_scene(points=150)
+    first, second = run(scene, seed=3).model, run(scene, seed=3).model
+    assert torch.equal(first.X, second.X)
+    assert torch.equal(first.poses.R, second.poses.R)
+
+
+def test_two_unrelated_scenes_give_two_models() -> None:
+    a, b = make_scene(seed=1), make_scene(orbit_poses(5, radius=5.0, sweep=1.0), seed=2)
+    both = Scene(
+        torch.cat([a.x, b.x]),
+        torch.cat([a.view, b.view + len(a.image_size)]),
+        torch.cat([a.track, b.track + int(a.track.max()) + 1]),
+        a.poses,
+        torch.cat([a.image_size, b.image_size]),
+    )
+    models = run(both).models
+    assert [m.num_registered for m in models] == [8, 5]
+    assert models[0].registered.tolist() == [True] * 8 + [False] * 5
+    assert not bool((models[0].registered & models[1].registered).any())
+
+
+def turning(views: int) -> Pose:
+    still = orbit_poses(1, radius=5.0)
+    angle = torch.linspace(-0.15, 0.15, views, dtype=torch.float64)
+    c, s, o = angle.cos(), angle.sin(), torch.zeros_like(angle)
+    turn = torch.stack([c, o, s, o, o + 1, o, -s, o, c], -1).reshape(-1, 3, 3)
+    return Pose(turn @ still.R, (turn @ still.t[..., None])[..., 0])
+
+
+def test_pure_rotation_is_refused() -> None:
+    result = run(make_scene(turning(4), outliers=0.0))
+    assert not result.models
+    assert result.report.pairs.count(Verdict.ROTATION) >= 4
+    assert "turned" in result.failure()
+
+
+def test_a_plane_is_called_planar() -> None:
+    result = run(make_scene(kind="plane", points=600, outliers=0.0))
+    assert result.report.pairs.count(Verdict.PLANAR) > result.report.pairs.count(Verdict.GENERAL)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: {"view": s.view[:-1]}, "one length"),
+        (lambda s: {"view": s.view + 1}, "view"),
+        (lambda s: {"track": s.track - 1}, "track"),
+    ],
+)
+def test_bad_arguments(change: Callable[[Scene], dict[str, Tensor]], message: str, unchecked: None) -> None:
+    scene = make_scene(points=50)
+    arguments = {"x": scene.x, "view": scene.view, "track": scene.track, "image_size": scene.image_size} | change(scene)
+    with pytest.raises(ValueError, match=message):
+        reconstruct_tracks(**arguments)
+
+
+def test_nothing_to_see() -> None:
+    scene = make_scene(points=8)
+    result = run(scene)
+    assert not result.models
+    assert "in common" in result.failure()
+
+
+def test_nan_observations_are_left_out() -> None:
+    scene = make_scene(points=200)
+    scene.x[::50] = torch.nan
+    model = run(scene).model
+    assert model.num_registered == 8
+    assert bool(model.x.isfinite().all())
+    assert bool(model.X.isfinite().all())

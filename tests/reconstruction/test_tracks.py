@@ -1,0 +1,54 @@
+"""Tracks: connected matches, one point per image."""
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchsfm.reconstruction.tracks import build_tracks
+
+
+def test_chains_become_tracks() -> None:
+    view = torch.tensor([0, 0, 1, 1, 2, 2])
+    match = torch.tensor([[0, 2], [2, 4], [1, 3]])
+    track = build_tracks(view, match)
+    assert track.tolist() == [0, 1, 0, 1, 0, -1]
+
+
+def test_a_contradicting_match_is_left_out_by_priority() -> None:
+    # Points 0 and 1 lie in one image; both claim point 2.
+    view = torch.tensor([0, 0, 1])
+    match = torch.tensor([[0, 2], [1, 2]])
+    assert build_tracks(view, match).tolist() == [0, -1, 0]
+    assert build_tracks(view, match, torch.tensor([1, 5])).tolist() == [-1, 0, 0]
+
+
+def test_no_matches() -> None:
+    assert build_tracks(torch.tensor([0, 1]), torch.zeros(0, 2, dtype=torch.long)).tolist() == [-1, -1]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**31), st.integers(2, 7), st.integers(2, 40), st.integers(0, 80))
+def test_laws(seed: int, images: int, points: int, matches: int) -> None:
+    g = torch.Generator().manual_seed(seed)
+    view = torch.randint(images, (points,), generator=g)
+    match = torch.randint(points, (matches, 2), generator=g)
+    match = match[view[match[:, 0]] != view[match[:, 1]]]
+    track = build_tracks(view, match)
+    used = track[track >= 0]
+    # Numbered without gaps, at least two points each, never two of one image.
+    assert sorted(set(used.tolist())) == list(range(int(used.max()) + 1 if len(used) else 0))
+    assert bool((torch.bincount(used) >= 2).all())
+    keys = (track * images + view)[track >= 0]
+    assert len(torch.unique(keys)) == len(keys)
+    # Matches that share no image with any other's component are all honoured when nothing contradicts.
+    conflict_free = all(len(set(view[c].tolist())) == len(c) for c in _components(points, match))
+    if conflict_free:
+        assert bool((track[match[:, 0]] == track[match[:, 1]]).all())
+
+
+def _components(points: int, match: torch.Tensor) -> list[list[int]]:
+    group = list(range(points))
+    for _ in range(points):
+        for a, b in match.tolist():
+            group[a] = group[b] = min(group[a], group[b])
+    return [[i for i in range(points) if group[i] == k] for k in set(group)]

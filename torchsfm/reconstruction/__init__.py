@@ -1,0 +1,19 @@
+"""How do images become a model? The `Reconstruction`, and the doors from photographs and from tracks."""
+
+from torchsfm.reconstruction.models import reconstruct_tracks
+from torchsfm.reconstruction.photographs import reconstruct
+from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import ImageReport, PairReport, ReconstructionError, Report, SfmResult
+from torchsfm.reconstruction.view_graph import Verdict
+
+__all__ = [
+    "ImageReport",
+    "PairReport",
+    "Reconstruction",
+    "ReconstructionError",
+    "Report",
+    "SfmResult",
+    "Verdict",
+    "reconstruct",
+    "reconstruct_tracks",
+]

@@ -1,0 +1,185 @@
+"""Grow a model from two images to all that fit (incremental structure from motion).
+
+The order of work follows Schönberger & Frahm, Structure-from-Motion Revisited, 2016; images are registered, and tracks
+triangulated, many at a time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.geometry import Camera
+from torchsfm.reconstruction.adjust import adjust, neighbourhood
+from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.register import MIN_VISIBLE, register_images, visibility_scores
+from torchsfm.reconstruction.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
+
+MAX_STARTS = 5
+"""Starting pairs tried before a set of images is given up."""
+GLOBAL_GROWTH = 1.1
+"""A model this much larger than at its last global adjustment gets another."""
+SMALL = 20
+"""Models of up to this many images are adjusted as a whole every time."""
+UNKNOWN_FOCAL = 0.4
+"""Focal lengths more uncertain than this fraction are searched for when the first image of a camera is registered."""
+MIN_IMAGES_PRINCIPAL_POINT = 4
+"""Fewer images leave the principal point where it was expected."""
+
+
+@dataclass(frozen=True)
+class MappingOptions:
+    """How a model is grown; distances in pixels, angles in radians.
+
+    Attributes:
+        free: Intrinsic parameters to estimate.
+        expected: The cameras before any image point was seen; see `adjust`.
+        focal_sigma: How uncertain the expected focal lengths are, as a fraction.
+        reprojection: Largest reprojection error of an observation.
+        registration: Largest reprojection error of an inlier when an image is registered.
+        min_angle: Smallest angle between the rays of a point.
+        generator: Source of randomness.
+    """
+
+    free: tuple[str, ...]
+    expected: Camera
+    focal_sigma: Float[Tensor, "g"]
+    reprojection: float = 4.0
+    registration: float = 8.0
+    min_angle: float = 0.026
+    generator: torch.Generator | None = None
+
+    def free_for(self, images: int, *, final: bool = False) -> tuple[str, ...]:
+        """The parameters that a model of so many images determines; the principal point last, when all images are in."""
+        if images < 3:
+            return ()
+        late = set() if final and images >= MIN_IMAGES_PRINCIPAL_POINT else {"principal_point"}
+        return tuple(name for name in self.free if name not in late)
+
+    def priors(self, model: Mapping) -> dict[str, Any]:
+        """What to expect of the cameras, as `adjust` takes it."""
+        used = torch.unique(model.camera_index[model.registered])
+        return {"expected": self.expected, "focal_sigma": float(self.focal_sigma[used].max())}
+
+
+def grow_model(
+    mapping: Mapping, options: MappingOptions, progress: Callable[[int, int], None]
+) -> tuple[Mapping, dict[int, str]] | None:
+    """Reconstruct one component from the images not registered yet.
+
+    Args:
+        mapping: A mapping whose registered images belong to other models and are left alone.
+        options: How the model is grown.
+        progress: Called with the number of registered images and of all.
+
+    Returns:
+        A mapping of this component alone, and for each image that was tried and did not fit the reason; None if no pair of
+        images was a start.
+    """
+    empty = Mapping.start(mapping.graph, mapping.track, mapping.cameras, mapping.camera_index)
+    best: tuple[Mapping, dict[int, str]] | None = None
+    available = int((~mapping.registered).sum())
+    for start in starting_pairs(mapping, threshold=options.reprojection, generator=options.generator)[:MAX_STARTS]:
+        model = place_start(empty, start, threshold=options.reprojection)
+        model = adjust(model, free=(), tolerance=1e-4)
+        model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+        if len(model.X) < MIN_POINTS:
+            continue
+        grown = _grow(model, mapping.registered, options, progress)
+        if best is None or int(grown[0].registered.sum()) > int(best[0].registered.sum()):
+            best = grown
+        if int(grown[0].registered.sum()) > 0.5 * available:
+            break
+    return best
+
+
+def _grow(
+    model: Mapping, elsewhere: Bool[Tensor, "v"], options: MappingOptions, progress: Callable[[int, int], None]
+) -> tuple[Mapping, dict[int, str]]:
+    v = len(model.registered)
+    focal_known = options.focal_sigma < UNKNOWN_FOCAL
+    focal_known[model.camera_index[model.registered]] = True
+    failed: dict[int, str] = {}
+    adjusted_at = int(model.registered.sum())
+    second_try = False
+    while True:
+        images = _next_images(model, elsewhere, failed)
+        if not len(images):
+            # What failed against fewer points, or before the cameras were refined, is tried once more.
+            if second_try or not failed:
+                break
+            second_try = True
+            failed = {}
+            model = _refine(model, options)
+            continue
+        before = model.registered
+        model, count, inliers = register_images(
+            model, images, threshold=options.registration, focal_known=focal_known, generator=options.generator
+        )
+        new = model.registered & ~before
+        for i, n, k in zip(images.tolist(), count.tolist(), inliers.tolist(), strict=True):
+            if not new[i]:
+                failed[i] = f"a pose fits only {k} of the {n} points it sees"
+        if not bool(new.any()):
+            continue
+        second_try = False
+        focal_known[model.camera_index[new]] = True
+        model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
+        model = complete_tracks(model, threshold=options.reprojection)
+        registered = int(model.registered.sum())
+        progress(registered, v)
+        if registered <= SMALL or registered >= GLOBAL_GROWTH * adjusted_at:
+            model = adjust(model, free=options.free_for(registered), **options.priors(model), max_iterations=8, tolerance=1e-3)
+            adjusted_at = registered
+            failed = {}
+        else:
+            model = adjust(model, free=(), moving=neighbourhood(model, new), max_iterations=8, tolerance=1e-3)
+        model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+        model = _drop_unsupported(model, failed)
+    return _refine(model, options), failed
+
+
+def _next_images(model: Mapping, elsewhere: Bool[Tensor, "v"], failed: dict[int, str]) -> Int[Tensor, "k"]:
+    """The unregistered images that see the model best: those with at least half the best score, at most eight."""
+    count, score = visibility_scores(model)
+    able = ~model.registered & ~elsewhere & (count >= MIN_VISIBLE)
+    able[list(failed)] = False
+    if not bool(able.any()):
+        return torch.zeros(0, dtype=torch.long)
+    score = torch.where(able, score, -1.0)
+    order = torch.argsort(score, descending=True, stable=True)[:8]
+    return order[score[order] >= 0.5 * score[order[0]]].sort().values
+
+
+def _drop_unsupported(model: Mapping, failed: dict[int, str]) -> Mapping:
+    """Take out images that lost nearly all their observations: their pose is not supported by the structure."""
+    node = model.observations()
+    count = torch.bincount(model.graph.view[node], minlength=len(model.registered))
+    lost = model.registered & (count < 10)
+    if not bool(lost.any()) or int((model.registered & ~lost).sum()) < 2:
+        return model
+    for i in lost.nonzero()[:, 0].tolist():
+        failed[i] = f"only {int(count[i])} of its points fit the model after bundle adjustment"
+    model = model.without(node[lost[model.graph.view[node]]])
+    return replace(model, registered=model.registered & ~lost)
+
+
+def _refine(model: Mapping, options: MappingOptions) -> Mapping:
+    """Alternate global bundle adjustment with filtering, merging, completion and re-triangulation until little changes."""
+    free = options.free_for(int(model.registered.sum()), final=True)
+    for _ in range(4):
+        model = adjust(model, free=free, **options.priors(model), max_iterations=20, tolerance=3e-4)
+        before = model.point
+        model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+        model = merge_points(model, threshold=options.reprojection)
+        model = complete_tracks(model, threshold=options.reprojection)
+        model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
+        changed = int(((before >= 0) != (model.point >= 0)).sum())
+        if changed <= 0.01 * max(1, int((before >= 0).sum())):
+            break
+    model = adjust(model, free=free, **options.priors(model), max_iterations=40, tolerance=1e-5)
+    return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)

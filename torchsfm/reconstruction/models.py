@@ -1,0 +1,202 @@
+"""From a view graph to finished models: first cameras, tracks, one model per component."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm.geometry import DISTORTION_MODELS
+from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
+from torchsfm.reconstruction.incremental import MappingOptions, grow_model
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import ImageReport, ReconstructionError, Report, SfmResult, pair_report
+from torchsfm.reconstruction.stages import Stages
+from torchsfm.reconstruction.tracks import build_tracks
+from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
+
+MIN_IMAGES = 2
+"""Smallest number of images of a model."""
+MIN_FEATURES = 30
+"""An image with fewer features shows nothing to match."""
+
+
+def build_models(
+    graph: ViewGraph,
+    track: Int[Tensor, "n"] | None,
+    *,
+    labels: Sequence[str],
+    exif_focal: Sequence[float | None],
+    failures: dict[str, str],
+    order: Sequence[str],
+    camera: str,
+    shared_camera: bool | None,
+    K: Float[Tensor, "3 3"] | None,
+    free_principal_point: bool,
+    generator: torch.Generator,
+    stages: Stages,
+    progress: Callable[[str, int, int], None],
+) -> SfmResult:
+    """Reconstruct every component of a view graph.
+
+    Args:
+        graph: Image points and verified matches.
+        track: Track of each image point, or None to build tracks from the matches.
+        labels: What the files say of the camera, per image.
+        exif_focal: Focal length in pixels stated in each file.
+        failures: Files that could not be read, with the reason.
+        order: All files in the order of the input.
+        camera: Name of the distortion model.
+        shared_camera: See `reconstruct`.
+        K: Known intrinsics.
+        free_principal_point: Whether to estimate the principal point.
+        generator: Source of randomness.
+        stages: Timing and saving.
+        progress: Called as images are registered.
+    """
+    if camera not in DISTORTION_MODELS:
+        raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
+    with stages.timed("map"):
+        camera_index = group_cameras(graph.image_size, labels, shared_camera)
+        cameras, source = guess_cameras(graph, camera_index, model=camera, K=K, exif_focal=exif_focal)
+        if track is None:
+            # Matches of strongly linked pairs come first: they are wrong less often.
+            track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
+        free: tuple[str, ...] = () if K is not None else ("focal",)
+        free += DISTORTION_MODELS[camera].parameter_names
+        free += ("principal_point",) if free_principal_point and K is None else ()
+        options = MappingOptions(free=free, expected=cameras, focal_sigma=focal_uncertainty(source), generator=generator)
+        empty = Mapping.start(graph, track, cameras, camera_index)
+        models: list[Reconstruction] = []
+        reasons: dict[int, str] = {}
+        taken = empty.registered
+        while int((~taken).sum()) >= MIN_IMAGES:
+            mapped = grow_model(replace(empty, registered=taken), options, lambda n, v: progress("map", n, v))
+            if mapped is None:
+                break
+            model, failed = mapped
+            if not models:
+                reasons |= failed
+            taken = taken | model.registered
+            models.append(model.reconstruction())
+            if stages.folder is not None:
+                _save_model(models[-1], stages.folder, len(models) - 1)
+        models.sort(key=lambda model: (-model.num_registered, -model.num_points))
+    progress("map", len(graph.names), len(graph.names))
+    verdict = graph.verdicts(cameras.K[camera_index])
+    pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
+    images = _image_reports(graph, models, reasons, failures, order)
+    return SfmResult(tuple(models), Report(images, pairs, dict(stages.seconds), source))
+
+
+def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
+    (folder / "stages").mkdir(parents=True, exist_ok=True)
+    model.save(folder / "stages" / f"model-{number}.npz")
+
+
+def _image_reports(
+    graph: ViewGraph,
+    models: Sequence[Reconstruction],
+    reasons: dict[int, str],
+    failures: dict[str, str],
+    order: Sequence[str],
+) -> tuple[ImageReport, ...]:
+    features = torch.bincount(graph.view, minlength=len(graph.names)).tolist()
+    related = graph.pairs[graph.fundamental_inliers >= MIN_INLIERS].flatten()
+    linked = torch.bincount(related, minlength=len(graph.names)).tolist()
+    reports: list[ImageReport] = []
+    position = 0
+    for name in order:
+        if name in failures:
+            reports.append(ImageReport(name, None, failures[name]))
+            continue
+        i, position = position, position + 1
+        model = next((k for k, m in enumerate(models) if bool(m.registered[i])), None)
+        reason = ""
+        if model is None and features[i] < MIN_FEATURES:
+            reason = f"only {features[i]} features: nothing to match"
+        elif model is None and not linked[i]:
+            reason = "has too little in common with every other image"
+        elif model is None:
+            reason = reasons.get(i, "sees too few of the reconstructed points")
+        reports.append(ImageReport(name, model, reason, features[i]))
+    return tuple(reports)
+
+
+def reconstruct_tracks(
+    x: Float[Tensor, "n 2"],
+    view: Int[Tensor, "n"],
+    track: Int[Tensor, "n"],
+    image_size: Int[Tensor, "v 2"],
+    *,
+    names: Sequence[str] | None = None,
+    color: Float[Tensor, "n 3"] | None = None,
+    camera: str | None = None,
+    shared_camera: bool | None = None,
+    K: Float[Tensor, "3 3"] | None = None,
+    focal: float | None = None,
+    free_principal_point: bool = True,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> SfmResult:
+    """Reconstruct from image points whose correspondence is known.
+
+    Args:
+        x: Image points in pixels.
+        view: Image of each point, from 0.
+        track: Scene point of each image point, from 0; wrong ones are sorted out.
+        image_size: Width and height of each image in pixels.
+        names: Names of the images.
+        color: Colours of the image points in [0, 1].
+        camera: Distortion model, see `reconstruct`.
+        shared_camera: Whether all images of one size share a camera, as they do by default.
+        K: Known intrinsics of all images.
+        focal: First guess of the focal length in pixels, which is then adjusted.
+        free_principal_point: Estimate the principal point too.
+        seed: The same seed gives the same model.
+        progress: Called as images are registered.
+
+    Returns:
+        The models, the largest first, and a report.
+
+    Raises:
+        ValueError: Shapes disagree or an index is out of range.
+    """
+    v = len(image_size)
+    if not len(x) == len(view) == len(track):
+        raise ValueError(f"x, view, track: wanted one length, got {len(x)}, {len(view)}, {len(track)}")
+    if len(view) and not (int(view.min()) >= 0 and int(view.max()) < v):
+        raise ValueError(f"view: wanted indices from 0 to {v - 1}, got {int(view.min())} to {int(view.max())}")
+    if len(track) and int(track.min()) < 0:
+        raise ValueError("track: wanted numbers from 0, got a negative one")
+    named = tuple(names) if names is not None else tuple(f"image {i}" for i in range(v))
+    generator = torch.Generator().manual_seed(seed)
+    finite = x.isfinite().all(-1)
+    color = torch.full((len(x), 3), 0.5) if color is None else color
+    graph, tracks = graph_from_tracks(
+        named,
+        image_size,
+        x[finite].double(),
+        view[finite],
+        torch.unique(track[finite], return_inverse=True)[1],
+        color[finite].double(),
+        generator=generator,
+    )
+    return build_models(
+        graph,
+        tracks,
+        labels=[""] * v,
+        exif_focal=[focal] * v,
+        failures={},
+        order=named,
+        camera=camera or ("pinhole" if K is not None else "radial"),
+        shared_camera=shared_camera,
+        K=K,
+        free_principal_point=free_principal_point,
+        generator=generator,
+        stages=Stages(None, False, ""),
+        progress=progress or (lambda stage, done, total: None),
+    )

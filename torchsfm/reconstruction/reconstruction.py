@@ -1,0 +1,172 @@
+"""The model: images, cameras, poses, points and the observations that tie them together."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import tensor_map
+from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, Similarity
+from torchsfm.reconstruction.stages import load_arrays
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Cameras and 3D points in one world frame, whose scale is arbitrary unless it was aligned to known positions.
+
+    Images that could not be placed stay in the list with `registered` False and the identity as pose, so that indices mean the
+    same in every model made from one set of images. Observations are sorted by point, then by image.
+
+    Attributes:
+        names: File names of the images.
+        image_size: Width and height of each image in pixels.
+        cameras: Intrinsics and distortion of the distinct cameras.
+        camera_index: Which of the cameras took each image.
+        poses: `cam_from_world` of each image.
+        registered: Which images have a pose.
+        X: Points in the world frame.
+        color: Red, green, blue in [0, 1] of each point.
+        x: Observed image points in pixels, the centre of the top-left pixel at (0, 0).
+        view: Image of each observation.
+        point: Point of each observation.
+    """
+
+    names: tuple[str, ...]
+    image_size: Int[Tensor, "v 2"]
+    cameras: Camera
+    camera_index: Int[Tensor, "v"]
+    poses: Pose
+    registered: Bool[Tensor, "v"]
+    X: Float[Tensor, "n 3"]
+    color: Float[Tensor, "n 3"]
+    x: Float[Tensor, "m 2"]
+    view: Int[Tensor, "m"]
+    point: Int[Tensor, "m"]
+
+    @property
+    def num_registered(self) -> int:
+        """Number of images with a pose."""
+        return int(self.registered.sum())
+
+    @property
+    def num_points(self) -> int:
+        """Number of 3D points."""
+        return len(self.X)
+
+    @property
+    def num_observations(self) -> int:
+        """Number of image points that belong to a 3D point."""
+        return len(self.x)
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """Move to a device or floating dtype; the arguments are those of `Tensor.to`. Indices keep their integer type."""
+
+        def move(tensor: Tensor) -> Tensor:
+            moved = tensor.to(*args, **kwargs)
+            return moved if tensor.is_floating_point() else moved.to(tensor.dtype)
+
+        return tensor_map(move, self)
+
+    def projections(self) -> Float[Tensor, "m 2"]:
+        """Where each observation's point projects, in pixels; finite but meaningless behind the camera."""
+        X_cam = self.poses[self.view].transform(self.X[self.point, None])
+        return self.cameras[self.camera_index[self.view]].project(X_cam)[:, 0]
+
+    def residuals(self) -> Float[Tensor, "m"]:
+        """Distance of each observation from its point's projection, in pixels."""
+        distance: Tensor = torch.linalg.vector_norm(self.projections() - self.x, dim=-1)
+        return distance
+
+    def track_lengths(self) -> Int[Tensor, "n"]:
+        """Number of observations of each point."""
+        return torch.bincount(self.point, minlength=self.num_points)
+
+    def view_errors(self) -> Float[Tensor, "v"]:
+        """Mean reprojection error of each image in pixels; zero where an image has no observations."""
+        total = self.X.new_zeros(len(self.names)).index_add(0, self.view, self.residuals())
+        return total / torch.bincount(self.view, minlength=len(self.names)).clamp(min=1)
+
+    def point_errors(self) -> Float[Tensor, "n"]:
+        """Mean reprojection error of each point in pixels."""
+        total = self.X.new_zeros(self.num_points).index_add(0, self.point, self.residuals())
+        return total / self.track_lengths().clamp(min=1)
+
+    def transform(self, similarity: Similarity) -> Self:
+        """The same model in another world frame, `X' = s R X + t`; reprojections do not change."""
+        poses = similarity.transform_pose(self.poses)
+        keep = self.registered
+        poses = Pose(
+            R=torch.where(keep[:, None, None], poses.R, self.poses.R), t=torch.where(keep[:, None], poses.t, self.poses.t)
+        )
+        return replace(self, X=similarity.transform(self.X), poses=poses)
+
+    def summary(self) -> str:
+        """A few lines for people: what was registered, how many points, how well they fit, the cameras found."""
+        lines = [f"{self.num_registered} of {len(self.names)} images registered"]
+        if self.num_points:
+            lines += [
+                f"{self.num_points} points, {self.num_observations} observations, "
+                f"mean track length {self.num_observations / self.num_points:.2f}",
+                f"mean reprojection error {float(self.residuals().mean()):.3f} px",
+            ]
+        used = torch.unique(self.camera_index[self.registered]).tolist()
+        for index in used:
+            camera = self.cameras[index]
+            (fx, _, cx), (_, fy, cy) = camera.K[0].tolist(), camera.K[1].tolist()
+            text = f"camera {index}: f = {fx:.2f}" + ("" if abs(fx - fy) < 1e-9 * fx else f", {fy:.2f}")
+            text += f", principal point ({cx:.2f}, {cy:.2f}) px"
+            values = camera.distortion.parameters().tolist()
+            names = camera.distortion.parameter_names
+            text += "".join(f", {name} = {value:.5f}" for name, value in zip(names, values, strict=True))
+            lines.append(text)
+        return "\n".join(lines)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to one `.npz` file of plain arrays, without pickle."""
+        arrays: dict[str, np.ndarray[Any, Any]] = {
+            f.name: getattr(self, f.name).detach().cpu().numpy()
+            for f in fields(self)
+            if isinstance(getattr(self, f.name), Tensor)
+        }
+        distortion = self.cameras.distortion
+        model = next(name for name, cls in DISTORTION_MODELS.items() if type(distortion) is cls)
+        count = len(self.cameras.K)
+        arrays |= {
+            "names": np.array(self.names, dtype=np.str_),
+            "camera_model": np.array(model),
+            "camera_K": self.cameras.K.detach().cpu().numpy(),
+            "camera_distortion": distortion.parameters().detach().cpu().numpy().reshape(count, -1),
+            "pose_R": self.poses.R.detach().cpu().numpy(),
+            "pose_t": self.poses.t.detach().cpu().numpy(),
+        }
+        with Path(path).open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: The file is not a saved reconstruction.
+            FileNotFoundError: There is no such file.
+        """
+        try:
+            arrays = load_arrays(Path(path))
+            tensors = {
+                f.name: torch.from_numpy(arrays[f.name]) for f in fields(cls) if f.name not in ("names", "cameras", "poses")
+            }
+            K = torch.from_numpy(arrays["camera_K"])
+            parameters = torch.from_numpy(arrays["camera_distortion"])
+            distortion = DISTORTION_MODELS[str(arrays["camera_model"])].from_parameters(parameters)
+            return cls(
+                names=tuple(str(name) for name in arrays["names"]),
+                cameras=Camera(K, distortion),
+                poses=Pose(torch.from_numpy(arrays["pose_R"]), torch.from_numpy(arrays["pose_t"])),
+                **tensors,
+            )
+        except (KeyError, ValueError) as error:
+            raise ValueError(f"{path} is not a saved reconstruction ({error})") from error

@@ -1,0 +1,106 @@
+"""What happened to each image and each pair on the way to the models."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.view_graph import Verdict
+
+
+class ReconstructionError(ValueError):
+    """The input cannot be used; the message is one line for people."""
+
+
+@dataclass(frozen=True)
+class ImageReport:
+    """One image: the number of its model (0 is the largest), or None and the reason."""
+
+    name: str
+    model: int | None
+    reason: str = ""
+    features: int = 0
+
+
+@dataclass(frozen=True)
+class PairReport:
+    """All compared pairs: matches, how many agree with F and with H, and what that says of the pair."""
+
+    pairs: Int[Tensor, "q 2"]
+    num_matches: Int[Tensor, "q"]
+    fundamental_inliers: Int[Tensor, "q"]
+    homography_inliers: Int[Tensor, "q"]
+    verdict: Int[Tensor, "q"]
+
+    def count(self, verdict: Verdict) -> int:
+        """Number of pairs with this verdict."""
+        return int((self.verdict == verdict).sum())
+
+
+@dataclass(frozen=True)
+class Report:
+    """The course of a reconstruction.
+
+    Attributes:
+        images: One entry per input file, in the order of the input.
+        pairs: The comparison of all pairs, with indices into the images that could be read.
+        seconds: Wall-clock time of each stage.
+        focal_source: Where each camera's first focal length came from: "given", "exif", "fundamental matrices" or "default".
+    """
+
+    images: tuple[ImageReport, ...]
+    pairs: PairReport
+    seconds: dict[str, float]
+    focal_source: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """A few lines for people."""
+        lines = []
+        if len(self.pairs.pairs):
+            names = {Verdict.GENERAL: "general", Verdict.PLANAR: "planar", Verdict.ROTATION: "pure rotation"}
+            kinds = ", ".join(f"{self.pairs.count(kind)} {name}" for kind, name in names.items())
+            lines.append(f"{len(self.pairs.pairs)} pairs compared: {kinds}, {self.pairs.count(Verdict.UNRELATED)} unrelated")
+        if self.focal_source:
+            lines.append("focal length first from: " + ", ".join(sorted(set(self.focal_source))))
+        lines += [f"not registered: {image.name} ({image.reason})" for image in self.images if image.model is None]
+        lines.append("seconds: " + ", ".join(f"{stage} {time:.1f}" for stage, time in self.seconds.items()))
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class SfmResult:
+    """Models, the largest first (none when nothing could be reconstructed), and the report."""
+
+    models: tuple[Reconstruction, ...]
+    report: Report
+
+    @property
+    def model(self) -> Reconstruction:
+        """The largest model.
+
+        Raises:
+            ReconstructionError: Nothing could be reconstructed; the message says why.
+        """
+        if not self.models:
+            raise ReconstructionError("nothing could be reconstructed: " + self.failure())
+        return self.models[0]
+
+    def failure(self) -> str:
+        """Why there is no model, in one line."""
+        pairs = self.report.pairs
+        readable = sum(1 for image in self.report.images if image.features)
+        if readable < 2:
+            return f"{readable} of {len(self.report.images)} images show anything to match"
+        related = int((pairs.verdict != Verdict.UNRELATED).sum())
+        if not related:
+            return f"none of the {len(pairs.pairs)} pairs of images have enough in common"
+        if pairs.count(Verdict.ROTATION) == related:
+            return "the camera only turned about its centre, which gives no depth"
+        return f"no model could be started from the {related} pairs of images that have something in common"
+
+
+def pair_report(pairs: Tensor, num_matches: Tensor, num_F: Tensor, num_H: Tensor, verdict: Tensor) -> PairReport:
+    """A pair report with integer tensors."""
+    return PairReport(*(t.to(torch.long) for t in (pairs, num_matches, num_F, num_H, verdict)))

@@ -1,0 +1,106 @@
+"""Results of finished stages on disk, so that an interrupted reconstruction goes on where it was."""
+
+import hashlib
+import json
+import os
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Arrays = dict[str, Tensor]
+
+
+@dataclass
+class Stages:
+    """Runs stages, times them, and keeps their tensors in a folder.
+
+    A saved stage is used again only if it was made from the same input: every file carries a fingerprint of the images and
+    options before it.
+
+    Attributes:
+        folder: Where to save; nowhere when None.
+        resume: Use what an earlier run saved.
+        fingerprint: What the results depend on.
+        seconds: Time each stage took.
+    """
+
+    folder: Path | None
+    resume: bool
+    fingerprint: str
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def run(self, name: str, compute: Callable[[], Arrays]) -> Arrays:
+        """The tensors of a stage, from disk if they are there and fit, else computed and saved."""
+        with self.timed(name):
+            if self.resume and (saved := self._load(name)) is not None:
+                return saved
+            arrays = compute()
+            self._save(name, arrays)
+            return arrays
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Add the time spent inside to a stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+    def _path(self, name: str) -> Path | None:
+        return None if self.folder is None else self.folder / "stages" / f"{name}.npz"
+
+    def _load(self, name: str) -> Arrays | None:
+        path = self._path(name)
+        if path is None or not path.exists():
+            return None
+        try:
+            arrays = load_arrays(path)
+        except (OSError, ValueError):
+            return None  # cut short by a crash: made again
+        if str(arrays.pop("fingerprint", "")) != self.fingerprint:
+            return None
+        return {key: torch.from_numpy(value) for key, value in arrays.items()}
+
+    def _save(self, name: str, arrays: Arrays) -> None:
+        path = self._path(name)
+        if path is None:
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Written beside and renamed, so that no half file is ever found under the name.
+        partial = path.with_suffix(".partial")
+        content: dict[str, Any] = {key: value.numpy() for key, value in arrays.items()}
+        with partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, fingerprint=np.array(self.fingerprint), **content)
+        os.replace(partial, path)
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    """The arrays of an `.npz` file, none of them pickled.
+
+    Raises:
+        ValueError: The file is no such archive, or a damaged one.
+    """
+    # NumPy leaves the file open when the archive is damaged; opened here it is closed.
+    with path.open("rb") as stream:
+        try:
+            with np.load(stream, allow_pickle=False) as file:
+                return {key: file[key] for key in file.files}
+        except (zipfile.BadZipFile, EOFError, KeyError, AttributeError, zlib.error) as error:
+            raise ValueError(str(error) or type(error).__name__) from error
+
+
+def fingerprint(files: list[Path], options: dict[str, Any]) -> str:
+    """A digest of names, sizes and modification times of files, and of options."""
+    listing = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    text = json.dumps([listing, options], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -1,0 +1,47 @@
+"""From matches between pairs to tracks through many images."""
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+
+def build_tracks(
+    view: Int[Tensor, "n"], match: Int[Tensor, "k 2"], priority: Int[Tensor, "k"] | None = None
+) -> Int[Tensor, "n"]:
+    """Join matching image points into tracks that pass through each image at most once.
+
+    Matches are taken in order of priority (Kruskal's algorithm on the graph of matches); one that would put two points of the
+    same image into one track contradicts better ones and is left out.
+
+    Args:
+        view: Image of each image point.
+        match: Pairs of matching image points.
+        priority: Matches with a larger value are taken first; among equals the earlier one.
+
+    Returns:
+        Track of each image point, numbered by first point, or -1 where a point matches nothing.
+    """
+    order = torch.arange(len(match)) if priority is None else torch.argsort(priority, descending=True, stable=True)
+    parent = list(range(len(view)))
+    # The images a track passes through, as the bits of one integer: disjointness is one operation at any number of images.
+    images = [1 << v for v in view.tolist()]
+    for a, b in match[order].tolist():
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        if a != b and not images[a] & images[b]:
+            parent[b] = a
+            images[a] |= images[b]
+    root = torch.tensor(parent, dtype=torch.long)
+    while not torch.equal(root, root[root]):
+        root = root[root]
+    size = torch.bincount(root, minlength=len(view))
+    first = torch.full((len(view),), len(view), dtype=torch.long)
+    first = first.scatter_reduce(0, root, torch.arange(len(view)), "amin")
+    _, track = torch.unique(torch.where(size[root] > 1, first[root], -1), return_inverse=True)
+    unmatched = bool((size[root] == 1).any())
+    numbered: Tensor = track - int(unmatched)
+    return numbered

@@ -1,0 +1,216 @@
+"""What the images say of each other: matches between all pairs, checked against epipolar geometry in one batched call."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.motion import estimate_fundamental, estimate_homography
+
+MIN_INLIERS = 15
+"""Fewer epipolar inliers than this also occur between unrelated images."""
+
+_ROWS_PER_CALL = 4_000_000
+"""Padded correspondences verified at once; bounds memory, changes no result."""
+
+
+class Verdict(IntEnum):
+    """What two images have to do with each other."""
+
+    UNRELATED = 0
+    """Too few matches agree with any epipolar geometry."""
+    GENERAL = 1
+    """Structure in depth seen from two places: the fundamental matrix is determined."""
+    PLANAR = 2
+    """A homography explains nearly all: one plane, seen from two places."""
+    ROTATION = 3
+    """A homography explains nearly all and is that of a camera turning about its centre: no depth can be found."""
+
+
+@dataclass(frozen=True)
+class ViewGraph:
+    """Image points, and which of them show the same scene point.
+
+    Attributes:
+        names: File names of the images.
+        image_size: Width and height in pixels.
+        x: Image points of all images, those of one image together, in pixels.
+        view: Image of each point.
+        color: Red, green, blue in [0, 1] at each point.
+        pairs: Pairs of images that were compared.
+        num_matches: Matches found per pair.
+        F: Fundamental matrix per pair, `x2' F x1 = 0`.
+        H: Homography per pair, `x2 ~ H x1`.
+        fundamental_inliers: Matches that agree with F.
+        homography_inliers: Matches that agree with H.
+        match: Verified matches, as indices into `x`.
+        match_pair: Pair of each verified match.
+    """
+
+    names: tuple[str, ...]
+    image_size: Int[Tensor, "v 2"]
+    x: Float[Tensor, "n 2"]
+    view: Int[Tensor, "n"]
+    color: Float[Tensor, "n 3"]
+    pairs: Int[Tensor, "q 2"]
+    num_matches: Int[Tensor, "q"]
+    F: Float[Tensor, "q 3 3"]
+    H: Float[Tensor, "q 3 3"]
+    fundamental_inliers: Int[Tensor, "q"]
+    homography_inliers: Int[Tensor, "q"]
+    match: Int[Tensor, "k 2"]
+    match_pair: Int[Tensor, "k"]
+
+    def verdicts(self, K: Float[Tensor, "v 3 3"]) -> Int[Tensor, "q"]:
+        """The `Verdict` on each pair, given (roughly known) intrinsics of each image.
+
+        A pair is called planar or rotating when its homography explains at least 80 % of what the fundamental matrix does
+        (Schönberger & Frahm 2016, section 4.1); the singular values of `K2^-1 H K1` are equal for a rotation alone.
+        """
+        related = self.fundamental_inliers >= MIN_INLIERS
+        flat = self.homography_inliers >= 0.8 * self.fundamental_inliers
+        K1, K2 = K[self.pairs[:, 0]], K[self.pairs[:, 1]]
+        turn = torch.linalg.solve_ex(K2, self.H @ K1).result
+        s = torch.linalg.svdvals(turn)
+        spread = s[:, 0] / s[:, 2].clamp(min=1e-12) - 1
+        verdict = torch.where(flat, int(Verdict.PLANAR), int(Verdict.GENERAL))
+        verdict = torch.where(flat & (spread < 0.05), int(Verdict.ROTATION), verdict)
+        return torch.where(related, verdict, int(Verdict.UNRELATED))
+
+
+def verify_pairs(
+    names: Sequence[str],
+    image_size: Int[Tensor, "v 2"],
+    x: Sequence[Float[Tensor, "_ 2"]],
+    color: Sequence[Float[Tensor, "_ 3"]],
+    pairs: Int[Tensor, "q 2"],
+    matches: Sequence[Int[Tensor, "_ 2"]],
+    *,
+    threshold: float = 3.0,
+    generator: torch.Generator | None = None,
+) -> ViewGraph:
+    """Keep the matches that agree with the epipolar geometry of their pair; all pairs are estimated together.
+
+    Args:
+        names: File names of the images.
+        image_size: Width and height in pixels.
+        x: Image points per image, in pixels.
+        color: Colours of the image points.
+        pairs: Pairs of images that were matched.
+        matches: Per pair, indices of matching points in its first and second image.
+        threshold: Largest distance of an inlier in pixels, for images whose longer side is 1600 pixels or less; it grows in
+            proportion beyond that.
+        generator: Source of randomness.
+
+    Returns:
+        The view graph; a pair with fewer than `MIN_INLIERS` inliers keeps its counts but none of its matches.
+    """
+    counts = torch.tensor([len(m) for m in matches], dtype=torch.long)
+    offset = torch.tensor([0, *(len(p) for p in x)], dtype=torch.long).cumsum(0)
+    q = len(pairs)
+    dtype = x[0].dtype if x else torch.float64
+    F, H = torch.zeros(q, 3, 3, dtype=dtype), torch.zeros(q, 3, 3, dtype=dtype)
+    num_F, num_H = torch.zeros(q, dtype=torch.long), torch.zeros(q, dtype=torch.long)
+    kept: dict[int, Tensor] = {}
+    scale = image_size.amax(dim=-1).to(dtype).div(1600).clamp(min=1)
+    for block in _blocks(counts):
+        slots = int(counts[block].max())
+        x1, x2 = torch.zeros(len(block), slots, 2, dtype=dtype), torch.zeros(len(block), slots, 2, dtype=dtype)
+        for row, index in enumerate(block.tolist()):
+            (i, j), m = pairs[index].tolist(), matches[index]
+            x1[row, : len(m)], x2[row, : len(m)] = x[i][m[:, 0]], x[j][m[:, 1]]
+        mask = torch.arange(slots) < counts[block, None]
+        limit = threshold * scale[pairs[block]].amax(dim=-1)
+        epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, generator=generator)
+        planar = estimate_homography(x1, x2, threshold=limit, mask=mask, generator=generator)
+        F[block], H[block] = epipolar.model, planar.model
+        num_F[block] = epipolar.inliers.sum(-1) * (epipolar.status == Status.OK)
+        num_H[block] = planar.inliers.sum(-1) * (planar.status == Status.OK)
+        for row, index in enumerate(block.tolist()):
+            if num_F[index] >= MIN_INLIERS:
+                kept[index] = matches[index][epipolar.inliers[row, : len(matches[index])]]
+    verified = sorted(kept)
+    edges = [kept[index] + offset[pairs[index]] for index in verified]
+    sizes = torch.tensor([len(e) for e in edges], dtype=torch.long)
+    return ViewGraph(
+        names=tuple(names),
+        image_size=image_size,
+        x=torch.cat(list(x)) if x else torch.zeros(0, 2, dtype=dtype),
+        view=torch.arange(len(x)).repeat_interleave(offset.diff()),
+        color=torch.cat(list(color)) if color else torch.zeros(0, 3, dtype=dtype),
+        pairs=pairs,
+        num_matches=counts,
+        F=F,
+        H=H,
+        fundamental_inliers=num_F,
+        homography_inliers=num_H,
+        match=torch.cat(edges) if edges else torch.zeros(0, 2, dtype=torch.long),
+        match_pair=torch.tensor(verified, dtype=torch.long).repeat_interleave(sizes),
+    )
+
+
+def _blocks(counts: Int[Tensor, "q"]) -> list[Int[Tensor, "_"]]:
+    """Pairs with enough matches, like sizes together, cut so that a padded block stays within memory."""
+    order = torch.argsort(counts, descending=True, stable=True)
+    order = order[counts[order] >= MIN_INLIERS]
+    blocks = []
+    while len(order):
+        rows = max(1, _ROWS_PER_CALL // int(counts[order[0]]))
+        blocks.append(order[:rows])
+        order = order[rows:]
+    return blocks
+
+
+def graph_from_tracks(
+    names: Sequence[str],
+    image_size: Int[Tensor, "v 2"],
+    x: Float[Tensor, "n 2"],
+    view: Int[Tensor, "n"],
+    track: Int[Tensor, "n"],
+    color: Float[Tensor, "n 3"],
+    *,
+    generator: torch.Generator | None = None,
+) -> tuple[ViewGraph, Int[Tensor, "n"]]:
+    """The view graph of given tracks: every pair of images that share enough of them, verified.
+
+    Args:
+        names: File names of the images.
+        image_size: Width and height in pixels.
+        x: Image points in pixels.
+        view: Image of each point.
+        track: Track of each point; two points of one image in one track keep the first.
+        color: Colour at each point.
+        generator: Source of randomness.
+
+    Returns:
+        The graph, whose image points are sorted by image, and their tracks.
+    """
+    order = torch.argsort(view, stable=True)
+    x, view, track, color = x[order], view[order], track[order], color[order]
+    v, labels = len(names), int(track.max()) + 1 if len(track) else 0
+    node = torch.full((v, labels), -1, dtype=torch.long)
+    flipped = torch.arange(len(x)).flip(0)
+    node[view[flipped], track[flipped]] = flipped
+    counts = torch.bincount(view, minlength=v)
+    start = counts.cumsum(0) - counts
+    seen = (node >= 0).double()
+    shared = (seen @ seen.T).triu(1)
+    pairs = (shared >= 15).nonzero()
+    matches = []
+    for i, j in pairs.tolist():
+        both = (node[i] >= 0) & (node[j] >= 0)
+        matches.append(torch.stack([node[i][both] - start[i], node[j][both] - start[j]], 1))
+    graph = verify_pairs(
+        names,
+        image_size,
+        list(torch.split(x, counts.tolist())),
+        list(torch.split(color, counts.tolist())),
+        pairs,
+        matches,
+        generator=generator,
+    )
+    return graph, track
