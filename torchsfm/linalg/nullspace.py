@@ -36,11 +36,11 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
         reflections.append((v, beta))
         if i + 1 < m:
             rest = a[i + 1 :, i:]
-            rest -= ((rest * v).sum(1) * beta)[:, None] * v
+            rest.addcmul_(((rest * v).sum(1) * beta)[:, None], v, value=-1)
     basis = torch.eye(n - m, n, dtype=a.dtype, device=a.device).roll(m, 1)[..., None].repeat(1, 1, batch)
     for i in range(m - 1, -1, -1):
         v, beta = reflections[i]
-        basis[:, i:] -= ((basis[:, i + 1 :] * v[1:]).sum(1) * beta)[:, None] * v
+        basis[:, i:].addcmul_(((basis[:, i + 1 :] * v[1:]).sum(1) * beta)[:, None], v, value=-1)
     assert smallest is not None
     return basis, smallest
 

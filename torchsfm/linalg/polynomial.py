@@ -32,10 +32,8 @@ def quadratic_rows(c0: Tensor, c1: Tensor, c2: Tensor) -> tuple[tuple[Tensor, Te
     return (torch.where(fine0, x0, 0), torch.where(fine1, x1, 0)), (ok0 & fine0, ok1 & fine1)
 
 
-def cubic_rows(
-    c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor
-) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
-    """The roots of c0 + c1 x + c2 x^2 + c3 x^3 with the coefficients as separate tensors.
+def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, Tensor]:
+    """The roots of c0 + c1 x + c2 x^2 + c3 x^3 with the coefficients as separate tensors; (3, ...) roots and real.
 
     The root farthest from the inflection point is well separated from the other two. It is found by Newton's method from a
     closed-form start; deflation leaves a quadratic (after Kahan, 1986). No trigonometric function is needed.
@@ -43,35 +41,31 @@ def cubic_rows(
     a, b, c = c2 / c3, c1 / c3, c0 / c3
     shift = a / -3
     Q = shift * shift - b / 3
-
     R = 0.5 * (((shift + a) * shift + b) * shift + c)
-    # Depressed: y^3 - 3 Q y + 2 R = 0 with x = y + shift.
+    # Depressed: y^3 - 3 Q y + 2 R = 0 with x = y + shift; |y| is looked for.
     size = R.abs()
-    root_q = Q.clamp_min(0).sqrt()
+    root = Q.clamp_min(0).sqrt()
     inner = size * size - Q * Q * Q
     outer = (size + inner.clamp_min(0).sqrt()) ** (1 / 3)
-    ratio = (size / (root_q * root_q * root_q)).clamp_max(1)
-    three = root_q * (1.7320508 + ratio * (0.3208 - 0.0529 * ratio))
-    y = torch.where(inner > 0, outer + Q / outer, three)
+    ratio = (size / (root * root * root)).clamp_max(1)
+    # 2 cos(acos(ratio) / 3) to three digits.
+    y = torch.where(inner > 0, outer + Q / outer, root * (1.7320508 + ratio * (0.3208 - 0.0529 * ratio)))
     for _ in range(2):
-        y = y - (y * (y * y - 3 * Q) - 2 * size) / (3 * (y * y - Q))
-    y = torch.copysign(torch.where(torch.isfinite(y), y, 0), -R)
+        square = y * y
+        y = y - (y * (square - 3 * Q) - 2 * size) / (3 * (square - Q))
+    y = torch.where(torch.isfinite(y), y, 0)
     rest = 3 * (4 * Q - y * y)
-    half = 0.5 * rest.clamp_min(0).sqrt()
     other = rest >= 0
-    roots = (y + shift, shift - 0.5 * y - half, shift - 0.5 * y + half)
-    reals = []
-    polished = []
-    for x, ok in zip(roots, (torch.ones_like(other), other, other), strict=True):
-        value = ((x + a) * x + b) * x + c
-        slope = (3 * x + 2 * a) * x + b
-        new = x - value / slope
-        better = (((new + a) * new + b) * new + c).abs() < value.abs()
-        new = torch.where(better, new, x)
-        fine = torch.isfinite(new)
-        polished.append(torch.where(fine, new, 0))
-        reals.append(ok & fine & (c3 != 0))
-    return (polished[0], polished[1], polished[2]), (reals[0], reals[1], reals[2])
+    y = torch.copysign(y, -R)
+    half, middle = 0.5 * rest.clamp_min(0).sqrt(), shift - 0.5 * y
+    x = torch.stack((shift + y, middle - half, middle + half))
+    # One step on the cubic itself, where it helps.
+    value = ((x + a) * x + b) * x + c
+    new = x - value / ((3 * x + 2 * a) * x + b)
+    better = (((new + a) * new + b) * new + c).abs() < value.abs()
+    x = torch.where(better, new, x)
+    fine = torch.isfinite(x) & (c3 != 0)
+    return torch.where(fine, x, 0), fine & torch.stack((torch.ones_like(other), other, other))
 
 
 def solve_quadratic(c: Float[Tensor, "*batch 3"]) -> Roots:
@@ -97,7 +91,7 @@ def solve_cubic(c: Float[Tensor, "*batch 4"]) -> Roots:
         Roots in three slots and the mask of real ones.
     """
     roots, real = cubic_rows(*c.unbind(-1))
-    return torch.stack(roots, -1), torch.stack(real, -1)
+    return roots.movedim(0, -1), real.movedim(0, -1)
 
 
 def companion_roots(c: Float[Tensor, "*batch m"]) -> Roots:

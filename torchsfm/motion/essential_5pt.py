@@ -3,7 +3,8 @@
 E is x X + y Y + z Z + w W in an orthonormal basis of the null space of the five linear equations; ten cubic equations in
 (x, y, z, w) remain, whose elimination leaves three that are linear in (x, y) and polynomial in z, and their determinant, of
 degree ten. The basis is taken such that z : w is about the direction of the baseline in the image plane: over it the solutions
-are spread, while over an arbitrary coordinate they crowd where the rotation, the baseline or the field of view is small. Every solution is polished on the manifold of essential matrices. All arithmetic has the batch in the last dimension.
+are spread, while over an arbitrary coordinate they crowd where the rotation, the baseline or the field of view is small. Every
+solution is polished on the manifold of essential matrices. All arithmetic has the batch in the last dimension.
 """
 
 from collections.abc import Sequence

@@ -1,13 +1,22 @@
-"""Seven points in two uncalibrated images: F with x2' F x1 = 0 and det F = 0 (Hartley & Zisserman 2004, 11.1.2)."""
+"""Seven points in two uncalibrated images: F with x2' F x1 = 0 and det F = 0 (Hartley & Zisserman 2004, 11.1.2).
+
+The seven linear equations leave a G0 + b G1, and the determinant is a cubic form in (a, b). All arithmetic has the batch in the
+last dimension.
+"""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg import adjugate_3x3, determinant_3x3, orthonormal_nullspace
+from torchsfm.linalg import determinant_3x3
+from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.polynomial import cubic_rows
 from torchsfm.optim import attach_implicit, wants_derivative
+
+_CHUNK = 2048
+"""Problems at a time: their matrices fit the cache."""
+_INDEPENDENT = 1e-13
 
 
 def equations(
@@ -37,48 +46,66 @@ def fundamental_7pt(
     Raises:
         ValueError: Wrong shape, dtype or device.
     """
-    check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
-    F, valid = _solve(x1.detach(), x2.detach())
+    batch = check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
+    with torch.no_grad():
+        rows1, rows2 = (x.detach().double().expand(*batch, 7, 2).reshape(-1, 7, 2).permute(1, 2, 0) for x in (x1, x2))
+        chunks = [_solve(a, b) for a, b in zip(rows1.split(_CHUNK, -1), rows2.split(_CHUNK, -1), strict=True)]
+        rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
+        F = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 3).to(x1.dtype)
+        valid = good.mT.reshape(*batch, 3)
     if wants_derivative(x1, x2):
         F = attach_implicit(equations, F, x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
     return Solutions(F, valid)
 
 
-def _similarity(x: Tensor) -> tuple[Tensor, Tensor]:
-    centre = x.mean(-2, keepdim=True)
-    size = (x - centre).abs().amax((-2, -1), keepdim=True)
-    scale = torch.where(size > 0, 1 / size, 1)
-    T = torch.zeros(*x.shape[:-2], 3, 3, dtype=x.dtype, device=x.device)
-    T[..., :1, :1], T[..., 1:2, 1:2], T[..., :2, 2:], T[..., 2, 2] = scale, scale, -(scale * centre).mT, 1
-    return (x - centre) * scale, T
-
-
-def _solve(x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
-    dtype = x1.dtype
-    x1, x2 = torch.broadcast_tensors(x1.double(), x2.double())
-    finite = torch.isfinite(x1).all(-1).all(-1) & torch.isfinite(x2).all(-1).all(-1)
-    y1, T1 = _similarity(torch.where(finite[..., None, None], x1, 0))
-    y2, T2 = _similarity(torch.where(finite[..., None, None], x2, 0))
-    h1 = torch.cat((y1, torch.ones_like(y1[..., :1])), -1)
-    h2 = torch.cat((y2, torch.ones_like(y2[..., :1])), -1)
-    A = (h2[..., :, None] * h1[..., None, :]).flatten(-2)
-    basis = orthonormal_nullspace(A)
-    G, K = basis[..., 0].unflatten(-1, (3, 3)), basis[..., 1].unflatten(-1, (3, 3))
-    # det(a G + b K), with a^3 first.
-    c0, c3 = determinant_3x3(K), determinant_3x3(G)
-    c1, c2 = (adjugate_3x3(K).mT * G).sum((-2, -1)), (adjugate_3x3(G).mT * K).sum((-2, -1))
-    turn = c0.abs() > c3.abs()
+def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tuple[Tensor, Tensor]:
+    """F as (9, 3, batch) and valid as (3, batch)."""
+    count = x1.shape[-1]
+    if count == 1:
+        x1, x2 = x1.repeat(1, 1, 2), x2.repeat(1, 1, 2)
+    h1, c1, s1, fine1 = _normalised(x1)
+    h2, c2, s2, fine2 = _normalised(x2)
+    basis, pivot = nullspace_rows((h2[:, :, None] * h1[:, None]).flatten(1, 2))
+    G = basis.unflatten(1, (3, 3))
+    r0, r1, r2 = G.unbind(1)
+    cofactors = torch.stack((_cross(r1, r2), _cross(r2, r0), _cross(r0, r1)), 1)
+    # det(a G0 + b G1): the coefficients of b^3, a b^2, a^2 b, a^3.
+    d0 = (cofactors[1, 0] * G[1, 0]).sum(0)
+    d1 = (cofactors[1] * G[0]).flatten(0, 1).sum(0)
+    d2 = (cofactors[0] * G[1]).flatten(0, 1).sum(0)
+    d3 = (cofactors[0, 0] * G[0, 0]).sum(0)
+    # The larger of the outer coefficients leads.
+    turn = d0.abs() > d3.abs()
     roots, real = cubic_rows(
-        torch.where(turn, c3, c0), torch.where(turn, c2, c1), torch.where(turn, c1, c2), torch.where(turn, c0, c3)
+        torch.where(turn, d3, d0), torch.where(turn, d2, d1), torch.where(turn, d1, d2), torch.where(turn, d0, d3)
     )
-    r = torch.stack(roots, -1)[..., None, None]
-    t = turn[..., None, None, None]
-    G, K = G[..., None, :, :], K[..., None, :, :]
-    F = torch.where(t, G + r * K, r * G + K)
-    F = T2.mT[..., None, :, :] @ F @ T1[..., None, :, :]
-    norm = (F * F).sum((-2, -1), keepdim=True).sqrt()
-    F = F / norm
-    valid = torch.stack(real, -1) & finite[..., None] & torch.isfinite(F).all(-1).all(-1)
-    # The rank of A: the product of its pivots is small where the equations are dependent.
-    fallback = torch.eye(3, dtype=F.dtype, device=F.device)
-    return torch.where(valid[..., None, None], F, fallback).to(dtype), valid
+    one = torch.ones_like(roots)
+    F = torch.where(turn, one, roots) * basis[0, :, None] + torch.where(turn, roots, one) * basis[1, :, None]
+    # Back to the coordinates that came: T2' F T1 with the similarities T = [s I, -s c].
+    F = F.unflatten(0, (3, 3))
+    last = F[:, 2] - s1 * (c1[0] * F[:, 0] + c1[1] * F[:, 1])
+    F = torch.stack((s1 * F[:, 0], s1 * F[:, 1], last), 1)
+    last = F[2] - s2 * (c2[0] * F[0] + c2[1] * F[1])
+    F = torch.cat((s2 * F[0], s2 * F[1], last))
+    F = F * (F * F).sum(0).rsqrt()
+    valid = real & (fine1 & fine2 & (pivot > _INDEPENDENT)) & torch.isfinite(F).all(0)
+    # An empty slot holds diag(1, 1, 0).
+    empty = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=F.dtype, device=F.device)[:, None, None] / 2**0.5
+    return torch.where(valid, F, empty)[..., :count], valid[..., :count]
+
+
+def _normalised(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Homogeneous points (7, 3, batch) with |u|, |v| <= 1; centre, scale, and which elements are finite and not a point."""
+    low, high = x.amin(0), x.amax(0)
+    centre, size = 0.5 * (low + high), 0.5 * (high - low).amax(0)
+    fine = torch.isfinite(size) & (size > 0)
+    scale = 1 / torch.where(fine, size, 1)
+    h = torch.ones(7, 3, x.shape[-1], dtype=x.dtype, device=x.device)
+    h[:, :2] = torch.where(fine, (x - centre) * scale, 0)
+    return h, centre, scale, fine
+
+
+def _cross(a: Float[Tensor, "k 3 batch"], b: Float[Tensor, "k 3 batch"]) -> Float[Tensor, "k 3 batch"]:
+    a0, a1, a2 = a.unbind(1)
+    b0, b1, b2 = b.unbind(1)
+    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0), 1)
