@@ -1,6 +1,6 @@
 """The essential matrix from corresponding rays of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -10,46 +10,78 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.geometry import cross_matrix, rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import (
-    damped_solve,
-    frame,
-    left_epipole,
+    cofactor_rows,
+    forms,
     normal_equations,
-    oriented,
+    one_data_set_for_many,
     sphere_rows,
     squared_distance,
 )
 from torchsfm.motion.essential_5pt import essential_5pt
-from torchsfm.robust import RobustResult, ransac
+from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.tensors import essential_from_pose
 
 
 @dataclass(frozen=True)
-class EssentialEstimator:
-    """E with d2' E d1 = 0, |E|^2 = 2. Distances are Sampson's on the sphere of rays, in radians."""
+class RelativePoseEstimator:
+    """The pose [R | t] of the second camera, |t| = 1, from corresponding rays.
 
-    model_name: ClassVar[str] = "essential"
+    Distances are Sampson's on the sphere of rays, in radians, and infinite for rays that meet behind a camera. Of two rays that
+    meet far away the noise decides on which side: they must miss the front by an angle to count as behind.
+
+    Attributes:
+        slack: That angle in radians, for each problem.
+    """
+
+    slack: Float[Tensor, "*batch"]
+
+    model_name: ClassVar[str] = "relative_pose"
     data_names: ClassVar[tuple[str, ...]] = ("d1", "d2")
     sample_size: ClassVar[int] = 5
     max_solutions: ClassVar[int] = 10
 
     def minimal(
         self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]
-    ) -> Solutions[Float[Tensor, "*batch 10 3 3"]]:
-        """The E of five rays that can meet in front of both cameras."""
+    ) -> Solutions[Float[Tensor, "*batch 10 3 4"]]:
+        """The poses for which five rays meet in front of both cameras; at most one of the four of each E."""
         solutions = essential_5pt(d1, d2)
-        possible = oriented(solutions.model, d1.mT[..., None, :, :], d2.mT[..., None, :, :])
-        return replace(solutions, valid=solutions.valid & possible)
+        E = solutions.model
+        h1, h2 = sphere_rows(d1[..., None, :, :]), sphere_rows(d2[..., None, :, :])
+        C = torch.stack([torch.stack(row, -1) for row in cofactor_rows(E)], -2)
+        best = (C * C).sum(-2).argmax(-1)
+        t = C.gather(-1, best[..., None, None].expand(*best.shape, 3, 1))[..., 0]
+        t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
+        turned = _cross_rows(t, E)
+        pose, valid = torch.cat((C, t[..., None]), -1), torch.zeros_like(solutions.valid)
+        # E = [t]x R or -E = [t]x R, each with t or -t (Horn 1990).
+        for sign in (-1, 1):
+            R = C + sign * turned
+            first, second = self._depths(R, t, h1, h2)
+            least, most = torch.minimum(first, second).amin(-1), torch.maximum(first, second).amax(-1)
+            slack = self.slack[..., None]
+            for direction, front in ((1, least > -slack), (-1, most < slack)):
+                front = front & solutions.valid & ~valid
+                pose = torch.where(front[..., None, None], torch.cat((R, direction * t[..., None]), -1), pose)
+                valid = valid | front
+        fallback = torch.eye(3, 4, dtype=pose.dtype, device=pose.device)
+        fallback[:, 3] = fallback[:, 2]
+        return Solutions(torch.where(valid[..., None, None], pose, fallback), valid)
 
     def squared_residual(
-        self, E: Float[Tensor, "*#batch 3 3"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
+        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
     ) -> Float[Tensor, "*batch n"]:
-        """Squared angular Sampson distance."""
-        return squared_distance(E, sphere_rows(d1), sphere_rows(d2), sphere=True)
+        """Squared angular Sampson distance; infinite behind a camera."""
+        h1, h2 = sphere_rows(d1), sphere_rows(d2)
+        R, t = model[..., :3], model[..., 3]
+        squared = squared_distance(_cross_rows(t, R), h1, h2, sphere=True)
+        first, second = self._depths(R, t, h1, h2)
+        return torch.where(torch.minimum(first, second) > -self.slack[..., None], squared, torch.inf)
 
     def residual(
-        self, E: Float[Tensor, "*#batch 3 3"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
+        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
     ) -> Float[Tensor, "*batch n"]:
         """Sampson distance in radians: by how much the two rays must turn together to meet, to first order."""
-        return self.squared_residual(E, d1, d2).sqrt()
+        return self.squared_residual(model, d1, d2).sqrt()
 
     def degenerate(self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]) -> Bool[Tensor, "*batch"]:
         """Whether the first two rays coincide in an image."""
@@ -57,25 +89,44 @@ class EssentialEstimator:
 
     def refine(
         self,
-        E: Float[Tensor, "*#batch 3 3"],
+        model: Float[Tensor, "*#batch 3 4"],
         d1: Float[Tensor, "*#batch n 3"],
         d2: Float[Tensor, "*#batch n 3"],
         *,
         weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 3"]:
-        """A Gauss-Newton step on Sampson's distance along E <- exp(a) E exp(b), with b moving the first epipole alone."""
-        A, b = normal_equations(E, sphere_rows(d1), sphere_rows(d2), weights, sphere=True)
-        E = E.double()
-        axes = torch.eye(3, dtype=E.dtype, device=E.device)
-        turn = frame(left_epipole(E.mT))[..., :2].mT
-        left = cross_matrix(axes) @ E[..., None, :, :]
-        right = E[..., None, :, :] @ cross_matrix(turn)
-        tangent = torch.cat((left, right), -3).flatten(-2).mT
-        step = damped_solve(tangent.mT @ A @ tangent, (b[..., None, :] @ tangent)[..., 0, :])
-        R2 = rotation_from_rotvec(-step[..., :3])
-        R1 = rotation_from_rotvec(-(step[..., None, 3:] @ turn)[..., 0, :])
-        E = R2 @ E @ R1
-        return (E * (2**0.5 / E.flatten(-2).norm(dim=-1)[..., None, None])).to(d1.dtype)
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """A Gauss-Newton step on Sampson's distance: R <- exp(w) R, and t along the unit sphere."""
+        R, t = model[..., :3], model[..., 3]
+        A, b = normal_equations(_cross_rows(t, R), sphere_rows(d1), sphere_rows(d2), weights, sphere=True)
+        R, t = R.double(), t.double()
+        axes = cross_matrix(torch.eye(3, dtype=R.dtype, device=R.device))
+        turn = cross_matrix(t)[..., None, :, :] @ axes @ R[..., None, :, :]
+        # The three moves of t include one along t, which changes the length of E alone: damping leaves it at zero.
+        move = axes @ R[..., None, :, :]
+        tangent = torch.cat((turn, move), -3).flatten(-2).mT
+        step = -damped_solve(tangent.mT @ A @ tangent, tangent.mT @ b[..., None])[..., 0]
+        t = t + step[..., 3:]
+        t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
+        return torch.cat((rotation_from_rotvec(step[..., :3]) @ R, t[..., None]), -1).to(d1.dtype)
+
+    @staticmethod
+    def _depths(R: Tensor, t: Tensor, h1: list[Tensor], h2: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """The depths along unit rays, times the squared sine of the angle between them."""
+        if one_data_set_for_many(R, h1[0]):
+            cosine = R.flatten(-2) @ torch.cat([b * a for b in h2 for a in h1], -2)
+        else:
+            a = forms(R, h1)
+            cosine = a[0] * h2[0] + a[1] * h2[1] + a[2] * h2[2]
+        (along2,) = forms(t[..., None, :], h2)
+        (along1,) = forms((R * t[..., None]).sum(-2)[..., None, :], h1)
+        return along2 * cosine - along1, along2 - along1 * cosine
+
+
+def _cross_rows(t: Tensor, A: Tensor) -> Tensor:
+    """[t]x A."""
+    t0, t1, t2 = t[..., None].unbind(-2)
+    a0, a1, a2 = A.unbind(-2)
+    return torch.stack((t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0), -2)
 
 
 def estimate_essential(
@@ -91,9 +142,9 @@ def estimate_essential(
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The essential matrix of each pair of calibrated cameras, from corresponding rays of which many may be wrong.
 
-    LO-RANSAC over five-point samples with the oriented epipolar constraint, then a robust minimum of Sampson's distance over the
-    essential matrices. `pose_from_essential` turns the result into a pose. A pure rotation leaves E undetermined without a sign of
-    it here: every translation then fits.
+    LO-RANSAC over the poses of five-point samples, scored by Sampson's distance for rays that meet in front of both cameras, then
+    a robust minimum of that distance over the poses. `pose_from_essential` turns the result into a pose. A pure rotation leaves
+    E undetermined without a sign of it here: every translation then fits.
 
     Args:
         d1: Rays of the first camera, of any length, pointing to the points.
@@ -115,10 +166,12 @@ def estimate_essential(
     check_tensors(d1=(d1, "n 3"), d2=(d2, "n 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
     length1, length2 = d1.double().norm(dim=-1, keepdim=True), d2.double().norm(dim=-1, keepdim=True)
     # A ray of length 0 becomes NaN, and is left out.
+    slack = threshold.double() if isinstance(threshold, Tensor) else length1.new_tensor(threshold)
+    batch = torch.broadcast_shapes(d1.shape[:-2], d2.shape[:-2], slack.shape, () if mask is None else mask.shape[:-1])
     result = ransac(
-        EssentialEstimator(), d1 / length1, d2 / length2,
-        threshold=threshold.double() if isinstance(threshold, Tensor) else threshold, mask=mask,
+        RelativePoseEstimator(slack.expand(batch)), d1 / length1, d2 / length2, threshold=slack, mask=mask,
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
         max_iterations=max_iterations, scoring_dtype=torch.float32,
     )  # fmt: skip
-    return replace(result, model=result.model.to(d1.dtype), score=result.score.to(d1.dtype))
+    E = essential_from_pose(result.model[..., :3], result.model[..., 3])
+    return RobustResult(E.to(d1.dtype), result.inliers, result.score.to(d1.dtype), result.iterations, result.status)

@@ -8,18 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.motion.epipolar_fit import (
-    damped_solve,
-    frame,
-    left_epipole,
-    normal_equations,
-    oriented,
-    plane_rows,
-    squared_distance,
-)
+from torchsfm.motion.epipolar_fit import cofactor_rows, forms, normal_equations, plane_rows, squared_distance
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.normalization import common_scale
-from torchsfm.robust import RobustResult, ransac
+from torchsfm.robust import RobustResult, damped_solve, ransac
 
 
 @dataclass(frozen=True)
@@ -34,9 +26,16 @@ class FundamentalEstimator:
     def minimal(
         self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]
     ) -> Solutions[Float[Tensor, "*batch 3 3 3"]]:
-        """The F of seven points that can be in front of both cameras."""
+        """The F of seven points that can be in front of both cameras: e2 x h2 ~ F h1 with one sign (Chum, Werner & Matas 2004)."""
         solutions = fundamental_7pt(x1, x2)
-        possible = oriented(solutions.model, plane_rows(x1)[..., None, :, :], plane_rows(x2)[..., None, :, :])
+        C = torch.stack([torch.stack(row, -1) for row in cofactor_rows(solutions.model)], -2)
+        best = (C * C).sum(-2).argmax(-1)
+        e0, e1, e2 = C.gather(-1, best[..., None, None].expand(*best.shape, 3, 1)).unbind(-2)
+        h1, h2 = plane_rows(x1[..., None, :, :]), plane_rows(x2[..., None, :, :])
+        l0, l1, l2 = forms(solutions.model, h1)
+        u, v, _ = h2
+        side = (e1 - e2 * v) * l0 + (e2 * u - e0) * l1 + (e0 * v - e1 * u) * l2
+        possible = (side.amin(-1) >= 0) | (side.amax(-1) <= 0)
         return replace(solutions, valid=solutions.valid & possible)
 
     def squared_residual(
@@ -63,23 +62,31 @@ class FundamentalEstimator:
         *,
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 3"]:
-        """A Gauss-Newton step on Sampson's distance along the matrices of rank 2.
+        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and, to second order, of determinant 0.
 
-        In frames that end in the two epipoles F is [[M, 0], [0, 0]], and its tangents change everything but the last entry.
+        The step minimises the quadratic model under the linearised constraint (sequential quadratic programming).
         """
         A, b = normal_equations(F, plane_rows(x1), plane_rows(x2), weights, sphere=False)
         F = F.double()
-        V2, V1 = frame(left_epipole(F)), frame(left_epipole(F.mT))
-        basis = (V2[..., :, None, :, None] * V1[..., None, :, None, :]).flatten(-4, -3).flatten(-2)
-        A, b = (basis.mT @ A @ basis)[..., :8, :8], (b[..., None, :] @ basis)[..., 0, :8]
-        own = (V2.mT @ F @ V1).flatten(-2)[..., :8]
-        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * own[..., :, None] * own[..., None, :]
-        entry = own - damped_solve(A, b)
-        m0, m1, q0, m2, m3, q1, p0, p1 = entry.unbind(-1)
-        det = m0 * m3 - m1 * m2
-        corner = (p0 * (m3 * q0 - m1 * q1) + p1 * (m0 * q1 - m2 * q0)) / torch.where(det == 0, 1, det)
-        F_new = V2 @ torch.cat((entry, corner[..., None]), -1).unflatten(-1, (3, 3)) @ V1.mT
-        return (F_new / F_new.flatten(-2).norm(dim=-1)[..., None, None]).to(x1.dtype)
+        f, cofactors = F.flatten(-2), torch.stack([c for row in cofactor_rows(F) for c in row], -1)
+        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * f[..., :, None] * f[..., None, :]
+        free, bound = damped_solve(A, torch.stack((b, cofactors), -1)).unbind(-1)
+        gap = (cofactors * f).sum(-1) / 3 - (cofactors * free).sum(-1)
+        share = (cofactors * bound).sum(-1)
+        f = f - free - (gap / torch.where(share > 0, share, torch.inf))[..., None] * bound
+        return (f * (f * f).sum(-1, keepdim=True).rsqrt()).unflatten(-1, (3, 3)).to(x1.dtype)
+
+
+def _singular(F: Tensor) -> Tensor:
+    """Move matrices of small determinant to determinant 0 by Newton steps along its gradient, and to norm 1."""
+    f = F.flatten(-2)
+    for _ in range(3):
+        c = torch.stack([c for row in cofactor_rows(f.unflatten(-1, (3, 3))) for c in row], -1)
+        square = (c * c).sum(-1)
+        f = f - ((c * f).sum(-1) / 3 / torch.where(square > 0, square, 1))[..., None] * c
+        size = (f * f).sum(-1, keepdim=True).sqrt()
+        f = f / torch.where(size > 0, size, 1)
+    return f.unflatten(-1, (3, 3))
 
 
 def estimate_fundamental(
@@ -123,7 +130,5 @@ def estimate_fundamental(
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
         max_iterations=max_iterations, scoring_dtype=torch.float32,
     )  # fmt: skip
-    F = y.T2.mT @ result.model @ y.T1
-    size = F.flatten(-2).norm(dim=-1)[..., None, None]
-    F = F / torch.where(size > 0, size, 1)
-    return replace(result, model=F.to(x1.dtype), score=result.score.to(x1.dtype))
+    F = _singular(y.T2.mT @ _singular(result.model) @ y.T1)
+    return RobustResult(F.to(x1.dtype), result.inliers, result.score.to(x1.dtype), result.iterations, result.status)

@@ -8,12 +8,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.motion.epipolar_fit import damped_solve, one_datum_set_for_many, plane_rows, squares
+from torchsfm.motion.epipolar_fit import forms, plane_rows
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale
-from torchsfm.robust import RobustResult, ransac
+from torchsfm.robust import RobustResult, damped_solve, ransac
 
-_PAIR = [[0, 3, 4], [3, 1, 5], [4, 5, 2]]
+# Where entry ((i, j), (k, l)) of a sum of Kronecker products is among 6 x 6 products, both in the order 00, 01, 02, 11, 12, 22.
+_PAIR = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+_KRONECKER = [6 * _PAIR[i][k] + _PAIR[j][m] for i in range(3) for j in range(3) for k in range(3) for m in range(3)]
 
 
 @dataclass(frozen=True)
@@ -85,20 +87,20 @@ class HomographyEstimator:
         good = (det > 0) & (weights > 0)
         inverse = torch.where(good, 1 / torch.where(good, det, 1), 0)
         k0, k1 = (s11 * c0 - s01 * c1) * inverse, (s00 * c1 - s01 * c0) * inverse
-        shift = torch.stack((B[0] * k0 + B[2] * k1, B[1] * k0 + B[3] * k1, torch.zeros_like(k0)), -2)
-        p1 = plane_rows(x1) - shift
+        x, y = x1[..., 0] - B[0] * k0 - B[2] * k1, x1[..., 1] - B[1] * k0 - B[3] * k1
+        one = torch.ones_like(x)
         u, v = x2[..., 0] - w * k0, x2[..., 1] - w * k1
-        q00, q01, q11 = s11 * inverse * weights, -s01 * inverse * weights, s00 * inverse * weights
-        # Rows of [-I, x2]' S^-1 [-I, x2], in the order xx, yy, zz, xy, xz, yz.
+        inverse, k0, k1 = inverse * weights, k0 * weights, k1 * weights
+        q00, q01, q11 = s11 * inverse, -s01 * inverse, s00 * inverse
+        # The distinct entries of [-I, x2]' S^-1 [-I, x2], and those of h1 h1'.
         z0, z1 = q00 * u + q01 * v, q01 * u + q11 * v
-        metric = torch.stack((q00, q11, z0 * u + z1 * v, q01, -z0, -z1), -2)
-        moments = (metric @ squares(p1).mT).double()
-        A = moments[..., _PAIR, :][..., _PAIR].transpose(-3, -2).flatten(-2).flatten(-3, -2)
-        k0, k1 = k0 * weights, k1 * weights
-        b = (torch.stack((-k0, -k1, k0 * u + k1 * v), -2) @ p1.mT).double().flatten(-2)
+        metric = torch.stack((q00, q01, -z0, q11, -z1, z0 * u + z1 * v), -2)
+        moments = (metric @ torch.stack((x * x, x * y, x, y * y, y, one), -2).mT).double().flatten(-2)
+        A = moments.index_select(-1, torch.tensor(_KRONECKER, device=H.device)).unflatten(-1, (9, 9))
+        b = (torch.stack((-k0, -k1, k0 * u + k1 * v), -2) @ torch.stack((x, y, one), -2).mT).double().flatten(-2)
         h = H.double().flatten(-2)
         A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * h[..., :, None] * h[..., None, :]
-        h = h - damped_solve(A, b)
+        h = h - damped_solve(A, b[..., None])[..., 0]
         return (h / h.norm(dim=-1, keepdim=True)).unflatten(-1, (3, 3)).to(x1.dtype)
 
 
@@ -106,12 +108,7 @@ def _constraint(
     H: Tensor, x1: Tensor, x2: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
     """The constraint c, the depth w, S, and B row by row."""
-    h = plane_rows(x1)
-    if one_datum_set_for_many(H, x1):
-        h = h[..., 0, :, :]
-        y0, y1, w = H[..., 0, :] @ h, H[..., 1, :] @ h, H[..., 2, :] @ h
-    else:
-        y0, y1, w = (H @ h).unbind(-2)
+    y0, y1, w = forms(H, plane_rows(x1))
     u, v = x2[..., 0], x2[..., 1]
     c0, c1 = u * w - y0, v * w - y1
     h00, h01, h10, h11, h20, h21 = (H[..., i, j, None] for i in range(3) for j in range(2))

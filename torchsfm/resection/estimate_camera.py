@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.geometry import cross_matrix, rotation_from_rotvec
+from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import RobustResult, ransac
+from torchsfm.robust import RobustResult, damped_solve, ransac
 
 
 @dataclass(frozen=True)
@@ -89,24 +89,12 @@ class CameraEstimator:
         full = torch.cat((J, r[..., None, :]), -2)
         moments = (full @ J.mT).double()
         A, g = moments[..., :6, :], moments[..., 6, :]
-        step = -_solve(A, g)
+        step = -damped_solve(A, g[..., None])[..., 0]
         pose = model.double()
         R = rotation_from_rotvec(step[..., :3])
         pose = R @ pose
         pose = torch.cat((pose[..., :3], pose[..., 3:] + step[..., 3:, None]), -1)
         return pose.to(x.dtype)
-
-
-def _solve(A: Tensor, b: Tensor) -> Tensor:
-    """Solve normal equations scaled to a unit diagonal; no step where that fails."""
-    scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
-    A = A * scale[..., :, None] * scale[..., None, :] + 1e-10 * eye
-    factor, info = torch.linalg.cholesky_ex(A)
-    good = (info == 0) & torch.isfinite(scale).all(-1)
-    factor = torch.where(good[..., None, None], factor, eye)
-    step = torch.cholesky_solve((b * scale)[..., None], factor)[..., 0] * scale
-    return torch.where(good[..., None] & torch.isfinite(step), step, 0)
 
 
 def estimate_camera(

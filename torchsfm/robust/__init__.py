@@ -1,6 +1,7 @@
 """Engine: which model do most of the data agree on? It knows no model; the rooms that do bring an `Estimator`."""
 
 from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.local_optimisation import damped_solve
 from torchsfm.robust.ransac import RobustResult, ransac
 
-__all__ = ["Estimator", "RobustResult", "ransac"]
+__all__ = ["Estimator", "RobustResult", "damped_solve", "ransac"]

@@ -1,6 +1,6 @@
 """What robust estimation needs to know of a problem, and nothing more."""
 
-from typing import ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -21,6 +21,8 @@ class Estimator(Protocol[M]):
     All methods work on any leading batch dimensions, which broadcast between models, data and fields, and treat each element on
     its own. Nothing here may raise on bad values.
 
+    The signatures below are as wide as they are so that implementations can name their data.
+
     An implementation may also define `squared_residual(model, *data)`: the square of `residual`, where that is cheaper.
     """
 
@@ -29,18 +31,21 @@ class Estimator(Protocol[M]):
     max_solutions: ClassVar[int]
     """The number of solution slots that `minimal` returns."""
 
-    def minimal(self, *sample: Float[Tensor, "*#batch m _"]) -> Solutions[M]:
-        """The models through a minimal sample, `(*batch, m, d)` -> `(*batch, slots, ...)`."""
+    def minimal(self, *sample: Any, **options: Any) -> Solutions[M]:
+        """The models through minimal samples: tensors `(*batch, m, d)` -> `(*batch, slots, ...)`."""
         ...
 
-    def residual(self, model: M, *data: Float[Tensor, "*#batch n _"]) -> Float[Tensor, "*batch n"]:
+    def residual(self, model: M, *data: Any, **options: Any) -> Float[Tensor, "*batch n"]:
         """The distance of every datum to the model: unsquared, in the unit of the threshold."""
         ...
 
-    def degenerate(self, *sample: Float[Tensor, "*#batch m _"]) -> Bool[Tensor, "*batch"]:
+    def degenerate(self, *sample: Any, **options: Any) -> Bool[Tensor, "*batch"]:
         """Whether a sample is not worth solving: it determines no model, or none that could be right."""
         ...
 
-    def refine(self, model: M, *data: Float[Tensor, "*#batch n _"], weights: Float[Tensor, "*#batch n"]) -> M:
-        """One Gauss-Newton step, from a model, on the weighted sum of squared residuals, along the model's own manifold."""
+    def refine(self, model: M, *data: Any, **weights: Any) -> M:
+        """One Gauss-Newton step from a model on the sum of `weights` times squared residuals, along the model's own manifold.
+
+        Called as `refine(model, *data, weights=weights)` with weights `(*batch, n)`, 0 for data to leave out.
+        """
         ...

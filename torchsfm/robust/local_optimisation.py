@@ -56,3 +56,16 @@ def polish(
         weights = torch.where((ratio < 4) & inside[:, None], 1 / (1 + 4 * ratio), 0)
         model = estimator.refine(model, *data, weights=weights)
     return model
+
+
+def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"]) -> Float[Tensor, "*batch k r"]:
+    """Solve normal equations `A x = b`, damped as little as makes them definite; zero where even that fails.
+
+    The unknowns are scaled to a unit diagonal first, so that they may be of different units.
+    """
+    scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-280).rsqrt()
+    eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
+    factor, info = torch.linalg.cholesky_ex(A * scale[..., :, None] * scale[..., None, :] + 1e-10 * eye)
+    factor = torch.where((info == 0)[..., None, None], factor, eye)
+    x = torch.cholesky_solve(b * scale[..., None], factor) * scale[..., None]
+    return torch.where((info == 0)[..., None, None] & torch.isfinite(x), x, 0)

@@ -32,7 +32,7 @@ class Problems:
     """
 
     estimator: Estimator[Any]
-    data: tuple[Float[Tensor, "p width _"], ...]
+    data: tuple[Float[Tensor, "p *models width _"], ...]
     inside: Bool[Tensor, "p width"]
     count: Int[Tensor, "p"]
     limit: Float[Tensor, "p"]
@@ -77,17 +77,16 @@ def pack(
     width = SMALLEST_WIDTH * torch.ones_like(count)
     while bool((wider := width < count).any()):
         width = torch.where(wider, 2 * width, width)
-    for size in width[chosen].unique().tolist():
+    for size in sorted(set(width[chosen].tolist())):
         member = (chosen & (width == size)).nonzero()[:, 0]
         source = compact(usable[member], count[member], size)
         inside = torch.arange(size, device=count.device) < count[member, None]
         ranking = None
         if trust is not None:
             sorted_by = torch.where(inside, trust[member].gather(1, source), -torch.inf)
-            ranking = sorted_by.argsort(-1, descending=True, stable=True)
+            ranking = sorted_by.argsort(dim=-1, descending=True, stable=True)
         packed = tuple(d[member].mT.gather(2, source[:, None].expand(-1, d.shape[-1], -1)).mT for d in data)
-        own = _at(estimator, member)
-        yield Problems(own, packed, inside, count[member], limit[member], ranking, source, member)
+        yield Problems(_at(estimator, member), packed, inside, count[member], limit[member], ranking, source, member)
 
 
 def _at(estimator: Estimator[Any], member: Tensor) -> Estimator[Any]:

@@ -58,8 +58,8 @@ def ransac(
     """Estimate a model for each problem of a batch from data of which many may be wrong.
 
     Minimal samples are solved in float64, hypotheses are scored and locally optimised in `scoring_dtype`, and the best model of
-    each problem is refined in float64 on all its inliers with a robust loss. A problem ends when, with the given confidence, one
-    of its samples was free of outliers, by the exact probability of such a sample.
+    each problem is refined in float64 on all its inliers with a robust loss. A problem ends when, with the given confidence,
+    one of its samples was free of outliers, by the exact probability of such a sample.
 
     Rows with NaN or infinite numbers are left out. The result for a problem is the same whatever else is in the batch.
 
@@ -126,7 +126,7 @@ def ransac(
             score[member] = soft
             iterations[member] = best.iterations
         return RobustResult(
-            tensor_map(lambda t: t.to(dtype).unflatten(0, batch) if batch else t[0].to(dtype), model),
+            tensor_map(lambda t: t.to(dtype).reshape(*batch, *t.shape[1:]), model),
             inliers.reshape(*batch, n),
             score.to(dtype).reshape(batch),
             iterations.reshape(batch),

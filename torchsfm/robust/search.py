@@ -71,7 +71,7 @@ def search(problems: Problems, options: Options) -> Best:
     while len(active):
         group = _chunk(device, size * problems.estimator.max_solutions * min(problems.width, 64))
         parts = []
-        for part in active.split(group):
+        for part in torch.split(active, group):
             parts.append(_round(problems.take(part), coarse.take(part), _take(best, part), options, drawn, size))
         found = join(parts)
         best = _put(best, active, found)
@@ -146,7 +146,7 @@ def _hypotheses(fine: Problems, options: Options, drawn: int, size: int) -> tupl
     sample = []
     for d in fine.data:
         picked = d.mT.gather(2, index[:, None].expand(-1, d.shape[-1], -1))
-        sample.append(picked.unflatten(2, (m, size)).permute(0, 3, 2, 1))
+        sample.append(picked.reshape(*picked.shape[:2], m, size).permute(0, 3, 2, 1))
     estimator = fine.spread().estimator
     solutions = estimator.minimal(*sample)
     valid = solutions.valid & ~estimator.degenerate(*sample)[..., None]
@@ -179,7 +179,7 @@ def _polished(problems: Problems, best: Best) -> Best:
     """Refine the best models in float64 on all data, and keep what does not lose support."""
     group = _chunk(problems.count.device, 16 * problems.width)
     parts = []
-    for part in torch.arange(len(problems.count), device=problems.count.device).split(group):
+    for part in torch.split(torch.arange(len(problems.count), device=problems.count.device), group):
         some, old = problems.take(part), cast(_take(best, part), torch.float64)
         wide = some.spread()
         start = tensor_map(lambda t: t[:, None], old.model)
