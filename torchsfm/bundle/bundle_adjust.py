@@ -94,8 +94,9 @@ def bundle_adjust(
     model = type(cameras.distortion)
     columns = free_columns(free, model)
     rows = camera_rows(cameras)
+    start = torch.cat((_orthonormal(poses.R.detach().double()).flatten(1), poses.t.detach().double()), 1)
     blocks = {
-        "pose": Block(torch.cat((poses.R.flatten(1), poses.t), 1), RigidMotion(), fixed_poses),
+        "pose": Block(start, RigidMotion(), fixed_poses),
         "camera": Block(rows, Subset(rows.shape[1], columns), fixed_cameras),
         "point": Block(X, None, fixed_points),
     }
@@ -113,12 +114,11 @@ def bundle_adjust(
         function_tolerance=tolerance,
         progress=progress,
     )
-    pose, used = result.x["pose"], result.used[0]
+    used = result.used[0]
     distance = torch.linalg.vector_norm(result.residuals[0], dim=-1)
-    moved = rows != result.x["camera"]
     return BundleResult(
-        Pose(pose[:, :9].reshape(-1, 3, 3), pose[:, 9:].contiguous()),
-        _replace_changed(cameras, camera_from_rows(result.x["camera"], model), moved.any(-1)),
+        _moved_poses(poses, start, result.x["pose"]),
+        _moved_cameras(cameras, rows, result.x["camera"]),
         result.x["point"],
         result.cost,
         result.initial_cost,
@@ -145,10 +145,32 @@ def _prior(sigma: Mapping[str, float], mean: Tensor, model: type) -> Term:
     )
 
 
-def _replace_changed(before: Camera, after: Camera, changed: Tensor) -> Camera:
-    """Cameras that did not move keep every bit of K."""
-    K = torch.where(changed[:, None, None], after.K, before.K)
-    return Camera(K, after.distortion)
+def _orthonormal(R: Tensor) -> Tensor:
+    """The nearest rotations, by two Newton steps for the polar factor.
+
+    Rotations that come rounded (float32, text files) would make scale a direction in which the cost still falls a little.
+    """
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    near = (R.mT @ R - eye).abs().amax((-2, -1), keepdim=True) < 0.1
+    turned = R
+    for _ in range(2):
+        turned = turned @ (1.5 * eye - 0.5 * (turned.mT @ turned))
+    return torch.where(near, turned, R)
+
+
+def _moved_poses(poses: Pose, start: Tensor, end: Tensor) -> Pose:
+    """Poses that did not move keep every bit."""
+    moved = (start != end).any(-1)
+    new = end.to(poses.t.dtype)
+    R = torch.where(moved[:, None, None], new[:, :9].reshape(-1, 3, 3), poses.R)
+    return Pose(R, torch.where(moved[:, None], new[:, 9:], poses.t))
+
+
+def _moved_cameras(cameras: Camera, start: Tensor, end: Tensor) -> Camera:
+    """Cameras that did not change keep every bit of K."""
+    changed = (start != end).any(-1)
+    new = camera_from_rows(end, type(cameras.distortion))
+    return Camera(torch.where(changed[:, None, None], new.K, cameras.K), new.distortion)
 
 
 def _check(

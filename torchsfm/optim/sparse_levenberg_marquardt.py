@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -17,7 +16,7 @@ from torchsfm.optim.terms import Block, Term, term_cost, term_residual
 class SparseResult:
     """The minimum of a sparse least-squares problem.
 
-    `x` holds every block, `residuals` every term's residuals there, `used` those of each term that count: a residual that is
+    `x` holds every block, `residuals` every term's residuals (m, d) there, `used` (m) which of them count: a residual that is
     not finite at the start is left out. `status` is `Status.OK` where a tolerance was met or no step lowers the cost any more,
     `NOT_CONVERGED` where the iteration limit came first, `TOO_FEW` where nothing is free or observed, `NOT_FINITE` where no
     residual is finite.
@@ -26,8 +25,8 @@ class SparseResult:
     x: dict[str, Tensor]
     cost: float
     initial_cost: float
-    residuals: tuple[Float[Tensor, "m d"], ...]
-    used: tuple[Bool[Tensor, "m"], ...]
+    residuals: tuple[Tensor, ...]
+    used: tuple[Tensor, ...]
     iterations: int
     status: Status
 
@@ -146,7 +145,7 @@ def _used(term: Term, x: dict[str, Tensor]) -> Tensor:
 
 
 def _cost(terms: Sequence[Term], x: dict[str, Tensor]) -> float:
-    return sum(float(term_cost(t, term_residual(t, x))) for t in terms)
+    return sum((float(term_cost(t, term_residual(t, x))) for t in terms), 0.0)
 
 
 def _length(x: dict[str, Tensor]) -> float:
