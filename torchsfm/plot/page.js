@@ -134,6 +134,8 @@ function load(index) {
   }
   model = source.ready;
   looking = hovered = pointed = -1;
+  flight = null;
+  tip.style.display = $("through").style.display = "none";
   $("summary").textContent = model.summary;
   const [low, high] = model.trackRange, [, worst] = model.errorRange;
   set.size = Math.round(4 * Math.min(4, Math.max(1.5, 2.75 * Math.pow(3e4 / Math.max(model.count, 1), 0.2)))) / 4;
@@ -156,7 +158,7 @@ function overview() {  // from the proposed side, as near as the bulk of the poi
   const dots = [], step = Math.max(1, Math.floor(model.count / 20000));
   for (let i = 0; i < model.count; i += step) dots.push(needed(model.positions.subarray(3 * i, 3 * i + 3)));
   const cameras = model.images.filter(c => c.pose).map(c => needed(c.centre));
-  const distance = Math.max(most(dots, 0.93), Math.min(most(cameras, 0.95), 4 * model.radius), 0.5 * model.radius);
+  const distance = Math.max(most(dots, 0.93), Math.min(most(cameras, 0.95), 5 * model.radius), 0.5 * model.radius);
   return { pivot: [0, 0, 0], q: qaxes(right, up, back), distance, fov, offset: [0, 0] };
 }
 
@@ -180,15 +182,26 @@ const strokeArray = gl.createVertexArray(); gl.bindVertexArray(strokeArray);
 const strokeBuffers = [0, 1, 2].map(i => attribute(i, new Float32Array(4), i == 2 ? 4 : 3, gl.FLOAT, false, 1));
 const sheetArray = gl.createVertexArray(); gl.bindVertexArray(sheetArray);
 const sheetBuffer = attribute(0, new Float32Array(12), 3, gl.FLOAT);
-function drawStrokes(list, width, m) {
-  if (!list.length) return;
+const packStrokes = list => ({ count: list.length, arrays: [0, 1, 2].map(i => new Float32Array(list.flatMap(s => s[i]))) });
+let frusta = { key: "" };
+function allFrusta(line) {  // packed anew only when something about them changes
+  const key = [line, set.frustum, looking, hovered].join();
+  if (frusta.model != model || frusta.key != key) {
+    const list = [];
+    model.images.forEach((c, i) => { if (c.pose && i != looking && i != hovered) list.push(...frustumStrokes(c, [...line, 1])); });
+    frusta = { model, key, ...packStrokes(list) };
+  }
+  return frusta;
+}
+function drawStrokes({ count, arrays }, width, m) {
+  if (!count) return;
   gl.useProgram(strokes.p);
   gl.bindVertexArray(strokeArray);
-  [0, 1, 2].forEach(i => { gl.bindBuffer(gl.ARRAY_BUFFER, strokeBuffers[i]); gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(list.flatMap(s => s[i])), gl.DYNAMIC_DRAW); });
+  [0, 1, 2].forEach(i => { gl.bindBuffer(gl.ARRAY_BUFFER, strokeBuffers[i]); gl.bufferData(gl.ARRAY_BUFFER, arrays[i], gl.DYNAMIC_DRAW); });
   gl.uniformMatrix4fv(strokes.view, false, m);
   gl.uniform2f(strokes.pixels, canvas.width, canvas.height);
   gl.uniform1f(strokes.width, width * (devicePixelRatio || 1));
-  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, list.length);
+  gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
 }
 function frustumStrokes(c, color) {
   const k = corners(c), s = [];
@@ -259,15 +272,13 @@ function paint(now) {
   gl.uniform3f(dots.back, ...back);
   gl.drawArrays(gl.POINTS, 0, model.count);
   if (set.frustum > 0) {
-    const list = [];
-    model.images.forEach((c, i) => { if (c.pose && i != looking && i != hovered) list.push(...frustumStrokes(c, [...line, 1])); });
-    drawStrokes(list, 0.6, m);
-    if (hovered >= 0 && hovered != looking) drawStrokes(frustumStrokes(model.images[hovered], [...accent, 1]), 1.4, m);
+    drawStrokes(allFrusta(line), 0.6, m);
+    if (hovered >= 0 && hovered != looking) drawStrokes(packStrokes(frustumStrokes(model.images[hovered], [...accent, 1])), 1.4, m);
   }
   if (pointed >= 0) {
     const p = Array.from(model.positions.subarray(3 * pointed, 3 * pointed + 3)), list = [];
     for (let k = model.first[pointed]; k < model.first[pointed + 1]; k++) list.push([p, model.images[model.views[k]].centre, [...accent, 1]]);
-    drawStrokes(list, 0.6, m);
+    drawStrokes(packStrokes(list), 0.6, m);
   }
   if (set.photos && set.frustum > 0 && looking < 0) for (const c of model.images) drawPhotograph(c, m);
 }

@@ -111,9 +111,12 @@ def _model(
     X = model.X[good] @ framing.R.mT
     shown = tracks[good]
     low = int(shown.min()) if len(shown) else 2
+    counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
+    by_view = np.split(model.view.sort(stable=True).indices.numpy(), np.cumsum(counts)[:-1])
     entries = [
-        _image(model, i, framing.R, residuals[model.view == i], photos, _status(model.names[i], number, report))
-        for i in range(len(model.names))
+        _image(model, i, framing.R, own := torch.from_numpy(by_view[i]), residuals[own], photos.get(name))
+        | ({} if bool(model.registered[i]) else {"status": _status(name, number, report)})
+        for i, name in enumerate(model.names)
     ]
     if report is not None and number == 0:
         known = set(model.names)
@@ -128,7 +131,7 @@ def _model(
         summary.append(f"{model.num_observations:,} observations, mean track {track:.1f}")
         summary.append(f"residuals: mean {float(residuals.mean()):.3g}, median {_quantile(residuals, 0.5):.3g} px")
     return {
-        "label": f"{number + 1} of {count}: {model.num_registered} images, {model.num_points:,} points",
+        "label": f"{number + 1} of {count}: {model.num_registered} images",
         "summary": "\n".join(summary),
         "positions": _pack(X - framing.centre, np.float32),
         "colors": _pack((model.color[good].clamp(0, 1) * 255).round(), np.uint8),
@@ -176,10 +179,8 @@ def _status(name: str, number: int, report: Report | None) -> str:
     return "not registered"
 
 
-def _image(
-    model: Reconstruction, i: int, R: Tensor, residuals: Tensor, photos: dict[str, str | None], status: str
-) -> dict[str, Any]:
-    """One row of the table, and the camera if there is one."""
+def _image(model: Reconstruction, i: int, R: Tensor, own: Tensor, residuals: Tensor, photo: str | None) -> dict[str, Any]:
+    """One row of the table, and the camera if there is one; `own` are the image's observations."""
     entry: dict[str, Any] = {
         "name": model.names[i],
         "pose": None,
@@ -188,7 +189,7 @@ def _image(
         "high": float(f"{_quantile(residuals, 0.95):.4g}"),
     }
     if not bool(model.registered[i]):
-        return entry | {"status": status}
+        return entry
     camera, pose = model.cameras[model.camera_index[i]], model.poses[i]
     # Centre, then the camera's axes (right, down, forward) in the picture's world.
     entry["pose"] = torch.cat((R @ pose.centre, (pose.R @ R.mT).reshape(-1)))
@@ -200,12 +201,12 @@ def _image(
     plain = torch.linalg.solve_ex(camera.K, torch.cat((corner, torch.ones(4, 1, dtype=corner.dtype)), -1).mT)[0].mT
     usable = bool((valid & (d[:, 2] > 0.2)).all())
     rays = (d / d[:, 2:] if usable else plain)[:, :2].clamp(-4, 4)
-    own = model.poses[i].transform(model.X[model.point[model.view == i]])[:, 2]
+    depth = pose.transform(model.X[model.point[own]])[:, 2]
     entry["corners"] = [_numbers(row) for row in rays]
-    entry["depth"] = float(f"{_quantile(own[own > 0], 0.5) or 1.0:.6g}")
+    entry["depth"] = float(f"{_quantile(depth[depth > 0], 0.5) or 1.0:.6g}")
     entry["focal"] = float(f"{float(camera.K[0, 0]):.6g}")
-    if photos.get(model.names[i]):
-        entry["photo"] = photos[model.names[i]]
+    if photo is not None:
+        entry["photo"] = photo
     return entry
 
 

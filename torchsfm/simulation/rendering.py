@@ -67,7 +67,7 @@ def render_sequence(
     Textures are band-limited to each pixel's footprint; pixels on the outline of a surface or a shadow are supersampled.
 
     Args:
-        scene: What to render; `courtyard_scene` where none is given.
+        scene: What to render; a `courtyard_scene` with texels to suit the width where none is given.
         poses: Viewpoints, batch (v,); an arc of `views` cameras around the courtyard where none are given.
         camera: Intrinsics and distortion of all views (batch of none) or of each (v,); `default_camera` where none is given.
         views: Number of viewpoints when `poses` is not given.
@@ -86,7 +86,8 @@ def render_sequence(
             raise ValueError(f"{name}: wanted at least 1, got {value}")
     device = generator.device if generator is not None else None
     if scene is None:
-        scene = courtyard_scene(generator=generator)
+        # Texels about as large as pixels at the distance of the nearer things.
+        scene = courtyard_scene(texel=min(max(5.8 / width, 0.002), 0.03), generator=generator)
     if poses is None:
         poses = orbit_poses(
             views, radius=5.2, height=(0.6, 2.6), sweep=math.radians(75), start=math.radians(-82.5),
