@@ -12,6 +12,9 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.optim import attach_implicit, wants_derivative
 
+_CHUNK = 4096
+"""Problems at a time: their numbers fit the cache."""
+
 
 def equations(
     H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]
@@ -40,63 +43,57 @@ def homography_4pt(
     Raises:
         ValueError: Wrong shape, dtype or device.
     """
-    check_tensors(x1=(x1, "4 2"), x2=(x2, "4 2"))
-    H, valid = _solve(x1.detach(), x2.detach())
+    batch = check_tensors(x1=(x1, "4 2"), x2=(x2, "4 2"))
+    with torch.no_grad():
+        rows1, rows2 = (x.detach().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0).contiguous() for x in (x1, x2))
+        chunks = [_solve(a, b) for a, b in zip(rows1.split(_CHUNK, -1), rows2.split(_CHUNK, -1), strict=True)]
+        rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
+        H = rows.mT.reshape(*batch, 1, 3, 3)
+        valid = good.reshape(*batch, 1)
     if wants_derivative(x1, x2):
         H = attach_implicit(equations, H, x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
     return Solutions(H, valid)
 
 
-def _centred(x: Tensor) -> tuple[list[Tensor], list[Tensor], tuple[Tensor, Tensor, Tensor]]:
-    """Rows of u and v with the fourth point at the origin and the largest coordinate 1, and what undoes it."""
-    x = torch.where(torch.isfinite(x).all(-1).all(-1)[..., None, None], x, 0)
-    u = [row.contiguous() for row in x[..., 0].unbind(-1)]
-    v = [row.contiguous() for row in x[..., 1].unbind(-1)]
-    cu, cv = u[3], v[3]
-    u, v = [a - cu for a in u[:3]], [a - cv for a in v[:3]]
-    size = u[0].abs()
-    for a in (*u[1:], *v):
-        size = torch.maximum(size, a.abs())
-    inverse = torch.where(size > 0, 1 / size, 0)
-    return [a * inverse for a in u], [a * inverse for a in v], (cu, cv, inverse)
+def _centred(x: Float[Tensor, "4 2 batch"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Three points (3, 2, batch) with the fourth at the origin and the largest coordinate 1; what undoes it; what is fine."""
+    origin = x[3]
+    offset = x[:3] - origin
+    size = offset.abs().amax((0, 1))
+    fine = torch.isfinite(size) & torch.isfinite(origin.abs().amax(0)) & (size > 0)
+    scale = 1 / torch.where(fine, size, 1)
+    return torch.where(fine, offset * scale, 0), torch.where(fine, origin, 0), scale, fine
 
 
-def _solve(x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
-    x1, x2 = torch.broadcast_tensors(x1, x2)
-    (u, v, (cu, cv, inv1)), (a, b, (ca, cb, inv2)) = _centred(x1), _centred(x2)
-    # With the fourth point at the origin, the weights are the 2x2 cross products of the other three.
-    l0, l1, l2 = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-    m0, m1, m2 = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    det1, det2 = l0 + l1 + l2, m0 + m1 + m2
-    w0, w1, w2 = m0 * l1 * l2, m1 * l2 * l0, m2 * l0 * l1
-    # Rows of adj [p1 p2 p3]: (v_j - v_k, u_k - u_j, l_i).
-    rows = ((v[1] - v[2], u[2] - u[1], l0), (v[2] - v[0], u[0] - u[2], l1), (v[0] - v[1], u[1] - u[0], l2))
-    g = []
-    for q in range(3):
-        s0, s1, s2 = w0 * rows[0][q], w1 * rows[1][q], w2 * rows[2][q]
-        g.append((a[0] * s0 + a[1] * s1 + a[2] * s2, b[0] * s0 + b[1] * s1 + b[2] * s2, s0 + s1 + s2))
-    # Undo: x1 -> (x1 - c1) * inv1 on the right, x2 = y / inv2 + c2 on the left.
-    left = []
-    for top, middle, bottom in g:
-        left.append((top + ca * inv2 * bottom, middle + cb * inv2 * bottom, bottom * inv2))
-    columns = [[e * inv1 for e in left[0]], [e * inv1 for e in left[1]]]
-    columns.append([e - cu * f - cv * h for e, f, h in zip(left[2], *columns, strict=True)])
-    entries = [columns[j][i] for i in range(3) for j in range(3)]
-    scale = entries[0].abs()
-    for e in entries[1:]:
-        scale = torch.maximum(scale, e.abs())
-    inverse = 1 / scale
-    entries = [e * inverse for e in entries]
-    norm = entries[0] * entries[0]
-    for e in entries[1:]:
-        norm = norm + e * e
-    inverse = norm.rsqrt()
-    eps = 64 * torch.finfo(x1.dtype).eps
-    smallest = l0.abs()
-    for e in (l1, l2, det1, m0, m1, m2, det2):
-        smallest = torch.minimum(smallest, e.abs())
-    valid = (smallest > eps) & torch.isfinite(norm) & torch.isfinite(x1).all(-1).all(-1) & torch.isfinite(x2).all(-1).all(-1)
-    H = torch.stack([e * inverse for e in entries], -1).unflatten(-1, (3, 3))
-    return torch.where(valid[..., None, None], H, torch.eye(3, dtype=H.dtype, device=H.device))[..., None, :, :], valid[
-        ..., None
-    ]
+def _weights(y: Tensor) -> Tensor:
+    """The weights of three points in the fourth, which is the origin: 2x2 cross products."""
+    u, v = y.unbind(1)
+    return torch.stack((u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]))
+
+
+def _solve(x1: Float[Tensor, "4 2 batch"], x2: Float[Tensor, "4 2 batch"]) -> tuple[Tensor, Tensor]:
+    """H as (9, batch) and valid as (batch)."""
+    y1, c1, s1, fine1 = _centred(x1)
+    y2, c2, s2, fine2 = _centred(x2)
+    l1, l2 = _weights(y1), _weights(y2)
+    w = l2 * torch.stack((l1[1] * l1[2], l1[2] * l1[0], l1[0] * l1[1]))
+    # Rows of adj [p1 p2 p3] times w, and with x1 in its own coordinates again: (a, b, c) -> (a, b, c / s - a c_u - b c_v).
+    u, v = y1.unbind(1)
+    first = torch.stack((v[1] - v[2], v[2] - v[0], v[0] - v[1])) * w
+    second = torch.stack((u[2] - u[1], u[0] - u[2], u[1] - u[0])) * w
+    third = l1 * w / s1 - first * c1[0] - second * c1[1]
+    q = torch.stack((first, second, third))
+    # Columns [p'1 p'2 p'3] in coordinates of the second image: (y / s + c, 1).
+    bottom = q.sum(1)
+    a, b = y2.unbind(1)
+    inverse = 1 / s2
+    top = (q * a).sum(1) * inverse + c2[0] * bottom
+    middle = (q * b).sum(1) * inverse + c2[1] * bottom
+    H = torch.cat((top, middle, bottom))
+    # The squares of small numbers must not vanish.
+    H = H / H.abs().amax(0)
+    H = H * (H * H).sum(0).rsqrt()
+    areas = torch.cat((l1, l2, l1.sum(0, keepdim=True), l2.sum(0, keepdim=True))).abs().amin(0)
+    valid = fine1 & fine2 & (areas > 64 * torch.finfo(H.dtype).eps) & torch.isfinite(H).all(0)
+    identity = torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1) / 3**0.5
+    return torch.where(valid, H, identity), valid
