@@ -49,6 +49,8 @@ class Layout:
     eliminated: str | None
     point_size: int
     pieces: list[Piece]
+    still: list[Term]
+    """Residuals that depend on nothing free."""
 
     @property
     def points(self) -> int:
@@ -82,38 +84,43 @@ def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | No
         if name != eliminate and free[name].numel():
             first[name] = size
             size += free[name].numel() * block.tangent
-    pieces = [piece for term in terms for piece in _cut(term, blocks, number, first, size, eliminate)]
+    pieces: list[Piece] = []
+    still: list[Term] = []
+    for term in terms:
+        rows = _cut(term, number, eliminate)
+        places = [number[name][index] for name, index in zip(term.blocks, term.index, strict=True)]
+        for kind in ((True, True), (True, False), (False, True)):
+            if rows[kind].numel():
+                pieces.append(_sort(term, rows[kind], places, kind, blocks, first, size, eliminate))
+        if rows[False, False].numel():
+            still.append(term.select(rows[False, False]))
     if eliminate is None or not free[eliminate].numel():
-        return Layout(free, first, size, None, 0, pieces)
+        return Layout(free, first, size, None, 0, pieces, still)
     count = free[eliminate].numel()
     order = _order_points(pieces, count)
     free[eliminate] = free[eliminate][order]
     rank = torch.empty_like(order).index_copy_(0, order, torch.arange(count, device=order.device))
     pieces = [_renumber(piece, rank) for piece in pieces]
-    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, pieces)
+    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, pieces, still)
 
 
-def _cut(
-    term: Term, blocks: dict[str, Block], number: dict[str, Tensor], first: dict[str, int], size: int, eliminate: str | None
-) -> list[Piece]:
-    """The pieces of a term: residuals with a free point, without one, and with nothing free but the point."""
+def _cut(term: Term, number: dict[str, Tensor], eliminate: str | None) -> dict[tuple[bool, bool], Tensor]:
+    """The residuals of a term by whether they have a free retained and a free eliminated variable."""
     if term.blocks.count(eliminate or "") > 1:
         raise ValueError(f"eliminate: a residual depends on two variables of {eliminate!r}; they cannot be eliminated singly")
-    places = [number[name][index] for name, index in zip(term.blocks, term.index, strict=True)]
-    has_point = torch.zeros_like(places[0], dtype=torch.bool)
+    has_point = torch.zeros_like(term.index[0], dtype=torch.bool)
     has_camera = torch.zeros_like(has_point)
-    for name, place in zip(term.blocks, places, strict=True):
+    for name, index in zip(term.blocks, term.index, strict=True):
         if name == eliminate:
-            has_point |= place >= 0
+            has_point |= number[name][index] >= 0
         else:
-            has_camera |= place >= 0
+            has_camera |= number[name][index] >= 0
     counts = torch.ones_like(has_point) if term.weights is None else term.weights > 0
-    pieces = []
-    for camera, point in ((True, True), (True, False), (False, True)):
-        rows = (counts & (has_camera == camera) & (has_point == point)).nonzero()[:, 0]
-        if rows.numel() > 0:
-            pieces.append(_sort(term, rows, places, (camera, point), blocks, first, size, eliminate))
-    return pieces
+    return {
+        (camera, point): (counts & (has_camera == camera) & (has_point == point)).nonzero()[:, 0]
+        for camera in (True, False)
+        for point in (True, False)
+    }
 
 
 def _sort(

@@ -73,7 +73,7 @@ def sparse_levenberg_marquardt(
         used = tuple(_used(term, x) for term in terms)
         counted = [t if bool(u.all()) else t.select(u.nonzero()[:, 0]) for t, u in zip(terms, used, strict=True)]
         layout = lay_out(double, counted, eliminate)
-        constant = _cost(counted, x) - _cost([p.term for p in layout.pieces], x)
+        constant = _cost(layout.still, x)
         # The pieces hold only what moves; a residual of fixed variables is a constant of the cost.
         cost = _cost([p.term for p in layout.pieces], x)
         initial = cost
