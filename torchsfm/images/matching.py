@@ -4,13 +4,17 @@ from collections.abc import Sequence
 from functools import cache
 
 import torch
-from jaxtyping import Int, Shaped
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchsfm.images.features import Features
 
 _ROWS = 128
 """Rows of one block of similarities: 128 x 8192 integers stay in a processor's cache through all that is done with them."""
+
+
+_SPREAD = 0.02
+"""Integer descriptors whose lengths differ by a larger share are made unit vectors, which is slower."""
 
 
 def match_features(
@@ -33,7 +37,13 @@ def match_features(
     Returns:
         One tensor for each pair: rows (index in the first image, index in the second), sorted by the first. What a pair gets
         does not depend on the other pairs.
+
+    Raises:
+        ValueError: As `match_descriptors`; or a pair names an image that is not there.
     """
+    _check(ratio, max_distance)
+    if pairs.numel() and not 0 <= int(pairs.min()) <= int(pairs.max()) < len(features):
+        raise ValueError(f"pairs: wanted indices from 0 to {len(features) - 1}, got {int(pairs.min())} to {int(pairs.max())}")
     ready = {i: _prepare(features[i].descriptors) for i in sorted(set(pairs.flatten().tolist()))}
     return [_match(ready[i], ready[j], ratio, mutual, max_distance) for i, j in pairs.tolist()]
 
@@ -62,27 +72,42 @@ def match_descriptors(
         Rows (index in the first set, index in the second), sorted by the first.
 
     Raises:
-        ValueError: Descriptors of two lengths, or one set of integers and one of floating point numbers.
+        ValueError: Descriptors of two lengths or two precisions, or an option is wrong.
     """
+    _check(ratio, max_distance)
     return _match(_prepare(descriptors1), _prepare(descriptors2), ratio, mutual, max_distance)
+
+
+def _check(ratio: float, max_distance: float) -> None:
+    if not (ratio > 0 and max_distance > 0):
+        raise ValueError(f"wanted positive ratio and max_distance, got {ratio} and {max_distance}")
+
+
+def unit_descriptors(descriptors: Shaped[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+    """Descriptors as floating point vectors of length 1; those of length 0, or with NaN, as zeros."""
+    values: Tensor = descriptors if descriptors.is_floating_point() else descriptors.float()
+    values = values / values.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    return torch.where(values.isfinite().all(-1, keepdim=True), values, 0.0)
 
 
 def _prepare(descriptors: Tensor) -> tuple[Tensor, Tensor]:
     """Descriptors as int8 with their norms, or as unit vectors with norms of one."""
     if descriptors.ndim != 2:
         raise ValueError(f"descriptors: wanted shape (n, d), got {tuple(descriptors.shape)}")
-    if not descriptors.is_floating_point():
-        if (
-            descriptors.numel() == 0
-            or int(descriptors.abs().max() if descriptors.dtype.is_signed else descriptors.max()) <= 127
-        ):
-            return descriptors.to(torch.int8), descriptors.double().norm(dim=-1).clamp_min(1e-12)
-        descriptors = descriptors.float()
-    unit = descriptors / descriptors.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    return unit.nan_to_num(), torch.ones(unit.shape[0], dtype=torch.float64, device=unit.device)
+    if not descriptors.is_floating_point() and descriptors.numel():
+        low, high = (int(v) for v in descriptors.aminmax())
+        norm = descriptors.double().norm(dim=-1)
+        # Products rank as angles do where all lengths are equal; zeros are nobody's best either way.
+        shortest = torch.where(norm > 0, norm, torch.inf).min()
+        if low >= -127 and high <= 127 and bool(norm.max() <= shortest * (1 + _SPREAD)):
+            return descriptors.to(torch.int8), norm.clamp_min(1e-12)
+    unit = unit_descriptors(descriptors)
+    return unit, torch.ones(unit.shape[0], dtype=torch.float64, device=unit.device)
 
 
 def _match(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], ratio: float, mutual: bool, limit: float) -> Tensor:
+    if torch.int8 in (first[0].dtype, second[0].dtype) and first[0].dtype != second[0].dtype:
+        first, second = (_prepare(unit_descriptors(d)) for d, _ in (first, second))
     (d1, norm1), (d2, norm2) = first, second
     if d1.shape[1] != d2.shape[1] or d1.dtype != d2.dtype:
         raise ValueError(f"descriptors2: wanted {d1.shape[1]} values of {d1.dtype}, got {d2.shape[1]} of {d2.dtype}")
@@ -97,15 +122,11 @@ def _match(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor], ratio: f
         keep &= angle[:, 0] < ratio * angle[:, 1]
     rows = keep.nonzero()[:, 0]
     best = index[rows, 0]
-    if mutual:
+    if mutual and len(rows):
         # Few rows pass the tests above: looking back from their partners alone is cheaper than a maximum of every column.
         columns, where = torch.unique(best, return_inverse=True)
-        back = _top_one(d2[columns], d1)
-        # Of rows that are equally near to a column the first is taken.
-        keep = value[rows, 0] >= back[where]
-        rows, best, where = rows[keep], best[keep], where[keep]
-        owner = torch.full_like(columns, n).scatter_reduce(0, where, rows, "amin")
-        keep = owner[where] == rows
+        back = _top_two(d2[columns], d1)[1][:, 0]
+        keep = back[where] == rows
         rows, best = rows[keep], best[keep]
     return torch.stack([rows, best], 1)
 
@@ -165,14 +186,6 @@ def _merge(values: list[Tensor], indices: list[Tensor]) -> tuple[Tensor, Tensor]
         value, order = value.sort(dim=1, descending=True, stable=True)
         value, index = value[:, :2], index.gather(1, order[:, :2])
     return value, index
-
-
-def _top_one(a: Tensor, b: Tensor) -> Tensor:
-    """The largest product of each row of `a` with the rows of `b`."""
-    top = torch.empty(a.shape[0], dtype=torch.int32 if a.dtype == torch.int8 else a.dtype, device=a.device)
-    for start in range(0, a.shape[0], _ROWS):
-        top[start : start + _ROWS] = _products(a[start : start + _ROWS], b).amax(1)
-    return top
 
 
 def _products(a: Tensor, b: Tensor) -> Tensor:

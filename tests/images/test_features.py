@@ -1,0 +1,167 @@
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.images import Photograph, detect_features, match_descriptors, read_image
+
+
+def blobs(centres: np.ndarray, sizes: np.ndarray, height: int = 240, width: int = 320) -> Tensor:
+    """Gaussian blobs on grey, exact at every pixel centre."""
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    image = np.full((height, width), 0.35)
+    for (cx, cy), s in zip(centres, sizes, strict=True):
+        image += 0.4 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * s * s))
+    return torch.from_numpy(image.astype(np.float32))[None]
+
+
+def nearest(points: Tensor, centre: np.ndarray) -> int:
+    return int((points.double() - torch.from_numpy(centre)).norm(dim=1).argmin())
+
+
+@pytest.mark.parametrize(("size", "spread"), [(1.5, 0.03), (2.5, 0.06), (4.0, 0.08), (8.0, 0.12), (14.0, 0.25)])
+def test_blobs_are_found_where_they_are(size: float, spread: float) -> None:
+    rng = np.random.default_rng(1)
+    errors, scales = [], []
+    for _ in range(6):
+        # OpenCV leaves out a border of five pixels at the scale of the point.
+        centres = np.array([[110.0, 120.0], [210.0, 120.0]]) + rng.uniform(-10, 10, (2, 2))
+        features = detect_features(blobs(centres, np.array([size, size])))
+        for centre in centres:
+            i = nearest(features.x, centre)
+            errors.append(features.x[i].double().numpy() - centre)
+            scales.append(float(features.scale[i]) / size)
+    errors = np.array(errors)
+    # Without bias: a quarter of a pixel is what a wrong pixel-centre convention gives.
+    assert np.abs(errors.mean(0)).max() < spread
+    assert np.linalg.norm(errors, axis=1).max() < 4 * spread
+    assert np.array(scales) == pytest.approx(1, abs=0.05)
+
+
+def test_shrunk_images_give_positions_in_the_image_given() -> None:
+    rng = np.random.default_rng(2)
+    centres = np.array([[90.0, 120.0], [220.0, 110.0]]) + rng.uniform(-1, 1, (2, 2))
+    features = detect_features(blobs(centres, np.array([7.0, 10.0])), max_size=107)  # about a third
+    for centre, size in zip(centres, (7.0, 10.0), strict=True):
+        i = nearest(features.x, centre)
+        assert np.linalg.norm(features.x[i].double().numpy() - centre) < 0.3
+        assert float(features.scale[i]) == pytest.approx(size, rel=0.1)
+
+
+def texture(seed: int, height: int = 240, width: int = 320) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    image = sum(cv2.GaussianBlur(rng.standard_normal((height, width)), (0, 0), s) * s for s in (1.5, 3, 6, 12))
+    return ((image - image.min()) / np.ptp(image)).astype(np.float32)
+
+
+def warp(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    return cv2.warpAffine(
+        image, matrix, (image.shape[1], image.shape[0]), flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT
+    )
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 137.0])
+def test_rotation_and_zoom_are_followed(degrees: float) -> None:
+    angle, zoom = math.radians(degrees), 0.8
+    A = zoom * np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    centre = np.array([160.3, 119.6])
+    matrix = np.hstack([A, (centre - A @ centre)[:, None]])
+    first = texture(3)
+    f1, f2 = (detect_features(torch.from_numpy(i)[None]) for i in (first, warp(first, matrix)))
+    matches = match_descriptors(f1.descriptors, f2.descriptors)
+    expected = f1.x[matches[:, 0]].double().numpy() @ A.T + matrix[:, 2]
+    error = np.linalg.norm(f2.x[matches[:, 1]].double().numpy() - expected, axis=1)
+    good = error < 1
+    assert len(matches) > 150
+    assert good.mean() > 0.97
+    assert np.median(error) < 0.12
+    assert np.abs((f2.x[matches[:, 1]].double().numpy() - expected)[good].mean(0)).max() < 0.03
+    turned = (f2.angle[matches[:, 1]] - f1.angle[matches[:, 0]]).double().numpy()[good] - angle
+    assert np.median(np.abs(np.angle(np.exp(1j * turned)))) < 0.03
+    grown = (f2.scale[matches[:, 1]] / f1.scale[matches[:, 0]]).double().numpy()[good]
+    assert np.median(grown) == pytest.approx(zoom, rel=0.02)
+
+
+def test_angle_is_that_of_the_gradient() -> None:
+    # A blob on a ramp that brightens downwards: its surroundings point along y, a quarter turn from x.
+    image = blobs(np.array([[160.0, 120.0]]), np.array([5.0])) * 0.3 + torch.linspace(0, 0.5, 240)[None, :, None]
+    features = detect_features(image)
+    i = nearest(features.x, np.array([160.0, 120.0]))
+    assert float(features.angle[i]) == pytest.approx(math.pi / 2, abs=0.1)
+
+
+def test_the_strongest_are_kept_in_order() -> None:
+    image = torch.from_numpy(texture(4))[None]
+    every = detect_features(image, 100000)
+    some = detect_features(image, 200)
+    assert len(every) > 400
+    assert len(some) == 200
+    assert bool((every.response.diff() <= 0).all())
+    for name in ("x", "scale", "angle", "response"):
+        assert torch.equal(getattr(some, name), getattr(every, name)[:200])
+    # Tie or not, the same descriptors go with the same points.
+    assert torch.equal(some.descriptors, every.descriptors[:200])
+
+
+def test_the_answer_is_always_the_same() -> None:
+    image = torch.from_numpy(texture(5))[None]
+    before = image.clone()
+    threads = cv2.getNumThreads()
+    try:
+        runs = []
+        for count in (1, 4, 4):
+            cv2.setNumThreads(count)
+            runs.append(detect_features(image))
+    finally:
+        cv2.setNumThreads(threads)
+    for run in runs[1:]:
+        for name in ("x", "scale", "angle", "response", "descriptors"):
+            assert torch.equal(getattr(run, name), getattr(runs[0], name))
+    assert torch.equal(image, before)
+    photograph = detect_features(Photograph(pixels=image, name="a"))
+    assert torch.equal(photograph.x, runs[0].x)
+    color = detect_features(image.expand(3, -1, -1))  # the luma's rounding may differ by one in 255
+    assert len(color) == pytest.approx(len(runs[0]), rel=0.01)
+    assert (color.x[:50, None] - runs[0].x).norm(dim=-1).amin(1).max() < 0.1
+
+
+def test_descriptors_are_root_sift() -> None:
+    features = detect_features(torch.from_numpy(texture(6))[None])
+    assert features.descriptors.dtype == torch.uint8
+    assert features.descriptors.shape == (len(features), 128)
+    assert int(features.descriptors.max()) <= 127
+    # The squares of RootSIFT are SIFT over its sum: they add up to one.
+    total = (features.descriptors.double() / 256).square().sum(1)
+    assert bool(((total - 1).abs() < 0.03).all())
+
+
+def test_images_without_structure_have_no_features() -> None:
+    for image in (torch.zeros(1, 50, 60), torch.full((3, 40, 40), 0.5), torch.zeros(1, 1, 1), torch.rand(1, 2, 3)):
+        features = detect_features(image)
+        assert len(features) == 0
+        assert features.descriptors.shape == (0, 128)
+        assert features.x.shape == (0, 2)
+    assert len(detect_features(torch.full((1, 30, 30), torch.nan))) == 0
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_shapes_are_named() -> None:
+    for shape in ((2, 30, 30), (30, 30), (1, 1, 30, 30), (1, 0, 5)):
+        with pytest.raises(ValueError, match="image: wanted shape"):
+            detect_features(torch.zeros(shape))
+    with pytest.raises(ValueError, match="max_features"):
+        detect_features(torch.zeros(1, 30, 30), 0)
+
+
+def test_photographs_are_rich(data: Path) -> None:
+    photo = read_image(data / "images" / "sceaux_castle" / "100_7103.JPG", gray=True)
+    features = detect_features(photo)
+    assert len(features) == 8192
+    assert bool((features.x >= 0).all())
+    assert bool((features.x[:, 0] <= photo.width - 1).all())
+    assert bool((features.x[:, 1] <= photo.height - 1).all())
+    assert len(torch.unique(torch.cat([features.x, features.scale[:, None], features.angle[:, None]], 1), dim=0)) == 8192

@@ -1,0 +1,99 @@
+"""Which images are worth matching with one another, where there are too many to try all pairs."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm.images.features import Features
+from torchsfm.images.matching import unit_descriptors
+
+
+def retrieve_pairs(
+    features: Sequence[Features],
+    neighbours: int = 20,
+    *,
+    words: int = 64,
+    generator: torch.Generator | None = None,
+) -> Int[Tensor, "p 2"]:
+    """Pairs of images that are likely to show the same things.
+
+    Every image is paired with the `neighbours` images most like it by `describe_images`. Where that would be all of them, all
+    pairs are returned and nothing is computed.
+
+    Args:
+        features: The features of every image.
+        neighbours: How many partners to find for each image; an image may have more, as it may be the partner of others.
+        words: Number of visual words.
+        generator: Randomness for the choice of words; a fixed seed where not given.
+
+    Returns:
+        Pairs of indices, the smaller first, sorted, each once. An image without features is in no pair.
+
+    Raises:
+        ValueError: `neighbours` or `words` is not positive.
+    """
+    if neighbours < 1 or words < 1:
+        raise ValueError(f"wanted positive neighbours and words, got {neighbours} and {words}")
+    usable = torch.tensor([i for i, f in enumerate(features) if len(f) > 0], dtype=torch.long)
+    n = len(usable)
+    if n - 1 <= neighbours:
+        return usable[torch.combinations(torch.arange(n)).reshape(-1, 2)]
+    described = describe_images([features[i] for i in usable.tolist()], words=words, generator=generator)
+    similarity = (described @ described.mT).fill_diagonal_(-torch.inf)
+    # Sorted stably, so that images equally alike are taken in order.
+    partners = similarity.argsort(dim=1, descending=True, stable=True)[:, :neighbours].cpu()
+    pairs = torch.stack([torch.arange(n)[:, None].expand_as(partners), partners], -1).reshape(-1, 2)
+    pairs = torch.unique(pairs.sort(dim=1).values, dim=0)
+    return usable[pairs]
+
+
+def describe_images(
+    features: Sequence[Features], *, words: int = 64, generator: torch.Generator | None = None
+) -> Float[Tensor, "v k"]:
+    """One unit vector for each image, near those of images that show the same things.
+
+    VLAD (Jegou et al., CVPR 2010): the sum of the descriptors' differences from the visual word nearest to them, normalised for
+    each word (Arandjelovic and Zisserman, CVPR 2013). The words are found among the descriptors of these images.
+
+    Args:
+        features: The features of every image.
+        words: Number of visual words; fewer are used where there are fewer descriptors.
+        generator: Randomness for the choice of words; a fixed seed where not given.
+
+    Returns:
+        One row for each image; zeros for an image without features.
+    """
+    if not features:
+        return torch.zeros(0, 0)
+    device = features[0].descriptors.device
+    generator = generator or torch.Generator().manual_seed(0)
+    share = max(1, 256 * words // len(features))
+    sample = []
+    for f in features:
+        chosen = torch.randperm(len(f), generator=generator)[:share].to(device)
+        sample.append(unit_descriptors(f.descriptors[chosen]))
+    centres = _cluster(torch.cat(sample), words, generator)
+    rows = []
+    for f in features:
+        unit = unit_descriptors(f.descriptors)
+        word = _nearest(unit, centres)
+        total = torch.zeros_like(centres).index_add_(0, word, unit - centres[word])
+        rows.append(torch.nn.functional.normalize(total, dim=1).flatten())
+    return torch.nn.functional.normalize(torch.stack(rows), dim=1)
+
+
+def _nearest(x: Tensor, centres: Tensor) -> Tensor:
+    return (x @ centres.mT - 0.5 * centres.square().sum(1)).argmax(1)
+
+
+def _cluster(x: Tensor, count: int, generator: torch.Generator, rounds: int = 15) -> Tensor:
+    """Centres of clusters by Lloyd's iteration from random rows; a cluster that has lost its last row stays where it is."""
+    centres = x[torch.randperm(len(x), generator=generator)[:count].to(x.device)]
+    for _ in range(rounds):
+        label = _nearest(x, centres)
+        total = torch.zeros_like(centres).index_add_(0, label, x)
+        size = torch.bincount(label, minlength=len(centres))[:, None]
+        centres = torch.where(size > 0, total / size.clamp_min(1), centres)
+    return centres
