@@ -64,7 +64,7 @@ def test_unproject_undoes_project(name, dtype, generator):
     assert (found[..., 2] == 1).all()
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=80)
 @given(st.sampled_from(NAMES[1:]), st.integers(0, 2**31), st.sampled_from([0.05, 0.3, 1.0]))
 def test_every_ray_of_the_domain_is_found_again(name, seed, spread):
     """Parameters without any physical sense, too: 0.99 of all rays up to 0.999 of the valid radius."""
@@ -274,6 +274,28 @@ def test_names_and_counts():
     assert doubled.parameters().tolist() == [-0.5, 0.24]
     with pytest.raises(ValueError, match="p: wanted shape"):
         Radial.from_parameters(torch.zeros(3))
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.sampled_from(NAMES[1:]),
+    st.sampled_from([torch.float32, torch.float64]),
+    st.integers(0, 2**31),
+    st.sampled_from([1e-30, 1e-3, 1.0, 1e3]),
+    st.sampled_from([1e-30, 1e-6, 1.0, 1e3, 1e6]),
+)
+def test_any_numbers_give_finite_numbers_and_gradients(name, dtype, seed, size, distance):
+    generator = torch.Generator().manual_seed(seed)
+    cls = DISTORTION_MODELS[name]
+    p = (size * torch.randn(20, cls.num_parameters, generator=generator, dtype=torch.float64)).to(dtype).requires_grad_()
+    u = (distance * torch.randn(20, 10, 2, generator=generator, dtype=torch.float64)).to(dtype).requires_grad_()
+    d, _ = cls.from_parameters(p).unproject(u)
+    X = torch.cat([u, u[..., :1].roll(1, 0)], -1)
+    x = cls.from_parameters(p).project(X)
+    for result in (d.clamp(-1e3, 1e3), x):
+        assert result.isfinite().all()
+        for gradient in torch.autograd.grad(result.sum(), (u, p)):
+            assert gradient.isfinite().all()
 
 
 @pytest.mark.reference

@@ -42,7 +42,7 @@ def axes(count, generator):
     return v / v.norm(dim=-1, keepdim=True)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=100)
 @given(st.floats(0, math.pi), st.integers(0, 2**31))
 def test_matrix_exponential_and_round_trip(angle, seed):
     w = axes(8, torch.Generator().manual_seed(seed)) * angle

@@ -245,7 +245,7 @@ def _cameras_from_colmap(cameras: list[Any]) -> Camera:
     rows: list[Tensor] = [
         torch.tensor([values.get(name, 0.0) for name in cls.parameter_names], dtype=torch.float64) for values in named
     ]
-    return Camera(torch.stack(K), cls.from_parameters(torch.stack(rows)))  # type: ignore[arg-type]
+    return Camera(torch.stack(K), cls.from_parameters(torch.stack(rows)))
 
 
 def _read_unregistered(path: Path, camera_of: dict[int, int]) -> dict[int, tuple[int, str]]:

@@ -68,7 +68,7 @@ class Camera:
         fx, fy = torch.where(regular, fx, 1.0), torch.where(regular, fy, 1.0)
         skew = torch.where(regular, skew, 0.0)
         centre = torch.where(regular[..., None], K[..., :2, 2], 0.0)
-        known = torch.isfinite(x.detach()).all(-1)
+        known = torch.isfinite(x.detach().sum(-1))
         x = finite_or_zero(x)
         v = (x[..., 1] - centre[..., None, 1]) / fy[..., None]
         u = (x[..., 0] - centre[..., None, 0] - skew[..., None] * v) / fx[..., None]

@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torchsfm.linalg import solve_cubic
+
 GUARDED = 3
 """Newton steps that narrow a bracket around the root; then the rest converges by itself on all but contrived functions."""
 PLAIN = 7
@@ -62,7 +64,7 @@ def flatten_ray(X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 
 def first_fold(coefficients: Sequence[Tensor]) -> Tensor:
-    """Find the smallest r > 0 where r (1 + k1 r^2 + k2 r^4 + ...) stops increasing; inf where it never does.
+    """Find the smallest r > 0 where r (1 + k1 r^2 + k2 r^4 + ...) stops increasing; inf where it does not before a million.
 
     With w = 1 / r^2 the condition is a monic polynomial in w, so no coefficient is divided by, and its largest positive root is
     wanted. Parameters that are not finite give 0: no point is inside. Not differentiated.
@@ -82,14 +84,22 @@ def first_fold(coefficients: Sequence[Tensor]) -> Tensor:
             sum_ = torch.where(half < 0, half - root, half + root)
             other = torch.where(sum_ == 0, 0.0, c[..., 1] / torch.where(sum_ == 0, 1.0, sum_))
             w = torch.where(square >= 0, torch.maximum(sum_, other), 0.0)
+        elif count == 3:
+            c1, c2, c3 = c.unbind(-1)
+            roots, exist = solve_cubic(torch.stack([c3, c2, c1, torch.ones_like(c1)], -1))
+            # Coefficients near the smallest numbers underflow there, so what comes is checked.
+            terms = torch.stack([roots**3, c1[..., None] * roots**2, c2[..., None] * roots, c3[..., None].expand_as(roots)])
+            good = exist & (terms.sum(0).abs() <= 1e-9 * terms.abs().sum(0))
+            w = torch.where(good, roots, 0.0).amax(-1)
         else:
             companion = torch.diag_embed(c.new_ones(count - 1), offset=-1).expand(*c.shape, count).clone()
             companion[..., 0, :] = -c
-            roots = torch.linalg.eigvals(companion)
+            values = torch.linalg.eigvals(companion)
             # A double root comes out as a pair with an imaginary part of half the digits: there the slope touches zero.
-            real = roots.imag.abs() <= 1e-7 * roots.real.abs()
-            w = torch.where(real, roots.real, 0.0).amax(-1)
-        radius = torch.where(w > 0, w.clamp(min=1e-300).rsqrt(), torch.inf)
+            real = values.imag.abs() <= 1e-7 * values.real.abs()
+            w = torch.where(real, values.real, 0.0).amax(-1)
+        # Smaller roots are rounding errors of zero, which zero coefficients make.
+        radius = torch.where(w > 1e-12, w.clamp(min=1e-12).rsqrt(), torch.inf)
         return torch.where(finite, radius, 0.0).to(slopes.dtype)
 
 
