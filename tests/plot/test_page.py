@@ -175,6 +175,14 @@ def test_empty_and_broken_models_still_make_a_page(model: Reconstruction, tmp_pa
     assert np.array_equal(unpack(shown["views"], "<u2"), model.view[keep].numpy())
 
 
+def test_cameras_that_are_not_finite_are_not_drawn(model: Reconstruction, tmp_path: Path) -> None:
+    t = model.poses.t.clone()
+    t[1, 0] = math.nan
+    shown = content(write_page(replace(model, poses=Pose(model.poses.R, t)), tmp_path / "page.html"))["models"][0]
+    assert [row["pose"] is not None for row in shown["images"]] == [True, False, True, False, True]
+    assert np.isfinite(unpack(shown["errors"], "<f4")).all()
+
+
 def test_single_precision_models_are_welcome(model: Reconstruction, tmp_path: Path) -> None:
     assert content(write_page(model.to(torch.float32), tmp_path / "page.html"))["models"][0]["images"][0]["focal"] == 500
 

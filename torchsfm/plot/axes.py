@@ -2,7 +2,7 @@
 
 from typing import Any, TypeAlias
 
-import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 Axes: TypeAlias = Any
@@ -38,7 +38,7 @@ def spatial_axes(ax: Axes | None) -> Axes:
     return ax
 
 
-def array(tensor: Tensor) -> np.ndarray[Any, Any]:
+def array(tensor: Tensor) -> NDArray[Any]:
     """The values of a tensor for matplotlib."""
-    values: np.ndarray[Any, Any] = tensor.detach().cpu().numpy()
+    values: NDArray[Any] = tensor.detach().cpu().numpy()
     return values

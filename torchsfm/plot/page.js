@@ -391,7 +391,7 @@ function gesture() {
   return { x, y, spread: p.length > 1 ? Math.hypot(p[0].x - p[1].x, p[0].y - p[1].y) : 0 };
 }
 const place = event => { const box = canvas.getBoundingClientRect(); return { x: event.clientX - box.left, y: event.clientY - box.top }; };
-function freeView() {  // leave a camera's place without a jump: drop its wide or narrow angle slowly, as one moves
+function freeView() {  // leave a camera's place without a jump; its angle of view stays until the next overview
   if (looking >= 0) leave(false);
   flight = null;
 }

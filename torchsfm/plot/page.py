@@ -6,6 +6,7 @@ import json
 import math
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -99,9 +100,13 @@ def _model(
 ) -> dict[str, Any]:
     """Everything the script needs to draw one model."""
     model = model.to("cpu", torch.float64)
+    # A camera with numbers that are not finite cannot be drawn.
+    sound = [getattr(model.poses, name).flatten(1).isfinite().all(-1) for name in ("R", "t")]
+    K_sound = model.cameras.K.flatten(1).isfinite().all(-1)[model.camera_index]
+    model = replace(model, registered=model.registered & sound[0] & sound[1] & K_sound)
     framing = frame(model)
-    residuals = model.residuals()
-    errors, tracks = model.point_errors(), model.track_lengths()
+    residuals, errors = model.residuals().nan_to_num(), model.point_errors().nan_to_num()
+    tracks = model.track_lengths()
     good = torch.isfinite(model.X).all(-1)
     # Observations by point, those of dropped points left out.
     order = model.point.sort(stable=True).indices
