@@ -13,6 +13,8 @@ from torch import Tensor
 
 from torchsfm._types import check_tensors
 
+LARGEST = 1e60
+"""Numbers from here on count as not finite."""
 PIECE = 32768
 """Observations in one piece: some ten temporaries of it fit a second-level cache."""
 
@@ -39,6 +41,8 @@ class Observations:
     """Where the origin of the moved world lies, (3, problem, 1)."""
     scale: Tensor
     """The unit of length of the moved world, (problem, 1)."""
+    apart: Tensor
+    """Whether the cameras in use have more than one centre, (problem, 1)."""
     broken: Tensor
     """Points of which a wanted observation is not finite, (problem, point)."""
 
@@ -110,7 +114,8 @@ def _solve_ragged(
 ) -> list[Tensor]:
     """The same, for points seen in some of the views only: each becomes a problem of as many views as see it.
 
-    Points are sorted by their number of views, rounded up to a power of two; what becomes of a point depends on its own number alone.
+    Points are sorted by their number of views, rounded up to a power of two: a point's own number, so that what becomes of it
+    does not depend on the others.
     """
     size, v, n = x.shape[:3]
     wanted = torch.ones_like(x[..., 0], dtype=torch.bool) if visible is None else visible
@@ -122,8 +127,10 @@ def _solve_ragged(
     # The exponent of the power of two, exactly.
     level = torch.frexp((count - 1).double()).exponent
     results, places = [], []
-    for k in level.unique().tolist():
+    for k in range(1, (v - 1).bit_length() + 1):
         place = (level == k).nonzero()[:, 0]
+        if len(place) == 0:
+            continue
         m = min(2**k, v)
         row, view = wanted[place].nonzero().unbind(-1)
         views = torch.zeros(len(place), m, dtype=torch.long, device=x.device)
@@ -148,9 +155,11 @@ def _ranges(size: int, step: int) -> Iterator[slice]:
 
 def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> Observations:
     """Lay a piece out: x (problem, view, point, 2), P (problem, view, 3, 4), visible and weights (problem, view, point)."""
-    good_x = torch.isfinite(x).all(-1)
-    good_P = torch.isfinite(P).all(-1).all(-1)[..., None]
-    good = good_x & good_P
+    # Squares must be finite too, and the scale of a camera matrix is arbitrary.
+    size = P[..., :3].detach().double().abs().amax((-2, -1), keepdim=True)
+    P = P.double() / torch.where((size > 0) & torch.isfinite(size), size, 1.0)
+    good_P = (P.abs() < LARGEST).all(-1).all(-1)[..., None]
+    good = (x.abs() < LARGEST).all(-1) & good_P
     wanted = torch.ones_like(good) if visible is None else visible
     if weights is not None:
         wanted = wanted & (weights != 0)
@@ -159,10 +168,7 @@ def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | Non
     one = torch.ones((), dtype=torch.float64, device=x.device)
     w = torch.where(use, one if weights is None else weights.double(), 0.0)
     x = torch.where(use[..., None], x.double(), 0.0)
-    P = torch.where(good_P[..., None], P.double(), torch.eye(3, 4, dtype=torch.float64, device=P.device))
-    # The scale of a camera matrix is arbitrary, and products of its entries must not overflow.
-    size = P[..., :3].detach().abs().amax(-1).amax(-1)[..., None, None]
-    P = P / torch.where(size > 0, size, 1.0)
+    P = torch.where(good_P[..., None], P, torch.eye(3, 4, dtype=torch.float64, device=P.device))
 
     u, v = x.permute(3, 1, 0, 2).contiguous().unbind(0)
     w = w.permute(1, 0, 2).contiguous()
@@ -177,15 +183,17 @@ def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | Non
     offsets = [torch.where(finite, c - s, c) for c, s in zip(centre[:3], shift.unbind(0), strict=True)]
     spread = torch.stack([torch.where(counted, o * o, 0.0).sum(0) for o in offsets]).sum(0) / number
     # One place for all centres: there is no unit but the world's own.
-    apart = spread.detach() > 1e-28 * (shift.detach() ** 2).sum(0).clamp_min(1e-200)
+    reach = torch.stack([torch.where(counted, c.detach() * c.detach(), 0.0).sum(0) for c in centre[:3]]).sum(0) / number
+    apart = spread.detach() > 1e-22 * reach.clamp_min(1e-200)
     scale = torch.where(apart, spread, 1.0).sqrt()
+    apart = apart | (used & ~finite).any(0)
     moved = tuple(
         (r[0] * scale, r[1] * scale, r[2] * scale, r[3] + r[0] * shift[0] + r[1] * shift[1] + r[2] * shift[2]) for r in rows
     )
     scaled = [torch.where(finite, o / scale, o) for o in offsets]
     broken = (wanted & ~good).any(1)
     handed = torch.where(finite, torch.sign(_determinant(rows)).detach(), 0.0)
-    return Observations((u, v), moved, w, (scaled[0], scaled[1], scaled[2], centre[3]), handed, shift, scale, broken)
+    return Observations((u, v), moved, w, (scaled[0], scaled[1], scaled[2], centre[3]), handed, shift, scale, apart, broken)
 
 
 def _determinant(P: tuple[tuple[Tensor, ...], ...]) -> Tensor:

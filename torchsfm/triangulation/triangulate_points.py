@@ -97,7 +97,7 @@ def _solve(data: Observations, max_iterations: int) -> tuple[Tensor, ...]:
         _, decrease, _ = tangent_step(X, system.hessian(), system.g)
         converged = found & (decrease <= 1e-18 * trace)
         _, _, smallest = tangent_step(X, system.N, system.g)
-        determined = (smallest > 1e-14) & (X[3].abs() > 1e-9)
+        determined = fixed.apart & (smallest > 1e-14) & (X[3].abs() > 1e-9)
     if wants_derivative(*data.x, *(e for row in data.P for e in row), data.w):
         hessian, system = system.hessian(), _System(data, X)
         # A Newton step from the optimum leaves it where it is and carries the derivative.
@@ -138,6 +138,7 @@ def _detached(data: Observations) -> Observations:
         data.handed,
         data.shift.detach(),
         data.scale.detach(),
+        data.apart,
         data.broken,
     )
 
@@ -155,7 +156,7 @@ def _corrected(data: Observations) -> Observations:
     use = alike & torch.isfinite(a1 + b1 + a2 + b2)
     u = torch.stack((torch.where(use, a1, u1), torch.where(use, a2, u2)))
     v = torch.stack((torch.where(use, b1, v1), torch.where(use, b2, v2)))
-    return Observations((u, v), data.P, data.w, data.centre, data.handed, data.shift, data.scale, data.broken)
+    return Observations((u, v), data.P, data.w, data.centre, data.handed, data.shift, data.scale, data.apart, data.broken)
 
 
 class _System:
