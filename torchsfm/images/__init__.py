@@ -3,8 +3,10 @@
 from torchsfm.images.corners import Corners, detect_corners
 from torchsfm.images.exif import Exif, parse_exif
 from torchsfm.images.features import Features, detect_features
+from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
 from torchsfm.images.matching import match_descriptors, match_features
 from torchsfm.images.reading import ImageError, Photograph, list_images, read_image, save_image, scale_image
+from torchsfm.images.retrieval import describe_images, retrieve_pairs
 from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_sequence
 
 __all__ = [
@@ -12,16 +14,22 @@ __all__ = [
     "Exif",
     "Features",
     "ImageError",
+    "LearnedDetector",
+    "LearnedMatcher",
     "Photograph",
     "TrackedPoints",
     "Tracks",
+    "describe_images",
     "detect_corners",
     "detect_features",
     "list_images",
+    "load_detector",
+    "load_matcher",
     "match_descriptors",
     "match_features",
     "parse_exif",
     "read_image",
+    "retrieve_pairs",
     "save_image",
     "scale_image",
     "track_points",
