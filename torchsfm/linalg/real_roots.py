@@ -17,14 +17,12 @@ from torch import Tensor
 _CELLS = 32
 """Cells from 0 to 45 degrees."""
 _CLOSER = 4
-"""Cells looked at more closely ..."""
+"""Cells looked at more closely (two bits of a number say which) ..."""
 _PARTS = 8
 """... and the parts they are cut into."""
 _STEP = math.pi / 4 / _CELLS
 _MARGIN = 2.0
 """A cubic's Bernstein coefficient is h + (step / 3) h'; 2 in the place of 3 makes up for what is not cubic."""
-_WORD = 48
-"""Bits of a word: whole numbers below 2^53 are exact in float64."""
 
 
 def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]:
@@ -51,23 +49,30 @@ def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slot
 
 
 def real_root_rows(
-    c: Float[Tensor, "m batch"],
+    c: Float[Tensor, "m batch"], steps: int = 3
 ) -> tuple[Float[Tensor, "slots batch"], Float[Tensor, "slots batch"], Bool[Tensor, "slots batch"]]:
     """The real roots x = s / t of polynomials that stand in columns, and which slots hold one; max(|s|, |t|) = 1.
 
-    The homogeneous form holds infinite roots too (t = 0).
+    The homogeneous form holds infinite roots too (t = 0). `steps` of Newton's method end the search.
     """
     n = c.shape[0] - 1
     finite = torch.isfinite(c).all(0)
     c = torch.where(finite, c, 0)
     both = torch.stack((c, c.flip(0)), 1)
-    z, first = _nodes(both)
-    values = first[:, :, 0], first[:, :, 1]
-    changes, several = _several(*values, z.new_tensor([_STEP, -_STEP])[:, None, None])
-    single = (changes & ~several).flatten(0, 2)
-    i1, ok1 = _positions(single, n)
+    fine = torch.tan(torch.arange(_CELLS * _PARTS + 1, dtype=c.dtype, device=c.device) * (_STEP / _PARTS))
+    fine[-1] = 1
+    # Rows of values: at the nodes [node, side (+z, -z), value or slope, polynomial or reversal], then at the closer nodes
+    # [node, value or slope, cell]. The slope is (1 + z^2) p' - n z p, the same multiple of h' as the value p is of h.
+    start = 8 * (_CELLS + 1)
+    rows = torch.empty(start + 2 * _CLOSER * (_PARTS + 1), c.shape[1], dtype=c.dtype, device=c.device)
+    first = rows[:start].view(_CELLS + 1, 2, 2, 2, -1)
+    second = rows[start:].view(_PARTS + 1, 2, _CLOSER, -1)
+    _nodes(both, fine[::_PARTS], first)
+    changes, several = _several(first[:, :, 0], first[:, :, 1], fine.new_tensor([_STEP, -_STEP])[:, None, None])
+    # A cell's number is (node * 2 + side) * 2 + reversal.
+    i1, ok1 = _positions((changes & ~several).flatten(0, 2), n)
     close, used = _positions(several.flatten(0, 2), _CLOSER)
-    second = _closer(both, z, close)
+    _closer(both, fine, close, second)
     minus = (close & 2) != 0
     changes, several = _several(second[:, 0], second[:, 1], torch.where(minus, -_STEP / _PARTS, _STEP / _PARTS))
     i2, ok2 = _positions((changes & used).flatten(0, 1), n)
@@ -75,57 +80,54 @@ def real_root_rows(
     # Single roots fill the slots from the front, pairs from the back; n slots are enough for both.
     slot = torch.arange(n, device=c.device)
     i2, ok2 = _after(i2, ok2, slot[:, None] - ok1.sum(0))
-    back = (n - 1 - slot) // 2
-    back = back.clamp_max(n // 2 - 1)
+    back = ((n - 1 - slot) // 2).clamp_max(n // 2 - 1)
     left, right = ok1 | ok2, ((n - 1 - slot) % 2 == 1)[:, None]
-    pair = ~left & ok3[back]
-    part = torch.where(ok2 & ~ok1, i2, i3[back])
-    piece = part // _CLOSER
-    parent = close.gather(0, part - piece * _CLOSER)
-    cell = torch.where(ok1, i1, parent)
-    reverse, minus, g = (cell & 1) != 0, (cell & 2) != 0, cell >> 2
-    # Values at both ends of the slot's cell.
-    rows = torch.cat((first.flatten(0, 3), second.flatten(0, 2)))
-    at = torch.where(
-        ok1, g * 8 + (cell & 2) * 2 + (cell & 1), first.shape[0] * 8 + piece * 2 * _CLOSER + part - piece * _CLOSER
-    )
+    pair = ~left & ok3.index_select(0, back)
+    part = torch.where(ok2, i2, i3.index_select(0, back))
+    piece, which = part >> 2, part & 3
+    cell = torch.where(ok1, i1, close.gather(0, which))
+    reverse, minus, node = (cell & 1) != 0, (cell & 2) != 0, (cell >> 2) * _PARTS
+    # Both ends of the slot's cell.
+    at = torch.where(ok1, (cell >> 2) * 8 + (cell & 2) * 2 + (cell & 1), start + piece * (2 * _CLOSER) + which)
     to_slope = torch.where(ok1, 2, _CLOSER)
-    to_next = torch.where(ok1, 8, 2 * _CLOSER)
-    p0, p1 = rows.gather(0, at), rows.gather(0, at + to_next)
-    q0, q1 = rows.gather(0, at + to_slope), rows.gather(0, at + to_next + to_slope)
+    to_next = at + torch.where(ok1, 8, 2 * _CLOSER)
+    p0, p1 = rows.gather(0, at), rows.gather(0, to_next)
+    q0, q1 = rows.gather(0, at + to_slope), rows.gather(0, to_next + to_slope)
+    node = torch.where(ok1, node, node + piece)
+    low, high = _look_up(fine, node), _look_up(fine, node + torch.where(ok1, _PARTS, 1))
     step = torch.where(ok1, _STEP, _STEP / _PARTS)
-    tiles = torch.tan(torch.arange(_PARTS, dtype=c.dtype, device=c.device) * (_STEP / _PARTS))
-    low = _turn(z[g], tiles[torch.where(ok1, 0, piece)])
-    high = _turn(low, torch.where(ok1, math.tan(_STEP), math.tan(_STEP / _PARTS)))
     # From here on the path goes up from low to high, and h is positive at its start.
-    weight = ((1 + low * low) / (1 + high * high)) ** (n // 2)
-    up = torch.copysign(torch.ones_like(p0), p0)
+    weight = _power((1 + low * low) / (1 + high * high), n // 2)
+    up = torch.where(p0 > 0, torch.ones_like(p0), -1)
     along = torch.where(minus, -step, step) * up
-    start, dip = _cubic_start(p0.abs(), p1 * weight * up, q0 * along, q1 * weight * along, pair)
-    y = _turn(low, start * step * (1 + (start * step) ** 2 / 3))
+    begin, dip = _cubic_start(p0.abs(), p1 * weight * up, q0 * along, q1 * weight * along, pair)
+    angle = begin * step
+    tangent = angle * (1 + angle * angle / 3)
+    y = (low + tangent) / (1 - low * tangent)
     # The coefficients of the slot's sector, with the sign of the side in the odd ones.
     k = torch.where(reverse, both[:, 1, None], both[:, 0, None]) * up
-    k[1::2] = torch.where(minus, -k[1::2], k[1::2])
-    y, found = _newton(k, y, low, high, dip / (step * step), pair, right, n)
+    k[1::2] *= torch.where(minus, -torch.ones_like(up), 1)
+    y, found = _newton(k, y, low, high, dip / (step * step), pair, right, steps)
     found = found & (left | pair) & finite
     y = torch.where(found, torch.where(minus, -y, y), 0)
     one = torch.ones_like(y)
     return torch.where(reverse, one, y), torch.where(reverse, y, one), found
 
 
-def _turn(z: Tensor, tangent: Tensor | float) -> Tensor:
-    """The tangent of the sum of two angles."""
-    return (z + tangent) / (1 - z * tangent)
+def _power(x: Tensor, exponent: int) -> Tensor:
+    out = x if exponent % 2 else torch.ones_like(x)
+    while exponent := exponent // 2:
+        x = x * x
+        out = out * x if exponent % 2 else out
+    return out
 
 
-def _nodes(both: Float[Tensor, "m 2 batch"]) -> tuple[Float[Tensor, " nodes"], Float[Tensor, "nodes 2 2 2 batch"]]:
-    """The nodes z, and at [node, side (+z, -z), value or slope, polynomial or reversal] what the cells are judged by.
+def _look_up(table: Float[Tensor, " k"], index: Int[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    return table.index_select(0, index.flatten()).view(index.shape)
 
-    The slope is (1 + z^2) p' - n z p, a positive multiple of h' as the value p is of h, both with the same factor.
-    """
+
+def _nodes(both: Float[Tensor, "m 2 batch"], z: Float[Tensor, " nodes"], out: Float[Tensor, "nodes 2 2 2 batch"]) -> None:
     n = both.shape[0] - 1
-    z = torch.tan(torch.arange(_CELLS + 1, dtype=both.dtype, device=both.device) * _STEP)
-    z[-1] = 1
     k = torch.arange(n + 1, dtype=both.dtype, device=both.device)[:, None, None]
     q = torch.zeros_like(both)
     q[:-1] = both[1:] * k[1:]
@@ -133,8 +135,9 @@ def _nodes(both: Float[Tensor, "m 2 batch"]) -> tuple[Float[Tensor, " nodes"], F
     c = torch.stack((both, q), 1)
     square = (z * z)[:, None, None, None]
     even, odd = _horner(c[0::2], square), _horner(c[1::2], square)
-    odd = odd * z[:, None, None, None]
-    return z, torch.stack((even + odd, even - odd), 1)
+    odd *= z[:, None, None, None]
+    torch.add(even, odd, out=out[:, 0])
+    torch.sub(even, odd, out=out[:, 1])
 
 
 def _horner(c: Tensor, x: Tensor) -> Tensor:
@@ -155,22 +158,40 @@ def _horner_slope(c: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
 
 def _several(p: Tensor, q: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
     """Which cells between neighbours in the first dimension change sign, and which may hold two roots or more."""
-    positive = p > 0
     third = q * (step / _MARGIN)
-    out, back = positive ^ ((p + third) > 0), positive ^ ((p - third) > 0)
+    positive = p > 0
+    out, back = positive ^ (p > -third), positive ^ (p > third)
     changes = positive[1:] ^ positive[:-1]
     out, back = out[:-1], back[1:]
     return changes, (out & back) | (~changes & (out | back))
 
 
 def _positions(bits: Bool[Tensor, "cells batch"], count: int) -> tuple[Int[Tensor, "count batch"], Bool[Tensor, "count batch"]]:
-    """The first `count` cells whose bit is set, and whether there are that many; 0 where there are not."""
-    index, ok = _word_positions(bits[:_WORD], count)
-    for start in range(_WORD, bits.shape[0], _WORD):
-        more, more_ok = _word_positions(bits[start : start + _WORD], count)
-        more, more_ok = _after(more, more_ok, torch.arange(count, device=bits.device)[:, None] - ok.sum(0))
-        index, ok = torch.where(ok, index, more + start), ok | more_ok
-    return torch.where(ok, index, 0), ok
+    """The first `count` of a multiple of 8 cells whose bit is set, and whether there are that many; 0 where there are not."""
+    octets = bits.view(torch.uint8).unflatten(0, (-1, 8))
+    byte = octets[:, 7].clone()
+    for i in range(6, -1, -1):
+        byte.mul_(2).add_(octets[:, i])
+    words = []
+    for part in byte.long().split(8):
+        shift = torch.arange(part.shape[0], device=bits.device)[:, None] * 8
+        words.append((part << shift).sum(0))
+    word = torch.stack(words)
+    lowest = []
+    for _ in range(count):
+        bit = word & -word
+        lowest.append(bit)
+        word = word ^ bit
+    bit = torch.stack(lowest)
+    # The exponent of a power of two; the 64th bit is a sign.
+    index = ((bit.double().view(torch.int64) >> 52) & 0x7FF) - 1023
+    ok = bit != 0
+    slot = torch.arange(count, device=bits.device)[:, None]
+    first, found = index[:, 0], ok[:, 0]
+    for w in range(1, len(words)):
+        more, more_ok = _after(index[:, w] + w * 64, ok[:, w], slot - found.sum(0))
+        first, found = torch.where(found, first, more), found | more_ok
+    return torch.where(found, first, 0), found
 
 
 def _after(index: Tensor, ok: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
@@ -178,29 +199,14 @@ def _after(index: Tensor, ok: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
     return index.gather(0, take), ok.gather(0, take) & (shift >= 0)
 
 
-def _word_positions(bits: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    powers = 2.0 ** torch.arange(bits.shape[0], dtype=torch.float64, device=bits.device)
-    # Sums of powers of two are exact in any order.
-    word = (powers @ bits.double()).long()
-    lowest = []
-    for _ in range(count):
-        bit = word & -word
-        lowest.append(bit)
-        word = word ^ bit
-    bit = torch.stack(lowest)
-    # The exponent of a power of two.
-    return ((bit.double().view(torch.int64) >> 52) - 1023).clamp_min(0), bit != 0
-
-
-def _closer(both: Tensor, z: Tensor, cell: Int[Tensor, "closer batch"]) -> Float[Tensor, "parts 2 closer batch"]:
+def _closer(both: Tensor, fine: Tensor, cell: Int[Tensor, "closer batch"], out: Float[Tensor, "nodes 2 closer batch"]) -> None:
     """Values and slopes at the nodes that cut the given cells once more."""
     n = both.shape[0] - 1
-    tiles = torch.tan(torch.arange(_PARTS + 1, dtype=z.dtype, device=z.device) * (_STEP / _PARTS))[:, None, None]
-    x = _turn(z[cell >> 2], tiles)
+    x = _look_up(fine, (cell >> 2) * _PARTS + torch.arange(_PARTS + 1, device=cell.device)[:, None, None])
     x = torch.where((cell & 2) != 0, -x, x)
-    k = torch.where((cell & 1) != 0, both[:, 1, None], both[:, 0, None])
-    p, d = _horner_slope(k, x)
-    return torch.stack((p, (1 + x * x) * d - n * x * p), 1)
+    p, d = _horner_slope(torch.where((cell & 1) != 0, both[:, 1, None], both[:, 0, None]), x)
+    out[:, 0] = p
+    torch.addcmul((1 + x * x) * d, p, x, value=-n, out=out[:, 1])
 
 
 def _cubic_start(h0: Tensor, h1: Tensor, d0: Tensor, d1: Tensor, pair: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,23 +215,27 @@ def _cubic_start(h0: Tensor, h1: Tensor, d0: Tensor, d1: Tensor, pair: Tensor) -
     a2, a3 = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
     t = torch.full_like(h0, 0.5)
     for half in (0.25, 0.125, 0.0625):
-        value = ((a3 * t + a2) * t + d0) * t + h0
-        t = torch.where(value > 0, t + half, t - half)
+        value = torch.addcmul(h0, torch.addcmul(d0, torch.addcmul(a2, a3, t), t), t)
+        t = t + torch.where(value > 0, half, -half)
     for _ in range(2):
-        value = ((a3 * t + a2) * t + d0) * t + h0
-        t = (t - value / ((3 * a3 * t + 2 * a2) * t + d0)).clamp(0, 1)
-    bend = (a2 * a2 - 3 * a3 * d0).clamp_min(0).sqrt()
-    return torch.where(pair, (-d0 / (a2 + bend)).clamp(0, 1), t), 2 * bend
+        inner = torch.addcmul(a2, a3, t)
+        slope = torch.addcmul(d0, inner, t)
+        value = torch.addcmul(h0, slope, t)
+        slope.addcmul_(torch.addcmul(inner, a3, t), t)
+        t = (t - value / slope).clamp_(0, 1)
+    bend = torch.addcmul(a2 * a2, a3, d0, value=-3).clamp_min_(0).sqrt_()
+    return torch.where(pair, (-d0 / (a2 + bend)).clamp_(0, 1), t), 2 * bend
 
 
 def _newton(
-    k: Tensor, y: Tensor, low: Tensor, high: Tensor, bend: Tensor, pair: Tensor, right: Tensor, n: int
+    k: Tensor, y: Tensor, low: Tensor, high: Tensor, bend: Tensor, pair: Tensor, right: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
     """Newton's method between bounds that shrink; for a pair the parabola at the dip first. The root and whether it is one."""
+    n = k.shape[0] - 1
     p, d = _horner_slope(k, y)
     square = 1 + y * y
     q = square * d - n * y * p
-    bend = bend * (square / (1 + low * low)) ** (n // 2)
+    bend = bend * _power(square / (1 + low * low), n // 2)
     root = (q * q - 2 * p * bend).clamp_min(0).sqrt()
     angle = (torch.where(right, root, -root) - q) / bend
     found = ~pair | (p < 0)
@@ -233,7 +243,7 @@ def _newton(
     before = (p > 0) | right
     bottom, top = torch.where(before, y, low), torch.where(before & ~(pair & ~right), high, y)
     y = torch.where(pair, y + square * angle / (1 - y * angle), y - p / d)
-    for _ in range(3):
+    for _ in range(steps):
         # Rounding may carry a converged root over its bound.
         inside = (y >= bottom - 1e-10) & (y <= top + 1e-10)
         y = torch.where(inside, y, 0.5 * (bottom + top))

@@ -22,7 +22,10 @@ from torchsfm.optim import attach_implicit, wants_derivative
 _CHUNK = 1024
 """Problems at a time: their matrices fit the cache."""
 _INDEPENDENT = 1e-13
-_CONVERGED = 1e-6
+_POLISH = 3
+"""Newton steps: two for most, three for near-planar points."""
+_CONVERGED = 1e-5
+"""Distance from the manifold before the last of them."""
 
 # Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w); quadratic ones as pairs, squares first.
 _CUBICS = [(0, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 1), (0, 0, 2), (0, 0, 3), (1, 1, 2), (1, 1, 3), (0, 1, 2), (0, 1, 3)]
@@ -96,10 +99,10 @@ def _solve(d1: Float[Tensor, "5 3 batch"], d2: Float[Tensor, "5 3 batch"]) -> tu
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
     x, y, w = _three_rows(_eliminate(_constraints(basis.unflatten(1, (3, 3)))))
     n = _convolve(y[:, _NEXT], w[:, _AFTER]) - _convolve(y[:, _AFTER], w[:, _NEXT])
-    s, c, real = real_root_rows(_convolve(x, n).sum(1))
+    s, c, real = real_root_rows(_convolve(x, n).sum(1), steps=2)
     u = _back_substitute(x, y, w, s, c)
-    u, _ = _polish(u, basis)
-    u, error = _polish(u, basis)
+    for _ in range(_POLISH):
+        u, error = _polish(u, basis)
     E = _combine(u, basis)
     valid = real & fine & (error < _CONVERGED) & torch.isfinite(E).all(0)
     # An empty slot holds diag(1, 1, 0).
