@@ -160,9 +160,9 @@ def _patches(maps: Tensor, flat: Tensor, radius: int) -> Tensor:
     start = flat // inner * width + flat % inner
     steps = torch.arange(size, device=flat.device)
     index = start[..., None] + (steps[:, None] * width + steps).flatten()
-    b, n = flat.shape
-    values = maps.flatten(2).gather(2, index.reshape(b, 1, -1).expand(b, maps.shape[1], -1))
-    return values.reshape(b, -1, n, size, size).transpose(1, 2)
+    (b, n), channels = flat.shape, maps.shape[1]
+    values = maps.flatten(2).gather(2, index.reshape(b, 1, n * size * size).expand(b, channels, n * size * size))
+    return values.reshape(b, channels, n, size, size).transpose(1, 2)
 
 
 def _top_of_surface(strength: Tensor, flat: Tensor) -> Tensor:
