@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from torchsfm.simulation.surfaces import Rectangle
 from torchsfm.simulation.textured_scene import Textured, TexturedScene
 
 PROBES = (1, 2, 4, 8)
@@ -25,12 +26,19 @@ def cast(
     index = torch.full(d.shape[1:], -1, dtype=torch.int16, device=d.device)
     square = _dot(d, d)
     for i, thing in enumerate(scene.objects):
+        if isinstance(thing.surface, Rectangle):
+            s = thing.surface.intersect(origin, d)
+            closer = s < nearest
+            nearest = torch.where(closer, s, nearest)
+            index.masked_fill_(closer, i)
+            continue
         chosen = _near(thing, origin, d, square)
-        s = thing.surface.intersect(origin[:, chosen] if origin.shape[1] > 1 else origin, d[:, chosen])
-        closer = s < nearest[chosen]
-        chosen = chosen[closer]
-        nearest[chosen] = s[closer]
-        index[chosen] = i
+        start = origin if origin.shape[1] == 1 else origin.index_select(1, chosen)
+        s = thing.surface.intersect(start, d.index_select(1, chosen))
+        closer = (s < nearest.index_select(0, chosen)).nonzero()[:, 0]
+        chosen = chosen.index_select(0, closer)
+        nearest.index_copy_(0, chosen, s.index_select(0, closer))
+        index.index_fill_(0, chosen, i)
     return nearest, index
 
 
@@ -43,13 +51,17 @@ def lit(scene: TexturedScene, X: Float[Tensor, "3 n"]) -> Bool[Tensor, "n"]:
     free = torch.ones(X.shape[1:], dtype=torch.bool, device=X.device)
     square = torch.ones_like(X[0])
     for thing in scene.objects:
+        if isinstance(thing.surface, Rectangle):
+            free &= torch.isinf(thing.surface.intersect(X, sun))
+            continue
         chosen = _near(thing, X, sun, square)
-        free[chosen] &= torch.isinf(thing.surface.intersect(X[:, chosen], sun[:, chosen]))
+        s = thing.surface.intersect(X.index_select(1, chosen), sun.index_select(1, chosen))
+        free.index_fill_(0, chosen.index_select(0, torch.isfinite(s).nonzero()[:, 0]), False)
     return free
 
 
 def _near(thing: Textured, origin: Tensor, d: Tensor, square: Tensor) -> Tensor:
-    """Which rays come near enough to the surface to be worth intersecting: those that meet the ball around it."""
+    """Which rays come near enough to a solid to be worth intersecting: those that meet the ball around it."""
     middle, radius = thing.surface.ball()
     o = middle.to(d)[:, None] - origin
     ahead = (o.T @ d)[0] if o.shape[1] == 1 else _dot(o, d)
@@ -91,12 +103,12 @@ def shade(
         chosen = (index == i).nonzero()[:, 0]
         if not len(chosen):
             continue
-        e, s = d[:, chosen], distance[chosen]
+        e, s = d.index_select(1, chosen), distance.index_select(0, chosen)
         chart = thing.surface.chart(origin + s * e)
         normal = chart.normal
         facing = _dot(normal, e)
         steps = []
-        for step in (dx[:, chosen], dy[:, chosen]):
+        for step in (dx.index_select(1, chosen), dy.index_select(1, chosen)):
             # Where the neighbouring ray meets the tangent plane.
             moved = s * (step - e * (_dot(normal, step) / facing))
             steps += [_dot(g, moved) / thing.texel for g in (chart.du, chart.dv)]
@@ -105,7 +117,7 @@ def shade(
         outside = -torch.sign(facing)
         light = scene.ambient * (0.8 + 0.2 * normal[2] * outside)
         light = light + (1 - scene.ambient) * 1.25 * ((sun @ normal) * outside).clamp_min(0) * sunny[chosen]
-        color[:, chosen] = texture * light.to(torch.float32)
+        color.index_copy_(1, chosen, texture * light.to(torch.float32))
     return color.clamp(0, 1)
 
 
@@ -129,11 +141,11 @@ def lookup(
     for key in torch.bincount(wanted).nonzero()[:, 0].tolist():
         pyramid, probes = thing.sheets[key // len(PROBES)], PROBES[key % len(PROBES)]
         chosen = (wanted == key).nonzero()[:, 0]
-        at, along = uv[:, chosen], step[:, chosen]
-        level = torch.log2(torch.maximum(long[chosen] / probes, wide[chosen]).clamp_min(1.0))
+        at, along = uv.index_select(1, chosen), step.index_select(1, chosen)
+        level = torch.maximum(long.index_select(0, chosen) / probes, wide.index_select(0, chosen)).clamp_min(1.0).log2()
         shift = (torch.arange(probes, device=uv.device) + 0.5) / probes - 0.5
         every = (at[:, None] + along[:, None] * shift[:, None]).reshape(2, -1)
-        color[:, chosen] = _trilinear(pyramid, every, level.repeat(probes)).reshape(3, probes, -1).mean(1)
+        color.index_copy_(1, chosen, _trilinear(pyramid, every, level.repeat(probes)).reshape(3, probes, -1).mean(1))
     return color
 
 
@@ -148,9 +160,9 @@ def _trilinear(pyramid: tuple[Tensor, ...], uv: Tensor, level: Tensor) -> Tensor
             continue
         image = pyramid[k]
         size = torch.tensor([image.shape[2], image.shape[1]], device=uv.device)
-        grid = uv[:, chosen].T * (2.0 / 2**k / size) - 1
+        grid = uv.index_select(1, chosen).T * (2.0 / 2**k / size) - 1
         value = functional.grid_sample(
             image[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
         )[0, :, 0]
-        color[:, chosen] += value * weight[chosen]
+        color.index_add_(1, chosen, value * weight.index_select(0, chosen))
     return color
