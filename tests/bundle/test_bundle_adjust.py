@@ -21,7 +21,7 @@ from torchsfm.geometry import (
     similarity_from_points,
 )
 from torchsfm.optim import Cauchy, RigidMotion, Subset
-from torchsfm.optim.terms import Block, Term, lift_of, linearize
+from torchsfm.optim.terms import Block, Term, Workspace, lift_of, linearize
 
 F64 = torch.float64
 DISTORTION = {
@@ -87,15 +87,23 @@ def test_jacobians(model: str, generator: torch.Generator) -> None:
     values = {name: b.x.mT.contiguous().mT for name, b in blocks.items()}
     term = Term(projection.residual, ("pose", "camera", "point"), (view, group[view], point), (x,))
     lifts = {name: lift_of(b, values[name]) for name, b in blocks.items()}
-    r, automatic = linearize(term, values, lifts, (True, True, True))
     written = Term(term.residual, term.blocks, term.index, term.data, linearize=projection.linearize)
-    r2, by_hand = linearize(written, values, lifts, (True, True, True))
-    torch.testing.assert_close(r2, r, rtol=1e-12, atol=1e-9)
-    for a, b in zip(automatic, by_hand, strict=True):
-        torch.testing.assert_close(b, a, rtol=1e-9, atol=1e-8)
-    for wanted in ((True, False, False), (False, True, True)):
-        _, some = linearize(written, values, lifts, wanted)
-        assert [j is not None for j in some] == list(wanted)
+    sizes = (6, len(columns), 3)
+
+    def jacobians(term: Term, *wanted: bool) -> tuple[Tensor, list[Tensor | None]]:
+        m = len(x)
+        out = [x.new_empty((2, s, m)).permute(2, 0, 1) if w else None for s, w in zip(sizes, wanted, strict=True)]
+        residual, scale = linearize(term, values, lifts, out, Workspace(x))
+        assert scale is None
+        return residual, out
+
+    r, automatic = jacobians(term, True, True, True)
+    for wanted in ((True, True, True), (False, True, True), (True, False, False), (False, False, True)):
+        r2, by_hand = jacobians(written, *wanted)
+        torch.testing.assert_close(r2, r, rtol=1e-12, atol=1e-9)
+        for a, b, w in zip(automatic, by_hand, wanted, strict=True):
+            if w:
+                torch.testing.assert_close(b, a, rtol=1e-9, atol=1e-8)
 
 
 @pytest.mark.parametrize("model", list(DISTORTION))

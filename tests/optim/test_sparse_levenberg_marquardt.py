@@ -127,6 +127,7 @@ def test_small_chunks_change_nothing(scene: Scene, monkeypatch: pytest.MonkeyPat
     whole = sparse_levenberg_marquardt(scene.blocks(), [scene.term(loss=Cauchy(1.0))], eliminate="point", max_iterations=4)
     for seconds in (0.0, torch.inf):
         monkeypatch.setattr(schur, "CHUNK", 7)
+        monkeypatch.setattr(coupling_groups, "CHUNK", 7)
         monkeypatch.setattr(coupling_pairs, "BATCH", 16)
         monkeypatch.setattr(schur, "estimate_pairs", lambda layout, seconds=seconds: seconds)
         cut = sparse_levenberg_marquardt(scene.blocks(), [scene.term(loss=Cauchy(1.0))], eliminate="point", max_iterations=4)

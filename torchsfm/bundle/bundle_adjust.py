@@ -100,7 +100,7 @@ def bundle_adjust(
         "camera": Block(rows, Subset(rows.shape[1], columns), fixed_cameras),
         "point": Block(X, None, fixed_points),
     }
-    projection = Projection(model, columns)
+    projection = Projection(model, columns, bool((rows[:, 4] != 0).any()) or 4 in columns)
     gathered = (view, index[view], point)
     names = ("pose", "camera", "point")
     terms = [Term(projection.residual, names, gathered, (x,), loss, weights, projection.linearize)]

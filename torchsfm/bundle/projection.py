@@ -50,108 +50,138 @@ class Projection:
     model: type[DistortionModel]
     free: tuple[int, ...]
     """Columns of the camera row that are optimised."""
+    skew: bool = True
+    """Whether any camera has skew; False saves time."""
 
     def residual(self, pose: Tensor, camera: Tensor, point: Tensor, x: Tensor) -> Tensor:
         """Predicted minus measured image points, pixels; finite for all finite points, also behind the camera."""
-        X, Y, Z = _transform(pose, point)
-        u, v = self.model.project_rows(X, Y, Z, *camera[:, 5:].unbind(-1))
-        fx, aspect, cx, cy, skew = camera[:, :5].unbind(-1)
-        ex = torch.addcmul(torch.addcmul(cx - x[:, 0], fx, u), skew, v)
-        ey = torch.addcmul(cy - x[:, 1], fx * aspect, v)
-        return torch.stack((ex, ey)).mT
+        moved, k = _transform(pose, point), camera.mT[5:]
+        if issubclass(self.model, RADIAL):
+            uv, _, s = _flatten(moved)
+            if len(k):
+                uv = uv * _radial(s, k)
+        else:
+            uv = torch.stack(self.model.project_rows(*moved.unbind(0), *k.unbind(0)))
+        return self._pixels(uv, camera.mT, x.mT, _focal(camera.mT)).mT
 
-    def linearize(
-        self, pose: Tensor, camera: Tensor, point: Tensor, x: Tensor, wanted: tuple[bool, ...]
-    ) -> tuple[Tensor, list[Tensor | None]]:
-        """Residuals, and Jacobians by pose step, free camera numbers and point; by the chain rule, written out."""
-        X, Y, Z = _transform(pose, point)
-        distortion = camera[:, 5:].unbind(-1)
-        u, v, by_ray, by_parameter = _distort(self.model, X, Y, Z, distortion)
-        fx, aspect, cx, cy, skew = camera[:, :5].unbind(-1)
-        fy = fx * aspect
-        ex = torch.addcmul(torch.addcmul(cx - x[:, 0], fx, u), skew, v)
-        ey = torch.addcmul(cy - x[:, 1], fy, v)
-        # Pixels by camera coordinates: (2, 3, m).
-        by_camera = torch.stack((torch.addcmul(fx * by_ray[0], skew, by_ray[1]), fy * by_ray[1]))
-        jacobians: list[Tensor | None] = [None, None, None]
-        if wanted[0]:
-            gx, gy, gz = by_camera.unbind(1)
-            turn = (
-                torch.addcmul(Y * gz, Z, gy, value=-1),
-                torch.addcmul(Z * gx, X, gz, value=-1),
-                torch.addcmul(X * gy, Y, gx, value=-1),
-            )
-            jacobians[0] = torch.cat((torch.stack(turn, 1), by_camera), 1).permute(2, 0, 1)
-        if wanted[1]:
-            zero, one = torch.zeros_like(ex), torch.ones_like(ex)
-            columns = [(u, aspect * v), (zero, fx * v), (one, zero), (zero, one), (v, zero)]
-            columns += [(torch.addcmul(fx * du, skew, dv), fy * dv) for du, dv in by_parameter]
-            chosen = [columns[c] for c in self.free]
-            jacobians[1] = torch.stack([torch.stack(pair) for pair in chosen], 1).permute(2, 0, 1)
-        if wanted[2]:
+    def linearize(self, pose: Tensor, camera: Tensor, point: Tensor, x: Tensor, out: list[Tensor | None]) -> Tensor:
+        """Residuals; `out` gets their derivatives by pose step, free camera numbers and point: the chain rule, written out."""
+        moved, rows = _transform(pose, point), camera.mT
+        by_pose, by_intrinsics, by_point = (None if o is None else o.permute(1, 2, 0) for o in out)
+        # Pixels by camera coordinates, which is pixels by translation: (2, 3, m).
+        by_camera = (
+            torch.empty((2, 3, moved.shape[1]), dtype=moved.dtype, device=moved.device) if by_pose is None else by_pose[:, 3:]
+        )
+        if issubclass(self.model, RADIAL):
+            uv, by_parameter = _differentiate_radial(moved, rows[5:], by_camera)
+        else:
+            uv, by_parameter = _differentiate(self.model, moved, rows[5:], by_camera)
+        focal = _focal(rows)
+        residual = self._pixels(uv, rows, x.mT, focal)
+        shear = rows[4] * by_camera[1] if self.skew else None
+        by_camera *= focal[:, None]
+        if shear is not None:
+            by_camera[0] += shear
+        if by_pose is not None:
+            # A small turn w moves the point by w x X, so the derivative is X x gradient.
+            for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+                torch.mul(by_camera[:, k], moved[j], out=by_pose[:, i]).addcmul_(by_camera[:, j], moved[k], value=-1)
+        if by_intrinsics is not None:
+            self._by_intrinsics(uv, rows, focal, by_parameter, by_intrinsics)
+        if by_point is not None:
             R = pose.mT[:9].reshape(3, 3, -1)
-            by_point = by_camera[:, 0, None] * R[0]
-            by_point.addcmul_(by_camera[:, 1, None], R[1]).addcmul_(by_camera[:, 2, None], R[2])
-            jacobians[2] = by_point.permute(2, 0, 1)
-        return torch.stack((ex, ey)).mT, jacobians
+            torch.mul(by_camera[:, :1], R[0], out=by_point)
+            by_point.addcmul_(by_camera[:, 1:2], R[1]).addcmul_(by_camera[:, 2:], R[2])
+        return residual.mT
+
+    def _pixels(self, uv: Tensor, rows: Tensor, x: Tensor, focal: Tensor) -> Tensor:
+        pixels = torch.addcmul(rows[2:4] - x, focal, uv)
+        if self.skew:
+            pixels = torch.stack((torch.addcmul(pixels[0], rows[4], uv[1]), pixels[1]))
+        return pixels
+
+    def _by_intrinsics(self, uv: Tensor, rows: Tensor, focal: Tensor, by_parameter: Sequence[Tensor], out: Tensor) -> None:
+        for place, column in enumerate(self.free):
+            here = out[:, place]
+            if column == 0:
+                here[0] = uv[0]
+                torch.mul(rows[1], uv[1], out=here[1])
+            elif column == 1:
+                here[0] = 0
+                torch.mul(rows[0], uv[1], out=here[1])
+            elif column in (2, 3):
+                here[column - 2] = 1
+                here[3 - column] = 0
+            elif column == 4:
+                here[0] = uv[1]
+                here[1] = 0
+            else:
+                by = by_parameter[column - 5]
+                torch.mul(focal, by, out=here)
+                if self.skew:
+                    here[0].addcmul_(rows[4], by[1])
 
 
-def _transform(pose: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+RADIAL = (NoDistortion, SimpleRadial, Radial)
+NEAREST = 1e20
+"""Largest reciprocal of a depth: it keeps every derivative finite for points in the focal plane."""
+
+
+def _focal(rows: Tensor) -> Tensor:
+    return torch.stack((rows[0], rows[0] * rows[1]))
+
+
+def _transform(pose: Tensor, point: Tensor) -> Tensor:
+    """Points in camera coordinates, (3, m)."""
     p = pose.mT
     X, Y, Z = point.unbind(-1)
-    moved = torch.addcmul(p[9:], p[0:9:3], X).addcmul_(p[1:9:3], Y) if not pose.requires_grad else None
-    if moved is None or point.requires_grad:
-        moved = p[9:] + p[0:9:3] * X + p[1:9:3] * Y + p[2:9:3] * Z
-    else:
-        moved.addcmul_(p[2:9:3], Z)
-    a, b, c = moved.unbind(0)
-    return a, b, c
+    return torch.addcmul(torch.addcmul(torch.addcmul(p[9:], p[0:9:3], X), p[1:9:3], Y), p[2:9:3], Z)
 
 
-def _distort(
-    model: type[DistortionModel], X: Tensor, Y: Tensor, Z: Tensor, parameters: Sequence[Tensor]
-) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-    """Distorted coordinates with derivatives by the ray (2, 3, m) and by each parameter."""
-    if issubclass(model, NoDistortion | SimpleRadial | Radial):
-        return _radial(X, Y, Z, parameters)
-    leaves = [r.detach().requires_grad_() for r in (X, Y, Z, *parameters)]
+def _flatten(moved: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`(X, Y) / Z`, 1 / Z, and the squared radius."""
+    depth = moved[2].reciprocal().clamp(-NEAREST, NEAREST)
+    uv = moved[:2] * depth
+    return uv, depth, torch.addcmul(uv[0] * uv[0], uv[1], uv[1])
+
+
+def _radial(s: Tensor, k: Tensor) -> Tensor:
+    """`1 + k1 s + k2 s^2`."""
+    inner = k[0] if len(k) == 1 else torch.addcmul(k[0], k[1], s)
+    return 1 + inner * s
+
+
+def _differentiate_radial(moved: Tensor, k: Tensor, by_ray: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Distorted coordinates (2, m) and their derivatives by each parameter (2, m); `by_ray` (2, 3, m) gets those by the ray.
+
+    `h (x, y)` grows by h in every direction, and by `2 h' s` more outwards, where depth acts.
+    """
+    uv, depth, s = _flatten(moved)
+    if not len(k):
+        by_ray[:, :2] = 0
+        by_ray[0, 0] = by_ray[1, 1] = depth
+        torch.mul(uv, -depth, out=by_ray[:, 2])
+        return uv, []
+    h = _radial(s, k)
+    slope = (k[0] if len(k) == 1 else torch.addcmul(k[0], k[1], s, value=2)) * depth * 2
+    along = h * depth
+    bent = uv * slope
+    torch.addcmul(along, uv[0], bent[0], out=by_ray[0, 0])
+    torch.addcmul(along, uv[1], bent[1], out=by_ray[1, 1])
+    torch.mul(uv[0], bent[1], out=by_ray[0, 1])
+    by_ray[1, 0] = by_ray[0, 1]
+    torch.mul(uv, torch.addcmul(along, s, slope).neg_(), out=by_ray[:, 2])
+    first = uv * s
+    return uv * h, [first] if len(k) == 1 else [first, first * s]
+
+
+def _differentiate(model: type[DistortionModel], moved: Tensor, k: Tensor, by_ray: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """The same for any model, by two reverse sweeps."""
+    leaves = [row.detach().requires_grad_() for row in (*moved, *k)]
     with torch.enable_grad():
         both = model.project_rows(*leaves)
-        ones = torch.ones_like(X)
+        ones = torch.ones_like(leaves[0])
         du, dv = (torch.autograd.grad(c, leaves, ones, retain_graph=True, materialize_grads=True) for c in both)
-    by_ray = torch.stack((torch.stack(du[:3]), torch.stack(dv[:3])))
-    return both[0].detach(), both[1].detach(), by_ray, list(zip(du[3:], dv[3:], strict=True))
-
-
-def _radial(
-    X: Tensor, Y: Tensor, Z: Tensor, parameters: Sequence[Tensor]
-) -> tuple[Tensor, Tensor, Tensor, list[tuple[Tensor, Tensor]]]:
-    """`(x, y) (1 + k1 s + k2 s^2)` with s = x^2 + y^2, x = X / Z, y = Y / Z."""
-    eps = torch.finfo(Z.dtype).eps
-    floor = torch.maximum(X.abs(), Y.abs()) * eps + eps * eps
-    depth = 1 / torch.copysign(torch.maximum(Z.abs(), floor), Z)
-    x, y = X * depth, Y * depth
-    zero = torch.zeros_like(x)
-    if not parameters:
-        by_ray = torch.stack((torch.stack((depth, zero, -x * depth)), torch.stack((zero, depth, -y * depth))))
-        return x, y, by_ray, []
-    s = torch.addcmul(x * x, y, y)
-    k1 = parameters[0]
-    if len(parameters) == 1:
-        h = torch.addcmul(torch.ones_like(s), k1, s)
-        slope = 2 * k1
-    else:
-        k2 = parameters[1]
-        h = torch.addcmul(torch.ones_like(s), torch.addcmul(k1, k2, s), s)
-        slope = 2 * torch.addcmul(k1, k2, s, value=2)
-    # h (x, y) grows by h in every direction and by s slope more outwards; outwards is what depth changes.
-    out = torch.addcmul(h, s, slope) * depth
-    xs, ys = x * slope, y * slope
-    xx = torch.addcmul(h, x, xs) * depth
-    yy = torch.addcmul(h, y, ys) * depth
-    xy = x * ys * depth
-    by_ray = torch.stack((torch.stack((xx, xy, -x * out)), torch.stack((xy, yy, -y * out))))
-    by_parameter = [(x * s, y * s)]
-    if len(parameters) == 2:
-        by_parameter.append((x * s * s, y * s * s))
-    return x * h, y * h, by_ray, by_parameter
+    for row, slope in zip((*by_ray[0], *by_ray[1]), (*du[:3], *dv[:3]), strict=True):
+        row.copy_(slope)
+    return torch.stack(both).detach(), [torch.stack(pair) for pair in zip(du[3:], dv[3:], strict=True)]

@@ -9,8 +9,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsfm.optim.layout import Layout, Piece
+from torchsfm.optim.layout import CHUNK, Layout, Piece
+from torchsfm.optim.terms import Workspace
 
+CACHE = 100_000
+"""Numbers worked on at once, to stay in the cache."""
 ATOM = 64
 """Points that stay together when groups are formed."""
 PRODUCT = 6.0 / 25e9
@@ -39,13 +42,15 @@ class GroupCoupling:
 
     def __init__(self, layout: Layout, spans: list[Span], some: Tensor) -> None:
         self.size, self.q, self.points = layout.size, layout.point_size, layout.points
-        self.groups, self.targets = _lay_groups(layout, spans)
-        largest = max(g.columns.numel() * (g.end - g.start) for g in self.groups)
+        self.groups, targets = _lay_groups(layout, spans)
+        # Contiguous for each call of `add`.
+        self._targets = [
+            {start: t[:, start : start + CHUNK].flatten() for start in range(0, t.shape[1], CHUNK)} for t in targets
+        ]
         total = sum(g.columns.numel() * (g.end - g.start) for g in self.groups)
         # These live as long as the problem: memory that is new costs more than the arithmetic on it.
         self._W = some.new_empty((self.q, total))
-        self._scratch = some.new_empty(self.q * largest)
-        self._product = some.new_empty(0)
+        self._work = Workspace(some)
 
     def clear(self) -> None:
         """Start a linearisation."""
@@ -54,10 +59,8 @@ class GroupCoupling:
     def add(self, piece: int, start: int, J: Tensor, P: Tensor) -> None:
         """Add the products of Jacobians J (d, c, m) and P (d, q, m), those of a piece's residuals from `start` on."""
         d, c, m = J.shape
-        target = self.targets[piece][:, start : start + m].reshape(-1)
-        if self._product.numel() < c * m:
-            self._product = J.new_empty(c * m)
-        product = self._product[: c * m].view(c, m)
+        target = self._targets[piece][start]
+        product = self._work.get("product", c, m)
         for a in range(self.q):
             torch.mul(J[0], P[0, a], out=product)
             for k in range(1, d):
@@ -68,18 +71,21 @@ class GroupCoupling:
         """Subtract `W V^-1 W'` from S, with `V = L L'`; return `W L'^-1 z`."""
         right = S.new_zeros(S.shape[0])
         for group in self.groups:
-            W, span = self._matrix(group), slice(group.start, group.end)
-            Y = self._scratch[: W.numel()].view(W.shape)
-            for a in range(self.q):
-                row = W[a]
-                for b in range(a):
-                    torch.addcmul(row, L[a][b][span], Y[b], value=-1, out=Y[a])
-                    row = Y[a]
-                torch.mul(row, L[a][a][span], out=Y[a])
-            square, part = Y[0] @ Y[0].mT, Y[0] @ z[0, span]
-            for a in range(1, self.q):
-                square.addmm_(Y[a], Y[a].mT)
-                part.addmv_(Y[a], z[a, span])
+            columns = group.columns.numel()
+            square, part = S.new_zeros((columns, columns)), S.new_zeros(columns)
+            step = max(ATOM, CACHE // (columns * self.q + 1))
+            for first in range(group.start, group.end, step):
+                last = min(first + step, group.end)
+                W, span = self._matrix(group)[:, :, first - group.start : last - group.start], slice(first, last)
+                Y = self._work.get("Y", *W.shape)
+                for a in range(self.q):
+                    row = W[a]
+                    for b in range(a):
+                        torch.addcmul(row, L[a][b][span], Y[b], value=-1, out=Y[a])
+                        row = Y[a]
+                    torch.mul(row, L[a][a][span], out=Y[a])
+                    square.addmm_(Y[a], Y[a].mT)
+                    part.addmv_(Y[a], z[a, span])
             if group.everything:
                 S[: self.size, : self.size] -= square
                 right[: self.size] += part

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.optim.layout import Layout
+from torchsfm.optim.terms import Workspace
 
 PAIR = 1.5e-7
 """Seconds per pair, on a usual core."""
@@ -46,8 +47,7 @@ class PairCoupling:
         # One row of zeros more, for padding.
         self._W = some.new_zeros((rows + 1, self.q, self.width))
         self._Y = torch.zeros_like(self._W)
-        self._left = some.new_empty((BATCH, self.q * self.width))
-        self._right = torch.empty_like(self._left)
+        self._work = Workspace(some)
 
     def _plan(self, slots: Tensor, count: int) -> None:
         order = torch.argsort(self.point * count + slots)
@@ -73,9 +73,8 @@ class PairCoupling:
         starts = (runs.cumsum(0) - runs) * self._run - (sizes.cumsum(0) - sizes)
         place = torch.arange(left.numel(), device=left.device) + starts.repeat_interleave(sizes)
         padded = int(runs.sum()) * self._run
-        self._index = [
-            torch.full((padded,), slots.numel(), device=left.device).index_copy_(0, place, side) for side in (left, right)
-        ]
+        blank = torch.full((padded,), slots.numel(), device=left.device)
+        self._left, self._right = blank.index_copy(0, place, left), blank.index_copy(0, place, right)
         self._block = torch.arange(blocks.numel(), device=blocks.device).repeat_interleave(runs)
         self._row = self.columns[torch.div(blocks, count, rounding_mode="floor")] if count else self.columns
         self._column = self.columns[blocks % count] if count else self.columns
@@ -89,7 +88,7 @@ class PairCoupling:
         begin = self._first[piece] + start
         rows = self._W[begin : begin + m]
         for a in range(self.q):
-            product = J[0] * P[0, a]
+            product = torch.mul(J[0], P[0, a], out=self._work.get("product", c, m))
             for k in range(1, d):
                 product.addcmul_(J[k], P[k, a])
             rows[:, a, :c] = product.mT
@@ -101,7 +100,9 @@ class PairCoupling:
         step = BATCH
         for begin in range(0, self.point.numel(), step):
             span = slice(begin, begin + step)
-            torch.bmm(inverse.index_select(0, self.point[span]), self._W[:-1][span], out=self._Y[:-1][span])
+            chosen = self._work.get("inverse", self.point[span].numel(), q, q)
+            torch.index_select(inverse, 0, self.point[span], out=chosen)
+            torch.bmm(chosen, self._W[:-1][span], out=self._Y[:-1][span])
         right = S.new_zeros(wide)
         squares, sums = [], []
         at = z.mT.index_select(0, self.point)
@@ -116,13 +117,15 @@ class PairCoupling:
         S.view(-1).index_add_(0, place.flatten(), torch.stack(squares).flatten(), alpha=-1)
         flat = self._Y.view(-1, q * c)
         total = S.new_zeros((self._row.shape[0], c * c))
-        for begin in range(0, self._index[0].numel(), step):
+        for begin in range(0, self._left.numel(), step):
             sides = []
-            for index, buffer in zip(self._index, (self._left, self._right), strict=True):
+            for name, index in (("left", self._left), ("right", self._right)):
                 chosen = index[begin : begin + step]
-                sides.append(torch.index_select(flat, 0, chosen, out=buffer[: chosen.numel()]).view(-1, self._run * q, c))
+                out = self._work.get(name, chosen.numel(), q * c)
+                sides.append(torch.index_select(flat, 0, chosen, out=out).view(-1, self._run * q, c))
             block = self._block[begin // self._run : (begin + step) // self._run]
-            total.index_add_(0, block, torch.bmm(sides[0].mT, sides[1]).view(-1, c * c))
+            product = self._work.get("pairs", block.numel(), c, c)
+            total.index_add_(0, block, torch.bmm(sides[0].mT, sides[1], out=product).view(-1, c * c))
         place = self._row[:, :, None] * wide + self._column[:, None]
         off = torch.zeros_like(S)
         off.view(-1).index_add_(0, place.flatten(), total.view(-1))

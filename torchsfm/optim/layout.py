@@ -5,7 +5,7 @@ slot are products of contiguous matrices, and variables shared between slots are
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -84,24 +84,22 @@ def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | No
         if name != eliminate and free[name].numel():
             first[name] = size
             size += free[name].numel() * block.tangent
-    pieces: list[Piece] = []
+    drafts: list[Piece] = []
     still: list[Term] = []
     for term in terms:
         rows = _cut(term, number, eliminate)
         places = [number[name][index] for name, index in zip(term.blocks, term.index, strict=True)]
         for kind in ((True, True), (True, False), (False, True)):
             if rows[kind].numel():
-                pieces.append(_sort(term, rows[kind], places, kind, blocks, first, size, eliminate))
+                drafts.append(_find_slots(term, rows[kind], places, kind, blocks, first, size, eliminate))
         if rows[False, False].numel():
             still.append(term.select(rows[False, False]))
     if eliminate is None or not free[eliminate].numel():
-        return Layout(free, first, size, None, 0, pieces, still)
-    count = free[eliminate].numel()
-    order = _order_points(pieces, count)
+        return Layout(free, first, size, None, 0, [_sort(piece, None) for piece in drafts], still)
+    order = _order_points(drafts, free[eliminate].numel())
     free[eliminate] = free[eliminate][order]
-    rank = torch.empty_like(order).index_copy_(0, order, torch.arange(count, device=order.device))
-    pieces = [_renumber(piece, rank) for piece in pieces]
-    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, pieces, still)
+    rank = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
+    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, [_sort(piece, rank) for piece in drafts], still)
 
 
 def _cut(term: Term, number: dict[str, Tensor], eliminate: str | None) -> dict[tuple[bool, bool], Tensor]:
@@ -123,7 +121,7 @@ def _cut(term: Term, number: dict[str, Tensor], eliminate: str | None) -> dict[t
     }
 
 
-def _sort(
+def _find_slots(
     term: Term,
     rows: Tensor,
     places: list[Tensor],
@@ -133,6 +131,7 @@ def _sort(
     size: int,
     eliminate: str | None,
 ) -> Piece:
+    """A piece, not sorted yet."""
     camera, with_point = kind
     places = [place[rows] for place in places]
     wanted = tuple(
@@ -146,21 +145,23 @@ def _sort(
     for _, place in retained:
         key = key * (int(place.max()) + 2) + place + 1
     values, slots = torch.unique(key, return_inverse=True)
-    order = torch.argsort(slots if point is None else slots * (int(point.max()) + 1) + point)
-    rows, slots = rows[order], slots[order]
     columns = rows.new_empty((values.numel(), 0))
     for name, place in reversed(retained):
-        mine = torch.empty_like(values).index_copy_(0, slots, place[order])[:, None]
+        mine = torch.empty_like(values).index_copy_(0, slots, place)[:, None]
         width = blocks[name].tangent
         step = torch.arange(width, device=rows.device)
         columns = torch.cat((torch.where(mine >= 0, first[name] + mine * width + step, size + 1), columns), 1)
-    return Piece(term.select(rows), wanted, slots, columns, None if point is None else point[order])
+    return Piece(term.select(rows), wanted, slots, columns, point)
 
 
-def _renumber(piece: Piece, rank: Tensor) -> Piece:
-    if piece.point is None:
-        return piece
-    return Piece(piece.term, piece.wanted, piece.slots, piece.columns, rank[piece.point])
+def _sort(piece: Piece, rank: Tensor | None) -> Piece:
+    """Sort by slot, then by the new number of the eliminated variable."""
+    if piece.point is None or rank is None:
+        order = torch.argsort(piece.slots, stable=True)
+        return replace(piece, term=piece.term.select(order), slots=piece.slots[order])
+    point = rank[piece.point]
+    order = torch.argsort(piece.slots * rank.numel() + point)
+    return replace(piece, term=piece.term.select(order), slots=piece.slots[order], point=point[order])
 
 
 def _order_points(pieces: list[Piece], count: int) -> Tensor:

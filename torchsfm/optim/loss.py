@@ -118,4 +118,4 @@ def loss_slope(loss: Loss, s: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
         with torch.enable_grad():
             variable = s.detach().requires_grad_()
             (slope,) = torch.autograd.grad(loss(variable).sum(), variable)
-    return torch.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).clamp_min(0)
+    return torch.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).clamp_min_(0)

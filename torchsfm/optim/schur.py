@@ -19,7 +19,7 @@ from torch import Tensor
 from torchsfm.optim.coupling_groups import GroupCoupling, plan_groups
 from torchsfm.optim.coupling_pairs import PairCoupling, estimate_pairs
 from torchsfm.optim.layout import CHUNK, Layout, Piece
-from torchsfm.optim.terms import Block, Term, gather, lift_of, linearize
+from torchsfm.optim.terms import Block, Term, Workspace, gather, lift_of, linearize, term_cost, term_residual
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class _Part:
     wanted: tuple[bool, ...]
     width: int
     """Tangent coordinates of a slot."""
+    components: int
+    """Numbers in a residual."""
     segments: list[tuple[int, int]]
     """Where runs of one slot begin and end."""
     places: Tensor
@@ -46,7 +48,8 @@ class Elimination:
     def __init__(self, blocks: dict[str, Block], layout: Layout) -> None:
         self.blocks = blocks
         self.layout = layout
-        self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, layout.size)]
+        x = {name: b.x for name, b in blocks.items()}
+        self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, layout.size, x)]
         some = next(iter(blocks.values())).x
         q, n, size = layout.point_size, layout.points, layout.size
         self.coupling: GroupCoupling | PairCoupling | None = None
@@ -55,9 +58,13 @@ class Elimination:
             dense = seconds <= estimate_pairs(layout)
             self.coupling = GroupCoupling(layout, spans, some) if dense else PairCoupling(layout, some)
         self.U = some.new_empty((size + 2, size + 2))
-        self.V = some.new_empty((q * (q + 1) // 2, n))
-        self.h = some.new_empty((q, n))
-        self._work: dict[tuple[str, int, int], Tensor] = {}
+        self.V = some.new_empty((q * (q + 3) // 2, n))
+        self.work = Workspace(some)
+
+    def cost(self, x: dict[str, Tensor]) -> Tensor:
+        """The cost of all residuals that depend on something free."""
+        costs = [term_cost(part.term, term_residual(part.term, x, self.work)) for part in self.parts]
+        return torch.stack(costs).sum()
 
     def linearize(self, x: dict[str, Tensor]) -> "Linearized":
         """The blocks of the normal equations at `x`; they are overwritten by the next call."""
@@ -69,79 +76,81 @@ class Elimination:
             if w
         }
         lifts = {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
-        for buffer in (self.U, self.V, self.h):
-            buffer.zero_()
+        self.U.zero_()
+        self.V.zero_()
         if self.coupling is not None:
             self.coupling.clear()
         for part in self.parts:
-            self._add(part, *linearize(part.term, x, lifts, part.wanted))
-        return Linearized(self.layout, self.coupling, self.U, self.V, self.h)
+            self._add(part, x, lifts)
+        return Linearized(self.layout, self.coupling, self.U, self.V)
 
-    def _add(self, part: _Part, r: Tensor, jacobians: list[Tensor | None]) -> None:
+    def _add(self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None]) -> None:
         """Add squares and products of a part's Jacobians to the system."""
-        q, eliminated = self.layout.point_size, self.layout.eliminated
-        d, m = r.shape
-        J = self._buffer("J", d * (part.width + 1), m).view(d, part.width + 1, m)
-        start, P = 0, None
-        for name, j in zip(part.term.blocks, jacobians, strict=True):
-            if j is None:
-                continue
-            if name == eliminated:
-                P = j
+        q, c, d, m = self.layout.point_size, part.width, part.components, part.term.index[0].shape[0]
+        # Both with the residual as one more column, which gives the gradients.
+        J, P = self.work.get("J", d, c + 1, m), self.work.get("P", d, q + 1, m)
+        out: list[Tensor | None] = []
+        start = 0
+        for name, wanted in zip(part.term.blocks, part.wanted, strict=True):
+            if not wanted:
+                out.append(None)
+            elif name == self.layout.eliminated:
+                out.append(P[:, :q].permute(2, 0, 1))
             else:
-                J[:, start : start + j.shape[1]] = j
-                start += j.shape[1]
-        J[:, start] = r
-        if start:
+                end = start + self.blocks[name].tangent
+                out.append(J[:, start:end].permute(2, 0, 1))
+                start = end
+        r, scale = linearize(part.term, x, lifts, out, self.work)
+        J[:, c] = r.mT
+        if scale is not None:
+            J *= scale
+        if c:
             squares = torch.stack([torch.bmm(J[:, :, a:b], J[:, :, a:b].mT) for a, b in part.segments]).sum(1)
             self.U.view(-1).index_add_(0, part.places, squares.flatten())
-        if P is None or part.point is None:
+        if part.point is None:
             return
-        squares = self._buffer("V", self.V.shape[0] + q, m)
-        for row, (a, b) in zip(squares, _pairs(q), strict=False):
-            torch.mul(P[0, a], P[0, b], out=row)
+        if scale is not None:
+            P[:, :q] *= scale
+        P[:, q] = J[:, c]
+        squares = self.work.get("V", self.V.shape[0], m)
+        row = 0
+        for a in range(q):
+            rows = squares[row : row + q + 1 - a]
+            torch.mul(P[0, a], P[0, a:], out=rows)
             for k in range(1, d):
-                row.addcmul_(P[k, a], P[k, b])
-        torch.mul(P[0], r[0], out=squares[-q:])
-        for k in range(1, d):
-            squares[-q:].addcmul_(P[k], r[k])
-        self.V.index_add_(1, part.point, squares[:-q])
-        self.h.index_add_(1, part.point, squares[-q:])
-        if start and self.coupling is not None:
-            self.coupling.add(part.piece, part.start, J[:, :start], P)
-
-    def _buffer(self, name: str, rows: int, columns: int) -> Tensor:
-        key = (name, rows, columns)
-        if key not in self._work:
-            self._work[key] = self.U.new_empty((rows, columns))
-        return self._work[key]
+                rows.addcmul_(P[k, a], P[k, a:])
+            row += q + 1 - a
+        self.V.index_add_(1, part.point, squares)
+        if c and self.coupling is not None:
+            self.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
 
 
 @dataclass(frozen=True)
 class Linearized:
-    """The normal equations: `U` with the gradient as column `size`, `V` as its distinct entries, `h`, and the coupling `W`."""
+    """The normal equations: `U` with the gradient as column `size`, `V`, and the coupling `W`.
+
+    `V` holds the distinct entries of the blocks row by row, each row followed by its entry of the gradient.
+    """
 
     layout: Layout
     coupling: GroupCoupling | PairCoupling | None
     U: Tensor
     V: Tensor
-    h: Tensor
 
     def solve(self, damping: float) -> tuple[dict[str, Tensor], Tensor, Tensor]:
         """The step for `damping` times the diagonal, the decrease the model promises, and whether the system was solved."""
         layout = self.layout
         size, q = layout.size, layout.point_size
-        pairs = _pairs(q)
         weight = damping * _floor(self.U.diagonal()[:size])
         S, right = self.U.clone(), self.U[:size, size].clone()
         S.diagonal()[:size] += weight
-        point_weight = self.V
+        h = self.V[[_place(a, q, q) for a in range(q)]]
+        point_weight, z = h, h
         L: list[list[Tensor]] = []
-        z = self.h
         if q:
-            point_weight = damping * _floor(torch.stack([self.V[pairs.index((a, a))] for a in range(q)]))
+            point_weight = damping * _floor(self.V[[_place(a, a, q) for a in range(q)]])
             L = _factor(self.V, point_weight, q)
-            z = _forward(L, self.h)
+            z = _forward(L, h)
             if self.coupling is not None:
                 right -= self.coupling.reduce(S, L, z)[:size]
         factor, info = torch.linalg.cholesky_ex(S[:size, :size])
@@ -153,14 +162,14 @@ class Linearized:
             if self.coupling is not None:
                 z = z + _forward(L, self.coupling.product(torch.cat((camera, camera.new_zeros(2)))))
             point = _backward(L, z)
-            promise = promise + (point * (point_weight * point - self.h)).sum()
+            promise = promise + (point * (point_weight * point - h)).sum()
             step[layout.eliminated] = point.mT
         return step, promise / 2, solved
 
     def gradient(self) -> Tensor:
         """Largest absolute derivative of the cost."""
-        size = self.layout.size
-        return torch.cat((self.U[:size, size], self.h.flatten())).abs().amax()
+        size, q = self.layout.size, self.layout.point_size
+        return torch.cat((self.U[:size, size], *(self.V[_place(a, q, q)] for a in range(q)))).abs().amax()
 
     def _split(self, camera: Tensor) -> dict[str, Tensor]:
         """The columns of each block."""
@@ -171,16 +180,16 @@ class Linearized:
         }
 
 
-def _parts(number: int, piece: Piece, size: int) -> list[_Part]:
+def _parts(number: int, piece: Piece, size: int, x: dict[str, Tensor]) -> list[_Part]:
     """Cut a piece where the residuals linearised at once become too many."""
     m, width = piece.slots.numel(), piece.columns.shape[1]
     ends = torch.bincount(piece.slots, minlength=piece.columns.shape[0]).cumsum(0).tolist()
     # The residual is one more column, the gradient's.
     extended = torch.cat((piece.columns, torch.full_like(piece.columns[:, :1], size).expand(-1, 1)), 1) if width else None
     parts = []
-    count = -(-m // CHUNK)
+    components = term_residual(piece.term.select(piece.slots[:1] * 0), x).shape[1]
     slot = 0
-    for first, last in pairwise([m * k // count for k in range(count + 1)]):
+    for first, last in pairwise([*range(0, m, CHUNK), m]):
         segments, slots = [], []
         at = first
         while at < last:
@@ -202,12 +211,13 @@ def _parts(number: int, piece: Piece, size: int) -> list[_Part]:
             weights=None if piece.term.weights is None else piece.term.weights[rows],
         )
         point = None if piece.point is None else piece.point[rows]
-        parts.append(_Part(number, first, term, piece.wanted, width, segments, places, point))
+        parts.append(_Part(number, first, term, piece.wanted, width, components, segments, places, point))
     return parts
 
 
-def _pairs(q: int) -> list[tuple[int, int]]:
-    return [(a, b) for a in range(q) for b in range(a + 1)]
+def _place(a: int, b: int, q: int) -> int:
+    """Row of V that holds entry (a, b >= a) of the blocks; b = q is the gradient."""
+    return a * (q + 1) - a * (a - 1) // 2 + b - a
 
 
 def _floor(diagonal: Tensor) -> Tensor:
@@ -220,12 +230,11 @@ def _floor(diagonal: Tensor) -> Tensor:
 
 def _factor(V: Tensor, damping: Tensor, q: int) -> list[list[Tensor]]:
     """Cholesky factors of all point blocks, elementwise, with the reciprocals of the diagonal in its place."""
-    pairs = _pairs(q)
     L: list[list[Tensor]] = []
     for a in range(q):
         row: list[Tensor] = []
         for b in range(a + 1):
-            value = V[pairs.index((a, b))]
+            value = V[_place(b, a, q)]
             if a == b:
                 full = value + damping[a]
                 for c in range(b):

@@ -74,8 +74,9 @@ def sparse_levenberg_marquardt(
         counted = [t if bool(u.all()) else t.select(u.nonzero()[:, 0]) for t, u in zip(terms, used, strict=True)]
         layout = lay_out(double, counted, eliminate)
         constant = _cost(layout.still, x)
-        # The pieces hold only what moves; a residual of fixed variables is a constant of the cost.
-        cost = _cost([p.term for p in layout.pieces], x)
+        # A residual of fixed variables is a constant of the cost. The others come in parts small enough for the cache.
+        engine = Elimination(double, layout)
+        cost = float(engine.cost(x)) if layout.pieces else 0.0
         initial = cost
         status, iterations = Status.NOT_CONVERGED, 0
         if not any(bool(u.any()) for u in used):
@@ -83,7 +84,6 @@ def sparse_levenberg_marquardt(
         elif not layout.pieces:
             status = Status.TOO_FEW
         else:
-            engine = Elimination(double, layout)
             system = engine.linearize(x)
             damping, growth = initial_damping, 2.0
             while iterations < max_iterations:
@@ -94,7 +94,7 @@ def sparse_levenberg_marquardt(
                 promise = float(promise_)
                 iterations += 1
                 trial = move(double, layout, x, step)
-                trial_cost = _cost([p.term for p in layout.pieces], trial) if bool(solved) else torch.inf
+                trial_cost = float(engine.cost(trial)) if bool(solved) else torch.inf
                 ratio = (cost - trial_cost) / max(promise, 1e-300)
                 accepted = trial_cost < cost and ratio > 1e-3
                 small = bool(solved) and _length(step) <= step_tolerance * (_length(x) + step_tolerance)

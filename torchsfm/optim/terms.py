@@ -4,7 +4,7 @@ A `Block` is a family of variables of one kind (all poses, all points); a `Term`
 depends on. The sum to be minimised is `sum_i w_i rho(|r_i|^2) / 2` over all residuals of all terms.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,8 +13,6 @@ from torch import Tensor
 
 from torchsfm.optim.loss import Loss, loss_slope
 from torchsfm.optim.manifold import Manifold
-
-Linearization = Callable[..., tuple[Tensor, Sequence[Tensor | None]]]
 
 
 @dataclass(frozen=True)
@@ -44,9 +42,9 @@ class Term:
     picks, then the rows of each tensor in `data`. Row i must depend on rows i alone. Rows are stored one coordinate after the
     other, so code that works on `x[:, 0], x[:, 1], ...` (or `unbind(-1)`) runs on contiguous memory.
 
-    Derivatives come from `d` reverse sweeps. Where a hand-written one pays, `linearize(*variables, *data, wanted=...)` returns
-    the residuals `(m, d)` and one Jacobian `(m, d, tangent)` per block with respect to its tangent step, or None where
-    `wanted` says that it is not needed; views of storage with m last are fastest.
+    Derivatives come from `d` reverse sweeps. Where hand-written ones pay, `linearize(*variables, *data, out=...)` returns the
+    residuals and fills `out`: for each block a tensor `(m, d, tangent)` for the derivatives with respect to its tangent step
+    (stored with m last), or None where they are not needed.
     """
 
     residual: Callable[..., Tensor]
@@ -56,7 +54,7 @@ class Term:
     loss: Loss | None = None
     weights: Float[Tensor, "m"] | None = None
     """Weight of each residual's squared norm; 0 leaves it out, whatever number it has."""
-    linearize: Linearization | None = None
+    linearize: Callable[..., Tensor] | None = None
 
     def select(self, rows: Tensor) -> "Term":
         """The term with some of its residuals."""
@@ -73,15 +71,37 @@ def _columns(x: Tensor) -> Tensor:
     return x.movedim(0, -1).contiguous()
 
 
-def gather(x: Float[Tensor, "n k"], index: Int[Tensor, "m"]) -> Float[Tensor, "m k"]:
+class Workspace:
+    """Memory that is used again and again: memory that is new costs more than the arithmetic on it."""
+
+    def __init__(self, like: Tensor) -> None:
+        self._like = like
+        self._buffers: dict[tuple[str, tuple[int, ...]], Tensor] = {}
+
+    def get(self, name: str, *shape: int) -> Tensor:
+        """A buffer with whatever numbers it had last."""
+        if (name, shape) not in self._buffers:
+            self._buffers[name, shape] = self._like.new_empty(shape)
+        return self._buffers[name, shape]
+
+
+def gather(x: Float[Tensor, "n k"], index: Int[Tensor, "m"], out: Tensor | None = None) -> Float[Tensor, "m k"]:
     """Pick rows of a tensor stored column by column, and store the result so."""
     columns = x.mT
-    return columns.gather(1, index.expand(columns.shape[0], -1)).mT
+    return torch.gather(columns, 1, index.expand(columns.shape[0], -1), out=out).mT
 
 
-def term_residual(term: Term, x: dict[str, Tensor]) -> Float[Tensor, "m d"]:
+def _arguments(term: Term, x: dict[str, Tensor], work: Workspace | None) -> list[Tensor]:
+    found = []
+    for k, (name, index) in enumerate(zip(term.blocks, term.index, strict=True)):
+        out = None if work is None else work.get(f"{k} {name}", x[name].shape[1], index.shape[0])
+        found.append(gather(x[name], index, out))
+    return found
+
+
+def term_residual(term: Term, x: dict[str, Tensor], work: Workspace | None = None) -> Float[Tensor, "m d"]:
     """The residuals at `x`."""
-    return term.residual(*(gather(x[name], i) for name, i in zip(term.blocks, term.index, strict=True)), *term.data)
+    return term.residual(*_arguments(term, x, work), *term.data)
 
 
 def term_cost(term: Term, residual: Float[Tensor, "m d"]) -> Float[Tensor, ""]:
@@ -95,59 +115,47 @@ def term_cost(term: Term, residual: Float[Tensor, "m d"]) -> Float[Tensor, ""]:
 
 
 def linearize(
-    term: Term, x: dict[str, Tensor], lifts: dict[str, Tensor | None], wanted: tuple[bool, ...]
-) -> tuple[Tensor, list[Tensor | None]]:
-    """Weighted residuals `(d, m)` and Jacobians `(d, tangent, m)` whose squares add up to the robust Gauss-Newton model.
+    term: Term, x: dict[str, Tensor], lifts: dict[str, Tensor | None], out: list[Tensor | None], work: Workspace
+) -> tuple[Tensor, Tensor | None]:
+    """Fill `out` with the Jacobians `(m, d, tangent)`; return the residuals `(m, d)` and the factor `(m)` to scale both by.
 
-    Rows are scaled by `sqrt(w rho')` (the first-order variant of Triggs et al. 2000, 4.3, which stays positive definite).
+    Scaled by `sqrt(w rho')`, their squares add up to the robust Gauss-Newton model (the first-order variant of Triggs et al.
+    2000, 4.3, which stays positive definite). None is no scaling.
     """
-    arguments = [gather(x[name], i) for name, i in zip(term.blocks, term.index, strict=True)]
+    arguments = _arguments(term, x, work)
     if term.linearize is not None:
-        r, found = term.linearize(*arguments, *term.data, wanted=wanted)
-        residual = r.mT
-        jacobians = [None if j is None or not w else j.permute(1, 2, 0) for j, w in zip(found, wanted, strict=True)]
+        residual = term.linearize(*arguments, *term.data, out=out)
     else:
-        residual, jacobians = _differentiate(term, arguments, lifts, wanted)
-    if term.loss is not None or term.weights is not None:
-        scale = None
-        if term.loss is not None:
-            scale = loss_slope(term.loss, residual.square().sum(0))
-        if term.weights is not None:
-            scale = term.weights if scale is None else scale * term.weights
-        root = scale.sqrt()  # type: ignore[union-attr]
-        residual = residual * root
-        jacobians = [None if j is None else j * root for j in jacobians]
-    return residual, jacobians
+        residual = _differentiate(term, arguments, lifts, out)
+    if term.loss is None:
+        return residual, None if term.weights is None else term.weights.sqrt()
+    scale = loss_slope(term.loss, residual.square().sum(-1))
+    return residual, (scale if term.weights is None else scale * term.weights).sqrt()
 
 
-def _differentiate(
-    term: Term, arguments: list[Tensor], lifts: dict[str, Tensor | None], wanted: tuple[bool, ...]
-) -> tuple[Tensor, list[Tensor | None]]:
+def _differentiate(term: Term, arguments: list[Tensor], lifts: dict[str, Tensor | None], out: list[Tensor | None]) -> Tensor:
     """Each residual sees one row of each argument, so one reverse sweep gives one row of every Jacobian."""
-    leaves = [a.mT.detach().requires_grad_(w) for a, w in zip(arguments, wanted, strict=True)]
-    follow = [leaf for leaf, w in zip(leaves, wanted, strict=True) if w]
+    leaves = [a.mT.detach().requires_grad_(o is not None) for a, o in zip(arguments, out, strict=True)]
+    follow = [leaf for leaf in leaves if leaf.requires_grad]
     with torch.enable_grad():
         value = term.residual(*(leaf.mT for leaf in leaves), *term.data)
         components = value.unbind(-1)
         ones = torch.ones_like(components[0])
-        sweeps = [
-            torch.autograd.grad(c, follow, ones, retain_graph=i + 1 < len(components), materialize_grads=True)
-            if c.requires_grad
-            else [torch.zeros_like(leaf) for leaf in follow]
-            for i, c in enumerate(components)
-        ]
-    stacked = iter([torch.stack(rows) for rows in zip(*sweeps, strict=True)])
-    jacobians: list[Tensor | None] = []
-    for name, index, w in zip(term.blocks, term.index, wanted, strict=True):
-        if not w:
-            jacobians.append(None)
-            continue
-        ambient, lift = next(stacked), lifts[name]
-        if lift is not None:
-            columns = lift.index_select(-1, index)
-            ambient = (ambient[:, :, None] * columns).sum(1)
-        jacobians.append(ambient)
-    return value.detach().mT, jacobians
+        for k, component in enumerate(components):
+            if component.requires_grad:
+                last = k + 1 == len(components)
+                slopes = torch.autograd.grad(component, follow, ones, retain_graph=not last, materialize_grads=True)
+            else:
+                slopes = tuple(torch.zeros_like(leaf) for leaf in follow)
+            rows = iter(slopes)
+            for name, index, target in zip(term.blocks, term.index, out, strict=True):
+                if target is None:
+                    continue
+                ambient, lift = next(rows), lifts[name]
+                if lift is not None:
+                    ambient = (ambient[:, None] * lift.index_select(-1, index)).sum(0)
+                target[:, k] = ambient.mT
+    return value.detach()
 
 
 def lift_of(block: Block, x: Float[Tensor, "n k"]) -> Tensor | None:
