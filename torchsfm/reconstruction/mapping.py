@@ -1,7 +1,6 @@
 """The state of a model while it grows: which images have poses, which image points have 3D points."""
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,7 +36,7 @@ class Mapping:
     point: Int[Tensor, "n"]
 
     @classmethod
-    def start(cls, graph: ViewGraph, track: Int[Tensor, "n"], cameras: Camera, camera_index: Int[Tensor, "v"]) -> Self:
+    def start(cls, graph: ViewGraph, track: Int[Tensor, "n"], cameras: Camera, camera_index: Int[Tensor, "v"]) -> "Mapping":
         """Nothing registered, no points."""
         v = len(graph.names)
         return cls(
@@ -73,7 +72,7 @@ class Mapping:
         node = (self.point >= 0).nonzero()[:, 0]
         return node[torch.argsort(self.point[node], stable=True)]
 
-    def assign(self, node: Int[Tensor, "k"], point: Int[Tensor, "k"], error: Float[Tensor, "k"]) -> Self:
+    def assign(self, node: Int[Tensor, "k"], point: Int[Tensor, "k"], error: Float[Tensor, "k"]) -> "Mapping":
         """Give image points to 3D points where that leaves each point one observation per image and each node one point.
 
         Conflicts are decided for the smaller error. Nodes that have a point keep it.
@@ -93,13 +92,13 @@ class Mapping:
         new[node[first]] = point[first]
         return replace(self, point=new)
 
-    def without(self, node: Int[Tensor, "k"]) -> Self:
+    def without(self, node: Int[Tensor, "k"]) -> "Mapping":
         """Take image points out of the model, and with them points seen by fewer than two."""
         point = self.point.clone()
         point[node] = -1
         return replace(self, point=point).compacted()
 
-    def compacted(self) -> Self:
+    def compacted(self) -> "Mapping":
         """Drop points with fewer than two observations and renumber the rest."""
         has = self.point >= 0
         keep = torch.bincount(self.point[has], minlength=len(self.X)) >= 2

@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsfm._types import tensor_map
@@ -62,7 +63,7 @@ class Reconstruction:
         """Number of image points that belong to a 3D point."""
         return len(self.x)
 
-    def to(self, *args: Any, **kwargs: Any) -> Self:
+    def to(self, *args: Any, **kwargs: Any) -> "Reconstruction":
         """Move to a device or floating dtype; the arguments are those of `Tensor.to`. Indices keep their integer type."""
 
         def move(tensor: Tensor) -> Tensor:
@@ -95,7 +96,7 @@ class Reconstruction:
         total = self.X.new_zeros(self.num_points).index_add(0, self.point, self.residuals())
         return total / self.track_lengths().clamp(min=1)
 
-    def transform(self, similarity: Similarity) -> Self:
+    def transform(self, similarity: Similarity) -> "Reconstruction":
         """The same model in another world frame, `X' = s R X + t`; reprojections do not change."""
         poses = similarity.transform_pose(self.poses)
         keep = self.registered
@@ -127,7 +128,7 @@ class Reconstruction:
 
     def save(self, path: str | Path) -> None:
         """Write everything to one `.npz` file of plain arrays, without pickle."""
-        arrays: dict[str, np.ndarray[Any, Any]] = {
+        arrays: dict[str, NDArray[Any]] = {
             f.name: getattr(self, f.name).detach().cpu().numpy()
             for f in fields(self)
             if isinstance(getattr(self, f.name), Tensor)
@@ -147,7 +148,7 @@ class Reconstruction:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path) -> "Reconstruction":
         """Read what `save` wrote.
 
         Raises:

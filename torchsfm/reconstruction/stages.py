@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 Arrays = dict[str, Tensor]
@@ -84,7 +85,7 @@ class Stages:
         os.replace(partial, path)
 
 
-def load_arrays(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` file, none of them pickled.
 
     Raises:

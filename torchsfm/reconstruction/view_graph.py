@@ -1,8 +1,10 @@
 """What the images say of each other: matches between all pairs, checked against epipolar geometry in one batched call."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -13,6 +15,10 @@ from torchsfm.motion import estimate_fundamental, estimate_homography
 
 MIN_INLIERS = 15
 """Fewer epipolar inliers than this also occur between unrelated images."""
+
+CONFIDENCE = 0.999
+MAX_ITERATIONS = 3000
+"""Pairs of unrelated images, the most of many, never reach the confidence; this is what they may cost."""
 
 _ROWS_PER_CALL = 4_000_000
 """Padded correspondences verified at once; bounds memory, changes no result."""
@@ -44,7 +50,7 @@ class ViewGraph:
         pairs: Pairs of images that were compared.
         num_matches: Matches found per pair.
         F: Fundamental matrix per pair, `x2' F x1 = 0`.
-        H: Homography per pair, `x2 ~ H x1`.
+        H: Homography per pair, `x2 ~ H x1`; the identity for unrelated pairs.
         fundamental_inliers: Matches that agree with F.
         homography_inliers: Matches that agree with H.
         match: Verified matches, as indices into `x`.
@@ -113,7 +119,7 @@ def verify_pairs(
     offset = torch.tensor([0, *(len(p) for p in x)], dtype=torch.long).cumsum(0)
     q = len(pairs)
     dtype = x[0].dtype if x else torch.float64
-    F, H = torch.zeros(q, 3, 3, dtype=dtype), torch.zeros(q, 3, 3, dtype=dtype)
+    F, H = (torch.eye(3, dtype=dtype).repeat(q, 1, 1) for _ in range(2))
     num_F, num_H = torch.zeros(q, dtype=torch.long), torch.zeros(q, dtype=torch.long)
     kept: dict[int, Tensor] = {}
     scale = image_size.amax(dim=-1).to(dtype).div(1600).clamp(min=1)
@@ -125,11 +131,15 @@ def verify_pairs(
             x1[row, : len(m)], x2[row, : len(m)] = x[i][m[:, 0]], x[j][m[:, 1]]
         mask = torch.arange(slots) < counts[block, None]
         limit = threshold * scale[pairs[block]].amax(dim=-1)
-        epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, generator=generator)
-        planar = estimate_homography(x1, x2, threshold=limit, mask=mask, generator=generator)
-        F[block], H[block] = epipolar.model, planar.model
+        options: dict[str, Any] = {"generator": generator, "confidence": CONFIDENCE, "max_iterations": _trials(slots)}
+        epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, **options)
+        F[block] = epipolar.model
         num_F[block] = epipolar.inliers.sum(-1) * (epipolar.status == Status.OK)
-        num_H[block] = planar.inliers.sum(-1) * (planar.status == Status.OK)
+        related = num_F[block] >= MIN_INLIERS
+        if bool(related.any()):
+            planar = estimate_homography(x1[related], x2[related], threshold=limit[related], mask=mask[related], **options)
+            H[block[related]] = planar.model
+            num_H[block[related]] = planar.inliers.sum(-1) * (planar.status == Status.OK)
         for row, index in enumerate(block.tolist()):
             if num_F[index] >= MIN_INLIERS:
                 kept[index] = matches[index][epipolar.inliers[row, : len(matches[index])]]
@@ -157,12 +167,20 @@ def _blocks(counts: Int[Tensor, "q"]) -> list[Int[Tensor, "_"]]:
     """Pairs with enough matches, like sizes together, cut so that a padded block stays within memory."""
     order = torch.argsort(counts, descending=True, stable=True)
     order = order[counts[order] >= MIN_INLIERS]
+    few = counts[order] <= 2 * MIN_INLIERS
     blocks = []
-    while len(order):
-        rows = max(1, _ROWS_PER_CALL // int(counts[order[0]]))
-        blocks.append(order[:rows])
-        order = order[rows:]
+    for rest in (order[~few], order[few]):
+        while len(rest):
+            rows = max(1, _ROWS_PER_CALL // int(counts[rest[0]]))
+            blocks.append(rest[:rows])
+            rest = rest[rows:]
     return blocks
+
+
+def _trials(most: int) -> int:
+    """Samples of seven that find `MIN_INLIERS` inliers, or a quarter, among the matches of a pair with confidence."""
+    share = max(MIN_INLIERS / most, 0.25)
+    return min(MAX_ITERATIONS, math.ceil(math.log(1 - CONFIDENCE) / math.log1p(-(share**7)))) if share < 1 else 1
 
 
 def graph_from_tracks(
