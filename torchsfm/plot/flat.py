@@ -110,8 +110,8 @@ def plot_points_2d(
 
 
 def plot_matches(
-    image1: Float[Tensor, "*channels h1 w1"],
-    image2: Float[Tensor, "*channels h2 w2"],
+    image1: Float[Tensor, "*channels1 h1 w1"],
+    image2: Float[Tensor, "*channels2 h2 w2"],
     x1: Float[Tensor, "n 2"],
     x2: Float[Tensor, "n 2"],
     *,
@@ -165,8 +165,8 @@ def plot_epipolar_lines(
     F: Float[Tensor, "3 3"],
     x1: Float[Tensor, "n 2"],
     x2: Float[Tensor, "n 2"],
-    image1: Float[Tensor, "*channels h1 w1"],
-    image2: Float[Tensor, "*channels h2 w2"],
+    image1: Float[Tensor, "*channels1 h1 w1"],
+    image2: Float[Tensor, "*channels2 h2 w2"],
     *,
     axes: tuple[Axes, Axes] | None = None,
 ) -> tuple[Axes, Axes]:
@@ -208,7 +208,7 @@ def plot_epipolar_lines(
 
 
 def clip_lines(
-    lines: Float[Tensor, "*batch 3"], width: float, height: float
+    lines: Float[Tensor, "*batch 3"], width: int, height: int
 ) -> tuple[Float[Tensor, "*batch 2 2"], Bool[Tensor, "*batch"]]:
     """Where lines enter and leave an image, and whether they do; the end points of others are finite but meaningless."""
     a, b, c = lines.unbind(-1)
