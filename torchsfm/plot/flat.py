@@ -149,7 +149,7 @@ def plot_matches(
     canvas = pair[0].new_zeros(3, height, sum(image.shape[2] for image in pair))
     canvas[:, : pair[0].shape[1], : pair[0].shape[2]] = pair[0]
     canvas[:, : pair[1].shape[1], pair[0].shape[2] :] = pair[1]
-    ax = show_image(canvas, ax=flat_axes(ax, (11, 4.5)))
+    ax = show_image(canvas, ax=flat_axes(ax, (11.0, 4.5)))
     moved = x2 + x2.new_tensor([pair[0].shape[2], 0])
     segments = torch.stack((x1, moved.to(x1)), 1)[::every].detach().cpu()
     good = torch.ones(len(segments), dtype=torch.bool) if inliers is None else inliers[::every].detach().cpu()
