@@ -8,7 +8,7 @@ from torch import Tensor
 def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
     """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose."""
     m = A.shape[-2]
-    Q, _ = torch.linalg.qr(A.mT, mode="complete")
+    Q: Tensor = torch.linalg.qr(A.mT, mode="complete")[0]
     return Q[..., m:]
 
 

@@ -13,7 +13,7 @@ Roots = tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]
 
 def evaluate(c: Float[Tensor, "*#batch m"], x: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
     """The values of polynomials at k points each, by Horner's rule."""
-    value = c[..., -1:].expand(torch.broadcast_shapes(c.shape[:-1], x.shape[:-1]) + x.shape[-1:])
+    value = c[..., -1:] + torch.zeros_like(x)
     for i in range(c.shape[-1] - 2, -1, -1):
         value = value * x + c[..., i : i + 1]
     return value

@@ -1,12 +1,23 @@
 """The nearest matrix with a property: a rotation, a rank, no negative eigenvalue. All in the Frobenius norm.
 
 Values come from LAPACK without derivatives; the derivative is then attached as a term that is zero in value and whose
-differential is the analytic one. It stays finite where singular values coincide and the answer is still smooth.
+differential is the analytic one. It stays finite where singular values coincide and the answer is still smooth, and is zero in
+the directions in which the answer is not.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd import forward_ad
+
+from torchsfm._types import check_tensors
+
+
+def _followed(A: Tensor) -> bool:
+    """Whether reverse- or forward-mode differentiation follows A right now."""
+    if torch.is_grad_enabled() and A.requires_grad:
+        return True
+    return forward_ad._current_level >= 0 and forward_ad.unpack_dual(A).tangent is not None  # type: ignore[no-untyped-call]
 
 
 def _finite_or_zero(A: Tensor) -> tuple[Tensor, Tensor]:
@@ -15,7 +26,7 @@ def _finite_or_zero(A: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
-    """The rotation (determinant +1) nearest to A, also nearest to any positive multiple of A.
+    """The rotation (determinant +1) nearest to A, which is also the nearest to any positive multiple of A.
 
     Args:
         A: Square matrices. The answer is not unique where the smallest singular value is 0 twice, or where det A < 0 and the
@@ -24,51 +35,74 @@ def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n 
     Returns:
         Rotations.
     """
+    check_tensors(A=(A, "n n"))
     safe, finite = _finite_or_zero(A)
     with torch.no_grad():
         U, s, Vh = torch.linalg.svd(safe)
+        flip = torch.linalg.det(U @ Vh) < 0
         sign = torch.ones_like(s)
-        sign[..., -1] = torch.where(torch.linalg.det(U @ Vh) < 0, -1, 1)
-        U = U * sign[..., None, :]
-        s = s * sign
-        R = U @ Vh
+        sign[..., -1] = torch.where(flip, -1, 1)
+        U, s = U * sign[..., None, :], s * sign
+        R: Tensor = U @ Vh
         total = s[..., :, None] + s[..., None, :]
-        weight = torch.where(total > 1e-12 * s[..., :1, None], 1 / total, 0)
-    if safe.requires_grad:
+        weight = torch.where(total > 64 * torch.finfo(A.dtype).eps * s[..., :1, None], 1 / total, 0)
+    if _followed(safe):
+        # In the bases of the singular vectors dR is skew.
         change = U.mT @ (safe - safe.detach()) @ Vh.mT
         R = R + U @ (weight * (change - change.mT)) @ Vh
     return torch.where(finite, R, torch.eye(A.shape[-1], dtype=A.dtype, device=A.device))
 
 
 def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*batch m n"]:
-    """The matrix of rank at most `rank` nearest to A (Eckart-Young): the small singular values are set to zero.
+    """The matrix of rank at most `rank` nearest to A (Eckart & Young 1936): the small singular values are set to zero.
 
     Args:
         A: Matrices. Those that are not finite give zero.
-        rank: The rank wanted, at least 1.
+        rank: The rank wanted, from 1 to min(m, n).
 
     Returns:
         Matrices of the same shape. Not unique, and without derivative across the gap, where singular values number `rank`
         and `rank` + 1 coincide.
+
+    Raises:
+        ValueError: `rank` is out of range.
     """
+    check_tensors(A=(A, "m n"))
+    if not 1 <= rank <= min(A.shape[-2:]):
+        raise ValueError(f"rank: wanted 1 to {min(A.shape[-2:])} for shape {tuple(A.shape)}, got {rank}")
     safe, _ = _finite_or_zero(A)
     with torch.no_grad():
-        U, s, Vh = torch.linalg.svd(safe, full_matrices=False)
-        V1, V2 = Vh[..., :rank, :].mT, Vh[..., rank:, :].mT
+        U, s, Vh = torch.linalg.svd(safe, full_matrices=True)
         U1, U2 = U[..., :rank], U[..., rank:]
-        B = (U1 * s[..., None, :rank]) @ V1.mT
-        s1, s2 = s[..., :rank, None], s[..., None, rank:]
-        gap = s1 * s1 - s2 * s2
-        weight = torch.where(gap > 1e-14 * s[..., :1, None] ** 2, 1 / gap, 0)
-    if safe.requires_grad:
-        change = safe - safe.detach()
-        # dB = dA P + A dP with P = V1 V1', dP from the perturbation of the right singular subspace.
-        c12 = U1.mT @ change @ V2
-        c21 = V1.mT @ change.mT @ U2
-        turn = weight * (s1 * c12 + c21 * s2)
-        right = V1 @ turn @ V2.mT
-        B = B + change @ V1 @ V1.mT + safe.detach() @ (right + right.mT)
-    return B
+        V1, V2 = Vh[..., :rank, :].mT, Vh[..., rank:, :].mT
+        s1 = s[..., :rank]
+        B: Tensor = (U1 * s1[..., None, :]) @ V1.mT
+        # Singular values of U2 and V2, padded with zeros where the matrix is not square.
+        s2 = s[..., rank:]
+        tall = torch.nn.functional.pad(s2, (0, U2.shape[-1] - s2.shape[-1]))
+        wide = torch.nn.functional.pad(s2, (0, V2.shape[-1] - s2.shape[-1]))
+        floor = 64 * torch.finfo(A.dtype).eps * s[..., :1, None] ** 2
+    if not _followed(safe):
+        return B
+    change = safe - safe.detach()
+    c11, c12, c21 = U1.mT @ change @ V1, U1.mT @ change @ V2, U2.mT @ change @ V1
+    # First-order change of the truncation in the bases of the singular vectors; c22 drops out.
+    upper = _coupled(s1[..., :, None], wide[..., None, :], c12, _fit(c21.mT, c12.shape), floor)
+    lower = _coupled(s1[..., None, :], tall[..., :, None], c21, _fit(c12.mT, c21.shape), floor)
+    moved: Tensor = B + U1 @ c11 @ V1.mT + U1 @ upper @ V2.mT + U2 @ lower @ V1.mT
+    return moved
+
+
+def _fit(A: Tensor, shape: torch.Size) -> Tensor:
+    """Cut or pad with zeros to the shape's last two dimensions."""
+    A = A[..., : shape[-2], : shape[-1]]
+    return torch.nn.functional.pad(A, (0, shape[-1] - A.shape[-1], 0, shape[-2] - A.shape[-2]))
+
+
+def _coupled(large: Tensor, small: Tensor, own: Tensor, other: Tensor, floor: Tensor) -> Tensor:
+    gap = large * large - small * small
+    inverse = torch.where(gap > floor, 1 / gap, 0)
+    return inverse * (large * large * own + large * small * other)
 
 
 def nearest_psd(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
@@ -78,18 +112,20 @@ def nearest_psd(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
         A: Square matrices. Those that are not finite give zero.
 
     Returns:
-        Symmetric matrices without negative eigenvalues.
+        Symmetric matrices without negative eigenvalues (Higham 1988).
     """
+    check_tensors(A=(A, "n n"))
     safe, _ = _finite_or_zero(A)
     with torch.no_grad():
         values, V = torch.linalg.eigh(0.5 * (safe + safe.mT))
         kept = values.clamp_min(0)
-        B = (V * kept[..., None, :]) @ V.mT
+        B: Tensor = (V * kept[..., None, :]) @ V.mT
         gap = values[..., :, None] - values[..., None, :]
-        positive = (values > 0).to(A.dtype)
-        same = gap.abs() <= 1e-12 * values.abs().amax(-1)[..., None, None]
-        slope = torch.where(same, positive[..., :, None].expand_as(gap), (kept[..., :, None] - kept[..., None, :]) / gap)
-    if safe.requires_grad:
+        positive = (values > 0).to(A.dtype)[..., :, None].expand_as(gap)
+        same = gap.abs() <= 64 * torch.finfo(A.dtype).eps * values.abs().amax(-1)[..., None, None]
+        slope = torch.where(same, positive, (kept[..., :, None] - kept[..., None, :]) / gap)
+    if _followed(safe):
         change = safe - safe.detach()
         B = B + V @ (slope * (V.mT @ (0.5 * (change + change.mT)) @ V)) @ V.mT
-    return 0.5 * (B + B.mT)
+    symmetric: Tensor = 0.5 * (B + B.mT)
+    return symmetric

@@ -168,15 +168,14 @@ def _several(p: Tensor, q: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
 
 def _positions(bits: Bool[Tensor, "cells batch"], count: int) -> tuple[Int[Tensor, "count batch"], Bool[Tensor, "count batch"]]:
     """The first `count` of a multiple of 8 cells whose bit is set, and whether there are that many; 0 where there are not."""
-    octets = bits.view(torch.uint8).unflatten(0, (-1, 8))
+    octets = bits.view(torch.uint8).view(bits.shape[0] // 8, 8, bits.shape[-1])
     byte = octets[:, 7].clone()
     for i in range(6, -1, -1):
         byte.mul_(2).add_(octets[:, i])
-    words = []
-    for part in byte.long().split(8):
-        shift = torch.arange(part.shape[0], device=bits.device)[:, None] * 8
-        words.append((part << shift).sum(0))
-    word = torch.stack(words)
+    words = -(-byte.shape[0] // 8)
+    shift = (torch.arange(byte.shape[0], device=bits.device) % 8)[:, None] * 8
+    byte = byte.long() << shift
+    word = torch.stack([byte[8 * w : 8 * w + 8].sum(0) for w in range(words)])
     lowest = []
     for _ in range(count):
         bit = word & -word
@@ -188,7 +187,7 @@ def _positions(bits: Bool[Tensor, "cells batch"], count: int) -> tuple[Int[Tenso
     ok = bit != 0
     slot = torch.arange(count, device=bits.device)[:, None]
     first, found = index[:, 0], ok[:, 0]
-    for w in range(1, len(words)):
+    for w in range(1, words):
         more, more_ok = _after(index[:, w] + w * 64, ok[:, w], slot - found.sum(0))
         first, found = torch.where(found, first, more), found | more_ok
     return torch.where(found, first, 0), found

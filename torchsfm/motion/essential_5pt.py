@@ -79,7 +79,8 @@ def essential_5pt(
     batch = check_tensors(d1=(d1, "5 3"), d2=(d2, "5 3"))
     with torch.no_grad():
         rows1, rows2 = (d.detach().double().expand(*batch, 5, 3).reshape(-1, 5, 3).permute(1, 2, 0) for d in (d1, d2))
-        chunks = [_solve(a, b) for a, b in zip(rows1.split(_CHUNK, -1), rows2.split(_CHUNK, -1), strict=True)]
+        starts = range(0, max(rows1.shape[-1], 1), _CHUNK)
+        chunks = [_solve(rows1[..., i : i + _CHUNK], rows2[..., i : i + _CHUNK]) for i in starts]
         rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
         E = rows.permute(2, 1, 0).reshape(*batch, 10, 3, 3).to(d1.dtype)
         valid = good.mT.reshape(*batch, 10)
@@ -97,7 +98,7 @@ def _solve(d1: Float[Tensor, "5 3 batch"], d2: Float[Tensor, "5 3 batch"]) -> tu
     d2, fine2 = _unit(d2)
     basis, pivot = _basis(d1, d2)
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
-    x, y, w = _three_rows(_eliminate(_constraints(basis.unflatten(1, (3, 3)))))
+    x, y, w = _three_rows(_eliminate(_constraints(basis.view(4, 3, 3, -1))))
     n = _convolve(y[:, _NEXT], w[:, _AFTER]) - _convolve(y[:, _AFTER], w[:, _NEXT])
     s, c, real = real_root_rows(_convolve(x, n).sum(1), steps=2)
     u = _back_substitute(x, y, w, s, c)
@@ -126,9 +127,9 @@ def _basis(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
     T = P.transpose(1, 2)
     S, D = (P + T) * half, (P - T) * half
     # Orthonormal coordinates: what is eliminated first, then trace, and the skew part by z, x, y.
-    rows = (P[:, 2, 2], S[:, 0, 2], S[:, 1, 2], (P[:, 0, 0] - P[:, 1, 1]) * half, S[:, 0, 1])
-    rows += ((P[:, 0, 0] + P[:, 1, 1]) * half, D[:, 1, 0], D[:, 2, 1], D[:, 0, 2])
-    N, pivot = nullspace_rows(torch.stack(rows, 1))
+    first = (P[:, 2, 2], S[:, 0, 2], S[:, 1, 2], (P[:, 0, 0] - P[:, 1, 1]) * half, S[:, 0, 1])
+    last = ((P[:, 0, 0] + P[:, 1, 1]) * half, D[:, 1, 0], D[:, 2, 1], D[:, 0, 2])
+    N, pivot = nullspace_rows(torch.stack((*first, *last), 1))
     e33, s13, s23, minus, s12, plus, a3, a1, a2 = N.unbind(1)
     entries = (plus + minus, s12 - a3, s13 + a2, s12 + a3, plus - minus, s23 - a1, s13 - a2, s23 + a1)
     return torch.stack((*(e * half for e in entries), e33), 1), pivot
@@ -148,7 +149,7 @@ def _constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"
     for squares, variables in _ROUNDS:
         s, e, m = S[squares], E[variables], minors[squares]
         rows = out[: len(squares)]
-        trace = rows[:, :9].unflatten(1, (3, 3))
+        trace = rows[:, :9].view(len(squares), 3, 3, E.shape[-1])
         for j in range(3):
             trace.addcmul_(s[:, :, j, None], e[:, j, None])
             rows[:, 9].addcmul_(m[:, j], e[:, 0, j])
@@ -232,13 +233,13 @@ def _polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     b = u3[0] * u3[1] * a
     u1 = (1 + sign * u3[0] * u3[0] * a, sign * b, -sign * u3[0])
     u2 = (b, sign + u3[1] * u3[1] * a, -u3[1])
-    rows = e.unflatten(0, (3, 3))
+    rows = e.view(3, 3, *e.shape[1:])
     v1 = _weighted(rows, u1)
     v1 = _normalised(v1 - v3 * _weighted(v1, v3))
     v2 = _cross(v3, v1)
     v2 = v2 * torch.copysign(torch.ones_like(sign), _weighted(_weighted(rows, u2), v2))
     # The normals' products with the basis, by rows of the basis matrices: B v, then u' B v.
-    columns = basis.unflatten(1, (3, 3)).permute(2, 1, 0, 3)[..., None, :]
+    columns = basis.view(4, 3, 3, -1).permute(2, 1, 0, 3)[..., None, :]
     Bv1, Bv2, Bv3 = (_weighted(columns, v) for v in (v1, v2, v3))
     p = _weighted(Bv3, u3)
     q = _weighted(Bv1, u1) - _weighted(Bv2, u2)

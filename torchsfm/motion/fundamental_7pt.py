@@ -49,7 +49,8 @@ def fundamental_7pt(
     batch = check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
     with torch.no_grad():
         rows1, rows2 = (x.detach().double().expand(*batch, 7, 2).reshape(-1, 7, 2).permute(1, 2, 0) for x in (x1, x2))
-        chunks = [_solve(a, b) for a, b in zip(rows1.split(_CHUNK, -1), rows2.split(_CHUNK, -1), strict=True)]
+        starts = range(0, max(rows1.shape[-1], 1), _CHUNK)
+        chunks = [_solve(rows1[..., i : i + _CHUNK], rows2[..., i : i + _CHUNK]) for i in starts]
         rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
         F = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 3).to(x1.dtype)
         valid = good.mT.reshape(*batch, 3)
@@ -66,7 +67,7 @@ def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tu
     h1, c1, s1, fine1 = _normalised(x1)
     h2, c2, s2, fine2 = _normalised(x2)
     basis, pivot = nullspace_rows((h2[:, :, None] * h1[:, None]).flatten(1, 2))
-    G = basis.unflatten(1, (3, 3))
+    G = basis.view(2, 3, 3, -1)
     r0, r1, r2 = G.unbind(1)
     cofactors = torch.stack((_cross(r1, r2), _cross(r2, r0), _cross(r0, r1)), 1)
     # det(a G0 + b G1): the coefficients of b^3, a b^2, a^2 b, a^3.
@@ -82,7 +83,7 @@ def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tu
     one = torch.ones_like(roots)
     F = torch.where(turn, one, roots) * basis[0, :, None] + torch.where(turn, roots, one) * basis[1, :, None]
     # Back to the coordinates that came: T2' F T1 with the similarities T = [s I, -s c].
-    F = F.unflatten(0, (3, 3))
+    F = F.view(3, 3, 3, -1)
     last = F[:, 2] - s1 * (c1[0] * F[:, 0] + c1[1] * F[:, 1])
     F = torch.stack((s1 * F[:, 0], s1 * F[:, 1], last), 1)
     last = F[2] - s2 * (c2[0] * F[0] + c2[1] * F[1])

@@ -34,7 +34,7 @@ def fundamental_8pt(
     h1, h2 = torch.cat((y1, one), -1), torch.cat((y2, one), -1)
     A = (w[..., None, None] * h2[..., :, None] * h1[..., None, :]).flatten(-2)
     f, _ = null_vector(A)
-    F = nearest_rank(f.unflatten(-1, (3, 3)), 2)
+    F = nearest_rank(f.reshape(*f.shape[:-1], 3, 3), 2)
     # T2 from its inverse: a similarity [s I, c] has the inverse [I / s, -c / s].
     T2 = _inverse_similarity(T2_inverse)
     F = T2.mT @ F @ T1
@@ -53,7 +53,7 @@ def _normalised(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor,
     """Both images in float64 with weighted centroid 0 and mean distance sqrt 2; root weights, T1, T2^-1, finite elements."""
     w = torch.ones_like(x1[..., 0]) if weights is None else weights
     w = w.double()
-    shape = torch.broadcast_shapes(x1.shape[:-1], x2.shape[:-1], w.shape)
+    shape = torch.broadcast_shapes(x1.shape[:-1], x2.shape[:-1], w.shape)  # type: ignore[no-untyped-call]
     w = w.expand(shape)
     y1, y2 = x1.double().expand(*shape, 2), x2.double().expand(*shape, 2)
     absent = w == 0

@@ -46,7 +46,8 @@ def homography_4pt(
     batch = check_tensors(x1=(x1, "4 2"), x2=(x2, "4 2"))
     with torch.no_grad():
         rows1, rows2 = (x.detach().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0).contiguous() for x in (x1, x2))
-        chunks = [_solve(a, b) for a, b in zip(rows1.split(_CHUNK, -1), rows2.split(_CHUNK, -1), strict=True)]
+        starts = range(0, max(rows1.shape[-1], 1), _CHUNK)
+        chunks = [_solve(rows1[..., i : i + _CHUNK], rows2[..., i : i + _CHUNK]) for i in starts]
         rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
         H = rows.mT.reshape(*batch, 1, 3, 3)
         valid = good.reshape(*batch, 1)

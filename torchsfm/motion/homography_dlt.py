@@ -36,7 +36,7 @@ def homography_dlt(
     second = torch.stack((zero, zero, zero, u1, v1, one, -v2 * u1, -v2 * v1, -v2), -1)
     root = w[..., None]
     h, _ = null_vector(torch.cat((root * first, root * second), -2))
-    H = T2_inverse @ h.unflatten(-1, (3, 3)) @ T1
+    H = T2_inverse @ h.reshape(*h.shape[:-1], 3, 3) @ T1
     H = H / (H * H).sum((-2, -1), keepdim=True).sqrt()
     fallback = torch.eye(3, dtype=H.dtype, device=H.device) / 3**0.5
     return torch.where(finite[..., None, None], H, fallback).to(x1.dtype)

@@ -15,8 +15,10 @@ from torchsfm.tensors.bifocal import (
     poses_from_essential,
     poses_from_fundamental,
 )
+from torchsfm.tensors.focals import Focals, focals_from_fundamental
 
 __all__ = [
+    "Focals",
     "RelativePose",
     "bifocal_tensors",
     "cameras_from_fundamental",
@@ -24,6 +26,7 @@ __all__ = [
     "epipoles",
     "essential_from_fundamental",
     "essential_from_pose",
+    "focals_from_fundamental",
     "fundamental_from_cameras",
     "fundamental_from_essential",
     "fundamental_from_pose",

@@ -230,7 +230,7 @@ def poses_from_fundamental(
     return poses_from_essential(essential_from_fundamental(F, K1, K2))
 
 
-def _unit_epipole(F: Tensor) -> Tensor:
+def unit_epipole(F: Tensor) -> Tensor:
     """The unit e with F e = 0, for F of rank 2; e3 where the rank is lower."""
     # The rows of the cofactor matrix are multiples of e.
     C = adjugate_3x3(F)
@@ -243,7 +243,7 @@ def _unit_epipole(F: Tensor) -> Tensor:
     return e / (e * e).sum(-1, keepdim=True).sqrt()
 
 
-def _unit_rank_2(F: Tensor) -> Tensor:
+def unit_rank_2(F: Tensor) -> Tensor:
     """F with Frobenius norm 1 and rank 2; zero where it is not finite or zero."""
     finite = torch.isfinite(F).all(-1).all(-1)[..., None, None]
     F = torch.where(finite, F, 0)
@@ -264,8 +264,8 @@ def epipoles(F: Float[Tensor, "*batch 3 3"]) -> tuple[Float[Tensor, "*batch 3"],
         is not finite, (0, 0, 1). Differentiable.
     """
     check_tensors(F=(F, "3 3"))
-    F = _unit_rank_2(F)
-    return _unit_epipole(F), _unit_epipole(F.mT)
+    F = unit_rank_2(F)
+    return unit_epipole(F), unit_epipole(F.mT)
 
 
 def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x: Float[Tensor, "*#batch n 2"]) -> Float[Tensor, "*batch n 3"]:
@@ -297,8 +297,8 @@ def cameras_from_fundamental(
         P1 and P2, one representative of the cameras that differ by a projective map of space. Differentiable.
     """
     check_tensors(F=(F, "3 3"))
-    F = _unit_rank_2(F)
-    e2 = _unit_epipole(F.mT)
+    F = unit_rank_2(F)
+    e2 = unit_epipole(F.mT)
     P2 = torch.cat((cross_matrix(e2) @ F, e2[..., None]), -1)
     P1 = torch.eye(3, 4, dtype=F.dtype, device=F.device).expand(P2.shape)
     return P1, P2
