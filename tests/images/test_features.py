@@ -59,9 +59,14 @@ def texture(seed: int, height: int = 240, width: int = 320) -> np.ndarray:
 
 
 def warp(image: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    return cv2.warpAffine(
-        image, matrix, (image.shape[1], image.shape[0]), flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT
-    )
+    """What is at X comes to be at A X + b, with matrix = [A b]; bilinear, as common cubic kernels bend ramps."""
+    height, width = image.shape
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    points = (np.stack([x, y], -1) - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
+    grid = torch.from_numpy(points / [width - 1, height - 1] * 2 - 1)[None]
+    values = torch.from_numpy(image).double()[None, None]
+    values = torch.nn.functional.grid_sample(values, grid, mode="bilinear", padding_mode="reflection", align_corners=True)
+    return values[0, 0].numpy().astype(np.float32)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 137.0])

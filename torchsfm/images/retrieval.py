@@ -67,6 +67,8 @@ def describe_images(
     """
     if not features:
         return torch.zeros(0, 0)
+    if not any(len(f) for f in features):
+        return torch.zeros(len(features), words * features[0].descriptors.shape[1])
     device = features[0].descriptors.device
     generator = generator or torch.Generator().manual_seed(0)
     share = max(1, 256 * words // len(features))

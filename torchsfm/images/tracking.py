@@ -70,10 +70,13 @@ def track_points(
     Raises:
         ValueError: A shape or an option is wrong.
     """
-    batch = check_tensors(image1=(image1, "c h w"), image2=(image2, "c h w"), x1=(x1, "n 2"), guess=(guess, "n 2"))
+    check_tensors(x1=(x1, "n 2"), guess=(guess, "n 2"))
+    start = x1 if guess is None else guess
+    batch = check_tensors(
+        image1=(image1, "c h w"), image2=(image2, "c h w"), x1=(x1.to(image1), "n 2"), guess=(start.to(image1), "n 2")
+    )
     if window < 3 or levels < 1:
         raise ValueError(f"wanted window >= 3 and levels >= 1, got {window} and {levels}")
-    start = x1 if guess is None else guess
     n, count = x1.shape[-2], batch.numel()
     first, second = (_bytes(to_gray(i)).expand(*batch, *i.shape[-2:]).reshape(count, *i.shape[-2:]) for i in (image1, image2))
     points, starts = (p.expand(*batch, n, 2).reshape(count, n, 2) for p in (x1, start))
