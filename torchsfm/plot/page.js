@@ -150,16 +150,28 @@ function load(index) {
   mark(-1);
   draw();
 }
-function overview() {  // from the proposed side, as near as the bulk of the points and most cameras fit in
+function overview() {  // from the proposed side, as near as the bulk of the points and the cameras fit in
   const back = unit(model.viewFrom), right = unit(cross([0, 0, 1], back)), up = cross(back, right);
-  const fov = 50 * Math.PI / 180, tall = Math.tan(fov / 2) * 0.9, wide = tall * Math.max(0.3, (canvas.clientWidth || 1) / (canvas.clientHeight || 1));
-  const needed = p => Math.max(Math.abs(dot(p, right)) / wide, Math.abs(dot(p, up)) / tall) + dot(p, back);
-  const most = (list, share) => list.length ? list.sort((a, b) => a - b)[Math.min(list.length - 1, Math.floor(share * list.length))] : 0;
-  const dots = [], step = Math.max(1, Math.floor(model.count / 20000));
-  for (let i = 0; i < model.count; i += step) dots.push(needed(model.positions.subarray(3 * i, 3 * i + 3)));
-  const cameras = model.images.filter(c => c.pose).map(c => needed(c.centre));
-  const distance = Math.max(most(dots, 0.93), Math.min(most(cameras, 0.95), 5 * model.radius), 0.5 * model.radius);
-  return { pivot: [0, 0, 0], q: qaxes(right, up, back), distance, fov, offset: [0, 0] };
+  const fov = 50 * Math.PI / 180, tall = Math.tan(fov / 2), wide = tall * Math.max(0.3, (canvas.clientWidth || 1) / (canvas.clientHeight || 1));
+  const local = p => [dot(p, right) / wide, dot(p, up) / tall, dot(p, back)];
+  const points = [], step = Math.max(1, Math.floor(model.count / 4000));
+  for (let i = 0; i < model.count; i += step) points.push(local(model.positions.subarray(3 * i, 3 * i + 3)));
+  const cameras = model.images.filter(c => c.pose && Math.hypot(...c.centre) < 6 * model.radius).map(c => local(c.centre));
+  const extent = (list, axis, distance, share) => {  // where most of the list is on the screen, along one axis
+    const at = list.map(p => p[2] < distance ? p[axis] / (distance - p[2]) : Math.sign(p[axis]) * 1e3).sort((x, y) => x - y), cut = Math.floor(share * at.length);
+    return at.length ? [at[cut], at[at.length - 1 - cut]] : [Infinity, -Infinity];
+  };
+  const box = distance => [0, 1].map(axis => {
+    const a = extent(points, axis, distance, 0.08), b = extent(cameras, axis, distance, 0.02);
+    return [Math.min(a[0], b[0]), Math.max(a[1], b[1])];
+  });
+  let near = 0.5 * model.radius, far = 20 * model.radius;
+  for (let i = 0; i < 24; i++) {
+    const distance = Math.sqrt(near * far);
+    if (box(distance).every(([low, high]) => high - low < 1.7)) far = distance; else near = distance;
+  }
+  const offset = box(far).map(([low, high]) => low <= high ? -(low + high) / 2 : 0);
+  return { pivot: [0, 0, 0], q: qaxes(right, up, back), distance: far, fov, offset };
 }
 
 // ---- drawing
