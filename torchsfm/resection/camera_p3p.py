@@ -52,14 +52,16 @@ def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"])
     with torch.no_grad():
         triangle = _Triangle(u.detach(), points.detach())
         depths, valid = triangle.depths()
-        depths = triangle.newton(triangle.newton(depths))
-        valid = valid & sound & triangle.met(depths)
-        depths = torch.where(valid, depths, 1.0)
+        depths, valid = triangle.polish(depths, valid & sound)
     differentiable = wants_derivative(d, X)
     if differentiable:
         # Two Newton steps from the solution: no change of value, and derivatives exact to second order.
         triangle = _Triangle(u, points)
-        depths = triangle.newton(triangle.newton(depths, valid), valid)
+        rows = depths.unbind(0)
+        for _ in range(2):
+            rows, _ = triangle.newton(rows, valid)
+        moved = torch.stack(rows)
+        depths = depths + (moved - moved.detach())
 
     # (slot, point, coordinate, problem)
     Y = depths.transpose(0, 1)[:, :, None] * u
@@ -138,6 +140,16 @@ def _across(u: tuple[Tensor, ...], dim: int) -> tuple[Tensor, Tensor]:
     return torch.stack((1 + s * x * x * a, s * b, -s * x), dim), torch.stack((b, s + y * y * a, -y), dim)
 
 
+def _fma(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """`a b + c` in one pass over memory, which is what this solver's time goes to."""
+    return torch.addcmul(c, a, b)
+
+
+def _fms(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """`c - a b`."""
+    return torch.addcmul(c, a, b, value=-1)
+
+
 class _Triangle:
     """The three quadrics in the depths, for rays `u` and points `X` as (point, coordinate, problem).
 
@@ -150,67 +162,69 @@ class _Triangle:
         chord = torch.stack((u[0] - u[1], u[0] - u[2], u[1] - u[2]))
         self.u = u
         self.a = (edge * edge).sum(1)
-        self.n = 0.5 * (chord * chord).sum(1)
+        self.n2 = (chord * chord).sum(1)
 
     def depths(self) -> tuple[Tensor, Tensor]:
         """Candidates (point, slot, problem) for the depths and which of them are real and positive."""
-        a, n = self.a, self.n
+        a, n = self.a, 0.5 * self.n2
         total = a.sum(0)
         a0, a1, a2 = (a / total).unbind(0)
         # Orthonormal directions of the pencil: weights of the three forms that cancel the right-hand sides.
-        root = (a0 * a0 + a1 * a1).rsqrt()
+        root = _fma(a0, a0, a1 * a1).rsqrt()
         p0, p1 = a1 * root, -a0 * root
-        q0, q1, q2 = -a2 * p1, a2 * p0, a0 * p1 - a1 * p0
-        root = (q0 * q0 + q1 * q1 + q2 * q2).rsqrt()
+        q0, q1, q2 = -a2 * p1, a2 * p0, _fms(a1, p0, a0 * p1)
+        root = _fma(q0, q0, _fma(q1, q1, q2 * q2)).rsqrt()
         p = torch.stack((p0, p1, torch.zeros_like(p0)))
-        q = torch.stack((q0 * root, q1 * root, q2 * root))
-        turned = torch.stack((p, (p + q) / SQRT2, q, (q - p) / SQRT2), 1)
+        q = torch.stack((q0, q1, q2)) * root
+        turned = torch.stack((p, (p + q) * (1 / SQRT2), q, (q - p) * (1 / SQRT2)), 1)
 
         # The determinant of a member of the pencil, and its cubic along the pencil from four values.
         s = n * (2 - n)
         u0, u1, u2 = self.u.unbind(0)
         volume = (u0 * _cross(u1, u2, 0)).sum(0)
         w0, w1, w2 = turned.unbind(0)
-        squares = turned * turned * s[:, None]
-        f = (w0 + w1) * squares[2] + (w0 + w2) * squares[1] + (w1 + w2) * squares[0]
-        f = f + w0 * w1 * w2 * (s.sum(0) - volume * volume)
+        b0, b1, b2 = (turned * turned * s[:, None]).unbind(0)
+        f = _fma(w0 + w1, b2, _fma(w0 + w2, b1, (w1 + w2) * b0))
+        f = _fma(w0 * w1 * w2, _fms(volume, volume, s.sum(0)), f)
         pick = f.abs().max(0, keepdim=True).indices
         g0, g1, g2, g3 = torch.cat((f, -f[:3])).gather(0, pick + torch.arange(4, device=f.device)[:, None]).unbind(0)
         both = torch.cat((turned, -turned[:, :2]), 1)
         at = pick.expand(3, -1)[:, None]
         p, q = both.gather(1, at)[:, 0], both.gather(1, at + 2)[:, 0]
-        c1 = SQRT2 * (g1 - g3) - g0
-        c2 = SQRT2 * (g1 + g3) - g2
-        root = _separate_root(c2 / g0, c1 / g0, g2 / g0)
-        size = (1 + root * root).rsqrt()
-        w, other = (root * p + q) * size, (p - root * q) * size
+        inverse = 1 / g0
+        c1 = torch.sub(SQRT2 * (g1 - g3), g0)
+        c2 = torch.sub(SQRT2 * (g1 + g3), g2)
+        root = _separate_root(c2 * inverse, c1 * inverse, g2 * inverse)
+        size = _fma(root, root, torch.ones_like(root)).rsqrt()
+        w, other = _fma(root, p, q) * size, _fms(root, q, p) * size
 
-        lines = self._lines(w)
+        lines = self._lines(w, n)
         e1, e2 = _across(lines.unbind(0), 0)
         # The other member on the line: q11 x^2 + 2 q12 x y + q22 y^2.
-        q11, q12, q22 = self._form(other, e1, e1), self._form(other, e1, e2), self._form(other, e2, e2)
-        discriminant = q12 * q12 - q11 * q22
-        slack = 1e-9 * (q12 * q12 + (q11 * q22).abs())
+        q12 = self._form(other, n, e1, e2)
+        q11, q22 = self._square(other, torch.stack((e1, e2), 1)).unbind(0)
+        product = q11 * q22
+        discriminant = _fma(q12, q12, -product)
+        slack = _fma(q12, q12, product.abs())
         z = -(q12 + torch.copysign(discriminant.clamp_min(0).sqrt(), q12))
-        first, second = z * e1 + q11 * e2, q22 * e1 + z * e2
-        depths = torch.cat((first, second), 1)
-        real = discriminant >= -slack
-        depths = depths * torch.sign(depths.sum(0))
-        scale = (total / self._form(torch.ones_like(a), depths, depths)).sqrt()
-        depths = depths * scale
+        depths = torch.cat((_fma(z, e1, q11 * e2), _fma(q22, e1, z * e2)), 1)
+        real = discriminant >= -1e-9 * slack
+        # All of one sign, and of the size that the sides of the triangle ask for.
+        size = torch.copysign((total / self._square(None, depths)).sqrt(), depths.sum(0))
+        depths = depths * size
         # False for NaN too.
         valid = torch.cat((real, real)) & (depths.amin(0) > 0) & (depths.amax(0) < torch.inf)
         return torch.where(valid, depths, 1.0), valid
 
-    def _lines(self, w: Tensor) -> Tensor:
+    def _lines(self, w: Tensor, n: Tensor) -> Tensor:
         """The two lines (coordinate, line, problem) of the member of the pencil with weights w, which must be degenerate."""
         w0, w1, w2 = w.unbind(0)
-        k0, k1, k2 = ((self.n - 1) * w).unbind(0)
+        k0, k1, k2 = ((n - 1) * w).unbind(0)
         d0, d1, d2 = w0 + w1, w0 + w2, w1 + w2
         # Minus the adjugate is v v' with v the common point of the lines; its diagonal without cancellation.
-        mixed = w0 * w1 + w0 * w2 + w1 * w2
-        diagonal = -(mixed + (self.n * (2 - self.n) * w * w).flip(0))
-        b01, b02, b12 = k0 * d2 - k1 * k2, k1 * d1 - k0 * k2, k2 * d0 - k0 * k1
+        mixed = _fma(w0, d2, w1 * w2)
+        diagonal = -(mixed + (n * (2 - n) * w * w).flip(0))
+        b01, b02, b12 = _fms(k1, k2, k0 * d2), _fms(k0, k2, k1 * d1), _fms(k0, k1, k2 * d0)
         columns = torch.stack((diagonal[0], b01, b02, b01, diagonal[1], b12, b02, b12, diagonal[2])).view(3, 3, -1)
         largest, pick = diagonal.max(0)
         best = columns.gather(0, pick.expand(1, 3, -1))[0]
@@ -221,47 +235,73 @@ class _Triangle:
         lines = torch.stack((row, (rank1 * row).sum(1)), 1)
         return lines * (lines * lines).sum(0).clamp_min(1e-300).rsqrt()
 
-    def _form(self, w: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """The bilinear form with weights w of the three pairs, for x and y as (point, slot, problem)."""
+    @staticmethod
+    def _form(w: Tensor, n: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """The bilinear form with weights w of the three pairs, for x and y as (point, ..., problem)."""
         x0, x1, x2 = x.unbind(0)
         y0, y1, y2 = y.unbind(0)
-        n = self.n
-        f = w[0] * ((x0 - x1) * (y0 - y1) + n[0] * (x0 * y1 + x1 * y0))
-        f = f + w[1] * ((x0 - x2) * (y0 - y2) + n[1] * (x0 * y2 + x2 * y0))
-        return f + w[2] * ((x1 - x2) * (y1 - y2) + n[2] * (x1 * y2 + x2 * y1))
+        f = w[0] * _fma(x0 - x1, y0 - y1, n[0] * _fma(x0, y1, x1 * y0))
+        f = _fma(w[1], _fma(x0 - x2, y0 - y2, n[1] * _fma(x0, y2, x2 * y0)), f)
+        return _fma(w[2], _fma(x1 - x2, y1 - y2, n[2] * _fma(x1, y2, x2 * y1)), f)
 
-    def residuals(self, depths: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Half of each quadric's error."""
-        l0, l1, l2 = depths.unbind(0)
-        a, n = self.a, self.n
+    def _square(self, w: Tensor | None, x: Tensor) -> Tensor:
+        """The quadratic form with weights w, all 1 if not given, for x as (point, ..., problem)."""
+        x0, x1, x2 = x.unbind(0)
+        m0, m1, m2 = self.n2.unbind(0)
+        e0, e1, e2 = x0 - x1, x0 - x2, x1 - x2
+        f0, f1, f2 = _fma(e0, e0, m0 * x0 * x1), _fma(e1, e1, m1 * x0 * x2), _fma(e2, e2, m2 * x1 * x2)
+        return f0 + f1 + f2 if w is None else _fma(w[0], f0, _fma(w[1], f1, w[2] * f2))
+
+    def newton(self, depths: tuple[Tensor, ...], valid: Tensor | None = None) -> tuple[tuple[Tensor, ...], Tensor]:
+        """One Newton step on the three quadrics from depths given as rows, and how well they were met before it.
+
+        That is the largest error of a quadric relative to its side of the triangle. Slots that are not `valid`, if given, stay as
+        they are and have no derivative; otherwise what divides by zero comes out as it does.
+        """
+        l0, l1, l2 = depths
+        m0, m1, m2 = self.n2.unbind(0)
         e0, e1, e2 = l0 - l1, l0 - l2, l1 - l2
-        return (
-            0.5 * (e0 * e0 - a[0]) + n[0] * l0 * l1,
-            0.5 * (e1 * e1 - a[1]) + n[1] * l0 * l2,
-            0.5 * (e2 * e2 - a[2]) + n[2] * l1 * l2,
-        )
+        m00, m01, m10, m12, m21, m22 = m0 * l0, m0 * l1, m1 * l0, m1 * l2, m2 * l1, m2 * l2
+        minus = -self.a
+        r0 = _fma(m00, l1, _fma(e0, e0, minus[0]))
+        r1 = _fma(m10, l2, _fma(e1, e1, minus[1]))
+        r2 = _fma(m21, l2, _fma(e2, e2, minus[2]))
+        a0, a1 = torch.add(m01, e0, alpha=2), torch.sub(m00, e0, alpha=2)
+        b0, b2 = torch.add(m12, e1, alpha=2), torch.sub(m10, e1, alpha=2)
+        c1, c2 = torch.add(m22, e2, alpha=2), torch.sub(m21, e2, alpha=2)
+        p, q, m = b2 * c1, b0 * c2, _fms(b2, r2, r1 * c2)
+        det = _fma(a0, p, a1 * q)
+        if valid is not None:
+            # At a double root there is no derivative to speak of.
+            valid = valid & (det.detach().abs() > 1e-13 * (_fma(a0, p, -a1 * q)).detach().abs())
+            det = torch.where(valid, det, 1.0)
+        inverse = 1 / det if valid is None else torch.where(valid, 1 / det, 0.0)
+        s0, s1 = _fma(r0, p, a1 * m), _fms(a0, m, r0 * q)
+        s2 = _fms(_fms(a0, r1, r0 * b0), c1, a1 * b0 * r2)
+        new = _fms(s0, inverse, l0), _fms(s1, inverse, l1), _fms(s2, inverse, l2)
+        return new, self._worst(r0, r1, r2)
 
-    def newton(self, depths: Tensor, valid: Tensor | None = None) -> Tensor:
-        """One Newton step on the three quadrics, where it is finite; slots not `valid` stay, without derivative."""
-        l0, l1, l2 = depths.unbind(0)
-        n0, n1, n2 = self.n.unbind(0)
-        r0, r1, r2 = self.residuals(depths)
-        e0, e1, e2 = l0 - l1, l0 - l2, l1 - l2
-        a0, a1 = e0 + n0 * l1, n0 * l0 - e0
-        b0, b2 = e1 + n1 * l2, n1 * l0 - e1
-        c1, c2 = e2 + n2 * l2, n2 * l1 - e2
-        p, q, m = b2 * c1, b0 * c2, r1 * c2 - b2 * r2
-        det = -(a0 * p + a1 * q)
-        usable = det.detach() != 0 if valid is None else valid & (det.detach() != 0)
-        inverse = 1 / torch.where(usable, det, 1.0)
-        step = torch.stack((-r0 * p - a1 * m, a0 * m - r0 * q, (r0 * b0 - a0 * r1) * c1 - a1 * b0 * r2))
-        size = step.detach().abs().amax(0) * inverse.detach().abs()
-        return depths - step * torch.where(usable & (size < depths.detach().amax(0)), inverse, 0.0)
+    def _worst(self, r0: Tensor, r1: Tensor, r2: Tensor) -> Tensor:
+        b0, b1, b2 = (1 / self.a).unbind(0)
+        return torch.maximum(torch.maximum((r0 * b0).abs(), (r1 * b1).abs()), (r2 * b2).abs())
 
-    def met(self, depths: Tensor) -> Tensor:
-        """Whether the quadrics are met, by positive depths."""
-        size = 1e-10 * self.a.amax(0) + 1e-14 * (depths * depths).amax(0)
-        return (torch.stack(self.residuals(depths)).abs().amax(0) <= size) & (depths.amin(0) > 0)
+    def polish(self, depths: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Newton steps, unless they lead astray as at a double root; and which slots meet the quadrics in the end.
+
+        Where two of the points are close to each other the start has a small error in the quadrics and a large one in the depths.
+        The first step then trades one for the other, so that what counts is the error after three.
+        """
+        rows, before = self.newton(depths.unbind(0))
+        rows, _ = self.newton(rows)
+        rows, _ = self.newton(rows)
+        _, after = self.newton(rows)
+        polished = torch.stack(rows)
+        # False for NaN too.
+        better = after <= before
+        depths = torch.where(better, polished, depths)
+        size = 1e-10 + 1e-14 * (depths * depths).amax(0) / self.a.amin(0)
+        valid = valid & (torch.where(better, after, before) <= size) & (depths.amin(0) > 0)
+        return torch.where(valid, depths, 1.0), valid
 
 
 def _separate_root(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
