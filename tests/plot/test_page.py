@@ -227,6 +227,15 @@ def test_up_of_aerial_images_is_against_the_view(model: Reconstruction) -> None:
     assert torch.allclose(up_direction(aerial), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=1e-6)
 
 
+def test_up_of_images_lying_on_their_side(model: Reconstruction) -> None:
+    poses = orbit_poses(12, radius=4.0, height=(0.5, 1.0), sweep=2 * math.pi)
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    half = torch.arange(12)[:, None, None] < 7
+    for turn in (quarter, quarter.mT, torch.where(half, quarter, quarter.mT)):
+        lying = with_poses(model, Pose(turn @ poses.R, (turn @ poses.t[..., None])[..., 0]))
+        assert torch.allclose(up_direction(lying), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=0.02)
+
+
 def test_one_camera_and_none_have_an_up(model: Reconstruction) -> None:
     one = with_poses(model, orbit_poses(1, radius=4.0, height=(0.0, 0.0)))
     assert torch.allclose(up_direction(one), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=1e-6)

@@ -27,8 +27,9 @@ def up_direction(reconstruction: Reconstruction) -> Float[Tensor, "3"]:
     """Which way is up, judging by how people hold cameras; the world's z axis where nothing can be said.
 
     The mean of the cameras' up directions, made perpendicular to their horizontal axes where these span a plane (then it
-    does not matter how far the cameras look down). Where the up directions cancel but the cameras look the same way, as
-    from an aeroplane, up is against the view.
+    does not matter how far the cameras look down). Where the up directions cancel but all cameras look the same way, as from
+    an aeroplane, up is against the view. Where the horizontal axes are all parallel and the up directions are not, the images
+    lie on their side, and up is the end of that axis from which the cameras look down.
     """
     rows = reconstruction.poses.R[reconstruction.registered].to(torch.float64)
     z_axis = rows.new_tensor([0.0, 0.0, 1.0])
@@ -36,16 +37,19 @@ def up_direction(reconstruction: Reconstruction) -> Float[Tensor, "3"]:
         return z_axis
     right, up, forward = rows[:, 0], -rows[:, 1], rows[:, 2]
     mean, view = up.mean(0), forward.mean(0)
-    # The direction that the horizontal axes avoid.
     values, vectors = torch.linalg.eigh(right.mT @ right / len(right))
+    steadiness = torch.linalg.eigvalsh(up.mT @ up / len(up))[2]
+    if float(values[2]) > 0.9 and float(steadiness) < 0.7:
+        aside: Tensor = vectors[:, 2] * -torch.sign(vectors[:, 2] @ view - 1e-12)
+        return aside
+    # The direction that the horizontal axes avoid.
     avoided: Tensor = vectors[:, 0] * torch.sign(vectors[:, 0] @ mean + 1e-12)
     if float(mean.norm()) >= 0.3:
         mean = mean / mean.norm()
         spanned = float(values[1]) > 0.02 and float(values[0]) < 0.1 * float(values[1])
-        best = avoided if spanned and float(avoided @ mean) > 0.8 else mean
-    else:
-        best = -view / view.norm() if float(view.norm()) > 0.7 else avoided
-    return best
+        return avoided if spanned and float(avoided @ mean) > 0.8 else mean
+    aerial: Tensor = -view / view.norm()
+    return aerial if float(view.norm()) > 0.7 else avoided
 
 
 def frame(reconstruction: Reconstruction) -> Framing:
