@@ -1,9 +1,10 @@
 """Numbers without geometry: null spaces, roots of polynomials, small systems, nearest matrices."""
 
 from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3, solve
-from torchsfm.linalg.nullspace import null_vector, orthonormal_nullspace
+from torchsfm.linalg.nullspace import null_vector, nullspace_rows, orthonormal_nullspace
 from torchsfm.linalg.polynomial import companion_roots, evaluate, solve_cubic, solve_quadratic
 from torchsfm.linalg.projections import nearest_psd, nearest_rank, nearest_rotation
+from torchsfm.linalg.real_roots import real_roots
 
 __all__ = [
     "adjugate_3x3",
@@ -15,7 +16,9 @@ __all__ = [
     "nearest_rank",
     "nearest_rotation",
     "null_vector",
+    "nullspace_rows",
     "orthonormal_nullspace",
+    "real_roots",
     "solve",
     "solve_cubic",
     "solve_quadratic",

@@ -50,10 +50,10 @@ def null_vector(
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
     """The unit vector v that makes `|A v|` smallest, and its derivative.
 
-    The eigenvector of A'A (formed and solved in float64) is corrected by one Newton step of `A'(A v) = s v` with the residual
-    taken from A itself, which restores the accuracy that squaring loses. That step is differentiable in A, and its derivative
-    is the derivative of v. Where the two smallest singular values coincide v is not unique: the value is one such vector, the
-    derivative leaves out the directions in which it is not determined.
+    The eigenvector of A'A (formed and solved in float64) is corrected by Newton steps of `A'(A v) = s v` with the residual
+    taken from A itself, which restores the accuracy that squaring loses. The last step is differentiable in A, and its
+    derivative is the derivative of v. Where the two smallest singular values coincide v is not unique: the value is one such
+    vector, the derivative leaves out the directions in which it is not determined.
 
     Args:
         A: Matrices with m >= n - 1 rows, any scale.
@@ -64,12 +64,17 @@ def null_vector(
     finite = torch.isfinite(A).all(-1).all(-1)
     safe = torch.where(finite[..., None, None], A, 0).double()
     with torch.no_grad():
-        values, vectors = torch.linalg.eigh(safe.mT @ safe)
-        v, value = vectors[..., :1], values[..., :1]
-        gaps = values[..., 1:] - value
+        base = safe.detach()
+        values, vectors = torch.linalg.eigh(base.mT @ base)
+        v = vectors[..., :1]
+        gaps = values[..., 1:] - values[..., :1]
         inverse = torch.where(gaps > 1e-14 * values[..., -1:], 1 / gaps, 0)[..., None]
         others = vectors[..., 1:]
-    residual = safe.mT @ (safe @ v) - value[..., None] * v
+        image = base @ v
+        v = v - others @ (inverse * (others.mT @ (base.mT @ image - (image * image).sum((-2, -1), keepdim=True) * v)))
+        image = base @ v
+        value = (image * image).sum((-2, -1), keepdim=True)
+    residual = safe.mT @ (safe @ v) - value * v
     corrected = (v - others @ (inverse * (others.mT @ residual)))[..., 0]
     unit = corrected / corrected.norm(dim=-1, keepdim=True)
     first = torch.zeros_like(unit)

@@ -54,17 +54,24 @@ def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, 
         square = y * y
         y = y - (y * (square - 3 * Q) - 2 * size) / (3 * (square - Q))
     y = torch.where(torch.isfinite(y), y, 0)
-    rest = 3 * (4 * Q - y * y)
+    x = shift + torch.copysign(y, -R)
+    new = x - (((x + a) * x + b) * x + c) / ((3 * x + 2 * a) * x + b)
+    x = torch.where(torch.isfinite(new), new, x)
+    # Division by x - x0 from the end that is stable for a root of this size.
+    q0 = b + (a + x) * x
+    large = x * x > q0.abs()
+    q0 = torch.where(large, -c / x, q0)
+    q1 = torch.where(large, (q0 - b) / x, a + x)
+    rest = q1 * q1 - 4 * q0
     other = rest >= 0
-    y = torch.copysign(y, -R)
-    half, middle = 0.5 * rest.clamp_min(0).sqrt(), shift - 0.5 * y
-    x = torch.stack((shift + y, middle - half, middle + half))
+    q = -0.5 * (q1 + torch.copysign(rest.clamp_min(0).sqrt(), q1))
+    x = torch.stack((x, q, torch.where(q != 0, q0 / q, 0)))
     # One step on the cubic itself, where it helps.
     value = ((x + a) * x + b) * x + c
     new = x - value / ((3 * x + 2 * a) * x + b)
     better = (((new + a) * new + b) * new + c).abs() < value.abs()
     x = torch.where(better, new, x)
-    fine = torch.isfinite(x) & (c3 != 0)
+    fine = torch.isfinite(x) & torch.isfinite(Q + R) & torch.isfinite(c3) & (c3 != 0)
     return torch.where(fine, x, 0), fine & torch.stack((torch.ones_like(other), other, other))
 
 

@@ -38,7 +38,7 @@ def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n 
     check_tensors(A=(A, "n n"))
     safe, finite = _finite_or_zero(A)
     with torch.no_grad():
-        U, s, Vh = torch.linalg.svd(safe)
+        U, s, Vh = torch.linalg.svd(safe.detach())
         flip = torch.linalg.det(U @ Vh) < 0
         sign = torch.ones_like(s)
         sign[..., -1] = torch.where(flip, -1, 1)
@@ -72,7 +72,7 @@ def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*b
         raise ValueError(f"rank: wanted 1 to {min(A.shape[-2:])} for shape {tuple(A.shape)}, got {rank}")
     safe, _ = _finite_or_zero(A)
     with torch.no_grad():
-        U, s, Vh = torch.linalg.svd(safe, full_matrices=True)
+        U, s, Vh = torch.linalg.svd(safe.detach(), full_matrices=True)
         U1, U2 = U[..., :rank], U[..., rank:]
         V1, V2 = Vh[..., :rank, :].mT, Vh[..., rank:, :].mT
         s1 = s[..., :rank]
@@ -117,7 +117,8 @@ def nearest_psd(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
     check_tensors(A=(A, "n n"))
     safe, _ = _finite_or_zero(A)
     with torch.no_grad():
-        values, V = torch.linalg.eigh(0.5 * (safe + safe.mT))
+        base = safe.detach()
+        values, V = torch.linalg.eigh(0.5 * (base + base.mT))
         kept = values.clamp_min(0)
         B: Tensor = (V * kept[..., None, :]) @ V.mT
         gap = values[..., :, None] - values[..., None, :]

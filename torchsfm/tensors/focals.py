@@ -1,9 +1,9 @@
 """Focal lengths from one fundamental matrix, when the rest of both calibrations is known.
 
 Principal points are given, pixels are square. Two unknown focal lengths: the closed form of Bougnoux ("From projective to
-Euclidean space under any practical situation", ICCV 1998). One focal length common to both: the Kruppa equations, which are then
-overdetermined and have a solution also in some poses where Bougnoux's formula is 0 / 0 (Sturm, "On focal length calibration from
-two views", CVPR 2001).
+Euclidean space under any practical situation", ICCV 1998). One focal length common to both: the Kruppa equations, which are
+then overdetermined and have a solution also in some poses where Bougnoux's formula is 0 / 0 (Sturm, "On focal length
+calibration from two views", CVPR 2001).
 """
 
 from dataclasses import dataclass
@@ -112,6 +112,8 @@ def _different(G: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(squares, -1), sensitivity
 
 
+_NO_FOCAL = 1e3
+"""Focal lengths this far from the moderate scale, up or down, are not meant."""
 _ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 
@@ -139,12 +141,14 @@ def _equal(G: Tensor) -> tuple[Tensor, Tensor]:
     c2, c3 = 3 * (q1 * q2).sum(-1), 2 * (q2 * q2).sum(-1)
     with torch.no_grad():
         roots, real = cubic_rows(c0, c1, c2, c3)
-        real = real & (roots > 0)
+        # Both matrices can have rank 1 at s = 0 or infinity: a parallel pair that means nothing.
+        real = real & (roots > _NO_FOCAL**-2) & (roots < _NO_FOCAL**2)
         s = torch.where(real, roots, 1)[..., None]
         size = ((a0 + a1 * s) ** 2).sum(-1) * ((b0 + b1 * s) ** 2).sum(-1)
         cost = ((q0 + q1 * s + q2 * s * s) ** 2).sum(-1) / size
-        best = torch.where(real, cost, torch.inf).argmin(0, keepdim=True)
-        found = real.gather(0, best)[0]
+        cost, order = torch.where(real, cost, torch.inf).sort(0)
+        best = order[:1]
+        found = real.gather(0, best)[0] & (cost[1] > (100 * torch.finfo(G.dtype).eps) ** 2)
         root, size = s[..., 0].gather(0, best)[0], size.gather(0, best)[0]
         curvature = c1 + root * (2 * c2 + root * 3 * c3)
         # How fast the angle opens per relative change of f = sqrt(s).
