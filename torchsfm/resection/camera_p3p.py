@@ -255,8 +255,8 @@ class _Triangle:
     def newton(self, depths: tuple[Tensor, ...], valid: Tensor | None = None) -> tuple[tuple[Tensor, ...], Tensor]:
         """One Newton step on the three quadrics from depths given as rows, and how well they were met before it.
 
-        That is the largest error of a quadric relative to its side of the triangle. Slots that are not `valid`, if given, stay as
-        they are and have no derivative; otherwise what divides by zero comes out as it does.
+        That is the largest error of a quadric relative to its side of the triangle. Slots that are not `valid`, if given,
+        stay as they are and have no derivative; otherwise what divides by zero comes out as it does.
         """
         l0, l1, l2 = depths
         m0, m1, m2 = self.n2.unbind(0)
@@ -288,8 +288,8 @@ class _Triangle:
     def polish(self, depths: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Newton steps, unless they lead astray as at a double root; and which slots meet the quadrics in the end.
 
-        Where two of the points are close to each other the start has a small error in the quadrics and a large one in the depths.
-        The first step then trades one for the other, so that what counts is the error after three.
+        Where two of the points are close to each other the start has a small error in the quadrics and a large one in the
+        depths. The first step then trades one for the other, so that what counts is the error after three.
         """
         rows, before = self.newton(depths.unbind(0))
         rows, _ = self.newton(rows)

@@ -113,17 +113,19 @@ def refine_camera(
         result = levenberg_marquardt(
             problem.residual, state, fixed[0], fixed[1], fixed[3], retract=problem.retract, size=6 + problem.size,
             weights=fixed[2], loss=loss, linearize=problem.linearize, max_iterations=max_iterations,
-            function_tolerance=1e-13, step_tolerance=1e-12,
+            function_tolerance=1e-9 if loss is None else 1e-6, step_tolerance=1e-12,
         )  # fmt: skip
         state = result.x
-        for _ in range(2):
+        for _ in range(2 if loss is None else 5):
             state = problem.settle(state, *fixed)
     refined, theta = problem.attach(state, data, (result.status == Status.OK) & ~bad)
     inside = _Inside(camera, problem.free)
     with torch.no_grad():
         r, J = _linearize(refined.transform(local), x, theta, inside)
         square = (r * r).sum(-1).double()
-        covariance, determined = _covariance(J.double(), problem.slopes(r, w))
+        J = J.double()
+        N = (J * problem.slopes(r, w)[..., None, None]).flatten(-3, -2).mT @ J.flatten(-3, -2)
+        covariance, determined = _inverse(N)
         depth = refined.transform(local)[..., 2]
         in_front = depth > 0
         ahead = torch.where(in_front, w, 0.0).sum(-1)
@@ -152,7 +154,7 @@ def refine_camera(
 
 
 def _or_zero(value: Tensor, good: Tensor) -> Tensor:
-    return torch.where(good.reshape(*good.shape, *([1] * (value.ndim - good.ndim))), value, 0.0)
+    return torch.where(_like(good, value), value, 0.0)
 
 
 def _expand(camera: Camera, batch: torch.Size) -> Camera:
@@ -194,25 +196,49 @@ class _Problem:
         return w.double() if self.loss is None else w.double() * loss_slope(self.loss, (r * r).sum(-1).double())
 
     def settle(self, state: State, x: Tensor, X: Tensor, w: Tensor, camera: Camera) -> State:
-        """A Gauss-Newton step too small for the cost to see it; the stationary point is known better than the lowest cost."""
+        """A Newton step near the optimum, on steps that may be too small for the cost to see them.
+
+        The stationary point is known much better than the lowest cost. The loss enters with its second derivative (Triggs
+        et al. 2000, section 4.3), without which robust losses converge slowly; that of the projection is left out.
+        """
         r, J = self.linearize(state, x, X, camera)
-        s = self.slopes(r, w)
-        J, r = J.double(), r.double()
-        g = (J * (s[..., None] * r)[..., None]).sum((-3, -2))
-        inverse, determined = _covariance(J, s)
+        r, J = r.double(), J.double()
+        slope = self.slopes(r, w)
+        pulled = (J * r[..., None]).sum(-2)
+        g = (slope[..., None] * pulled).sum(-2)
+        N = (J * slope[..., None, None]).flatten(-3, -2).mT @ J.flatten(-3, -2)
+        inverse, sound = _inverse(N)
+        if self.loss is not None:
+            bent, convex = _inverse(N + 2 * (pulled * (w.double() * self._bend(r))[..., None]).mT @ pulled)
+            inverse = torch.where(convex[..., None, None], bent, inverse)
         step = -(inverse @ g[..., None])[..., 0]
-        promise = -(step * g).sum(-1)
-        tiny = determined & (promise <= 1e-9 * (s * (r * r).sum(-1)).sum(-1)) & torch.isfinite(step).all(-1)
-        return self.retract(state, torch.where(tiny[..., None], step, 0.0).to(x.dtype))
+        cost = self.cost(r, w)
+        step = torch.where((sound & (-(step * g).sum(-1) <= 1e-2 * cost))[..., None], step, 0.0)
+        new = self.retract(state, step.to(x.dtype))
+        better = self.cost(self.residual(new, x, X, camera).double(), w) <= cost * (1 + 1e-12) + 1e-300
+        pose = Pose(*(torch.where(_like(better, a), a, b) for a, b in ((new[0].R, state[0].R), (new[0].t, state[0].t))))
+        return pose, torch.where(better[..., None], new[1], state[1])
+
+    def cost(self, r: Tensor, w: Tensor) -> Tensor:
+        """Twice the cost of residuals."""
+        square = (r * r).sum(-1)
+        return (w.double() * (square if self.loss is None else self.loss(square))).sum(-1)
+
+    def _bend(self, r: Tensor) -> Tensor:
+        """The second derivative of the loss with respect to the squared residual, by differences of the first."""
+        assert self.loss is not None
+        square = (r * r).sum(-1).clamp_min(1e-30)
+        h = 1e-4
+        return (loss_slope(self.loss, square * (1 + h)) - loss_slope(self.loss, square * (1 - h))) / (2 * h * square)
 
     def attach(self, state: State, data: tuple[Tensor, Tensor, Tensor, Camera], good: Tensor) -> State:
         """The state with the derivative of the optimum with respect to the data."""
         x, X, w, camera = data
         names = camera.distortion.parameter_names
-        leaves = (x, X, w, camera.K, *(getattr(camera.distortion, name) for name in names))
+        leaves = (x, X, w, camera.K, *(getattr(camera.distortion, name)[..., None] for name in names))
 
         def objective(delta: Tensor, x: Tensor, X: Tensor, w: Tensor, K: Tensor, *p: Tensor) -> Tensor:
-            inside = Camera(K, _changed(camera.distortion, dict(zip(names, p, strict=True))))
+            inside = Camera(K, _changed(camera.distortion, {name: v[..., 0] for name, v in zip(names, p, strict=True)}))
             square = self.residual(self.retract(state, delta), x, X, inside).square().sum(-1)
             return (w * (square if self.loss is None else self.loss(square))).sum(-1)
 
@@ -292,9 +318,8 @@ def _repeat(camera: Camera, n: int) -> Camera:
     return Camera(K, tensor_map(lambda p: p[..., None].expand(*p.shape, n), camera.distortion))
 
 
-def _covariance(J: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of J'WJ, scaled to a unit diagonal before it is inverted, and where it exists."""
-    N = (J * w[..., None, None]).flatten(-3, -2).mT @ J.flatten(-3, -2)
+def _inverse(N: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of positive definite matrices, scaled to a unit diagonal before, and where there is one."""
     diagonal = N.diagonal(dim1=-2, dim2=-1)
     positive = (diagonal > 0).all(-1) & torch.isfinite(N).all(-1).all(-1)
     eye = torch.eye(N.shape[-1], dtype=N.dtype, device=N.device)
@@ -304,3 +329,8 @@ def _covariance(J: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     determined = positive & (values[..., 0] > 1e-13)
     inverse = (vectors / torch.where(determined[..., None], values, 1.0)[..., None, :]) @ vectors.mT
     return inverse * root[..., :, None] * root[..., None, :], determined
+
+
+def _like(mask: Tensor, value: Tensor) -> Tensor:
+    """A mask with the dimensions of a value."""
+    return mask.reshape(mask.shape + (1,) * (value.ndim - mask.ndim))
