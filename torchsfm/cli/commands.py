@@ -74,8 +74,12 @@ def reconstruct(
         ),
     ] = None,
     free_principal_point: Annotated[
-        bool, typer.Option("--free-principal-point", help="Estimate the principal point too.")
-    ] = False,
+        bool,
+        typer.Option(
+            "--free-principal-point/--centred-principal-point",
+            help="Estimate the principal point too, or hold it at the middle of the image.",
+        ),
+    ] = True,
     max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
     seed: Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where an earlier run into the same folder stopped.")] = False,

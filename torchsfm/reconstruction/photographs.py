@@ -95,10 +95,8 @@ def reconstruct(
     report = progress or (lambda stage, done, total: None)
     files = _files(images)
     model = camera or ("pinhole" if K is not None else "radial")
-    options = {
-        "sequence": sequence, "camera": model, "shared": shared_camera, "K": None if K is None else K.tolist(),
-        "pp": free_principal_point, "features": max_features, "neighbours": neighbours, "seed": seed,
-    }  # fmt: skip
+    # What is saved depends on these alone; cameras and models are made from it each time.
+    options = {"sequence": sequence, "features": max_features, "neighbours": neighbours}
     stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
     generator = torch.Generator().manual_seed(seed)
     if sequence:
