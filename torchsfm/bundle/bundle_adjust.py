@@ -11,6 +11,7 @@ from torchsfm._types import Status, check_tensors
 from torchsfm.bundle.projection import Projection, camera_from_rows, camera_rows, free_columns
 from torchsfm.geometry import Camera, Pose
 from torchsfm.optim import Block, Loss, RigidMotion, Subset, Term, sparse_levenberg_marquardt
+from torchsfm.optim.sparse_derivative import Hessian
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ def bundle_adjust(
     intrinsics_mean: Camera | None = None,
     max_iterations: int = 50,
     tolerance: float = 1e-6,
+    hessian: Hessian = "exact",
     progress: Callable[[int, float], None] | None = None,
 ) -> BundleResult:
     """Minimise the reprojection error over poses, cameras and points together (Triggs et al. 2000; HZ 18.1).
@@ -82,28 +84,22 @@ def bundle_adjust(
         intrinsics_mean: Where the priors are centred; the cameras given if not given.
         max_iterations: Most steps tried.
         tolerance: End when a step lowers the cost by less than this fraction.
+        hessian: Used for derivatives only: "exact", or "gauss-newton", cheaper and some percent off where residuals are large.
         progress: Called with the number of steps and the cost after each.
 
     Returns:
-        The adjusted poses, cameras and points, in the dtype given, with costs and residuals.
+        The adjusted poses, cameras and points, in the dtype given, with costs and residuals. Where observations, weights, or
+        fixed poses, cameras or points require a gradient, the results carry their derivatives by the implicit function theorem
+        (first derivatives; with a free gauge, those of the solution that moves least).
 
     Raises:
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
-    index = _check(poses, cameras, X, x, view, point, camera_index, fixed_poses, fixed_points, fixed_cameras, weights)
-    model = type(cameras.distortion)
-    columns = free_columns(free, model)
-    rows = camera_rows(cameras)
-    start = torch.cat((_orthonormal(poses.R.detach().double()).flatten(1), poses.t.detach().double()), 1)
-    blocks = {
-        "pose": Block(start, RigidMotion(), fixed_poses),
-        "camera": Block(rows, Subset(rows.shape[1], columns), fixed_cameras),
-        "point": Block(X, None, fixed_points),
-    }
-    projection = Projection(model, columns, bool((rows[:, 4] != 0).any()) or 4 in columns)
-    gathered = (view, index[view], point)
-    names = ("pose", "camera", "point")
-    terms = [Term(projection.residual, names, gathered, (x,), loss, weights, projection.linearize)]
+    fixed = (fixed_poses, fixed_points, fixed_cameras)
+    index = check_bundle(poses, cameras, X, x, view, point, camera_index, *fixed, weights)
+    blocks, term = bundle_problem(poses, cameras, X, x, view, point, index, free, *fixed, weights, loss)
+    terms = [term]
+    model, rows = type(cameras.distortion), blocks["camera"].x
     if intrinsics_sigma:
         terms.append(_prior(intrinsics_sigma, rows if intrinsics_mean is None else camera_rows(intrinsics_mean), model))
     result = sparse_levenberg_marquardt(
@@ -112,12 +108,13 @@ def bundle_adjust(
         eliminate="point",
         max_iterations=max_iterations,
         function_tolerance=tolerance,
+        hessian=hessian,
         progress=progress,
     )
     used = result.used[0]
     distance = torch.linalg.vector_norm(result.residuals[0], dim=-1)
     return BundleResult(
-        _moved_poses(poses, start, result.x["pose"]),
+        _moved_poses(poses, blocks["pose"].x, result.x["pose"]),
         _moved_cameras(cameras, rows, result.x["camera"]),
         result.x["point"],
         result.cost,
@@ -127,6 +124,36 @@ def bundle_adjust(
         result.iterations,
         result.status,
     )
+
+
+def bundle_problem(
+    poses: Pose,
+    cameras: Camera,
+    X: Tensor,
+    x: Tensor,
+    view: Tensor,
+    point: Tensor,
+    camera_index: Tensor,
+    free: Sequence[str],
+    fixed_poses: Tensor | None,
+    fixed_points: Tensor | None,
+    fixed_cameras: Tensor | None,
+    weights: Tensor | None,
+    loss: Loss | None,
+) -> tuple[dict[str, Block], Term]:
+    """The variables of a bundle, "pose", "camera" and "point", and its reprojection term."""
+    model = type(cameras.distortion)
+    columns = free_columns(free, model)
+    rows = camera_rows(cameras)
+    blocks = {
+        "pose": Block(torch.cat((_orthonormal(poses.R.double()).flatten(1), poses.t.double()), 1), RigidMotion(), fixed_poses),
+        "camera": Block(rows, Subset(rows.shape[1], columns), fixed_cameras),
+        "point": Block(X, None, fixed_points),
+    }
+    skew = 4 in columns or cameras.K.requires_grad or bool((rows[:, 4] != 0).any())
+    projection = Projection(model, columns, skew)
+    index = (view, camera_index[view], point)
+    return blocks, Term(projection.residual, tuple(blocks), index, (x,), loss, weights, projection.linearize)
 
 
 def _prior(sigma: Mapping[str, float], mean: Tensor, model: type) -> Term:
@@ -173,7 +200,7 @@ def _moved_cameras(cameras: Camera, start: Tensor, end: Tensor) -> Camera:
     return Camera(torch.where(changed[:, None, None], new.K, cameras.K), new.distortion)
 
 
-def _check(
+def check_bundle(
     poses: Pose,
     cameras: Camera,
     X: Tensor,

@@ -1,5 +1,6 @@
 """Which parameters make the residuals smallest, and how do they move when the data move? Engines that know no geometry."""
 
+from torchsfm.optim.covariance import SparseCovariance, sparse_covariance
 from torchsfm.optim.implicit import attach_implicit, attach_optimum, wants_derivative
 from torchsfm.optim.levenberg_marquardt import LeastSquaresResult, levenberg_marquardt
 from torchsfm.optim.loss import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey, loss_slope
@@ -19,6 +20,7 @@ __all__ = [
     "RigidMotion",
     "Rotation",
     "SoftL1",
+    "SparseCovariance",
     "SparseResult",
     "Subset",
     "Term",
@@ -30,6 +32,7 @@ __all__ = [
     "levenberg_marquardt",
     "loss_slope",
     "rotation_exponential",
+    "sparse_covariance",
     "sparse_levenberg_marquardt",
     "wants_derivative",
 ]

@@ -76,16 +76,10 @@ class GroupCoupling:
             step = max(ATOM, CACHE // (columns * self.q + 1))
             for first in range(group.start, group.end, step):
                 last = min(first + step, group.end)
-                W, span = self._matrix(group)[:, :, first - group.start : last - group.start], slice(first, last)
-                Y = self._work.get("Y", *W.shape)
+                Y = self._whiten(group, first, last, L)
                 for a in range(self.q):
-                    row = W[a]
-                    for b in range(a):
-                        torch.addcmul(row, L[a][b][span], Y[b], value=-1, out=Y[a])
-                        row = Y[a]
-                    torch.mul(row, L[a][a][span], out=Y[a])
                     square.addmm_(Y[a], Y[a].mT)
-                    part.addmv_(Y[a], z[a, span])
+                    part.addmv_(Y[a], z[a, first:last])
             if group.everything:
                 S[: self.size, : self.size] -= square
                 right[: self.size] += part
@@ -100,6 +94,40 @@ class GroupCoupling:
         for group in self.groups:
             out[:, group.start : group.end] = camera[group.columns] @ self._matrix(group)
         return out
+
+    def lift(self, point: Tensor) -> Tensor:
+        """`W point`."""
+        out = point.new_zeros(self.size + 2)
+        for group in self.groups:
+            W = self._matrix(group)
+            out[group.columns] += torch.bmm(W, point[:, group.start : group.end, None])[:, :, 0].sum(0)
+        return out
+
+    def add_spread(self, out: Tensor, L: list[list[Tensor]], camera: Tensor) -> None:
+        """Add `Y' C Y` of each point to `out` (q, q, points), with `Y = W L'^-1` and C (size, size) of the retained."""
+        full = torch.nn.functional.pad(camera, (0, 2, 0, 2))
+        for group in self.groups:
+            C = full[group.columns[:, None], group.columns]
+            step = max(ATOM, CACHE // (group.columns.numel() * self.q + 1))
+            for first in range(group.start, group.end, step):
+                last = min(first + step, group.end)
+                Y = self._whiten(group, first, last, L)
+                for a in range(self.q):
+                    CY = C @ Y[a]
+                    for b in range(self.q):
+                        out[a, b, first:last] += (CY * Y[b]).sum(0)
+
+    def _whiten(self, group: _Group, first: int, last: int, L: list[list[Tensor]]) -> Tensor:
+        """`W L'^-1` of some points of a group, (q, columns, points)."""
+        W, span = self._matrix(group)[:, :, first - group.start : last - group.start], slice(first, last)
+        Y = self._work.get("Y", *W.shape)
+        for a in range(self.q):
+            row = W[a]
+            for b in range(a):
+                torch.addcmul(row, L[a][b][span], Y[b], value=-1, out=Y[a])
+                row = Y[a]
+            torch.mul(row, L[a][a][span], out=Y[a])
+        return Y
 
     def _matrix(self, group: _Group) -> Tensor:
         columns, points = group.columns.numel(), group.end - group.start

@@ -143,6 +143,16 @@ class PairCoupling:
         each = torch.cat(parts).view(-1, self.q)
         return camera.new_zeros((self.points, self.q)).index_add_(0, self.point, each).mT
 
+    def lift(self, point: Tensor) -> Tensor:
+        """`W point`."""
+        at = point.mT.index_select(0, self.point)
+        sums, begin = [], 0
+        for length in self._lengths:
+            span = slice(begin, begin + length)
+            sums.append(self._W[span].view(-1, self.width).mT @ at[span].reshape(-1))
+            begin += length
+        return point.new_zeros(self.size + 2).index_add_(0, self.columns.flatten(), torch.cat(sums))
+
 
 def estimate_pairs(layout: Layout) -> float:
     """Seconds that a reduction pair by pair takes, about."""

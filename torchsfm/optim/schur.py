@@ -6,8 +6,8 @@ With the eliminated variables (points) last, the normal equations of a problem o
     [ W'  V ] [ b ] = - [ h ],    V block diagonal,
 
 and `S = U - W V^-1 W'` is a system in the retained variables (cameras) alone (Brown 1958; Triggs et al. 2000, 6.1; HZ A6.3).
-Work comes in three tiers: once per problem (`layout`: who meets whom), once per linearisation (`linearize`), once per
-damping (`solve`), so that a rejected step costs only the last.
+Work comes in three tiers: once per problem (`layout`: who meets whom), once per linearisation (`Elimination.linearize`), once
+per damping (`NormalEquations.step`), so that a rejected step costs only the last.
 """
 
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from torch import Tensor
 from torchsfm.optim.coupling_groups import GroupCoupling, plan_groups
 from torchsfm.optim.coupling_pairs import PairCoupling, estimate_pairs
 from torchsfm.optim.layout import CHUNK, Layout, Piece
+from torchsfm.optim.normal_equations import NormalEquations
 from torchsfm.optim.terms import Block, Term, Workspace, gather, lift_of, linearize, term_cost, term_residual
 
 
@@ -45,7 +46,7 @@ class _Part:
 class Elimination:
     """Normal equations of a laid-out problem, linearised at one place at a time."""
 
-    def __init__(self, blocks: dict[str, Block], layout: Layout) -> None:
+    def __init__(self, blocks: dict[str, Block], layout: Layout, *, dense: bool = False) -> None:
         self.blocks = blocks
         self.layout = layout
         x = {name: b.x for name, b in blocks.items()}
@@ -55,7 +56,7 @@ class Elimination:
         self.coupling: GroupCoupling | PairCoupling | None = None
         if any(piece.coupled for piece in layout.pieces):
             spans, seconds = plan_groups(layout)
-            dense = seconds <= estimate_pairs(layout)
+            dense = dense or seconds <= estimate_pairs(layout)
             self.coupling = GroupCoupling(layout, spans, some) if dense else PairCoupling(layout, some)
         self.U = some.new_empty((size + 2, size + 2))
         self.V = some.new_empty((q * (q + 3) // 2, n))
@@ -66,7 +67,7 @@ class Elimination:
         costs = [term_cost(part.term, term_residual(part.term, x, self.work)) for part in self.parts]
         return torch.stack(costs).sum()
 
-    def linearize(self, x: dict[str, Tensor]) -> "Linearized":
+    def linearize(self, x: dict[str, Tensor]) -> "NormalEquations":
         """The blocks of the normal equations at `x`; they are overwritten by the next call."""
         needed = {
             name
@@ -82,7 +83,7 @@ class Elimination:
             self.coupling.clear()
         for part in self.parts:
             self._add(part, x, lifts)
-        return Linearized(self.layout, self.coupling, self.U, self.V)
+        return NormalEquations(self.layout, self.coupling, self.U, self.V)
 
     def _add(self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None]) -> None:
         """Add squares and products of a part's Jacobians to the system."""
@@ -125,61 +126,6 @@ class Elimination:
             self.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
 
 
-@dataclass(frozen=True)
-class Linearized:
-    """The normal equations: `U` with the gradient as column `size`, `V`, and the coupling `W`.
-
-    `V` holds the distinct entries of the blocks row by row, each row followed by its entry of the gradient.
-    """
-
-    layout: Layout
-    coupling: GroupCoupling | PairCoupling | None
-    U: Tensor
-    V: Tensor
-
-    def solve(self, damping: float) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-        """The step for `damping` times the diagonal, the decrease the model promises, and whether the system was solved."""
-        layout = self.layout
-        size, q = layout.size, layout.point_size
-        weight = damping * _floor(self.U.diagonal()[:size])
-        S, right = self.U.clone(), self.U[:size, size].clone()
-        S.diagonal()[:size] += weight
-        h = self.V[[_place(a, q, q) for a in range(q)]]
-        point_weight, z = h, h
-        L: list[list[Tensor]] = []
-        if q:
-            point_weight = damping * _floor(self.V[[_place(a, a, q) for a in range(q)]])
-            L = _factor(self.V, point_weight, q)
-            z = _forward(L, h)
-            if self.coupling is not None:
-                right -= self.coupling.reduce(S, L, z)[:size]
-        factor, info = torch.linalg.cholesky_ex(S[:size, :size])
-        camera = -torch.cholesky_solve(right[:, None], factor)[:, 0] if size else right
-        solved = (info == 0) & camera.isfinite().all()
-        promise = camera @ (weight * camera - self.U[:size, size])
-        step = self._split(camera)
-        if layout.eliminated is not None:
-            if self.coupling is not None:
-                z = z + _forward(L, self.coupling.product(torch.cat((camera, camera.new_zeros(2)))))
-            point = _backward(L, z)
-            promise = promise + (point * (point_weight * point - h)).sum()
-            step[layout.eliminated] = point.mT
-        return step, promise / 2, solved
-
-    def gradient(self) -> Tensor:
-        """Largest absolute derivative of the cost."""
-        size, q = self.layout.size, self.layout.point_size
-        return torch.cat((self.U[:size, size], *(self.V[_place(a, q, q)] for a in range(q)))).abs().amax()
-
-    def _split(self, camera: Tensor) -> dict[str, Tensor]:
-        """The columns of each block."""
-        ends = [*list(self.layout.first.values())[1:], self.layout.size]
-        return {
-            name: camera[start:end].view(self.layout.free[name].numel(), -1)
-            for (name, start), end in zip(self.layout.first.items(), ends, strict=True)
-        }
-
-
 def _parts(number: int, piece: Piece, size: int, x: dict[str, Tensor]) -> list[_Part]:
     """Cut a piece where the residuals linearised at once become too many."""
     m, width = piece.slots.numel(), piece.columns.shape[1]
@@ -213,62 +159,6 @@ def _parts(number: int, piece: Piece, size: int, x: dict[str, Tensor]) -> list[_
         point = None if piece.point is None else piece.point[rows]
         parts.append(_Part(number, first, term, piece.wanted, width, components, segments, places, point))
     return parts
-
-
-def _place(a: int, b: int, q: int) -> int:
-    """Row of V that holds entry (a, b >= a) of the blocks; b = q is the gradient."""
-    return a * (q + 1) - a * (a - 1) // 2 + b - a
-
-
-def _floor(diagonal: Tensor) -> Tensor:
-    """A variable that nothing depends on in some direction gets a damping of its own, and does not move."""
-    if diagonal.numel() == 0:
-        return diagonal
-    least = 1e-12 * diagonal.amax(0, keepdim=True)
-    return torch.where(least > 0, torch.maximum(diagonal, least), torch.ones_like(diagonal))
-
-
-def _factor(V: Tensor, damping: Tensor, q: int) -> list[list[Tensor]]:
-    """Cholesky factors of all point blocks, elementwise, with the reciprocals of the diagonal in its place."""
-    L: list[list[Tensor]] = []
-    for a in range(q):
-        row: list[Tensor] = []
-        for b in range(a + 1):
-            value = V[_place(b, a, q)]
-            if a == b:
-                full = value + damping[a]
-                for c in range(b):
-                    value = value - row[c] * row[c]
-                # Rounding must not take the pivot below what the damping guarantees.
-                row.append(torch.maximum(value + damping[a], 1e-15 * full).rsqrt())
-            else:
-                for c in range(b):
-                    value = value - row[c] * L[b][c]
-                row.append(value * L[b][b])
-        L.append(row)
-    return L
-
-
-def _forward(L: list[list[Tensor]], z: Tensor) -> Tensor:
-    """`L^-1 z`."""
-    rows: list[Tensor] = []
-    for a, value in enumerate(z.unbind(0)):
-        for b in range(a):
-            value = value - L[a][b] * rows[b]
-        rows.append(value * L[a][a])
-    return torch.stack(rows)
-
-
-def _backward(L: list[list[Tensor]], z: Tensor) -> Tensor:
-    """`-L'^-1 z`."""
-    q = len(L)
-    rows: list[Tensor] = [z[0]] * q
-    for a in reversed(range(q)):
-        value = -z[a]
-        for b in range(a + 1, q):
-            value = value - L[b][a] * rows[b]
-        rows[a] = value * L[a][a]
-    return torch.stack(rows)
 
 
 def move(blocks: dict[str, Block], layout: Layout, x: dict[str, Tensor], step: dict[str, Tensor]) -> dict[str, Tensor]:

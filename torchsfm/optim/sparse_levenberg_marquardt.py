@@ -1,5 +1,6 @@
 """Levenberg-Marquardt for one large sparse problem: terms over variable blocks, one block eliminated (`schur`)."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -7,8 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.optim.covariance import to_double, usable
+from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.schur import Elimination, move
+from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
 from torchsfm.optim.terms import Block, Term, term_cost, term_residual
 
 
@@ -41,6 +45,7 @@ def sparse_levenberg_marquardt(
     gradient_tolerance: float = 1e-10,
     step_tolerance: float = 1e-10,
     initial_damping: float = 1e-4,
+    hessian: Hessian = "exact",
     progress: Callable[[int, float], None] | None = None,
 ) -> SparseResult:
     """Minimise a sum of terms over variable blocks.
@@ -57,65 +62,103 @@ def sparse_levenberg_marquardt(
         gradient_tolerance: End when no derivative of the cost is larger.
         step_tolerance: End when the step is shorter than this fraction of the variables' norm.
         initial_damping: Damping relative to the diagonal of the normal equations, at the start (1 / Ceres' radius).
+        hessian: Used for derivatives of the minimum only: "exact", or "gauss-newton", which leaves out second derivatives of
+            the residuals and is some percent off where residuals are large.
         progress: Called with the number of iterations and the cost after each.
 
     Returns:
-        The minimum.
+        The minimum. Where data, weights or fixed variables require a gradient, `x` and `residuals` carry their derivatives by
+        the implicit function theorem (first derivatives, backwards); otherwise nothing is spent on it.
 
     Raises:
         ValueError: A term names an unknown block, its tensors disagree in length, or it depends on two eliminated variables.
     """
     _check(blocks, terms, eliminate)
+    options = (max_iterations, function_tolerance, gradient_tolerance, step_tolerance, initial_damping, progress)
     with torch.no_grad():
         double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
         x = {name: b.x for name, b in double.items()}
-        terms = [_to_double(term) for term in terms]
-        used = tuple(_used(term, x) for term in terms)
-        counted = [t if bool(u.all()) else t.select(u.nonzero()[:, 0]) for t, u in zip(terms, used, strict=True)]
+        plain = [to_double(term) for term in terms]
+        used = tuple(usable(term, x) for term in plain)
+        counted = [t if bool(u.all()) else t.select(u.nonzero()[:, 0]) for t, u in zip(plain, used, strict=True)]
         layout = lay_out(double, counted, eliminate)
-        constant = _cost(layout.still, x)
-        # A residual of fixed variables is a constant of the cost. The others come in parts small enough for the cache.
-        engine = Elimination(double, layout)
-        cost = float(engine.cost(x)) if layout.pieces else 0.0
-        initial = cost
-        status, iterations = Status.NOT_CONVERGED, 0
-        if not any(bool(u.any()) for u in used):
-            status = Status.NOT_FINITE if any(u.numel() for u in used) else Status.TOO_FEW
-        elif not layout.pieces:
-            status = Status.TOO_FEW
+        # A residual of fixed variables is a constant of the cost.
+        constant = sum((float(term_cost(t, term_residual(t, x))) for t in layout.still), 0.0)
+        if layout.pieces:
+            found = _descend(Elimination(double, layout), x, constant, *options)
         else:
-            system = engine.linearize(x)
-            damping, growth = initial_damping, 2.0
-            while iterations < max_iterations:
-                if float(system.gradient()) <= gradient_tolerance:
-                    status = Status.OK
-                    break
-                step, promise_, solved = system.solve(damping)
-                promise = float(promise_)
-                iterations += 1
-                trial = move(double, layout, x, step)
-                trial_cost = float(engine.cost(trial)) if bool(solved) else torch.inf
-                ratio = (cost - trial_cost) / max(promise, 1e-300)
-                accepted = trial_cost < cost and ratio > 1e-3
-                small = bool(solved) and _length(step) <= step_tolerance * (_length(x) + step_tolerance)
-                small = small or (bool(solved) and promise <= 1e-2 * function_tolerance * cost)
-                if accepted:
-                    small = small or cost - trial_cost <= function_tolerance * cost
-                    x, cost = trial, trial_cost
-                    damping = max(damping * max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3), 1e-16)
-                    growth = 2.0
-                else:
-                    damping, growth = damping * growth, 2 * growth
-                if progress is not None:
-                    progress(iterations, cost + constant)
-                if small or damping > 1e16:
-                    status = Status.OK
-                    break
-                if accepted:
-                    system = engine.linearize(x)
-        residuals = tuple(term_residual(t, x) for t in terms)
+            none = any(u.numel() for u in used) and not any(bool(u.any()) for u in used)
+            found = _End(x, constant, constant, 0, Status.NOT_FINITE if none else Status.TOO_FEW)
+    x = found.x
+    if wants_derivative(*followed(dict(blocks), terms)):
+        x = attach_sparse_optimum(dict(blocks), terms, x, used, eliminate, hessian)
+        plain = [replace(term, data=tuple(_double(d) for d in term.data)) for term in terms]
+    residuals = tuple(term_residual(t, x) for t in plain)
     out = {name: x[name].to(b.x.dtype).contiguous() for name, b in blocks.items()}
-    return SparseResult(out, cost + constant, initial + constant, residuals, used, iterations, status)
+    return SparseResult(out, found.cost, found.initial, residuals, used, found.iterations, found.status)
+
+
+@dataclass(frozen=True)
+class _End:
+    x: dict[str, Tensor]
+    cost: float
+    initial: float
+    iterations: int
+    status: Status
+
+
+def _descend(
+    engine: Elimination,
+    x: dict[str, Tensor],
+    constant: float,
+    max_iterations: int,
+    function_tolerance: float,
+    gradient_tolerance: float,
+    step_tolerance: float,
+    damping: float,
+    progress: Callable[[int, float], None] | None,
+) -> _End:
+    """Damped steps until a tolerance is met; a rejected step keeps the linearisation."""
+    cost = initial = float(engine.cost(x))
+    system = engine.linearize(x)
+    growth = 2.0
+    for iteration in range(1, max_iterations + 1):
+        slope = float(system.gradient())
+        if not slope > gradient_tolerance:
+            status = Status.OK if slope <= gradient_tolerance else Status.NOT_FINITE
+            return _End(x, cost + constant, initial + constant, iteration - 1, status)
+        if not math.isfinite(slope):
+            return _End(x, cost + constant, initial + constant, iteration - 1, Status.NOT_FINITE)
+        step, promised, solvable = system.step(damping)
+        solved, promise = bool(solvable), float(promised)
+        trial = move(engine.blocks, engine.layout, x, step)
+        trial_cost = float(engine.cost(trial)) if solved else math.inf
+        ratio = (cost - trial_cost) / max(promise, 1e-300)
+        # Below the rounding error of the cost a step is taken on its promise: it brings x, not the cost, to its end.
+        rounding = solved and promise <= 1e-12 * cost and trial_cost - cost <= 1e-14 * cost
+        accepted = rounding or (trial_cost < cost and ratio > 1e-3)
+        # A promise far below the tolerance ends it, kept or not: rounding decides whether such a step lowers the cost.
+        done = solved and promise <= 1e-2 * function_tolerance * cost
+        done = done or (solved and _length(step) <= step_tolerance * (_length(x) + step_tolerance))
+        if accepted:
+            done = done or (not rounding and cost - trial_cost <= function_tolerance * cost)
+            x, cost = trial, trial_cost
+            damping = max(damping * max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3), 1e-16)
+            growth = 2.0
+        else:
+            damping, growth = damping * growth, 2 * growth
+        if progress is not None:
+            progress(iteration, cost + constant)
+        # At the largest damping no step whatever lowers the cost.
+        if done or damping > 1e16:
+            return _End(x, cost + constant, initial + constant, iteration, Status.OK)
+        if accepted:
+            system = engine.linearize(x)
+    return _End(x, cost + constant, initial + constant, max_iterations, Status.NOT_CONVERGED)
+
+
+def _double(x: Tensor) -> Tensor:
+    return x.double() if x.is_floating_point() else x
 
 
 def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | None) -> None:
@@ -131,21 +174,6 @@ def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | 
         lengths = {t.shape[0] for t in (*term.index, *term.data, *weights)}
         if len(lengths) != 1:
             raise ValueError(f"terms[{k}]: wanted index, data and weights of one length, got {sorted(lengths)}")
-
-
-def _to_double(term: Term) -> Term:
-    data = tuple(d.detach().double() if d.is_floating_point() else d.detach() for d in term.data)
-    weights = None if term.weights is None else term.weights.detach().double()
-    return replace(term, data=data, weights=weights)
-
-
-def _used(term: Term, x: dict[str, Tensor]) -> Tensor:
-    finite = term_residual(term, x).isfinite().all(-1)
-    return finite if term.weights is None else finite & (term.weights > 0)
-
-
-def _cost(terms: Sequence[Term], x: dict[str, Tensor]) -> float:
-    return sum((float(term_cost(t, term_residual(t, x))) for t in terms), 0.0)
 
 
 def _length(x: dict[str, Tensor]) -> float:

@@ -1,0 +1,85 @@
+"""The covariance of a bundle: how well poses, cameras and points are known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.bundle.bundle_adjust import bundle_problem, check_bundle
+from torchsfm.geometry import Camera, Pose
+from torchsfm.optim import Loss, SparseCovariance, sparse_covariance
+
+
+@dataclass(frozen=True)
+class BundleCovariance:
+    """Covariances of each pose, camera and point by itself.
+
+    `poses` is in the coordinates of `Pose.retract`, (w, v): radians and the unit of the world, in the camera's frame; `cameras`
+    in the free intrinsics in the order focal (pixels along x), aspect, principal point, skew, distortion; `X` in the world.
+    Fixed ones are zero; those that are not determined have an infinite diagonal. `sigma` is the standard deviation of an image
+    coordinate, given or estimated. `nullity` is the dimension of the free gauge: 7 without anything fixed. More means that
+    something else is not determined either. `everything` is the engine's own result, with cross-covariances, for sigma = 1.
+    """
+
+    poses: Float[Tensor, "v 6 6"]
+    cameras: Float[Tensor, "g k k"]
+    X: Float[Tensor, "n 3 3"]
+    determined_points: Bool[Tensor, "n"]
+    sigma: float
+    nullity: int
+    everything: SparseCovariance
+
+
+def bundle_covariance(
+    poses: Pose,
+    cameras: Camera,
+    X: Float[Tensor, "n 3"],
+    x: Float[Tensor, "m 2"],
+    view: Int[Tensor, "m"],
+    point: Int[Tensor, "m"],
+    *,
+    camera_index: Int[Tensor, "v"] | None = None,
+    free: Sequence[str] = ("focal",),
+    fixed_poses: Bool[Tensor, "v"] | None = None,
+    fixed_points: Bool[Tensor, "n"] | None = None,
+    fixed_cameras: Bool[Tensor, "g"] | None = None,
+    weights: Float[Tensor, "m"] | None = None,
+    loss: Loss | None = None,
+    sigma: float | None = None,
+) -> BundleCovariance:
+    """Compute the covariance of an adjusted bundle, by the arguments of `bundle_adjust` at its result.
+
+    With a free gauge, the covariance is that in the gauge in which the cameras move least: a spread of shape, not of place.
+
+    Args:
+        poses: Adjusted poses, batch (v,).
+        cameras: Adjusted cameras, batch (g,).
+        X: Adjusted points.
+        x: Observations, pixels.
+        view: Which view made each observation.
+        point: Which point it shows.
+        camera_index: Which camera took each view, as in `bundle_adjust`.
+        free: What was optimised in the cameras.
+        fixed_poses: Views that did not move.
+        fixed_points: Points that did not move.
+        fixed_cameras: Cameras that did not change.
+        weights: Weights of the observations, inverse variances up to `sigma`.
+        loss: The robust loss; observations count by its slope.
+        sigma: Standard deviation of an image coordinate of weight 1, pixels; estimated from the residuals if not given.
+
+    Returns:
+        The covariances, float64.
+
+    Raises:
+        ValueError: Shapes, dtypes, indices or names do not fit.
+    """
+    fixed = (fixed_poses, fixed_points, fixed_cameras)
+    index = check_bundle(poses, cameras, X, x, view, point, camera_index, *fixed, weights)
+    with torch.no_grad():
+        blocks, term = bundle_problem(poses, cameras, X, x, view, point, index, free, *fixed, weights, loss)
+        unit = sparse_covariance(blocks, [term], eliminate="point")
+    scale = sigma if sigma is not None else (unit.square_sum / max(unit.redundancy, 1)) ** 0.5
+    pose, camera, points = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
+    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity, unit)

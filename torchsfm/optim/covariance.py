@@ -1,0 +1,104 @@
+"""The covariance of a minimum: how far variables would move if the measurements were made again.
+
+To first order it is the inverse of the Gauss-Newton matrix, in tangent coordinates, for residuals in units of their standard
+deviation (HZ 5.2). Where a gauge is free it is the covariance in the gauge in which the retained variables move least (Triggs
+et al. 2000, 9): differences and shapes are meaningful, absolute positions only with that convention.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm.optim.layout import lay_out
+from torchsfm.optim.loss import loss_slope
+from torchsfm.optim.schur import Elimination
+from torchsfm.optim.terms import Block, Term, term_residual
+
+
+@dataclass(frozen=True)
+class SparseCovariance:
+    """Covariances of all variables of a problem of terms.
+
+    `blocks` holds the covariance of each variable by itself, `(N, tangent, tangent)`: zero where it is fixed, infinite on the
+    diagonal where `determined` is False (nothing depends on it, or too little). `joint` is the covariance of all free retained
+    variables together, and `columns` says where each of them stands there, -1 where it does not. `nullity` counts the
+    dimensions of the gauge (7 for a bundle without anything fixed; more means that something is not determined).
+    `redundancy` is the number of residual components minus the number of unknowns determined: at a good fit `square_sum`, the
+    weighted sum of squared residuals, is about that.
+    """
+
+    blocks: dict[str, Tensor]
+    determined: dict[str, Tensor]
+    joint: Float[Tensor, "size size"]
+    columns: dict[str, Tensor]
+    nullity: int
+    redundancy: int
+    square_sum: float
+
+
+def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eliminate: str | None = None) -> SparseCovariance:
+    """Compute covariances at a minimum.
+
+    Args:
+        blocks: Variables at the minimum.
+        terms: Residuals in units of their standard deviation; those that are not finite are left out.
+        eliminate: The block to eliminate, as in `sparse_levenberg_marquardt`.
+
+    Returns:
+        The covariances, float64.
+    """
+    with torch.no_grad():
+        double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
+        x = {name: b.x for name, b in double.items()}
+        counted = [to_double(t) for t in terms]
+        counted = [t.select(usable(t, x).nonzero()[:, 0]) for t in counted]
+        layout = lay_out(double, counted, eliminate)
+        engine = Elimination(double, layout, dense=True)
+        inverse = engine.linearize(x).invert()
+        free_points = inverse.point_covariance() if inverse.L else None
+        squares = sum((_square_sum(part.term, x) for part in engine.parts), 0.0)
+        rows = sum(part.components * part.term.index[0].shape[0] for part in engine.parts)
+    found: dict[str, Tensor] = {}
+    determined: dict[str, Tensor] = {}
+    columns: dict[str, Tensor] = {}
+    for name, block in double.items():
+        count, width = block.x.shape[0], block.tangent
+        free = layout.free[name]
+        known = torch.zeros(count, dtype=torch.bool, device=free.device) if block.fixed is None else block.fixed.clone()
+        covariance = block.x.new_zeros((count, width, width))
+        covariance[~known] = torch.diag(block.x.new_full((width,), torch.inf))
+        place = torch.full((count, width), -1, device=free.device)
+        if name == eliminate:
+            if free_points is not None:
+                good = inverse.determined
+                known[free[good]] = True
+                covariance[free[good]] = free_points[good]
+        elif free.numel():
+            place[free] = layout.first[name] + torch.arange(free.numel() * width, device=free.device).view(-1, width)
+            known[free] = True
+            covariance[free] = inverse.camera[place[free][:, :, None], place[free][:, None]]
+        found[name], determined[name], columns[name] = covariance, known, place
+    unknowns = layout.size - inverse.nullity + int(inverse.determined.sum()) * layout.point_size
+    return SparseCovariance(found, determined, inverse.camera, columns, inverse.nullity, rows - unknowns, squares)
+
+
+def to_double(term: Term) -> Term:
+    """The term with all its numbers in float64, detached."""
+    data = tuple(d.detach().double() if d.is_floating_point() else d.detach() for d in term.data)
+    return replace(term, data=data, weights=None if term.weights is None else term.weights.detach().double())
+
+
+def _square_sum(term: Term, x: dict[str, Tensor]) -> float:
+    square = term_residual(term, x).square().sum(-1)
+    if term.loss is not None:
+        square = square * loss_slope(term.loss, square)
+    return float(square.sum() if term.weights is None else square @ term.weights)
+
+
+def usable(term: Term, x: dict[str, Tensor]) -> Tensor:
+    """Which residuals are finite and have weight."""
+    finite = term_residual(term, x).isfinite().all(-1)
+    return finite if term.weights is None else finite & (term.weights > 0)
