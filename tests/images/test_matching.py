@@ -93,9 +93,9 @@ def test_column_chunks_and_row_blocks_change_nothing(generator: torch.Generator,
 def test_without_byte_products_the_answer_is_the_same(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     a = random_descriptors(200, generator)
     b = noisy_copy(a, generator)
-    expected = match_descriptors(a, b)
-    monkeypatch.setattr(matching, "_int8_products_are_exact", lambda: False)
-    assert torch.equal(match_descriptors(a, b), expected)
+    for pays in (True, False):
+        monkeypatch.setattr(matching, "_bytes_pay", lambda pays=pays: pays)
+        assert match_descriptors(a, b).tolist() == brute_force(a, b, 0.8, True, 0.7)
 
 
 def test_extreme_bytes_do_not_overflow() -> None:
@@ -141,7 +141,15 @@ def test_a_pair_does_not_depend_on_the_others(generator: torch.Generator) -> Non
     sets += [noisy_copy(sets[0], generator), noisy_copy(sets[2], generator)]
     features = [features_of(s) for s in sets]
     pairs = torch.combinations(torch.arange(5))
-    together = match_features(features, pairs)
+    done: list[int] = []
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        together = match_features(features, pairs, progress=done.append)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
+    assert done == list(range(1, 11))
     for (i, j), matches in zip(pairs.tolist(), together, strict=True):
         assert torch.equal(match_features(features, torch.tensor([[i, j]]))[0], matches)
         assert torch.equal(match_descriptors(sets[i], sets[j]), matches)

@@ -1,7 +1,11 @@
 """Which points of two images look alike."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
+from threading import Lock
+from time import perf_counter
 
 import torch
 from jaxtyping import Float, Int, Shaped
@@ -12,6 +16,8 @@ from torchsfm.images.features import Features
 _ROWS = 128
 """Rows of one block of similarities: 128 x 8192 integers stay in a processor's cache through all that is done with them."""
 
+
+_LOCK = Lock()
 
 _SPREAD = 0.02
 """Integer descriptors whose lengths differ by a larger share are made unit vectors, which is slower."""
@@ -24,8 +30,12 @@ def match_features(
     ratio: float = 0.8,
     mutual: bool = True,
     max_distance: float = 0.7,
+    progress: Callable[[int], None] | None = None,
 ) -> list[Int[Tensor, "k 2"]]:
     """Match the descriptors of pairs of images.
+
+    On a CPU as many pairs are matched at a time as PyTorch has threads (`torch.get_num_threads`), each by one thread; meanwhile
+    operations started elsewhere in the program may run on one thread too.
 
     Args:
         features: The features of every image.
@@ -33,6 +43,7 @@ def match_features(
         ratio: The best distance must be below this share of the second best (Lowe's test); 1 switches the test off.
         mutual: Keep a match only where each point is the other's best, so that no point is matched twice.
         max_distance: The largest angle between two descriptors that still makes a match, in radians.
+        progress: Called with the number of pairs done.
 
     Returns:
         One tensor for each pair: rows (index in the first image, index in the second), sorted by the first. What a pair gets
@@ -45,7 +56,17 @@ def match_features(
     if pairs.numel() and not 0 <= int(pairs.min()) <= int(pairs.max()) < len(features):
         raise ValueError(f"pairs: wanted indices from 0 to {len(features) - 1}, got {int(pairs.min())} to {int(pairs.max())}")
     ready = {i: _prepare(features[i].descriptors) for i in sorted(set(pairs.flatten().tolist()))}
-    return [_match(ready[i], ready[j], ratio, mutual, max_distance) for i, j in pairs.tolist()]
+
+    def work(pair: list[int]) -> Tensor:
+        return _match(ready[pair[0]], ready[pair[1]], ratio, mutual, max_distance)
+
+    found = []
+    with _single_threads() as count, ThreadPoolExecutor(count) as pool:
+        for matches in pool.map(work, pairs.tolist()):
+            found.append(matches)
+            if progress is not None:
+                progress(len(found))
+    return found
 
 
 def match_descriptors(
@@ -76,6 +97,22 @@ def match_descriptors(
     """
     _check(ratio, max_distance)
     return _match(_prepare(descriptors1), _prepare(descriptors2), ratio, mutual, max_distance)
+
+
+@contextmanager
+def _single_threads() -> Iterator[int]:
+    """Let threads begun inside run each operation by themselves; gives how many to begin.
+
+    The blocks are small, and threads that wait for one another after each would spend most of their time on it, above all on a
+    machine that has other work. The number of threads is a setting of the process: it is put back at the end.
+    """
+    with _LOCK:
+        count = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            yield count
+        finally:
+            torch.set_num_threads(count)
 
 
 def _check(ratio: float, max_distance: float) -> None:
@@ -191,18 +228,31 @@ def _merge(values: list[Tensor], indices: list[Tensor]) -> tuple[Tensor, Tensor]
 def _products(a: Tensor, b: Tensor) -> Tensor:
     if a.dtype != torch.int8:
         return a @ b.mT
-    if a.device.type == "cpu" and _int8_products_are_exact():
+    if a.device.type == "cpu" and _bytes_pay():
         return torch._int_mm(a, b.mT)
     return (a.float() @ b.float().mT).to(torch.int32)  # exact: sums below 2^24 of integers
 
 
 @cache
-def _int8_products_are_exact() -> bool:
-    """Whether this processor multiplies bytes without saturating (those without VNNI may not)."""
-    a = torch.full((64, 128), 127, dtype=torch.int8)
+def _bytes_pay() -> bool:
+    """Whether this processor multiplies bytes exactly (those without VNNI may saturate) and faster than floats.
+
+    Both ways give the same integers, so that the choice never shows in an answer.
+    """
+    a = torch.full((_ROWS, 128), 127, dtype=torch.int8)
     a[::2, ::2] = -127
+    b = a.repeat(16, 1).mT
+
+    def fastest(product: Callable[[], Tensor]) -> float:
+        seconds = []
+        for _ in range(4):
+            start = perf_counter()
+            product()
+            seconds.append(perf_counter() - start)
+        return min(seconds)
+
     try:
-        product = torch._int_mm(a, a.mT)
+        exact = bool((torch._int_mm(a, b) == a.float() @ b.float()).all())
+        return exact and fastest(lambda: torch._int_mm(a, b)) < fastest(lambda: a.float() @ b.float())
     except (AttributeError, RuntimeError):
         return False
-    return bool((product == (a.float() @ a.float().mT)).all())
