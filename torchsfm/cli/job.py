@@ -45,6 +45,7 @@ class Job:
     console: Console = field(default_factory=lambda: Console(stderr=True, highlight=False))
     terminal: bool = field(default_factory=lambda: sys.stderr.isatty())
     bars: Progress | None = None
+    reported: float = field(default_factory=time.monotonic)
     tasks: dict[str, TaskID] = field(default_factory=dict)
 
     def progress(self, stage: str, done: int, total: int) -> None:
@@ -63,11 +64,14 @@ class Job:
                 MofNCompleteColumn(),
                 TimeElapsedColumn(),
             )
-            self.bars = Progress(*columns, console=self.console)
+            self.bars = Progress(*columns, console=self.console, get_time=time.monotonic)
             self.bars.start()
         if stage not in self.tasks:
             self.tasks[stage] = self.bars.add_task(LABELS.get(stage, stage), total=total)
+            # A stage that first reports when something is done began where the one before it ended.
+            self.bars.tasks[-1].start_time = self.reported
         self.bars.update(self.tasks[stage], completed=done, total=total)
+        self.reported = time.monotonic()
 
     def close(self) -> None:
         """Leave the bars as they are and give the terminal back."""
