@@ -45,6 +45,21 @@ def forms(A: Float[Tensor, "*#batch r 3"], h: Sequence[Tensor]) -> list[Tensor]:
     return [a * h[0] + b * h[1] + c * h[2] for a, b, c in columns]
 
 
+def bilinear(A: Float[Tensor, "*#batch 3 3"], h1: Sequence[Tensor], h2: Sequence[Tensor]) -> Float[Tensor, "*batch n"]:
+    """h2' A h1."""
+    if one_data_set_for_many(A, h1[0]):
+        return A.flatten(-2) @ torch.cat([b * a for b in h2 for a in h1], -2)
+    x, y, z = forms(A, h1)
+    return x * h2[0] + y * h2[1] + z * h2[2]
+
+
+def cross_rows(t: Float[Tensor, "*#batch 3"], A: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """[t]x A."""
+    t0, t1, t2 = t[..., None].unbind(-2)
+    a0, a1, a2 = A.unbind(-2)
+    return torch.stack((t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0), -2)
+
+
 def squared_distance(
     F: Float[Tensor, "*#batch 3 3"], h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool
 ) -> Float[Tensor, "*batch n"]:
@@ -58,7 +73,7 @@ def squared_distance(
 
 def _by_products(F: Tensor, h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool) -> tuple[Tensor, Tensor]:
     """e and |g|^2 as linear forms in the products of coordinates."""
-    e = F.flatten(-2) @ torch.cat([b * a for b in h2 for a in h1], -2)
+    e = bilinear(F, h1, h2)
     f = [[F[..., i, j] for j in range(3)] for i in range(3)]
     span = range(3) if sphere else range(2)
     coefficients, products = [], []

@@ -10,10 +10,11 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.geometry import cross_matrix, rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import (
+    bilinear,
     cofactor_rows,
+    cross_rows,
     forms,
     normal_equations,
-    one_data_set_for_many,
     sphere_rows,
     squared_distance,
 )
@@ -39,6 +40,7 @@ class RelativePoseEstimator:
     data_names: ClassVar[tuple[str, ...]] = ("d1", "d2")
     sample_size: ClassVar[int] = 5
     max_solutions: ClassVar[int] = 10
+    codimension: ClassVar[int] = 1
 
     def minimal(
         self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]
@@ -51,7 +53,7 @@ class RelativePoseEstimator:
         best = (C * C).sum(-2).argmax(-1)
         t = C.gather(-1, best[..., None, None].expand(*best.shape, 3, 1))[..., 0]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
-        turned = _cross_rows(t, E)
+        turned = cross_rows(t, E)
         pose, valid = torch.cat((C, t[..., None]), -1), torch.zeros_like(solutions.valid)
         # E = [t]x R or -E = [t]x R, each with t or -t (Horn 1990).
         for sign in (-1, 1):
@@ -73,7 +75,7 @@ class RelativePoseEstimator:
         """Squared angular Sampson distance; infinite behind a camera."""
         h1, h2 = sphere_rows(d1), sphere_rows(d2)
         R, t = model[..., :3], model[..., 3]
-        squared = squared_distance(_cross_rows(t, R), h1, h2, sphere=True)
+        squared = squared_distance(cross_rows(t, R), h1, h2, sphere=True)
         first, second = self._depths(R, t, h1, h2)
         return torch.where(torch.minimum(first, second) > -self.slack[..., None], squared, torch.inf)
 
@@ -97,14 +99,17 @@ class RelativePoseEstimator:
     ) -> Float[Tensor, "*batch 3 4"]:
         """A Gauss-Newton step on Sampson's distance: R <- exp(w) R, and t along the unit sphere."""
         R, t = model[..., :3], model[..., 3]
-        A, b = normal_equations(_cross_rows(t, R), sphere_rows(d1), sphere_rows(d2), weights, sphere=True)
+        A, b = normal_equations(cross_rows(t, R), sphere_rows(d1), sphere_rows(d2), weights, sphere=True)
         R, t = R.double(), t.double()
         axes = cross_matrix(torch.eye(3, dtype=R.dtype, device=R.device))
         turn = cross_matrix(t)[..., None, :, :] @ axes @ R[..., None, :, :]
-        # The three moves of t include one along t, which changes the length of E alone: damping leaves it at zero.
         move = axes @ R[..., None, :, :]
         tangent = torch.cat((turn, move), -3).flatten(-2).mT
-        step = -damped_solve(tangent.mT @ A @ tangent, tangent.mT @ b[..., None])[..., 0]
+        A, b = tangent.mT @ A @ tangent, tangent.mT @ b[..., None]
+        # A move along t changes nothing but the length of E: keep it at zero.
+        along = torch.cat((torch.zeros_like(t), t), -1)
+        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * along[..., :, None] * along[..., None, :]
+        step = -damped_solve(A, b)[..., 0]
         t = t + step[..., 3:]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
         return torch.cat((rotation_from_rotvec(step[..., :3]) @ R, t[..., None]), -1).to(d1.dtype)
@@ -112,21 +117,10 @@ class RelativePoseEstimator:
     @staticmethod
     def _depths(R: Tensor, t: Tensor, h1: list[Tensor], h2: list[Tensor]) -> tuple[Tensor, Tensor]:
         """The depths along unit rays, times the squared sine of the angle between them."""
-        if one_data_set_for_many(R, h1[0]):
-            cosine = R.flatten(-2) @ torch.cat([b * a for b in h2 for a in h1], -2)
-        else:
-            a = forms(R, h1)
-            cosine = a[0] * h2[0] + a[1] * h2[1] + a[2] * h2[2]
+        cosine = bilinear(R, h1, h2)
         (along2,) = forms(t[..., None, :], h2)
         (along1,) = forms((R * t[..., None]).sum(-2)[..., None, :], h1)
         return along2 * cosine - along1, along2 - along1 * cosine
-
-
-def _cross_rows(t: Tensor, A: Tensor) -> Tensor:
-    """[t]x A."""
-    t0, t1, t2 = t[..., None].unbind(-2)
-    a0, a1, a2 = A.unbind(-2)
-    return torch.stack((t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0), -2)
 
 
 def estimate_essential(

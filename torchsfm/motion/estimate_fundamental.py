@@ -1,6 +1,6 @@
 """The fundamental matrix from correspondences of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -8,7 +8,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.motion.epipolar_fit import cofactor_rows, forms, normal_equations, plane_rows, squared_distance
+from torchsfm.motion.epipolar_fit import (
+    bilinear,
+    cofactor_rows,
+    cross_rows,
+    forms,
+    normal_equations,
+    plane_rows,
+    squared_distance,
+)
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.normalization import common_scale
 from torchsfm.robust import RobustResult, damped_solve, ransac
@@ -16,39 +24,46 @@ from torchsfm.robust import RobustResult, damped_solve, ransac
 
 @dataclass(frozen=True)
 class FundamentalEstimator:
-    """F with x2' F x1 = 0, |F| = 1, from points of moderate size around 0. Distances are Sampson's, in the unit of the points."""
+    """F with x2' F x1 = 0, |F| = 1, and the epipole e2 whose sign puts the points in front of the cameras: models are [F | e2].
 
-    model_name: ClassVar[str] = "fundamental"
+    The points should be of moderate size around 0. Distances are Sampson's, in their unit, and infinite where e2 x h2 and F h1
+    are opposite: such a point is behind one camera and in front of the other (Chum, Werner & Matas 2004; Hartley 1998). That
+    rejects half of the wrong matches that happen to lie on their epipolar lines.
+    """
+
+    model_name: ClassVar[str] = "oriented_fundamental"
     data_names: ClassVar[tuple[str, ...]] = ("x1", "x2")
     sample_size: ClassVar[int] = 7
     max_solutions: ClassVar[int] = 3
+    codimension: ClassVar[int] = 1
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]
-    ) -> Solutions[Float[Tensor, "*batch 3 3 3"]]:
-        """The F of seven points that can be in front of both cameras: e2 x h2 ~ F h1 with one sign (Chum, Werner & Matas 2004)."""
+    ) -> Solutions[Float[Tensor, "*batch 3 3 4"]]:
+        """The F of seven points that can be in front of both cameras."""
         solutions = fundamental_7pt(x1, x2)
-        C = torch.stack([torch.stack(row, -1) for row in cofactor_rows(solutions.model)], -2)
-        best = (C * C).sum(-2).argmax(-1)
-        e0, e1, e2 = C.gather(-1, best[..., None, None].expand(*best.shape, 3, 1)).unbind(-2)
+        F, e = solutions.model, _left_epipole(solutions.model)
         h1, h2 = plane_rows(x1[..., None, :, :]), plane_rows(x2[..., None, :, :])
-        l0, l1, l2 = forms(solutions.model, h1)
-        u, v, _ = h2
-        side = (e1 - e2 * v) * l0 + (e2 * u - e0) * l1 + (e0 * v - e1 * u) * l2
-        possible = (side.amin(-1) >= 0) | (side.amax(-1) <= 0)
-        return replace(solutions, valid=solutions.valid & possible)
+        a, b, c = forms(F, h1)
+        e0, e1, e2 = e[..., None].unbind(-2)
+        side = (e1 * h2[2] - e2 * h2[1]) * a + (e2 * h2[0] - e0 * h2[2]) * b + (e0 * h2[1] - e1 * h2[0]) * c
+        plus, minus = side.amin(-1) >= 0, side.amax(-1) <= 0
+        e = torch.where(plus[..., None], e, -e)
+        return Solutions(torch.cat((F, e[..., None]), -1), solutions.valid & (plus | minus))
 
     def squared_residual(
-        self, F: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
+        self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
-        """Squared Sampson distance."""
-        return squared_distance(F, plane_rows(x1), plane_rows(x2), sphere=False)
+        """Squared Sampson distance; infinite for points that are behind one camera."""
+        F, e, h1, h2 = model[..., :3], model[..., 3], plane_rows(x1), plane_rows(x2)
+        squared = squared_distance(F, h1, h2, sphere=False)
+        return squared.masked_fill_(bilinear(cross_rows(e, F), h1, h2) > 0, torch.inf)
 
     def residual(
-        self, F: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
+        self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
-        """Sampson distance."""
-        return self.squared_residual(F, x1, x2).sqrt()
+        """Sampson distance; infinite for points that are behind one camera."""
+        return self.squared_residual(model, x1, x2).sqrt()
 
     def degenerate(self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]) -> Bool[Tensor, "*batch"]:
         """Whether the first two points coincide in an image."""
@@ -56,25 +71,37 @@ class FundamentalEstimator:
 
     def refine(
         self,
-        F: Float[Tensor, "*#batch 3 3"],
+        model: Float[Tensor, "*#batch 3 4"],
         x1: Float[Tensor, "*#batch n 2"],
         x2: Float[Tensor, "*#batch n 2"],
         *,
         weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 3"]:
+    ) -> Float[Tensor, "*batch 3 4"]:
         """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and, to second order, of determinant 0.
 
         The step minimises the quadratic model under the linearised constraint (sequential quadratic programming).
         """
-        A, b = normal_equations(F, plane_rows(x1), plane_rows(x2), weights, sphere=False)
-        F = F.double()
+        A, b = normal_equations(model[..., :3], plane_rows(x1), plane_rows(x2), weights, sphere=False)
+        F, e = model[..., :3].double(), model[..., 3].double()
         f, cofactors = F.flatten(-2), torch.stack([c for row in cofactor_rows(F) for c in row], -1)
         A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * f[..., :, None] * f[..., None, :]
         free, bound = damped_solve(A, torch.stack((b, cofactors), -1)).unbind(-1)
         gap = (cofactors * f).sum(-1) / 3 - (cofactors * free).sum(-1)
         share = (cofactors * bound).sum(-1)
         f = f - free - (gap / torch.where(share > 0, share, torch.inf))[..., None] * bound
-        return (f * (f * f).sum(-1, keepdim=True).rsqrt()).unflatten(-1, (3, 3)).to(x1.dtype)
+        F = (f * (f * f).sum(-1, keepdim=True).rsqrt()).unflatten(-1, (3, 3))
+        turned = _left_epipole(F)
+        turned = torch.where((turned * e).sum(-1, keepdim=True) < 0, -turned, turned)
+        return torch.cat((F, turned[..., None]), -1).to(x1.dtype)
+
+
+def _left_epipole(F: Tensor) -> Tensor:
+    """The left null vector, of norm 1: the largest column of the matrix of cofactors."""
+    C = torch.stack([torch.stack(row, -1) for row in cofactor_rows(F)], -2)
+    square = (C * C).sum(-2)
+    best = square.argmax(-1, keepdim=True)
+    e = C.gather(-1, best[..., None, :].expand(*C.shape[:-1], 1))[..., 0]
+    return e * square.gather(-1, best).clamp(min=1e-200).rsqrt()
 
 
 def _singular(F: Tensor) -> Tensor:
@@ -130,5 +157,5 @@ def estimate_fundamental(
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
         max_iterations=max_iterations, scoring_dtype=torch.float32,
     )  # fmt: skip
-    F = _singular(y.T2.mT @ _singular(result.model) @ y.T1)
+    F = _singular(y.T2.mT @ _singular(result.model[..., :3]) @ y.T1)
     return RobustResult(F.to(x1.dtype), result.inliers, result.score.to(x1.dtype), result.iterations, result.status)

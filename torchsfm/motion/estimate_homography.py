@@ -31,6 +31,7 @@ class HomographyEstimator:
     data_names: ClassVar[tuple[str, ...]] = ("x1", "x2")
     sample_size: ClassVar[int] = 4
     max_solutions: ClassVar[int] = 1
+    codimension: ClassVar[int] = 2
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]

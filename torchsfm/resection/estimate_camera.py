@@ -27,6 +27,7 @@ class CameraEstimator:
     data_names: ClassVar[tuple[str, ...]] = ("x", "X")
     sample_size: ClassVar[int] = 3
     max_solutions: ClassVar[int] = 4
+    codimension: ClassVar[int] = 2
 
     def minimal(
         self, x: Float[Tensor, "*#batch 3 2"], X: Float[Tensor, "*#batch 3 3"]

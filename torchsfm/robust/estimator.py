@@ -30,6 +30,8 @@ class Estimator(Protocol[M]):
     """The number of data in a minimal sample."""
     max_solutions: ClassVar[int]
     """The number of solution slots that `minimal` returns."""
+    codimension: ClassVar[int]
+    """How many independent equations a datum gives: its residual is the length of so many Gaussian numbers."""
 
     def minimal(self, *sample: Any, **options: Any) -> Solutions[M]:
         """The models through minimal samples: tensors `(*batch, m, d)` -> `(*batch, slots, ...)`."""

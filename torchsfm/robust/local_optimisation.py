@@ -1,5 +1,6 @@
 """From a model through a noisy sample to the optimum near it."""
 
+import math
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -14,6 +15,8 @@ M = TypeVar("M")
 
 LOCAL_STEPS = (9.0, 4.0, 1.5, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
+_LEAST = 1e-6
+"""Smallest variance of the noise in units of the squared threshold."""
 LOCAL_DATA = 512
 """Local optimisation looks at this many data at most."""
 
@@ -49,12 +52,45 @@ def polish(
     inside: Bool[Tensor, "g n"],
     steps: int,
 ) -> M:
-    """Iteratively reweighted Gauss-Newton on a Cauchy loss at half the threshold, cut off at twice the threshold."""
+    """Reweighted least squares out to the distance where an outlier is as likely as an inlier.
+
+    The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, estimated with the probabilities
+    of being an inlier among Gaussian inliers and evenly spread outliers (expectation maximisation), and from the density of the
+    outliers, counted between two and six thresholds from the model. So the answer depends little on how well the threshold was
+    chosen. One Gauss-Newton step for each round of weights.
+
+    Args:
+        estimator: The problem.
+        model: One model of each problem, `(g, 1, ...)`.
+        data: The data, each `(g, 1, n, d)`.
+        limit: Squared threshold.
+        inside: Which slots hold data.
+        steps: Number of rounds.
+    """
+    k = estimator.codimension
+    near, far = 2.0, 6.0
+    # Size of the unit ball and surface of the standard Gaussian at 0, in k dimensions.
+    ball = math.pi ** (k / 2) / math.gamma(k / 2 + 1)
+    peak = (2 * math.pi) ** (-k / 2)
+    present = inside[:, None]
+    variance = number = None
     for _ in range(steps):
-        squared = squared_residual(estimator, model, *data)
-        ratio = squared / limit[:, None, None]
-        weights = torch.where((ratio < 4) & inside[:, None], 1 / (1 + 4 * ratio), 0)
+        ratio = squared_residual(estimator, model, *data) / limit[:, None, None]
+        between = ((ratio > near * near) & (ratio < far * far) & present).sum(-1, keepdim=True)
+        density = (between + 0.5) / (ball * (far**k - near**k))
+        if variance is None or number is None:
+            core = ((ratio < 1) & present).to(ratio.dtype)
+            number = core.sum(-1, keepdim=True).clamp(min=1)
+            # A Gaussian cut off at the threshold looks narrower than it is.
+            variance = (1.6 / k * (core * ratio.clamp(max=1)).sum(-1, keepdim=True) / number).clamp(_LEAST, 1)
+        inlying = number * peak * variance ** (-k / 2)
+        reach = 1.6 * k * variance * (inlying / density).clamp(min=3).log()
+        weights = torch.where(present, (1 - ratio / reach).clamp(min=0), 0)
         model = estimator.refine(model, *data, weights=weights)
+        odds = density / inlying * torch.exp((0.5 * ratio / variance).clamp(max=60))
+        likely = torch.where(present & (ratio < 9), 1 / (1 + odds), 0)
+        number = likely.sum(-1, keepdim=True).clamp(min=1)
+        variance = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1)
     return model
 
 
