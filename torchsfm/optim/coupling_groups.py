@@ -88,11 +88,11 @@ class GroupCoupling:
                 right[group.columns] += part
         return right
 
-    def product(self, camera: Tensor) -> Tensor:
-        """`W' camera`."""
-        out = camera.new_empty((self.q, self.points))
+    def product(self, kept: Tensor) -> Tensor:
+        """`W' kept`."""
+        out = kept.new_empty((self.q, self.points))
         for group in self.groups:
-            out[:, group.start : group.end] = camera[group.columns] @ self._matrix(group)
+            out[:, group.start : group.end] = kept[group.columns] @ self._matrix(group)
         return out
 
     def lift(self, point: Tensor) -> Tensor:
@@ -103,9 +103,9 @@ class GroupCoupling:
             out[group.columns] += torch.bmm(W, point[:, group.start : group.end, None])[:, :, 0].sum(0)
         return out
 
-    def add_spread(self, out: Tensor, L: list[list[Tensor]], camera: Tensor) -> None:
+    def add_spread(self, out: Tensor, L: list[list[Tensor]], kept: Tensor) -> None:
         """Add `Y' C Y` of each point to `out` (q, q, points), with `Y = W L'^-1` and C (size, size) of the retained."""
-        full = torch.nn.functional.pad(camera, (0, 2, 0, 2))
+        full = torch.nn.functional.pad(kept, (0, 2, 0, 2))
         for group in self.groups:
             C = full[group.columns[:, None], group.columns]
             step = max(ATOM, CACHE // (group.columns.numel() * self.q + 1))

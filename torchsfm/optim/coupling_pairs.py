@@ -133,15 +133,15 @@ class PairCoupling:
         S -= off.mT
         return right
 
-    def product(self, camera: Tensor) -> Tensor:
-        """`W' camera`."""
-        steps = camera[self.columns]
+    def product(self, kept: Tensor) -> Tensor:
+        """`W' kept`."""
+        steps = kept[self.columns]
         parts, begin = [], 0
         for step, length in zip(steps, self._lengths, strict=True):
             parts.append(self._W[begin : begin + length].view(-1, self.width) @ step)
             begin += length
         each = torch.cat(parts).view(-1, self.q)
-        return camera.new_zeros((self.points, self.q)).index_add_(0, self.point, each).mT
+        return kept.new_zeros((self.points, self.q)).index_add_(0, self.point, each).mT
 
     def lift(self, point: Tensor) -> Tensor:
         """`W point`."""

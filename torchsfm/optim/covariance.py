@@ -79,10 +79,10 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
         elif free.numel():
             place[free] = layout.first[name] + torch.arange(free.numel() * width, device=free.device).view(-1, width)
             known[free] = True
-            covariance[free] = inverse.camera[place[free][:, :, None], place[free][:, None]]
+            covariance[free] = inverse.kept[place[free][:, :, None], place[free][:, None]]
         found[name], determined[name], columns[name] = covariance, known, place
     unknowns = layout.size - inverse.nullity + int(inverse.determined.sum()) * layout.point_size
-    return SparseCovariance(found, determined, inverse.camera, columns, inverse.nullity, rows - unknowns, squares)
+    return SparseCovariance(found, determined, inverse.kept, columns, inverse.nullity, rows - unknowns, squares)
 
 
 def to_double(term: Term) -> Term:

@@ -107,16 +107,16 @@ def _cut(term: Term, number: dict[str, Tensor], eliminate: str | None) -> dict[t
     if term.blocks.count(eliminate or "") > 1:
         raise ValueError(f"eliminate: a residual depends on two variables of {eliminate!r}; they cannot be eliminated singly")
     has_point = torch.zeros_like(term.index[0], dtype=torch.bool)
-    has_camera = torch.zeros_like(has_point)
+    has_kept = torch.zeros_like(has_point)
     for name, index in zip(term.blocks, term.index, strict=True):
         if name == eliminate:
             has_point |= number[name][index] >= 0
         else:
-            has_camera |= number[name][index] >= 0
+            has_kept |= number[name][index] >= 0
     counts = torch.ones_like(has_point) if term.weights is None else term.weights > 0
     return {
-        (camera, point): (counts & (has_camera == camera) & (has_point == point)).nonzero()[:, 0]
-        for camera in (True, False)
+        (kept, point): (counts & (has_kept == kept) & (has_point == point)).nonzero()[:, 0]
+        for kept in (True, False)
         for point in (True, False)
     }
 
@@ -132,10 +132,10 @@ def _find_slots(
     eliminate: str | None,
 ) -> Piece:
     """A piece, not sorted yet."""
-    camera, with_point = kind
+    kept, with_point = kind
     places = [place[rows] for place in places]
     wanted = tuple(
-        with_point if name == eliminate else camera and bool((place >= 0).any())
+        with_point if name == eliminate else kept and bool((place >= 0).any())
         for name, place in zip(term.blocks, places, strict=True)
     )
     retained = [(n, p) for n, p, w in zip(term.blocks, places, wanted, strict=True) if w and n != eliminate]

@@ -46,16 +46,16 @@ class NormalEquations:
             if self.coupling is not None:
                 right -= self.coupling.reduce(S, L, z)[:size]
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
-        camera = -torch.cholesky_solve(right[:, None], lower)[:, 0] if size else right
-        solved = (info == 0) & camera.isfinite().all()
-        promise = camera @ (weight * camera - self.U[:size, size])
+        kept = -torch.cholesky_solve(right[:, None], lower)[:, 0] if size else right
+        solved = (info == 0) & kept.isfinite().all()
+        promise = kept @ (weight * kept - self.U[:size, size])
         point = h
         if q:
             if self.coupling is not None:
-                z = z + forward(L, self.coupling.product(extend(camera)))
+                z = z + forward(L, self.coupling.product(extend(kept)))
             point = -backward(L, z)
             promise = promise + (point * (point_weight * point - h)).sum()
-        return self.split(camera, point), promise / 2, solved
+        return self.split(kept, point), promise / 2, solved
 
     def invert(self) -> "Inverse":
         """The inverse without damping; its pseudo-inverse where a gauge is free."""
@@ -89,12 +89,12 @@ class NormalEquations:
         size = self.layout.size
         return torch.cat((self.U[:size, size], self.point_gradient().flatten())).abs().amax()
 
-    def split(self, camera: Tensor, point: Tensor) -> dict[str, Tensor]:
+    def split(self, kept: Tensor, point: Tensor) -> dict[str, Tensor]:
         """A vector of the size of the system by blocks, (free variables, tangent)."""
         layout = self.layout
         ends = [*list(layout.first.values())[1:], layout.size]
         found = {
-            name: camera[start:end].view(layout.free[name].numel(), -1)
+            name: kept[start:end].view(layout.free[name].numel(), -1)
             for (name, start), end in zip(layout.first.items(), ends, strict=True)
         }
         if layout.eliminated is not None:
@@ -103,10 +103,10 @@ class NormalEquations:
 
     def join(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """The inverse of `split`."""
-        camera = [parts[name].reshape(-1) for name in self.layout.first]
+        kept = [parts[name].reshape(-1) for name in self.layout.first]
         empty = self.U.new_zeros(0)
         point = parts[self.layout.eliminated].mT if self.layout.eliminated is not None else self.point_gradient()
-        return torch.cat((empty, *camera)), point
+        return torch.cat((empty, *kept)), point
 
 
 @dataclass(frozen=True)
@@ -118,22 +118,22 @@ class Inverse:
 
     system: NormalEquations
     L: Triangle
-    camera: Tensor
+    kept: Tensor
     """The inverse of the reduced system: the covariance of the retained variables, (size, size)."""
     nullity: int
     """Dimensions of the gauge."""
     determined: Tensor
     """Which eliminated variables the residuals determine, given the others."""
 
-    def apply(self, camera: Tensor, point: Tensor) -> tuple[Tensor, Tensor]:
+    def apply(self, kept: Tensor, point: Tensor) -> tuple[Tensor, Tensor]:
         """The product with a vector, given and returned in its retained and eliminated part."""
         coupling, L = self.system.coupling, self.L
         if not L:
-            return self.camera @ camera, point
+            return self.kept @ kept, point
         z = forward(L, point)
         if coupling is not None:
-            camera = camera - coupling.lift(backward(L, z))[: camera.numel()]
-        a = self.camera @ camera
+            kept = kept - coupling.lift(backward(L, z))[: kept.numel()]
+        a = self.kept @ kept
         if coupling is not None:
             z = z - forward(L, coupling.product(extend(a)))
         return a, backward(L, z)
@@ -141,18 +141,18 @@ class Inverse:
     def point_covariance(self) -> Tensor:
         """The covariance of each eliminated variable, (points, q, q)."""
         coupling, q = self.system.coupling, len(self.L)
-        eye = torch.eye(q, dtype=self.camera.dtype, device=self.camera.device)
+        eye = torch.eye(q, dtype=self.kept.dtype, device=self.kept.device)
         inner = eye[:, :, None].expand(-1, -1, self.system.V.shape[-1]).clone()
         if coupling is not None:
             assert isinstance(coupling, GroupCoupling), "asked for with dense=True"
-            coupling.add_spread(inner, self.L, self.camera)
+            coupling.add_spread(inner, self.L, self.kept)
         half = torch.stack([backward(self.L, inner[:, b]) for b in range(q)], 1)
         return torch.stack([backward(self.L, half[a]) for a in range(q)]).permute(2, 0, 1)
 
 
-def extend(camera: Tensor) -> Tensor:
+def extend(kept: Tensor) -> Tensor:
     """Zeros for the columns of the gradient and of fixed variables."""
-    return torch.cat((camera, camera.new_zeros(2)))
+    return torch.cat((kept, kept.new_zeros(2)))
 
 
 def _place(a: int, b: int, q: int) -> int:

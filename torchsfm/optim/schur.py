@@ -1,11 +1,11 @@
 """The Schur complement: normal equations in which one family of variables is eliminated, each variable by itself.
 
-With the eliminated variables (points) last, the normal equations of a problem of terms are
+With the eliminated variables (points, for short) last, the normal equations of a problem of terms are
 
     [ U   W ] [ a ]     [ g ]
     [ W'  V ] [ b ] = - [ h ],    V block diagonal,
 
-and `S = U - W V^-1 W'` is a system in the retained variables (cameras) alone (Brown 1958; Triggs et al. 2000, 6.1; HZ A6.3).
+and `S = U - W V^-1 W'` is a system in the retained variables alone (Brown 1958; Triggs et al. 2000, 6.1; HZ A6.3).
 Work comes in three tiers: once per problem (`layout`: who meets whom), once per linearisation (`Elimination.linearize`), once
 per damping (`NormalEquations.step`), so that a rejected step costs only the last.
 """
