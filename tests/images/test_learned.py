@@ -51,6 +51,7 @@ def test_shrunk_images_give_positions_in_the_image_given(disk: tuple[Any, Path])
     assert float((distance < 1e-3).float().mean()) > 0.6
 
 
+@pytest.mark.filterwarnings("ignore:CUDA is not available")  # kornia 0.8
 def test_dedode_has_its_first_pixel_at_zero(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = feature.DeDoDe(descriptor_model="B", amp_dtype=torch.float32).eval()

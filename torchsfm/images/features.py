@@ -39,7 +39,7 @@ def detect_features(
     *,
     contrast: float = 0.01,
     edge: float = 10.0,
-    max_size: int = 3200,
+    max_size: int = 2400,
 ) -> Features:
     """SIFT points with RootSIFT descriptors (Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012).
 
@@ -90,10 +90,11 @@ def _gray_bytes(pixels: Tensor) -> NDArray[np.uint8]:
     if pixels.ndim != 3 or pixels.shape[0] not in (1, 3) or 0 in pixels.shape:
         raise ValueError(f"image: wanted shape (1, h, w) or (3, h, w), got {tuple(pixels.shape)}")
     pixels = pixels.detach().to("cpu", torch.float32)
-    gray = pixels[0]
+    # In place, as a large photograph takes half a gigabyte.
+    gray = pixels[0].clone()
     if pixels.shape[0] == 3:  # the luma of ITU-R BT.601, as JPEG has it
-        gray = gray * 0.299 + pixels[1] * 0.587 + pixels[2] * 0.114
-    return gray.nan_to_num().clamp(0, 1).mul(255).round_().to(torch.uint8).numpy()
+        gray.mul_(0.299).add_(pixels[1], alpha=0.587).add_(pixels[2], alpha=0.114)
+    return gray.nan_to_num_().clamp_(0, 1).mul_(255).round_().to(torch.uint8).numpy()
 
 
 def _root_sift(raw: Tensor) -> Tensor:
