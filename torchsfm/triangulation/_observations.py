@@ -61,9 +61,12 @@ class Observations:
         return torch.where(votes < 0, -1.0, 1.0).to(X.dtype)
 
 
-def row_dot(row: tuple[Tensor, ...], X: Tensor) -> Tensor:
+def row_dot(row: tuple[Tensor, ...], X: Tensor | tuple[Tensor, ...]) -> Tensor:
     """A row of every camera times homogeneous points (4, problem, point)."""
-    return row[0] * X[0] + row[1] * X[1] + row[2] * X[2] + row[3] * X[3]
+    product = row[0] * X[0]
+    for i in range(1, 4):
+        product = torch.addcmul(product, row[i], X[i])
+    return product
 
 
 def check(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> tuple[torch.Size, int]:

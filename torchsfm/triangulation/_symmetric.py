@@ -7,16 +7,19 @@ from torch import Tensor
 def smallest_eigenvector(N: Tensor) -> Tensor:
     """A unit vector (4, *b) near the eigenvector of the smallest eigenvalue of positive semidefinite N (4, 4, *b).
 
-    Powers of the inverse: the sixteenth of it is nearly of rank one. Not polished; that is what `tangent_step` is for.
+    Inverse iteration to the twelfth power, from the largest column of the inverse's square, which cannot be orthogonal to it.
+    Not polished; that is what `tangent_step` is for.
     """
     trace = N[0, 0] + N[1, 1] + N[2, 2] + N[3, 3]
     M = inverse(N / torch.where(trace > 0, trace, 1.0), 4e-16)
-    for _ in range(4):
-        M = (M[:, :, None] * M[None]).sum(1)
-        M = M / (M[0, 0] + M[1, 1] + M[2, 2] + M[3, 3])
+    M = M / (M[0, 0] + M[1, 1] + M[2, 2] + M[3, 3])
+    M = (M[:, :, None] * M[None]).sum(1)
     diagonal = torch.stack((M[0, 0], M[1, 1], M[2, 2], M[3, 3]))
-    pick = diagonal.argmax(0)
+    largest, pick = diagonal.max(0)
+    M = M / largest
     x: Tensor = M.gather(0, pick.expand(1, 4, *pick.shape))[0]
+    for _ in range(5):
+        x = (M * x).sum(1)
     return x * (x * x).sum(0).rsqrt()
 
 

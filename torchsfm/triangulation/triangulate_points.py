@@ -170,13 +170,13 @@ class _System:
         u, v = row_dot(p1, X) * inverse_z, row_dot(p2, X) * inverse_z
         e, f = u - data.x[0], v - data.x[1]
         we, wf = data.w * e, data.w * f
-        ju = tuple((p - u * r) * inverse_z for p, r in zip(p1, p3, strict=True))
-        jv = tuple((p - v * r) * inverse_z for p, r in zip(p2, p3, strict=True))
+        ju = tuple(torch.addcmul(p, u, r, value=-1) * inverse_z for p, r in zip(p1, p3, strict=True))
+        jv = tuple(torch.addcmul(p, v, r, value=-1) * inverse_z for p, r in zip(p2, p3, strict=True))
         wju, wjv = tuple(data.w * j for j in ju), tuple(data.w * j for j in jv)
-        self._bend = tuple((we * j + wf * k) * inverse_z for j, k in zip(ju, jv, strict=True))
-        self._p3 = p3
-        self.g = torch.stack([(we * j + wf * k).sum(0) for j, k in zip(ju, jv, strict=True)])
-        self.N = symmetric({(i, j): (wju[i] * ju[j] + wjv[i] * jv[j]).sum(0) for i in range(4) for j in range(i, 4)})
+        pulled = tuple(torch.addcmul(we * j, wf, k) for j, k in zip(ju, jv, strict=True))
+        self._pulled, self._inverse_z, self._p3 = pulled, inverse_z, p3
+        self.g = torch.stack([p.sum(0) for p in pulled])
+        self.N = symmetric({(i, j): torch.addcmul(wju[i] * ju[j], wjv[i], jv[j]).sum(0) for i in range(4) for j in range(i, 4)})
         self.cost = (we * e + wf * f).sum(0)
         self.size = (data.w * (u * u + v * v)).sum(0)
 
@@ -186,8 +186,10 @@ class _System:
 
     def hessian(self) -> Tensor:
         """Half the exact Hessian of the cost."""
-        b, p = self._bend, self._p3
-        return self.N - symmetric({(i, j): (b[i] * p[j] + p[i] * b[j]).sum(0) for i in range(4) for j in range(i, 4)})
+        b, p = tuple(pulled * self._inverse_z for pulled in self._pulled), self._p3
+        return self.N - symmetric(
+            {(i, j): torch.addcmul(b[i] * p[j], p[i], b[j]).sum(0) for i in range(4) for j in range(i, 4)}
+        )
 
 
 def _minimise(data: Observations, X: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:

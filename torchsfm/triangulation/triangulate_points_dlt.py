@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm.triangulation._observations import Observations, in_pieces
+from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
 from torchsfm.triangulation._symmetric import smallest_eigenvector, symmetric, tangent_step
 
 
@@ -71,8 +71,7 @@ def linear_points(data: Observations) -> Tensor:
         N = _normal_matrix(*fixed)
         X = smallest_eigenvector(N)
         # The normal matrix has squared the condition number; residuals from the planes themselves undo that.
-        for _ in range(2):
-            X = _refine(X, N, *fixed)
+        X = _refine(X, N, *fixed)
     return _refine(X, N, a, b, s, t)
 
 
@@ -81,22 +80,20 @@ def _planes(data: Observations) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...],
     p1, p2, p3 = data.P
     a = tuple(data.x[0] * r - q for q, r in zip(p1, p3, strict=True))
     b = tuple(data.x[1] * r - q for q, r in zip(p2, p3, strict=True))
-    s = a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3]
-    t = b[0] * b[0] + b[1] * b[1] + b[2] * b[2] + b[3] * b[3]
+    s, t = row_dot(a, a), row_dot(b, b)
     return a, b, data.w / torch.where(s.detach() > 0, s, 1.0), data.w / torch.where(t.detach() > 0, t, 1.0)
 
 
 def _normal_matrix(a: tuple[Tensor, ...], b: tuple[Tensor, ...], s: Tensor, t: Tensor) -> Tensor:
     """The 4x4 sums of squares, (4, 4, problem, point)."""
     sa, tb = tuple(s * e for e in a), tuple(t * e for e in b)
-    return symmetric({(i, j): (sa[i] * a[j] + tb[i] * b[j]).sum(0) for i in range(4) for j in range(i, 4)})
+    return symmetric({(i, j): torch.addcmul(sa[i] * a[j], tb[i], b[j]).sum(0) for i in range(4) for j in range(i, 4)})
 
 
 def _refine(X: Tensor, N: Tensor, a: tuple[Tensor, ...], b: tuple[Tensor, ...], s: Tensor, t: Tensor) -> Tensor:
     """One Newton step for the eigenvector, its gradient from the planes."""
-    e = s * (a[0] * X[0] + a[1] * X[1] + a[2] * X[2] + a[3] * X[3])
-    f = t * (b[0] * X[0] + b[1] * X[1] + b[2] * X[2] + b[3] * X[3])
-    g = torch.stack([(e * p + f * q).sum(0) for p, q in zip(a, b, strict=True)])
+    e, f = s * row_dot(a, X), t * row_dot(b, X)
+    g = torch.stack([torch.addcmul(e * p, f, q).sum(0) for p, q in zip(a, b, strict=True)])
     value = (X * g).sum(0).detach()
     diagonal = torch.eye(4, dtype=N.dtype, device=N.device)[..., None, None]
     return tangent_step(X, N - value * diagonal, g - value * X)[0]
