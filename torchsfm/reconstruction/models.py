@@ -1,6 +1,6 @@
 """From a view graph to finished models: first cameras, tracks, one model per component."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, gu
 from torchsfm.reconstruction.incremental import MappingOptions, grow_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import ImageReport, ReconstructionError, Report, SfmResult, pair_report
+from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
 from torchsfm.reconstruction.stages import Stages
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
@@ -38,7 +38,7 @@ def build_models(
     free_principal_point: bool,
     generator: torch.Generator,
     stages: Stages,
-    progress: Callable[[str, int, int], None],
+    progress: Progress,
 ) -> SfmResult:
     """Reconstruct every component of a view graph.
 
@@ -140,7 +140,7 @@ def reconstruct_tracks(
     focal: float | None = None,
     free_principal_point: bool = True,
     seed: int = 0,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> SfmResult:
     """Reconstruct from image points whose correspondence is known.
 

@@ -1,47 +1,25 @@
 """The main job: photographs in, cameras and points out."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.images import (
-    Features,
-    ImageError,
-    Photograph,
-    detect_features,
-    list_images,
-    match_features,
-    read_image,
-    retrieve_pairs,
-    track_sequence,
-)
+from torchsfm.images import ImageError, list_images, match_features, retrieve_pairs
+from torchsfm.reconstruction.image_points import ImagePoints, detect_all, unpack
 from torchsfm.reconstruction.models import build_models
-from torchsfm.reconstruction.report import ReconstructionError, SfmResult
+from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
+from torchsfm.reconstruction.sequence import add_corners, sequence_pairs, track_corners
 from torchsfm.reconstruction.stages import Arrays, Stages, fingerprint
-from torchsfm.reconstruction.view_graph import ViewGraph, graph_from_tracks, verify_pairs
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage, the number of items done and the number of all."""
+from torchsfm.reconstruction.view_graph import ViewGraph, verify_pairs
 
 MAX_IMAGES_ALL_PAIRS = 80
 """Up to this many images every pair is matched; beyond it, each image with those that look most alike."""
-
-
-@dataclass(frozen=True)
-class _Input:
-    """The readable images: file names, sizes, what the files say of the camera."""
-
-    names: tuple[str, ...]
-    image_size: Int[Tensor, "v 2"]
-    labels: tuple[str, ...]
-    focal: tuple[float | None, ...]
-    failures: dict[str, str]
+_PAIRS_PER_STEP = 64
+"""Pairs matched between two signs of progress."""
 
 
 def reconstruct(
@@ -67,7 +45,8 @@ def reconstruct(
 
     Args:
         images: A folder, or image files.
-        sequence: The images are consecutive frames of a video: corners are tracked instead of matching features of all pairs.
+        sequence: The images are consecutive frames of a video: corners are tracked through it, and features are matched
+            between frames that are near in time or look alike, instead of between all.
         camera: Distortion model: "pinhole", "simple_radial", "radial", "opencv" or "fisheye". By default "radial", or "pinhole"
             when `K` is given.
         shared_camera: Whether one camera took all images of the same size. By default it did where the files name the same
@@ -99,17 +78,14 @@ def reconstruct(
     options = {"sequence": sequence, "features": max_features, "neighbours": neighbours}
     stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
     generator = torch.Generator().manual_seed(seed)
-    if sequence:
-        found, graph, track = _tracked_graph(files, stages, report, generator)
-    else:
-        found, graph = _matched_graph(files, stages, report, generator, max_features=max_features, neighbours=neighbours)
-        track = None
+    points = unpack(stages.run("features", lambda: detect_all(files, max_features, report)), files)
+    graph = _view_graph(points, stages, report, generator, sequence=sequence, neighbours=neighbours)
     return build_models(
         graph,
-        track,
-        labels=found.labels,
-        exif_focal=found.focal,
-        failures=found.failures,
+        None,
+        labels=points.labels,
+        exif_focal=points.focal,
+        failures=points.failures,
         order=[path.name for path in files],
         camera=model,
         shared_camera=shared_camera,
@@ -135,57 +111,30 @@ def _files(images: str | Path | Sequence[str | Path]) -> list[Path]:
     return files
 
 
-def _matched_graph(
-    files: list[Path],
+def _view_graph(
+    points: ImagePoints,
     stages: Stages,
     progress: Progress,
     generator: torch.Generator,
     *,
-    max_features: int,
+    sequence: bool,
     neighbours: int,
-) -> tuple[_Input, ViewGraph]:
-    """Features of all images, matches of all pairs, verified."""
-
-    def detect() -> Arrays:
-        found: list[tuple[Photograph, Features, Tensor] | str] = []
-
-        def work(path: Path) -> tuple[Photograph, Features, Tensor] | str:
-            try:
-                photo = read_image(path)
-            except ImageError as error:
-                return str(error)
-            features = detect_features(photo, max_features)
-            color = _colors(photo.pixels, features.x)
-            # The pixels have served; only what the file says is kept.
-            return replace(photo, pixels=torch.zeros(1, 1, 1)), features, color
-
-        with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-            for result in pool.map(work, files):
-                found.append(result)
-                progress("features", len(found), len(files))
-        return _pack(found)
-
-    features_saved = stages.run("features", detect)
-    found = _input(features_saved, files)
-    counts = features_saved["count"].tolist()
-    x = list(torch.split(features_saved["x"], counts))
-    descriptors = list(torch.split(features_saved["descriptors"], counts))
-    color = list(torch.split(features_saved["color"], counts))
-    features = [
-        Features(x=a, scale=a[:, 0], angle=a[:, 0], response=a[:, 0], descriptors=b)
-        for a, b in zip(x, descriptors, strict=True)
-    ]
+) -> ViewGraph:
+    """Matches of all pairs worth comparing, verified."""
+    features = points.features
 
     def match() -> Arrays:
-        v = len(features)
-        if v <= MAX_IMAGES_ALL_PAIRS:
-            pairs = torch.tensor(list(combinations(range(v), 2)), dtype=torch.long).reshape(-1, 2)
+        if sequence:
+            pairs = sequence_pairs(features)
+        elif len(features) <= MAX_IMAGES_ALL_PAIRS:
+            pairs = torch.tensor(list(combinations(range(len(features)), 2)), dtype=torch.long).reshape(-1, 2)
         else:
             pairs = retrieve_pairs(features, neighbours=neighbours)
         rows: list[Tensor] = []
-        for start in range(0, len(pairs), 8):
-            rows += match_features(features, pairs[start : start + 8])
-            progress("match", len(rows), len(pairs))
+        for start in range(0, len(pairs), _PAIRS_PER_STEP):
+            progress("match", start, len(pairs))
+            rows += match_features(features, pairs[start : start + _PAIRS_PER_STEP])
+        progress("match", len(pairs), len(pairs))
         return {
             "pairs": pairs,
             "count": torch.tensor([len(m) for m in rows], dtype=torch.long),
@@ -193,113 +142,20 @@ def _matched_graph(
         }
 
     matched = stages.run("match", match)
-    matches = list(torch.split(matched["match"], matched["count"].tolist()))
+    pairs, matches = matched["pairs"], list(torch.split(matched["match"], matched["count"].tolist()))
+    x, color = [f.x for f in features], list(points.color)
+    if sequence:
+        add_corners(x, color, pairs, matches, stages.run("track", lambda: track_corners(points, progress)))
     with stages.timed("verify"):
         progress("verify", 0, len(matches))
         graph = verify_pairs(
-            found.names,
-            found.image_size,
+            points.names,
+            points.image_size,
             [a.double() for a in x],
             [c.double() for c in color],
-            matched["pairs"],
+            pairs,
             matches,
             generator=generator,
         )
         progress("verify", len(matches), len(matches))
-    return found, graph
-
-
-def _pack(found: list[tuple[Photograph, Features, Tensor] | str]) -> Arrays:
-    """One table of features of all readable images, and a record per file."""
-    good = [entry for entry in found if not isinstance(entry, str)]
-    records = [entry if isinstance(entry, str) else _label(entry[0]) for entry in found]
-    text = "\0".join(records).encode()
-    return {
-        "readable": torch.tensor([not isinstance(entry, str) for entry in found]),
-        "records": torch.frombuffer(bytearray(text or b"\0"), dtype=torch.uint8),
-        "focal": torch.tensor([photo.focal or 0.0 for photo, _, _ in good], dtype=torch.float64),
-        "size": torch.tensor([photo.size for photo, _, _ in good], dtype=torch.long).reshape(-1, 2),
-        "count": torch.tensor([len(features) for _, features, _ in good], dtype=torch.long),
-        "x": torch.cat([features.x for _, features, _ in good]) if good else torch.zeros(0, 2),
-        "descriptors": torch.cat([f.descriptors for _, f, _ in good]) if good else torch.zeros(0, 128, dtype=torch.uint8),
-        "color": torch.cat([color for _, _, color in good]) if good else torch.zeros(0, 3),
-    }
-
-
-def _label(photo: Photograph) -> str:
-    """What tells one camera from another in the files."""
-    focal = "" if photo.focal is None else f"{photo.focal / max(photo.size):.3f}"
-    return "|".join([photo.make, photo.model, focal]).replace("\0", "")
-
-
-def _input(saved: Arrays, files: list[Path]) -> _Input:
-    records = bytes(saved["records"].numpy()).decode().split("\0")
-    readable = saved["readable"].tolist()
-    failures = {path.name: record for path, record, ok in zip(files, records, readable, strict=True) if not ok}
-    if sum(readable) < 2:
-        worst = next(iter(failures.values()))
-        raise ReconstructionError(f"{sum(readable)} of {len(files)} files can be read as images; first failure: {worst}")
-    return _Input(
-        names=tuple(path.name for path, ok in zip(files, readable, strict=True) if ok),
-        image_size=saved["size"],
-        labels=tuple(record for record, ok in zip(records, readable, strict=True) if ok),
-        focal=tuple(f or None for f in saved["focal"].tolist()),
-        failures=failures,
-    )
-
-
-def _colors(pixels: Float[Tensor, "c h w"], x: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-    """Colours of the nearest pixels."""
-    height, width = pixels.shape[-2:]
-    column = x[:, 0].round().long().clamp(0, width - 1)
-    row = x[:, 1].round().long().clamp(0, height - 1)
-    return pixels[:, row, column].T.expand(-1, 3).float()
-
-
-def _tracked_graph(
-    files: list[Path], stages: Stages, progress: Progress, generator: torch.Generator
-) -> tuple[_Input, ViewGraph, Int[Tensor, "n"]]:
-    """Corners tracked through a sequence, with the pairs of frames they link verified."""
-
-    def track() -> Arrays:
-        photos: list[Photograph] = []
-        found: list[tuple[Photograph, Features, Tensor] | str] = []
-        empty = Features(torch.zeros(0, 2), *(torch.zeros(0),) * 3, torch.zeros(0, 128, dtype=torch.uint8))
-        for path in files:
-            try:
-                photo = read_image(path)
-            except ImageError as error:
-                found.append(str(error))
-                continue
-            found.append((photo, empty, torch.zeros(0, 3)))
-            photos.append(photo)
-            progress("track", len(found), 2 * len(files))
-        if len({photo.size for photo in photos}) > 1:
-            raise ReconstructionError("the frames of a sequence must have one size")
-        packed = _pack(found)
-        if len(photos) < 2:
-            return packed
-        tracks = track_sequence([photo.pixels for photo in photos])
-        order = torch.argsort(tracks.frame, stable=True)
-        packed["frame"], packed["track"], packed["x"] = tracks.frame[order], tracks.track[order], tracks.x[order]
-        packed["color"] = torch.cat(
-            [_colors(photo.pixels, packed["x"][packed["frame"] == i]) for i, photo in enumerate(photos)]
-        )
-        progress("track", 2 * len(files), 2 * len(files))
-        return packed
-
-    saved = stages.run("track", track)
-    found = _input(saved, files)
-    with stages.timed("verify"):
-        progress("verify", 0, 1)
-        graph, tracks = graph_from_tracks(
-            found.names,
-            found.image_size,
-            saved["x"].double(),
-            saved["frame"],
-            saved["track"],
-            saved["color"].double(),
-            generator=generator,
-        )
-        progress("verify", 1, 1)
-    return found, graph, tracks
+    return graph

@@ -1,5 +1,6 @@
 """What happened to each image and each pair on the way to the models."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +9,9 @@ from torch import Tensor
 
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.view_graph import Verdict
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage, the number of items done and the number of all."""
 
 
 class ReconstructionError(ValueError):
