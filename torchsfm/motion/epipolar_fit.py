@@ -39,8 +39,9 @@ def one_data_set_for_many(model: Tensor, row: Tensor) -> bool:
 def forms(A: Float[Tensor, "*#batch r 3"], h: Sequence[Tensor]) -> list[Tensor]:
     """The linear forms a'h of some points, one for each row a of A."""
     if one_data_set_for_many(A, h[0]):
-        stacked = torch.cat(list(h), -2)
-        return [A[..., i, :] @ stacked for i in range(A.shape[-2])]
+        models, r = A.shape[-3], A.shape[-2]
+        product = A.reshape(*A.shape[:-3], models * r, 3) @ torch.cat(torch.broadcast_tensors(*h), -2)
+        return list(product.reshape(*product.shape[:-2], models, r, product.shape[-1]).unbind(-2))
     columns = [[A[..., i, j, None] for j in range(3)] for i in range(A.shape[-2])]
     return [a * h[0] + b * h[1] + c * h[2] for a, b, c in columns]
 
@@ -64,29 +65,8 @@ def squared_distance(
     F: Float[Tensor, "*#batch 3 3"], h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool
 ) -> Float[Tensor, "*batch n"]:
     """The squared distance: of points, or of rays of unit length on the sphere."""
-    if one_data_set_for_many(F, h1[0]):
-        e, size = _by_products(F, h1, h2, sphere)
-    else:
-        e, _, _, size = _by_points(F, h1, h2, sphere)
-    return (e * e).div_(size.clamp_(min=_TINY))
-
-
-def _by_products(F: Tensor, h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool) -> tuple[Tensor, Tensor]:
-    """e and |g|^2 as linear forms in the products of coordinates."""
-    e = bilinear(F, h1, h2)
-    f = [[F[..., i, j] for j in range(3)] for i in range(3)]
-    span = range(3) if sphere else range(2)
-    coefficients, products = [], []
-    for i in range(3):
-        for j in range(i, 3):
-            first = sum(f[k][i] * f[k][j] for k in span)
-            second = sum(f[i][k] * f[j][k] for k in span)
-            coefficients += [first, second] if i == j else [2 * first, 2 * second]
-            products += [h1[i] * h1[j], h2[i] * h2[j]]
-    size = torch.stack(coefficients, -2).mT @ torch.cat(products, -2)  # type: ignore[arg-type]
-    if sphere:
-        size = size - 2 * e * e
-    return e, size
+    e, _, _, size = _by_points(F, h1, h2, sphere)
+    return e * e / size.clamp(min=_TINY)
 
 
 def _by_points(

@@ -77,7 +77,7 @@ class RelativePoseEstimator:
         R, t = model[..., :3], model[..., 3]
         squared = squared_distance(cross_rows(t, R), h1, h2, sphere=True)
         first, second = self._depths(R, t, h1, h2)
-        return torch.where(torch.minimum(first, second) > -self.slack[..., None], squared, torch.inf)
+        return squared.masked_fill(torch.minimum(first, second) < -self.slack[..., None], torch.inf)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]

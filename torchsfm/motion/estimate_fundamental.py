@@ -57,7 +57,7 @@ class FundamentalEstimator:
         """Squared Sampson distance; infinite for points that are behind one camera."""
         F, e, h1, h2 = model[..., :3], model[..., 3], plane_rows(x1), plane_rows(x2)
         squared = squared_distance(F, h1, h2, sphere=False)
-        return squared.masked_fill_(bilinear(cross_rows(e, F), h1, h2) > 0, torch.inf)
+        return squared.masked_fill(bilinear(cross_rows(e, F), h1, h2) > 0, torch.inf)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]

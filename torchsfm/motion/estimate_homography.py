@@ -42,17 +42,17 @@ class HomographyEstimator:
     def squared_residual(
         self, H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
-        """Squared Sampson distance; infinite where H sends the point to infinity."""
+        """Squared Sampson distance."""
         c0, c1, _, (s00, s01, s11), _ = _constraint(H, x1, x2)
-        det = s00 * s11 - s01 * s01
-        squared = (s11 * c0 * c0 - 2 * s01 * c0 * c1 + s00 * c1 * c1) / det
-        return torch.where(det > 0, squared, torch.inf)
+        # The determinant and the numerator are positive but for rounding.
+        det = (s00 * s11 - s01 * s01).clamp(min=1e-30)
+        return (((s11 * c0 - 2 * s01 * c1) * c0 + s00 * c1 * c1) / det).abs()
 
     def residual(
         self, H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
         """Sampson distance."""
-        return self.squared_residual(H, x1, x2).clamp(min=0).sqrt()
+        return self.squared_residual(H, x1, x2).sqrt()
 
     def degenerate(self, x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]) -> Bool[Tensor, "*batch"]:
         """Whether three of the points are collinear in an image, or turn the other way round in the other.

@@ -43,13 +43,14 @@ class CameraEstimator:
         P = self.K @ model
         points = torch.cat((X.mT, torch.ones_like(X.mT[..., :1, :])), -2)
         if P.ndim == X.ndim and P.ndim > 2 and X.shape[-3] == 1 and P.shape[-3] > 1:
-            points = points[..., 0, :, :]
-            y0, y1, y2 = P[..., 0, :] @ points, P[..., 1, :] @ points, P[..., 2, :] @ points
+            # Several models of the same data: one product for all.
+            product = P.reshape(*P.shape[:-3], 3 * P.shape[-3], 4) @ points[..., 0, :, :]
+            y0, y1, y2 = product.reshape(*P.shape[:-1], X.shape[-2]).unbind(-2)
         else:
             y0, y1, y2 = (P @ points).unbind(-2)
         inverse = 1 / y2
         u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
-        return torch.where(y2 > 0, u * u + v * v, torch.inf)
+        return (u * u + v * v).masked_fill(~(y2 > 0), torch.inf)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]

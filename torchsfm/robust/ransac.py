@@ -17,7 +17,7 @@ from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import cast, zip_map
 from torchsfm.robust.problems import pack
 from torchsfm.robust.scoring import squared_residual
-from torchsfm.robust.search import FIRST_ROUND, Options, no_model, search
+from torchsfm.robust.search import ROUNDS, Options, no_model, search
 
 M = TypeVar("M")
 
@@ -51,7 +51,7 @@ def ransac(
     scores: Float[Tensor, "*#batch n"] | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
-    min_iterations: int = FIRST_ROUND,
+    min_iterations: int = ROUNDS[0],
     max_iterations: int = 10_000,
     scoring_dtype: torch.dtype | None = None,
 ) -> RobustResult[M]:

@@ -26,14 +26,14 @@ def hash_integers(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
 
 
 def draw_samples(
-    seed: int, count: Int[Tensor, "g"], first: int, hypotheses: int, size: int, pool: Int[Tensor, "g h"] | None = None
+    seed: int, count: Int[Tensor, "g"], first: Int[Tensor, "g"], hypotheses: int, size: int, pool: Int[Tensor, "g h"] | None = None
 ) -> Int[Tensor, "g size h"]:
     """Distinct indices below `count` for each problem and hypothesis, every subset equally likely (Floyd's algorithm).
 
     Args:
         seed: Seed of the whole call.
         count: Number of data of each problem, at least `size`.
-        first: Number of the first hypothesis; the same hypothesis of the same problem always gets the same sample.
+        first: Number of the first hypothesis of each problem; the same hypothesis of the same problem always gets the same sample.
         hypotheses: How many samples to draw for each problem.
         size: Number of indices in a sample.
         pool: Draw hypothesis by hypothesis from the first `pool` data instead of all.
@@ -43,7 +43,8 @@ def draw_samples(
     """
     device = count.device
     limit = count[:, None] if pool is None else pool
-    counter = (first + torch.arange(hypotheses, device=device)) * size + torch.arange(size, device=device)[:, None]
+    counter = (first[:, None] + torch.arange(hypotheses, device=device)) * size
+    counter = counter[:, None] + torch.arange(size, device=device)[:, None]
     key = hash_integers(_signed(seed * 0xD1342543DE82EF95 & ((1 << 64) - 1)) + count * _GOLDEN)
     random = hash_integers(key[:, None, None] + counter * _GOLDEN)
     random = (random >> 33) & 0x7FFFFFFF
@@ -56,7 +57,7 @@ def draw_samples(
 
 
 def guided_pools(
-    count: Int[Tensor, "g"], first: int, hypotheses: int, size: int, growth: int = 1000
+    count: Int[Tensor, "g"], first: Int[Tensor, "g"], hypotheses: int, size: int, growth: int = 1000
 ) -> Int[Tensor, "g hypotheses"]:
     """From how many of the best-scored data each hypothesis draws: PROSAC's growing pool for odd ones, all data for even ones.
 
@@ -64,7 +65,7 @@ def guided_pools(
     among `growth` samples of all data (Chum & Matas 2005). Half of the samples stay uniform, so that a misleading order of the
     data costs at most a factor of two.
     """
-    t = first + torch.arange(hypotheses, device=count.device)
+    t = first[:, None] + torch.arange(hypotheses, device=count.device)
     fraction = ((t + 1) / growth).clamp(max=1) ** (1 / size)
     grown = (count[:, None] * fraction).ceil().long().clamp(min=size)
     return torch.where(t % 2 == 1, torch.minimum(grown, count[:, None]), count[:, None])

@@ -7,10 +7,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.models import tensors_of
 
 M = TypeVar("M")
 
+NUMBERS = {True: 1 << 16, False: 1 << 24}
+"""How many distances to compute at a time, on a CPU and elsewhere."""
 PREFIXES = (64, 256)
 """Numbers of data on which hypotheses are judged before all data are looked at."""
 
@@ -44,6 +48,35 @@ def truncated_loss(
     return loss.sum(-1).nan_to_num_(nan=torch.inf)
 
 
+def losses(
+    estimator: Estimator[M],
+    models: M,
+    data: Sequence[Tensor],
+    limit: Float[Tensor, "g"],
+    inside: Bool[Tensor, "g n"] | None,
+) -> Float[Tensor, "g s"]:
+    """The truncated loss of `s` models of each problem, computed in portions that stay in the cache.
+
+    Args:
+        estimator: The problem, with a dimension of size 1 for the models.
+        models: `(g, s, ...)`.
+        data: `(g, 1, n, d)` each.
+        limit: Squared threshold.
+        inside: Which slots hold data; all of them if not given.
+    """
+    (first, *_) = tensors_of(models)
+    g, s = first.shape[:2]
+    each = s * data[0].shape[-2]
+    portion = max(1, NUMBERS[first.device.type == "cpu"] // max(each, 1))
+    rows = []
+    for i in range(0, g, portion):
+        some = slice(i, i + portion)
+        own = tensor_map(lambda t: t[some], estimator)  # noqa: B023
+        squared = squared_residual(own, tensor_map(lambda t: t[some], models), *(d[some] for d in data))  # noqa: B023
+        rows.append(truncated_loss(squared, limit[some], None if inside is None else inside[some]))
+    return torch.cat(rows) if rows else limit.new_zeros(g, s)
+
+
 def stages(width: int, slots: int, kept: int) -> list[tuple[int, int]]:
     """On how many data `slots` models are scored, stage by stage, and how many of the models are kept each time."""
     prefixes = [prefix for prefix in PREFIXES if 2 * prefix <= width]
@@ -71,8 +104,3 @@ def gather_valid(valid: Bool[Tensor, "g s"]) -> tuple[Int[Tensor, "g _"], Bool[T
     index.scatter_(1, position, torch.arange(slots, device=valid.device).expand(g, slots))
     filled = torch.arange(columns, device=valid.device) < rank[:, -1:]
     return index[:, :columns], filled
-
-
-def first_data(data: Sequence[Tensor], number: int) -> list[Tensor]:
-    """The first data of each problem, ready to broadcast against several models per problem."""
-    return [d[:, None, :number] for d in data]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,17 +14,17 @@ from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_locally, pol
 from torchsfm.robust.models import cast, join, select, take_slots, zip_map
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import draw_samples, guided_pools
-from torchsfm.robust.scoring import gather_valid, smallest, squared_residual, stages, truncated_loss
+from torchsfm.robust.scoring import gather_valid, losses, smallest, squared_residual, stages, truncated_loss
 
-FIRST_ROUND = 64
-LARGEST_ROUND = 2048
+ROUNDS = (64, 128, 256, 512, 1024, 2048)
+"""How many samples a round may draw for a problem."""
 SCORED = 8
 """Hypotheses of a round that are scored on all data."""
 OPTIMISED = 3
 """Hypotheses of a round that are optimised locally."""
 POLISH_STEPS = 6
-_CHUNK = 1 << 18
-"""Numbers in the largest intermediate array on a CPU: what fits its cache."""
+_SAMPLES, _NUMBERS = 1 << 12, 1 << 15
+"""Samples to solve at a time, and numbers in one row of all data of several models, on a CPU: what fits its cache."""
 
 
 @dataclass(frozen=True)
@@ -67,21 +67,21 @@ def search(problems: Problems, options: Options) -> Best:
     best = Best(cast(no_model(problems.estimator, problems.data, p), options.dtype), infinite, none, infinite, none > 0, none)
     coarse = problems.cast(options.dtype)
     active = torch.arange(p, device=device)
-    drawn, size = 0, FIRST_ROUND
     while len(active):
-        group = _chunk(device, size * problems.estimator.max_solutions * min(problems.width, 64))
-        parts = []
-        for part in torch.split(active, group):
-            parts.append(_round(problems.take(part), coarse.take(part), _take(best, part), options, drawn, size))
-        found = join(parts)
-        best = _put(best, active, found)
-        drawn += size
-        if drawn >= options.max_iterations:
-            break
-        needed = samples_needed(found.support, problems.count[active], problems.estimator.sample_size, options.confidence)
-        active = active[(drawn < needed) | (drawn < options.min_iterations)]
-        size = min(drawn, LARGEST_ROUND)
+        size = _round_size(best.iterations[active], samples_needed(best, problems, active, options.confidence), options)
+        for number in sorted(set(size.tolist()) - {0}):
+            best = _round(problems, coarse, best, active[size == number], number, options)
+        active = active[size > 0]
     return _polished(problems, best)
+
+
+def _round_size(drawn: Int[Tensor, "g"], needed: Float[Tensor, "g"], options: Options) -> Int[Tensor, "g"]:
+    """How many samples to draw next: as many as drawn so far, or the rest if that is fewer; 0 for a problem that is done."""
+    rest = torch.maximum(needed, torch.full_like(needed, options.min_iterations)).clamp(max=options.max_iterations) - drawn
+    wanted = torch.minimum(rest, drawn.clamp(min=1).to(rest.dtype))
+    sizes = torch.tensor(ROUNDS, device=drawn.device)
+    size = sizes[torch.searchsorted(sizes, wanted.ceil().long()).clamp(max=len(ROUNDS) - 1)]
+    return torch.where(rest > 0, size, 0)
 
 
 def no_model(estimator: Any, data: Sequence[Tensor], number: int) -> Any:
@@ -91,56 +91,66 @@ def no_model(estimator: Any, data: Sequence[Tensor], number: int) -> Any:
     return tensor_map(lambda t: t.new_zeros(number, *t.shape[2:]), none.minimal(*samples).model)
 
 
-def samples_needed(support: Int[Tensor, "p"], count: Int[Tensor, "p"], size: int, confidence: float) -> Float[Tensor, "p"]:
-    """How many samples it takes to have drawn, with the given confidence, one of `support` among `count` data alone."""
-    steps = torch.arange(size, device=count.device)
-    inlying = (support[:, None] - steps).clamp(min=0).double() / (count[:, None] - steps).double()
+def samples_needed(best: Best, problems: Problems, index: Int[Tensor, "g"], confidence: float) -> Float[Tensor, "g"]:
+    """How many samples it takes to have drawn, with the given confidence, one of inliers alone."""
+    steps = torch.arange(problems.estimator.sample_size, device=index.device)
+    inlying = (best.support[index, None] - steps).clamp(min=0).double() / (problems.count[index, None] - steps).double()
     return math.log(1 - confidence) / torch.log1p(-inlying.prod(-1))
 
 
-def _chunk(device: torch.device, elements: int) -> int:
-    """How many problems to treat at a time when each needs so many numbers; devices other than CPUs want more at a time."""
-    return max(1, (_CHUNK if device.type == "cpu" else 256 * _CHUNK) // elements)
+def _split(index: Int[Tensor, "g"], each: int, budget: int) -> Sequence[Tensor]:
+    """Cut a list of problems so that what they need at a time stays within a budget; other devices than CPUs take more."""
+    size = max(1, (budget if index.device.type == "cpu" else 256 * budget) // each)
+    return [index[i : i + size] for i in range(0, len(index), size)]
 
 
-def _round(fine: Problems, coarse: Problems, best: Best, options: Options, drawn: int, size: int) -> Best:
-    """Draw samples for each problem, and update the best models with what comes of them."""
-    models, valid = _hypotheses(fine, options, drawn, size)
-    models, loss = _cascade(coarse, cast(models, options.dtype), valid)
-    improved = (loss[:, 0] < best.minimal_loss).nonzero()[:, 0]
-    solved = best.solved | valid.any(-1)
-    best = Best(best.model, best.loss, best.support, best.minimal_loss, solved, best.iterations + size)
-    if not len(improved):
-        return best
-    some = coarse.take(improved)
-    wide = some.spread()
-    top = tensor_map(lambda t: t[improved, :OPTIMISED], models)
+def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"], number: int, options: Options) -> Best:
+    """Draw samples for some problems, and update the best models with what comes of them."""
+    parts = []
+    for part in _split(index, number, _SAMPLES):
+        models, valid = _hypotheses(fine.take(part), best.iterations[part], number, options.seed)
+        parts.append((*_cascade(coarse.take(part), cast(models, options.dtype), valid), valid.any(-1)))
+    models, loss, solved = join([m for m, _, _ in parts]), torch.cat([x for _, x, _ in parts]), torch.cat([v for _, _, v in parts])
+    best = replace(
+        best,
+        solved=best.solved.index_put((index,), best.solved[index] | solved),
+        iterations=best.iterations.index_add(0, index, torch.full_like(index, number)),
+    )
+    improved = (loss[:, 0] < best.minimal_loss[index]).nonzero()[:, 0]
+    for part in _split(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), _NUMBERS):
+        top = tensor_map(lambda t: t[part, :OPTIMISED], models)  # noqa: B023
+        best = _optimised(coarse.take(index[part]), best, index[part], top, loss[part, 0])
+    return best
+
+
+def _optimised(coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, loss: Float[Tensor, "g"]) -> Best:
+    """Update the best models of some problems with what local optimisation makes of the best hypotheses of a round."""
+    wide = coarse.spread()
     prefix = [d[:, :, :LOCAL_DATA] for d in wide.data]
-    better = optimise_locally(wide.estimator, top, prefix, some.limit, some.inside[:, :LOCAL_DATA])
+    better = optimise_locally(wide.estimator, top, prefix, coarse.limit, coarse.inside[:, :LOCAL_DATA])
     candidates = join([better, tensor_map(lambda t: t[:, :1], top)], 1)
     squared = squared_residual(wide.estimator, candidates, *wide.data)
-    candidate_loss = truncated_loss(squared, some.limit, some.inside)
-    support = ((squared < some.limit[:, None, None]) & some.inside[:, None]).sum(-1)
+    candidate_loss = truncated_loss(squared, coarse.limit, coarse.inside)
+    support = ((squared < coarse.limit[:, None, None]) & coarse.inside[:, None]).sum(-1)
     winner = candidate_loss.argmin(-1, keepdim=True)
-    old = _take(best, improved)
     new_loss = candidate_loss.gather(1, winner)[:, 0]
+    old = _take(best, index)
     gain = new_loss < old.loss
-    new = Best(
-        select(gain, tensor_map(lambda t: t[:, 0], take_slots(candidates, winner)), old.model),
-        torch.where(gain, new_loss, old.loss),
-        torch.where(gain, support.gather(1, winner)[:, 0], old.support),
-        loss[improved, 0],
-        old.solved,
-        old.iterations,
+    new = replace(
+        old,
+        model=select(gain, tensor_map(lambda t: t[:, 0], take_slots(candidates, winner)), old.model),
+        loss=torch.where(gain, new_loss, old.loss),
+        support=torch.where(gain, support.gather(1, winner)[:, 0], old.support),
+        minimal_loss=loss,
     )
-    return _put(best, improved, new)
+    return _put(best, index, new)
 
 
-def _hypotheses(fine: Problems, options: Options, drawn: int, size: int) -> tuple[Any, Bool[Tensor, "g slots"]]:
+def _hypotheses(fine: Problems, drawn: Int[Tensor, "g"], size: int, seed: int) -> tuple[Any, Bool[Tensor, "g slots"]]:
     """The models through random samples, all solution slots of all samples in a row."""
     m = fine.estimator.sample_size
     pool = None if fine.ranking is None else guided_pools(fine.count, drawn, size, m)
-    index = draw_samples(options.seed, fine.count, drawn, size, m, pool).flatten(1)
+    index = draw_samples(seed, fine.count, drawn, size, m, pool).flatten(1)
     if fine.ranking is not None:
         index = fine.ranking.gather(1, index)
     sample = []
@@ -162,13 +172,11 @@ def _cascade(coarse: Problems, models: Any, valid: Bool[Tensor, "g slots"]) -> t
         slots = valid.shape[-1]
         if level == 0 and coarse.estimator.max_solutions > 1:
             column, filled = gather_valid(valid)
-            squared = squared_residual(wide.estimator, take_slots(models, column), *data)
-            part = truncated_loss(squared, coarse.limit, inside)
+            part = losses(wide.estimator, take_slots(models, column), data, coarse.limit, inside)
             loss = part.new_full((len(part), slots + 1), torch.inf)
             loss = loss.scatter_(1, torch.where(filled, column, slots), part)[:, :slots]
         else:
-            squared = squared_residual(wide.estimator, models, *data)
-            loss = truncated_loss(squared, coarse.limit, inside)
+            loss = losses(wide.estimator, models, data, coarse.limit, inside)
         loss = torch.where(valid, loss, torch.inf)
         chosen = smallest(loss, keep)
         models, loss, valid = take_slots(models, chosen), loss.gather(1, chosen), valid.gather(1, chosen)
@@ -177,9 +185,8 @@ def _cascade(coarse: Problems, models: Any, valid: Bool[Tensor, "g slots"]) -> t
 
 def _polished(problems: Problems, best: Best) -> Best:
     """Refine the best models in float64 on all data, and keep what does not lose support."""
-    group = _chunk(problems.count.device, 16 * problems.width)
     parts = []
-    for part in torch.split(torch.arange(len(problems.count), device=problems.count.device), group):
+    for part in _split(torch.arange(len(problems.count), device=problems.count.device), problems.width, _NUMBERS):
         some, old = problems.take(part), cast(_take(best, part), torch.float64)
         wide = some.spread()
         start = tensor_map(lambda t: t[:, None], old.model)
