@@ -63,7 +63,7 @@ def test_cubic_triple_and_degenerate() -> None:
     assert torch.isfinite(roots).all()
     assert real[:2].any(-1).all()
     assert not real[2:].any()
-    assert roots[0][real[0]].abs().max() == 0
+    assert roots[0][real[0]].abs().max() < 1e-90
     assert (roots[1][real[1]] - 1).abs().max() < 1e-5
 
 
@@ -138,3 +138,17 @@ def test_roots_batch_equals_loop(solver, generator: torch.Generator) -> None:
             assert torch.equal(one, roots[i, j])
             assert torch.equal(ok, real[i, j])
     assert solver(c[:0])[0].shape == (0, 7, 3)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's own, where its forward derivatives are first used
+@pytest.mark.parametrize("solver", [real_roots, solve_cubic, solve_quadratic])
+def test_derivatives_of_roots(solver, generator: torch.Generator) -> None:
+    truth = torch.tensor([[-2.0, 0.25, 3.0], [1.0, 1.5, -7.0]], dtype=F64)[:, : 2 if solver is solve_quadratic else 3]
+    c = from_roots(truth, 2.0).requires_grad_()
+    assert solver(c)[1].all()
+    assert torch.autograd.gradcheck(lambda c: solver(c)[0], c, check_forward_ad=True)
+    # No real root and a double one: no derivative, and no NaN.
+    c = torch.tensor([[1.0, 0, 1, 0], [0, 0, 1, 1]], dtype=F64)[:, : truth.shape[1] + 1].clone().requires_grad_()
+    solver(c)[0].sum().backward()
+    assert c.grad is not None
+    assert torch.isfinite(c.grad[0]).all()

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.linalg.rows import combine_rows
+
 
 def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
     """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose."""
@@ -16,7 +18,7 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
     """The same for a batch in the last dimension, by unrolled Householder reflections: many small matrices, few operations.
 
     Args:
-        a: Matrices of m < n rows, the batch in the last dimension, of size 2 or more so that sums always run in the same order.
+        a: Matrices of m < n rows, the batch in the last dimension.
 
     Returns:
         An orthonormal basis as k = n - m rows, and the smallest pivot: the distance of a row from the span of those before it,
@@ -28,7 +30,7 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
     smallest = None
     for i in range(m):
         v = a[i, i:].clone()
-        length = (v * v).sum(0).sqrt()
+        length = combine_rows(v, v).sqrt()
         smallest = length if smallest is None else torch.minimum(smallest, length)
         signed = torch.copysign(length, v[0])
         v[0] += signed
@@ -36,11 +38,12 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
         reflections.append((v, beta))
         if i + 1 < m:
             rest = a[i + 1 :, i:]
-            rest.addcmul_(((rest * v).sum(1) * beta)[:, None], v, value=-1)
+            rest.addcmul_((combine_rows(rest.unbind(1), v) * beta)[:, None], v, value=-1)
     basis = torch.eye(n - m, n, dtype=a.dtype, device=a.device).roll(m, 1)[..., None].repeat(1, 1, batch)
     for i in range(m - 1, -1, -1):
         v, beta = reflections[i]
-        basis[:, i:].addcmul_(((basis[:, i + 1 :] * v[1:]).sum(1) * beta)[:, None], v, value=-1)
+        product = combine_rows(basis[:, i + 1 :].unbind(1), v[1:])
+        basis[:, i:].addcmul_((product * beta)[:, None], v, value=-1)
     assert smallest is not None
     return basis, smallest
 

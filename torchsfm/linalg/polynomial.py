@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.linalg.derivative import followed
+
 Roots = tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]
 
 
@@ -32,6 +34,16 @@ def quadratic_rows(c0: Tensor, c1: Tensor, c2: Tensor) -> tuple[tuple[Tensor, Te
     return (torch.where(fine0, x0, 0), torch.where(fine1, x1, 0)), (ok0 & fine0, ok1 & fine1)
 
 
+def _cube_root(x: Tensor) -> Tensor:
+    """The cube root of numbers >= 0 to two or three digits: a third of the exponent (Kahan), then a step of Newton's method.
+
+    Not `pow`, whose last bit depends on the shape.
+    """
+    integer, offset = (torch.int64, 715094163 << 32) if x.dtype == torch.float64 else (torch.int32, 709958130)
+    root = (torch.div(x.view(integer), 3, rounding_mode="floor") + offset).view(x.dtype)
+    return (2 * root + x / (root * root)) * (1 / 3)
+
+
 def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, Tensor]:
     """The roots of c0 + c1 x + c2 x^2 + c3 x^3 with the coefficients as separate tensors; (3, ...) roots and real.
 
@@ -46,11 +58,11 @@ def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, 
     size = R.abs()
     root = Q.clamp_min(0).sqrt()
     inner = size * size - Q * Q * Q
-    outer = (size + inner.clamp_min(0).sqrt()) ** (1 / 3)
+    outer = _cube_root(size + inner.clamp_min(0).sqrt())
     ratio = (size / (root * root * root)).clamp_max(1)
     # 2 cos(acos(ratio) / 3) to three digits.
     y = torch.where(inner > 0, outer + Q / outer, root * (1.7320508 + ratio * (0.3208 - 0.0529 * ratio)))
-    for _ in range(2):
+    for _ in range(3):
         square = y * y
         y = y - (y * (square - 3 * Q) - 2 * size) / (3 * (square - Q))
     y = torch.where(torch.isfinite(y), y, 0)
@@ -75,6 +87,17 @@ def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, 
     return torch.where(fine, x, 0), fine & torch.stack((torch.ones_like(other), other, other))
 
 
+def attach_roots(c: Float[Tensor, "*batch m"], roots: Float[Tensor, "*batch k"], real: Bool[Tensor, "*batch k"]) -> Tensor:
+    """Give roots their derivative by the coefficients, -(dp/dc) / p', and leave their value. None at double roots."""
+    if not followed(c):
+        return roots
+    fixed = c.detach()
+    slope = evaluate(fixed[..., 1:] * torch.arange(1, c.shape[-1], dtype=c.dtype, device=c.device), roots)
+    good = real & (slope != 0)
+    value = evaluate(torch.where(good.any(-1, keepdim=True), c, fixed), roots)
+    return roots - torch.where(good, (value - value.detach()) / torch.where(good, slope, 1), 0)
+
+
 def solve_quadratic(c: Float[Tensor, "*batch 3"]) -> Roots:
     """The real roots of quadratics, without cancellation. A linear polynomial (c[2] = 0) has one root.
 
@@ -82,10 +105,11 @@ def solve_quadratic(c: Float[Tensor, "*batch 3"]) -> Roots:
         c: Coefficients, lowest power first.
 
     Returns:
-        Roots in two slots and the mask of real ones. A double root stands in both slots.
+        Roots in two slots and the mask of real ones. A double root stands in both slots. Differentiable.
     """
-    roots, real = quadratic_rows(*c.unbind(-1))
-    return torch.stack(roots, -1), torch.stack(real, -1)
+    pair, reals = quadratic_rows(*c.detach().unbind(-1))
+    real = torch.stack(reals, -1)
+    return attach_roots(c, torch.stack(pair, -1), real), real
 
 
 def solve_cubic(c: Float[Tensor, "*batch 4"]) -> Roots:
@@ -95,10 +119,11 @@ def solve_cubic(c: Float[Tensor, "*batch 4"]) -> Roots:
         c: Coefficients, lowest power first.
 
     Returns:
-        Roots in three slots and the mask of real ones.
+        Roots in three slots and the mask of real ones. Differentiable.
     """
-    roots, real = cubic_rows(*c.unbind(-1))
-    return roots.movedim(0, -1), real.movedim(0, -1)
+    kept = c.detach().float() if c.dtype.itemsize < 4 else c.detach()
+    roots, real = (x.movedim(0, -1) for x in cubic_rows(*kept.unbind(-1)))
+    return attach_roots(c, roots.to(c.dtype), real), real
 
 
 def companion_roots(c: Float[Tensor, "*batch m"]) -> Roots:

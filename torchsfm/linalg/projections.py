@@ -8,16 +8,9 @@ the directions in which the answer is not.
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchsfm._types import check_tensors
-
-
-def _followed(A: Tensor) -> bool:
-    """Whether reverse- or forward-mode differentiation follows A right now."""
-    if torch.is_grad_enabled() and A.requires_grad:
-        return True
-    return forward_ad._current_level >= 0 and forward_ad.unpack_dual(A).tangent is not None  # type: ignore[no-untyped-call]
+from torchsfm.linalg.derivative import followed
 
 
 def _finite_or_zero(A: Tensor) -> tuple[Tensor, Tensor]:
@@ -46,7 +39,7 @@ def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n 
         R: Tensor = U @ Vh
         total = s[..., :, None] + s[..., None, :]
         weight = torch.where(total > 64 * torch.finfo(A.dtype).eps * s[..., :1, None], 1 / total, 0)
-    if _followed(safe):
+    if followed(safe):
         # In the bases of the singular vectors dR is skew.
         change = U.mT @ (safe - safe.detach()) @ Vh.mT
         R = R + U @ (weight * (change - change.mT)) @ Vh
@@ -82,7 +75,7 @@ def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*b
         tall = torch.nn.functional.pad(s2, (0, U2.shape[-1] - s2.shape[-1]))
         wide = torch.nn.functional.pad(s2, (0, V2.shape[-1] - s2.shape[-1]))
         floor = 64 * torch.finfo(A.dtype).eps * s[..., :1, None] ** 2
-    if not _followed(safe):
+    if not followed(safe):
         return B
     change = safe - safe.detach()
     c11, c12, c21 = U1.mT @ change @ V1, U1.mT @ change @ V2, U2.mT @ change @ V1
@@ -125,7 +118,7 @@ def nearest_psd(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
         positive = (values > 0).to(A.dtype)[..., :, None].expand_as(gap)
         same = gap.abs() <= 64 * torch.finfo(A.dtype).eps * values.abs().amax(-1)[..., None, None]
         slope = torch.where(same, positive, (kept[..., :, None] - kept[..., None, :]) / gap)
-    if _followed(safe):
+    if followed(safe):
         change = safe - safe.detach()
         B = B + V @ (slope * (V.mT @ (0.5 * (change + change.mT)) @ V)) @ V.mT
     symmetric: Tensor = 0.5 * (B + B.mT)

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm.linalg.polynomial import attach_roots
+
 _CELLS = 32
 """Cells from 0 to 45 degrees."""
 _CLOSER = 4
@@ -37,7 +39,7 @@ def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slot
 
     Returns:
         Roots in m - 1 slots and the mask of slots that hold one; infinite roots are left out, other slots are zero. Polynomials
-        that are zero or not finite have none. Not differentiable.
+        that are zero or not finite have none. Differentiable.
     """
     with torch.no_grad():
         rows = c.detach().reshape(-1, c.shape[-1]).mT
@@ -45,7 +47,8 @@ def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slot
         real = real & (t.abs() > torch.finfo(c.dtype).tiny ** 0.5)
         x = torch.where(real, s / t, 0)
         shape = (*c.shape[:-1], c.shape[-1] - 1)
-        return x.mT.reshape(shape), real.mT.reshape(shape)
+        x, real = x.mT.reshape(shape), real.mT.reshape(shape)
+    return attach_roots(c, x, real), real
 
 
 def real_root_rows(

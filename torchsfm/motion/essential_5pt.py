@@ -17,13 +17,14 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.real_roots import real_root_rows
+from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _CHUNK = 1024
 """Problems at a time: their matrices fit the cache."""
 _INDEPENDENT = 1e-13
-_POLISH = 3
-"""Newton steps: two for most, three for near-planar points."""
+_POLISH = 4
+"""Newton steps: two do for most, near-planar points and small baselines need more."""
 _CONVERGED = 1e-5
 """Distance from the manifold before the last of them."""
 
@@ -100,7 +101,7 @@ def _solve(d1: Float[Tensor, "5 3 batch"], d2: Float[Tensor, "5 3 batch"]) -> tu
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
     x, y, w = _three_rows(_eliminate(_constraints(basis.view(4, 3, 3, -1))))
     n = _convolve(y[:, _NEXT], w[:, _AFTER]) - _convolve(y[:, _AFTER], w[:, _NEXT])
-    s, c, real = real_root_rows(_convolve(x, n).sum(1), steps=2)
+    s, c, real = real_root_rows(add_rows(_convolve(x, n).unbind(1)), steps=2)
     u = _back_substitute(x, y, w, s, c)
     for _ in range(_POLISH):
         u, error = _polish(u, basis)
@@ -116,8 +117,8 @@ def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
     largest = d.abs().amax((0, 1))
     fine = torch.isfinite(largest) & (largest > 0)
     d = torch.where(fine, d / torch.where(fine, largest, 1), 1)
-    norm = (d * d).sum(1, keepdim=True)
-    return d / torch.where(norm > 0, norm, 1).sqrt(), fine & (norm > 0).all(0)[0]
+    square = combine_rows(d.unbind(1), d.unbind(1))
+    return d / torch.where(square > 0, square, 1).sqrt()[:, None], fine & (square > 0).all(0)
 
 
 def _basis(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,7 +139,7 @@ def _basis(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
 def _constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"]:
     """Coefficients of the monomials in (E E' - tr(E E') / 2) E = 0 and det E = 0."""
     a, b = E[_I], E[_J]
-    S = _weighted(a.permute(2, 0, 1, 3)[:, :, :, None], b.permute(2, 0, 1, 3)[:, :, None])
+    S = combine_rows(a.permute(2, 0, 1, 3)[:, :, :, None], b.permute(2, 0, 1, 3)[:, :, None])
     S[4:] = S[4:] + S[4:].transpose(1, 2)
     half = 0.5 * (S[:, 0, 0] + S[:, 1, 1] + S[:, 2, 2])
     for i in range(3):
@@ -184,29 +185,21 @@ def _back_substitute(x: Tensor, y: Tensor, w: Tensor, s: Tensor, c: Tensor) -> T
     """The unit (x, y, z, w) for every root z = s / c: a null vector of the three rows, from the best-conditioned pair."""
     cc, ss = c * c, s * s
     powers = (cc * c, cc * s, ss * c, ss * s)
-    X, Y, W = (_weighted(p[:4, :, None], powers) for p in (x, y, w))
+    X, Y, W = (combine_rows(p[:4, :, None], powers) for p in (x, y, w))
     W = (W * c).addcmul_(w[4][:, None], ss * ss)
     pairs = [_cross((X[i], Y[i], W[i]), (X[j], Y[j], W[j])) for i, j in ((1, 2), (2, 0), (0, 1))]
     n = torch.stack(pairs)
-    best = (n * n).sum(1).max(0).indices
+    best = add_rows((n * n).unbind(1)).max(0).indices
     n0, n1, n2 = n.gather(0, best[None, None].expand(1, 3, *best.shape))[0]
     return _normalised(torch.stack((n0, n1, s * n2, c * n2)))
 
 
-def _weighted(rows: Tensor, weights: Sequence[Tensor] | Tensor) -> Tensor:
-    """The sum of rows times weights over the first dimension."""
-    out = rows[0] * weights[0]
-    for row, weight in zip(rows[1:], weights[1:], strict=True):
-        out.addcmul_(row, weight)
-    return out
-
-
 def _normalised(u: Tensor) -> Tensor:
-    return u * _weighted(u, u).rsqrt()
+    return u * combine_rows(u, u).rsqrt()
 
 
 def _combine(u: Float[Tensor, "4 slots batch"], basis: Float[Tensor, "4 9 batch"]) -> Float[Tensor, "9 slots batch"]:
-    return _weighted(basis[:, :, None], u)
+    return combine_rows(basis[:, :, None], u)
 
 
 def _cross(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Tensor:
@@ -224,7 +217,7 @@ def _polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     e = _combine(u, basis)
     cofactors = torch.stack((_cross(e[3:6], e[6:]), _cross(e[6:], e[:3]), _cross(e[:3], e[3:6])))
     squares = cofactors * cofactors
-    i, j = squares.sum(1).max(0).indices, squares.sum(0).max(0).indices
+    i, j = add_rows(squares.unbind(1)).max(0).indices, add_rows(squares).max(0).indices
     v3 = _normalised(cofactors.gather(0, i[None, None].expand(1, 3, *i.shape))[0])
     u3 = _normalised(cofactors.gather(1, j[None, None].expand(3, 1, *j.shape))[:, 0])
     # A frame around u3 without branches (Duff et al. 2017).
@@ -234,17 +227,17 @@ def _polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     u1 = (1 + sign * u3[0] * u3[0] * a, sign * b, -sign * u3[0])
     u2 = (b, sign + u3[1] * u3[1] * a, -u3[1])
     rows = e.view(3, 3, *e.shape[1:])
-    v1 = _weighted(rows, u1)
-    v1 = _normalised(v1 - v3 * _weighted(v1, v3))
+    v1 = combine_rows(rows, u1)
+    v1 = _normalised(v1 - v3 * combine_rows(v1, v3))
     v2 = _cross(v3, v1)
-    v2 = v2 * torch.copysign(torch.ones_like(sign), _weighted(_weighted(rows, u2), v2))
+    v2 = v2 * torch.copysign(torch.ones_like(sign), combine_rows(combine_rows(rows, u2), v2))
     # The normals' products with the basis, by rows of the basis matrices: B v, then u' B v.
     columns = basis.view(4, 3, 3, -1).permute(2, 1, 0, 3)[..., None, :]
-    Bv1, Bv2, Bv3 = (_weighted(columns, v) for v in (v1, v2, v3))
-    p = _weighted(Bv3, u3)
-    q = _weighted(Bv1, u1) - _weighted(Bv2, u2)
-    r = _weighted(Bv2, u1) + _weighted(Bv1, u2)
-    error = torch.stack([_weighted(f, u).abs() for f in (p, q, r)]).amax(0)
+    Bv1, Bv2, Bv3 = (combine_rows(columns, v) for v in (v1, v2, v3))
+    p = combine_rows(Bv3, u3)
+    q = combine_rows(Bv1, u1) - combine_rows(Bv2, u2)
+    r = combine_rows(Bv2, u1) + combine_rows(Bv1, u2)
+    error = torch.stack([combine_rows(f, u).abs() for f in (p, q, r)]).amax(0)
     p0, p1, p2, p3 = p
     q0, q1, q2, q3 = q
     r0, r1, r2, r3 = r

@@ -12,11 +12,13 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import determinant_3x3
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.polynomial import cubic_rows
+from torchsfm.linalg.rows import combine_rows
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _CHUNK = 2048
 """Problems at a time: their matrices fit the cache."""
-_INDEPENDENT = 1e-13
+_INDEPENDENT = 1e-12
+"""Smallest pivot of the normalised equations, and largest coefficient of the cubic, that are not taken for zero."""
 
 
 def equations(
@@ -40,8 +42,8 @@ def fundamental_7pt(
         x2: The corresponding points in the second image.
 
     Returns:
-        Three slots. None is valid where the seven equations are dependent (coinciding points, six or more points in a plane, a
-        pure rotation) or a coordinate is not finite. Differentiable in both arguments.
+        Three slots. None is valid where the points do not determine F (coinciding points, six or more points in a plane, a pure
+        rotation) or a coordinate is not finite. Computed in float64 whatever the dtype. Differentiable in both arguments.
 
     Raises:
         ValueError: Wrong shape, dtype or device.
@@ -71,10 +73,9 @@ def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tu
     r0, r1, r2 = G.unbind(1)
     cofactors = torch.stack((_cross(r1, r2), _cross(r2, r0), _cross(r0, r1)), 1)
     # det(a G0 + b G1): the coefficients of b^3, a b^2, a^2 b, a^3.
-    d0 = (cofactors[1, 0] * G[1, 0]).sum(0)
-    d1 = (cofactors[1] * G[0]).flatten(0, 1).sum(0)
-    d2 = (cofactors[0] * G[1]).flatten(0, 1).sum(0)
-    d3 = (cofactors[0, 0] * G[0, 0]).sum(0)
+    d0, d3 = combine_rows(cofactors[1, 0], G[1, 0]), combine_rows(cofactors[0, 0], G[0, 0])
+    d1, d2 = combine_rows(cofactors[1].flatten(0, 1), basis[0]), combine_rows(cofactors[0].flatten(0, 1), basis[1])
+    some = torch.stack((d0, d1, d2, d3)).abs().amax(0)
     # The larger of the outer coefficients leads.
     turn = d0.abs() > d3.abs()
     roots, real = cubic_rows(
@@ -88,8 +89,8 @@ def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tu
     F = torch.stack((s1 * F[:, 0], s1 * F[:, 1], last), 1)
     last = F[2] - s2 * (c2[0] * F[0] + c2[1] * F[1])
     F = torch.cat((s2 * F[0], s2 * F[1], last))
-    F = F * (F * F).sum(0).rsqrt()
-    valid = real & (fine1 & fine2 & (pivot > _INDEPENDENT)) & torch.isfinite(F).all(0)
+    F = F * combine_rows(F, F).rsqrt()
+    valid = real & (fine1 & fine2 & (torch.minimum(pivot, some) > _INDEPENDENT)) & torch.isfinite(F).all(0)
     # An empty slot holds diag(1, 1, 0).
     empty = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=F.dtype, device=F.device)[:, None, None] / 2**0.5
     return torch.where(valid, F, empty)[..., :count], valid[..., :count]

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _CHUNK = 4096
@@ -85,16 +86,16 @@ def _solve(x1: Float[Tensor, "4 2 batch"], x2: Float[Tensor, "4 2 batch"]) -> tu
     third = l1 * w / s1 - first * c1[0] - second * c1[1]
     q = torch.stack((first, second, third))
     # Columns [p'1 p'2 p'3] in coordinates of the second image: (y / s + c, 1).
-    bottom = q.sum(1)
+    bottom = add_rows(q.unbind(1))
     a, b = y2.unbind(1)
     inverse = 1 / s2
-    top = (q * a).sum(1) * inverse + c2[0] * bottom
-    middle = (q * b).sum(1) * inverse + c2[1] * bottom
+    top = combine_rows(q.unbind(1), a) * inverse + c2[0] * bottom
+    middle = combine_rows(q.unbind(1), b) * inverse + c2[1] * bottom
     H = torch.cat((top, middle, bottom))
     # The squares of small numbers must not vanish.
     H = H / H.abs().amax(0)
-    H = H * (H * H).sum(0).rsqrt()
-    areas = torch.cat((l1, l2, l1.sum(0, keepdim=True), l2.sum(0, keepdim=True))).abs().amin(0)
+    H = H * combine_rows(H, H).rsqrt()
+    areas = torch.cat((l1, l2, add_rows(l1)[None], add_rows(l2)[None])).abs().amin(0)
     valid = fine1 & fine2 & (areas > 64 * torch.finfo(H.dtype).eps) & torch.isfinite(H).all(0)
     identity = torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1) / 3**0.5
     return torch.where(valid, H, identity), valid

@@ -1,0 +1,28 @@
+"""Sums over rows in a fixed order, for arithmetic that keeps the batch in the last dimension.
+
+`Tensor.sum` chooses its order by the shape, so that an element's result would depend on how large its batch is.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def add_rows(rows: Tensor | Sequence[Tensor]) -> Tensor:
+    """The sum over the first dimension, from the first row to the last."""
+    first, second, *rest = rows if isinstance(rows, Sequence) else rows.unbind(0)
+    total = first + second
+    for row in rest:
+        total += row
+    return total
+
+
+def combine_rows(rows: Tensor | Sequence[Tensor], weights: Tensor | Sequence[Tensor]) -> Tensor:
+    """The sum over the first dimension of rows times weights, from the first row to the last, without keeping the products."""
+    rows = rows if isinstance(rows, Sequence) else rows.unbind(0)
+    weights = weights if isinstance(weights, Sequence) else weights.unbind(0)
+    total = rows[0] * weights[0]
+    for row, weight in zip(rows[1:], weights[1:], strict=True):
+        torch.addcmul(total, row, weight, out=total)
+    return total
