@@ -201,7 +201,13 @@ def test_derivatives(generator):
     def solve(F, c1, c2, w):
         return focal_from_fundamentals(F, c1, c2, weights=w, image_size=SIZE / 1e3).model
 
-    assert torch.autograd.gradcheck(solve, (F, c1, c2, w), rtol=1e-3)
+    assert torch.autograd.gradcheck(solve, (F, c1, c2, w), fast_mode=True)
+
+
+def test_nothing_leaves_the_device():
+    F = torch.empty(2, 5, 3, 3, device="meta")
+    c = torch.empty(2, 5, 2, device="meta")
+    assert focal_from_fundamentals(F, c, c).model.device.type == "meta"
 
 
 @pytest.mark.usefixtures("unchecked")

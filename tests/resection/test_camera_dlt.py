@@ -194,6 +194,11 @@ def test_derivatives(make_problem, generator):
     assert torch.autograd.gradcheck(lambda x, X, line, L, w: camera_dlt(x, X, line, L, weights=w).model, inputs)
 
 
+def test_nothing_leaves_the_device():
+    x, X, line, L = (torch.empty(4, 8, k, device="meta") for k in (2, 3, 3, 6))
+    assert camera_dlt(x, X, line, L).model.device.type == "meta"
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_arguments(make_problem):
     x, X, _ = make_problem(n=6)

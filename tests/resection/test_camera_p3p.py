@@ -261,6 +261,11 @@ def test_forward_mode_and_vmap(make_scene):
     assert torch.allclose(mapped[valid], camera_p3p(d, X).model[valid])
 
 
+def test_nothing_leaves_the_device():
+    d = torch.empty(7, 3, 3, device="meta")
+    assert camera_p3p(d, d).model.device.type == "meta"
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_arguments(make_scene):
     Y, X, _ = make_scene(2, n=4)

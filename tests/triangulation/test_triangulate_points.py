@@ -317,6 +317,13 @@ def test_derivatives_of_the_optimum(make_scene, generator, v):
     assert torch.autograd.gradcheck(lambda x: triangulate_points(x, P.detach()).model, inputs[:1])
 
 
+def test_values_do_not_depend_on_following_derivatives(make_scene):
+    x, P, _ = make_scene(v=3, n=20, noise=1.0)
+    plain, followed = triangulate_points(x, P), triangulate_points(x.clone().requires_grad_(), P)
+    for name in ("model", "status", "covariance", "error", "parallax"):
+        assert torch.equal(getattr(plain, name), getattr(followed, name).detach())
+
+
 def test_bad_points_have_no_derivative(make_scene):
     x, P, _ = make_scene(v=2, n=4, noise=0.01, focal=1.0)
     x[0, 1] = torch.nan
@@ -361,6 +368,18 @@ def test_opencv_corrects_matches_alike(make_scene):
     theirs = ((torch.tensor(z1)[0] - x[0]) ** 2).sum(-1) + ((torch.tensor(z2)[0] - x[1]) ** 2).sum(-1)
     ours = triangulate_points(x, P).error.square() * 2
     assert torch.allclose(ours, theirs, rtol=1e-6, atol=1e-8)
+
+
+def test_gross_errors_do_not_break_the_search(make_scene, generator, image_of):
+    x, P, _ = make_scene(300, v=4, n=1, noise=1.0)
+    x[:100, 0] = 1000 * torch.rand(100, 1, 2, generator=generator, dtype=torch.float64)
+    x[100:200] = 1000 * torch.rand(100, 4, 1, 2, generator=generator, dtype=torch.float64)
+    found, linear = triangulate_points(x, P), triangulate_points_dlt(x, P)
+    assert (found.status != Status.NOT_CONVERGED).all()
+    assert (found.status[200:] == Status.OK).all()
+    assert (found.error[200:] < 4).all()
+    cost = (image_of(P, linear) - x).square().sum((1, 3)) / 4
+    assert (found.error <= cost.sqrt() * (1 + 1e-9)).all()
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -187,6 +187,11 @@ def test_bad_points_have_no_derivative(make_scene):
     assert P.grad.isfinite().all()
 
 
+def test_nothing_leaves_the_device():
+    x, P = torch.empty(6, 3, 5, 2, device="meta"), torch.empty(6, 3, 3, 4, device="meta")
+    assert triangulate_points_dlt(x, P).device.type == "meta"
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_arguments(make_scene):
     x, P, _ = make_scene(v=3, n=4)

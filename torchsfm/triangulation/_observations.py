@@ -158,27 +158,28 @@ def _ranges(size: int, step: int) -> Iterator[slice]:
 
 def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> Observations:
     """Lay a piece out: x (problem, view, point, 2), P (problem, view, 3, 4), visible and weights (problem, view, point)."""
-    # Squares must be finite too, and the scale of a camera matrix is arbitrary.
-    size = P[..., :3].detach().double().abs().amax((-2, -1), keepdim=True)
-    P = P.double() / torch.where((size > 0) & torch.isfinite(size), size, 1.0)
-    good_P = (P.abs() < LARGEST).all(-1).all(-1)[..., None]
-    good = (x.abs() < LARGEST).all(-1) & good_P
-    wanted = torch.ones_like(good) if visible is None else visible
+    # Coordinates first, points last; cameras (3, 4, view, problem, 1), their arbitrary scale taken out.
+    u, v = x.permute(3, 1, 0, 2).double().contiguous().unbind(0)
+    entries = P.permute(2, 3, 1, 0).double().contiguous()[..., None]
+    size = entries[:, :3].detach().abs().amax((0, 1))
+    entries = entries / torch.where((size > 0) & (size < torch.inf), size, 1.0)
+    # Squares must be finite too.
+    good_P = entries.detach().abs().amax((0, 1)) < LARGEST
+    good = (u.detach().abs() < LARGEST) & (v.detach().abs() < LARGEST) & good_P
+    wanted = torch.ones_like(good) if visible is None else visible.permute(1, 0, 2)
+    w = torch.ones_like(u)
     if weights is not None:
-        wanted = wanted & (weights != 0)
-        good = good & torch.isfinite(weights) & (weights >= 0)
+        w = weights.permute(1, 0, 2).double()
+        wanted = wanted & (w.detach() != 0)
+        good = good & (w.detach() >= 0) & (w.detach() < LARGEST)
     use = wanted & good
-    one = torch.ones((), dtype=torch.float64, device=x.device)
-    w = torch.where(use, one if weights is None else weights.double(), 0.0)
-    x = torch.where(use[..., None], x.double(), 0.0)
-    P = torch.where(good_P[..., None], P, torch.eye(3, 4, dtype=torch.float64, device=P.device))
-
-    u, v = x.permute(3, 1, 0, 2).contiguous().unbind(0)
-    w = w.permute(1, 0, 2).contiguous()
-    entries = P.permute(2, 3, 1, 0).contiguous()[..., None]
-    used = (w.detach() > 0).any(-1, keepdim=True)
+    zero = torch.zeros((), dtype=torch.float64, device=x.device)
+    w, u, v = torch.where(use, w, zero), torch.where(use, u, zero), torch.where(use, v, zero)
+    harmless = torch.eye(3, 4, dtype=torch.float64, device=P.device)[..., None, None, None]
+    entries = torch.where(good_P, entries, harmless)
+    used = use.any(-1, keepdim=True)
     rows = tuple(row.unbind(0) for row in entries.unbind(0))
-    centre = _centres(rows)
+    *centre, handed = _centres(rows)
     finite = centre[3].detach() != 0
     counted = used & finite
     number = counted.sum(0).clamp_min(1)
@@ -194,28 +195,23 @@ def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | Non
         (r[0] * scale, r[1] * scale, r[2] * scale, r[3] + r[0] * shift[0] + r[1] * shift[1] + r[2] * shift[2]) for r in rows
     )
     scaled = [torch.where(finite, o / scale, o) for o in offsets]
-    broken = (wanted & ~good).any(1)
-    handed = torch.where(finite, torch.sign(_determinant(rows)).detach(), 0.0)
+    broken = (wanted & ~good).any(0)
     return Observations((u, v), moved, w, (scaled[0], scaled[1], scaled[2], centre[3]), handed, shift, scale, apart, broken)
 
 
-def _determinant(P: tuple[tuple[Tensor, ...], ...]) -> Tensor:
-    """The determinant of the left 3x3 parts."""
-    a, b, c = P
-    return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
-
-
 def _centres(P: tuple[tuple[Tensor, ...], ...]) -> tuple[Tensor, ...]:
-    """Homogeneous camera centres with last entry 1, or a unit direction and 0 for a camera at infinity."""
+    """Homogeneous camera centres, with last entry 1 or for a camera at infinity a unit direction and 0; and the sign of det."""
     a, b, c = P
-    m = {(i, j): a[i] * b[j] - a[j] * b[i] for i in range(4) for j in range(i + 1, 4)}
-    X = c[1] * m[2, 3] - c[2] * m[1, 3] + c[3] * m[1, 2]
-    Y = -(c[0] * m[2, 3] - c[2] * m[0, 3] + c[3] * m[0, 2])
-    Z = c[0] * m[1, 3] - c[1] * m[0, 3] + c[3] * m[0, 1]
-    W = -(c[0] * m[1, 2] - c[1] * m[0, 2] + c[2] * m[0, 1])
+    m = {(i, j): torch.addcmul(a[i] * b[j], a[j], b[i], value=-1) for i in range(4) for j in range(i + 1, 4)}
+
+    def minor(i: int, j: int, k: int) -> Tensor:
+        return torch.addcmul(torch.addcmul(c[i] * m[j, k], c[j], m[i, k], value=-1), c[k], m[i, j])
+
+    X, Y, Z, W = minor(1, 2, 3), -minor(0, 2, 3), minor(0, 1, 3), -minor(0, 1, 2)
     rows = [(row[0] * row[0] + row[1] * row[1] + row[2] * row[2]).sqrt() for row in P]
     finite = W.detach().abs() > 1e-13 * (rows[0] * rows[1] * rows[2]).detach()
     length = (X * X + Y * Y + Z * Z).sqrt()
     divisor = torch.where(finite, W, torch.where(length.detach() > 0, length, 1.0))
     divisor = torch.where(divisor.detach() == 0, 1.0, divisor)
-    return X / divisor, Y / divisor, Z / divisor, finite.to(W.dtype)
+    handed = torch.where(finite, -torch.sign(W.detach()), 0.0)
+    return X / divisor, Y / divisor, Z / divisor, finite.to(W.dtype), handed
