@@ -1,8 +1,8 @@
 """Bundle adjustment against Ceres (through pycolmap) on the problems of Bundle Adjustment in the Large: time and final cost.
 
-`python -m bench.bundle FOLDER` prints a table for the `problem-*.txt*` files in the folder (default: `bal` in $TORCHSFM_DATA). Both
-start at the same numbers, use one thread and end at a relative decrease of 1e-6; runs alternate, and the least CPU time counts.
-COLMAP drops observations of points behind their camera, so where there are any the costs differ by those.
+`python -m bench.bundle FOLDER` prints a table for the `problem-*.txt*` files in the folder (default: `bal` in $TORCHSFM_DATA).
+Both start at the same numbers, use one thread and end at a relative decrease of 1e-6; runs alternate, and the least CPU time
+counts. COLMAP drops observations of points behind their camera, so where there are any the costs differ by those.
 """
 
 import argparse

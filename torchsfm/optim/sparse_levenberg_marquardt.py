@@ -124,11 +124,9 @@ def _descend(
     growth = 2.0
     for iteration in range(1, max_iterations + 1):
         slope = float(system.gradient())
-        if not slope > gradient_tolerance:
-            status = Status.OK if slope <= gradient_tolerance else Status.NOT_FINITE
+        if slope <= gradient_tolerance or not math.isfinite(slope):
+            status = Status.OK if math.isfinite(slope) else Status.NOT_FINITE
             return _End(x, cost + constant, initial + constant, iteration - 1, status)
-        if not math.isfinite(slope):
-            return _End(x, cost + constant, initial + constant, iteration - 1, Status.NOT_FINITE)
         step, promised, solvable = system.step(damping)
         solved, promise = bool(solvable), float(promised)
         trial = move(engine.blocks, engine.layout, x, step)
