@@ -5,7 +5,6 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from shutil import copy
 
@@ -17,11 +16,11 @@ from typer.testing import CliRunner
 
 from torchsfm.cli import app
 from torchsfm.cli.inputs import read_intrinsics, warn_about_intrinsics
+from torchsfm.cli.job import Job
 from torchsfm.cli.results import VERSION
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction import photographs as stages_of_reconstruct
 from torchsfm.simulation import courtyard_scene, look_at, orbit_poses, render_sequence
 
 WIDTH, HEIGHT, VIEWS = 400, 300, 5
@@ -401,36 +400,31 @@ def test_a_wrong_option_is_wrong_usage(courtyard: Path, tmp_path: Path) -> None:
 # ---- interruption --------------------------------------------------------------------------------------------------------
 
 
-def stop(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
-
-
-@pytest.mark.parametrize(
-    ("function", "saved"), [("detect_features", []), ("match_features", ["features"]), ("build_models", ["features", "match"])]
-)
+@pytest.mark.parametrize(("stage", "saved"), [("features", []), ("match", ["features"]), ("verify", ["features", "match"])])
 def test_an_interrupted_run_goes_on_where_it_was(
-    function: str,
-    saved: list[str],
-    finished: tuple[Path, str],
-    courtyard: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    stage: str, saved: list[str], finished: tuple[Path, str], courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ["reconstruct", str(courtyard), "--out", str(tmp_path), "--seed", "3"]
     monkeypatch.setattr(sys, "argv", ["torchsfm", *words])
+
+    def interrupt(job: Job, reported: str, *_: int) -> None:
+        job.stage = reported
+        if reported == stage:
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patched:
-        patched.setattr(stages_of_reconstruct, function, stop)
+        patched.setattr(Job, "progress", interrupt)
         status, _, stderr = torchsfm(*words)
     assert status == 130
     assert "interrupted while" in stderr
     assert sorted(path.stem for path in tmp_path.glob("stages/*.npz")) == saved
     assert ("--resume" in stderr) == bool(saved)
-    done: dict[str, Callable[..., object]] = {"features": stages_of_reconstruct.detect_features}
-    done["match"] = stages_of_reconstruct.match_features
-    for stage in saved:
-        # What is saved is not made again.
-        monkeypatch.setattr(stages_of_reconstruct, done[stage].__name__, stop)
+
+    seen: list[str] = []
+    monkeypatch.setattr(Job, "progress", lambda job, reported, *_: seen.append(reported))
     assert torchsfm(*words, "--resume")[0] == 0
+    assert {"map", "write"} <= set(seen)
+    assert not set(saved) & set(seen), "what is saved is not made again"
     assert same_model(finished[0] / "model.npz", tmp_path / "model.npz")
 
 

@@ -38,11 +38,12 @@ Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; all
 Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
 
 
-def print_version(wanted: bool) -> None:
-    """Print the version and end."""
+def print_version(wanted: bool) -> bool:
+    """Print the version and end, if wanted."""
     if wanted:
         typer.echo(f"torchsfm {VERSION}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback()
