@@ -213,14 +213,13 @@ def _polish(curves: _Curves, w: Tensor, start: Tensor, step: Tensor) -> Tensor:
         low, high = torch.where(lower, low, left), torch.where(lower, right, high)
     x = 0.5 * (low + high)
 
-    def slope(v: Tensor) -> Tensor:
-        result: Tensor = torch.func.grad(lambda t: _robust(curves(t), w).sum())(v)
-        return result
-
     for _ in range(3):
-        first = slope(x)
-        second = torch.func.grad(lambda t: slope(t).sum())(x)
-        move = first / torch.where(second > 0, second, 1.0)
+        # Plain autograd: the first call of torch.func imports for seconds.
+        with torch.enable_grad():
+            t = x.detach().requires_grad_()
+            (first,) = torch.autograd.grad(_robust(curves(t), w).sum(), t, create_graph=True)
+            (second,) = torch.autograd.grad(first.sum(), t)
+        move = first.detach() / torch.where(second > 0, second, 1.0)
         x = torch.where((second > 0) & (move.abs() < 1e-4), x - move, x)
     return x
 
