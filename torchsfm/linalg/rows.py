@@ -9,6 +9,12 @@ import torch
 from torch import Tensor
 
 
+def take_columns(rows: Tensor, column: Tensor) -> Tensor:
+    """Columns by their numbers, in the last dimension; `gather` does it several times faster than `index_select`."""
+    flat = rows.flatten(0, -2)
+    return flat.gather(1, column.expand(len(flat), -1)).view(*rows.shape[:-1], len(column))
+
+
 def add_rows(rows: Tensor | Sequence[Tensor]) -> Tensor:
     """The sum over the first dimension, from the first row to the last."""
     first, second, *rest = rows if isinstance(rows, Sequence) else rows.unbind(0)

@@ -9,6 +9,7 @@ solution is polished on the manifold of essential matrices. All arithmetic has t
 
 from collections.abc import Sequence
 from itertools import product
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -16,17 +17,19 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.nullspace import nullspace_rows
-from torchsfm.linalg.real_roots import real_root_rows
-from torchsfm.linalg.rows import add_rows, combine_rows
+from torchsfm.linalg.real_roots import real_root_list
+from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.optim import attach_implicit, wants_derivative
 
-_CHUNK = 1024
+_CHUNK = 2048
 """Problems at a time: their matrices fit the cache."""
 _INDEPENDENT = 1e-13
-_POLISH = 4
-"""Newton steps: two do for most, near-planar points and small baselines need more."""
-_CONVERGED = 1e-5
-"""Distance from the manifold before the last of them."""
+_NEAR = 1e-8
+"""Distance from the manifold before a Newton step after which there is nothing left to gain."""
+_MORE = 4
+"""Newton steps for the others, among near-planar points and small baselines."""
+_CONVERGED = 1e-7
+"""Distance from the manifold before the last step, of what is a solution."""
 
 # Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w); quadratic ones as pairs, squares first.
 _CUBICS = [(0, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 1), (0, 0, 2), (0, 0, 3), (1, 1, 2), (1, 1, 3), (0, 1, 2), (0, 1, 3)]
@@ -80,37 +83,70 @@ def essential_5pt(
     batch = check_tensors(d1=(d1, "5 3"), d2=(d2, "5 3"))
     with torch.no_grad():
         rows1, rows2 = (d.detach().double().expand(*batch, 5, 3).reshape(-1, 5, 3).permute(1, 2, 0) for d in (d1, d2))
-        starts = range(0, max(rows1.shape[-1], 1), _CHUNK)
-        chunks = [_solve(rows1[..., i : i + _CHUNK], rows2[..., i : i + _CHUNK]) for i in starts]
-        rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
-        E = rows.permute(2, 1, 0).reshape(*batch, 10, 3, 3).to(d1.dtype)
-        valid = good.mT.reshape(*batch, 10)
+        E, valid = _solve(rows1, rows2)
+        E, valid = E.to(d1.dtype).reshape(*batch, 10, 3, 3), valid.reshape(*batch, 10)
     if wants_derivative(d1, d2):
         E = attach_implicit(equations, E, d1[..., None, :, :], d2[..., None, :, :], dims=2, valid=valid)
     return Solutions(E, valid)
 
 
+class _Candidates(NamedTuple):
+    """Solutions one after the other, in the last dimension."""
+
+    item: Tensor
+    slot: Tensor
+    E: Tensor
+    """(9, candidates), with |E| = 1."""
+    error: Tensor
+    """Distance from the essential manifold before the last Newton step."""
+    rest: Tensor
+    """Numbers of those that need more steps, with what these need:"""
+    u: Tensor
+    basis: Tensor
+
+
 def _solve(d1: Float[Tensor, "5 3 batch"], d2: Float[Tensor, "5 3 batch"]) -> tuple[Tensor, Tensor]:
-    """E as (9, 10, batch) and valid as (10, batch)."""
-    count = d1.shape[-1]
-    if count == 1:
-        d1, d2 = d1.repeat(1, 1, 2), d2.repeat(1, 1, 2)
+    """E as (batch, 10, 9) and valid as (batch, 10)."""
+    batch = d1.shape[-1]
+    starts = range(0, max(batch, 1), _CHUNK)
+    chunks = [_candidates(d1[..., i : i + _CHUNK], d2[..., i : i + _CHUNK]) for i in starts]
+    before = 0
+    for i, chunk in enumerate(chunks):
+        chunks[i] = chunk._replace(item=chunk.item + starts[i], rest=chunk.rest + before)
+        before += len(chunk.item)
+    item, slot, E, error, rest, u, basis = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
+    # The few that are not near yet, of all chunks together.
+    last = error.index_select(0, rest)
+    for _ in range(_MORE):
+        u, last = _polish(u, basis)
+    E = E.index_copy(1, rest, _combine(u, basis))
+    error = error.index_copy(0, rest, last)
+    keep = ((error < _CONVERGED) & torch.isfinite(E).all(0) & (slot < 10)).nonzero()[:, 0]
+    place = item.index_select(0, keep), slot.index_select(0, keep)
+    # An empty slot holds diag(1, 1, 0).
+    out = torch.zeros(batch, 10, 9, dtype=E.dtype, device=E.device)
+    out[..., ::4] = torch.tensor([1.0, 1.0, 0.0], dtype=E.dtype, device=E.device)
+    out[place] = take_columns(E, keep).mT * 2**0.5
+    valid = torch.zeros(batch, 10, dtype=torch.bool, device=E.device)
+    valid[place] = True
+    return out, valid
+
+
+def _candidates(d1: Tensor, d2: Tensor) -> _Candidates:
     d1, fine1 = _unit(d1)
     d2, fine2 = _unit(d2)
     basis, pivot = _basis(d1, d2)
-    fine = fine1 & fine2 & (pivot > _INDEPENDENT)
     x, y, w = _three_rows(_eliminate(_constraints(basis.view(4, 3, 3, -1))))
     n = _convolve(y[:, _NEXT], w[:, _AFTER]) - _convolve(y[:, _AFTER], w[:, _NEXT])
-    s, c, real = real_root_rows(add_rows(_convolve(x, n).unbind(1)), steps=2)
-    u = _back_substitute(x, y, w, s, c)
-    for _ in range(_POLISH):
-        u, error = _polish(u, basis)
-    E = _combine(u, basis)
-    valid = real & fine & (error < _CONVERGED) & torch.isfinite(E).all(0)
-    # An empty slot holds diag(1, 1, 0).
-    empty = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=E.dtype, device=E.device)[:, None, None]
-    E = torch.where(valid, E * 2**0.5, empty)
-    return E[..., :count], valid[..., :count]
+    # Without five independent equations there is no polynomial and no root.
+    fine = fine1 & fine2 & (pivot > _INDEPENDENT)
+    roots = real_root_list(torch.where(fine, add_rows(_convolve(x, n).unbind(1)), torch.nan), steps=2)
+    # From here on each root has a column of its own.
+    item = roots.item
+    x, y, w, basis = (take_columns(rows, item) for rows in (x, y, w, basis))
+    u, error = _polish(_back_substitute(x, y, w, roots.s, roots.t), basis)
+    rest = (error > _NEAR).nonzero()[:, 0]
+    return _Candidates(item, roots.slot(), _combine(u, basis), error, rest, take_columns(u, rest), take_columns(basis, rest))
 
 
 def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,12 +221,11 @@ def _back_substitute(x: Tensor, y: Tensor, w: Tensor, s: Tensor, c: Tensor) -> T
     """The unit (x, y, z, w) for every root z = s / c: a null vector of the three rows, from the best-conditioned pair."""
     cc, ss = c * c, s * s
     powers = (cc * c, cc * s, ss * c, ss * s)
-    X, Y, W = (combine_rows(p[:4, :, None], powers) for p in (x, y, w))
-    W = (W * c).addcmul_(w[4][:, None], ss * ss)
-    pairs = [_cross((X[i], Y[i], W[i]), (X[j], Y[j], W[j])) for i, j in ((1, 2), (2, 0), (0, 1))]
-    n = torch.stack(pairs)
+    X, Y, W = (combine_rows(p[:4], powers) for p in (x, y, w))
+    W = (W * c).addcmul_(w[4], ss * ss)
+    n = torch.stack([_cross((X[i], Y[i], W[i]), (X[j], Y[j], W[j])) for i, j in ((1, 2), (2, 0), (0, 1))])
     best = add_rows((n * n).unbind(1)).max(0).indices
-    n0, n1, n2 = n.gather(0, best[None, None].expand(1, 3, *best.shape))[0]
+    n0, n1, n2 = n.gather(0, best.expand(1, 3, -1))[0]
     return _normalised(torch.stack((n0, n1, s * n2, c * n2)))
 
 
@@ -198,8 +233,8 @@ def _normalised(u: Tensor) -> Tensor:
     return u * combine_rows(u, u).rsqrt()
 
 
-def _combine(u: Float[Tensor, "4 slots batch"], basis: Float[Tensor, "4 9 batch"]) -> Float[Tensor, "9 slots batch"]:
-    return combine_rows(basis[:, :, None], u)
+def _combine(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> Float[Tensor, "9 roots"]:
+    return combine_rows(basis, u)
 
 
 def _cross(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Tensor:
@@ -218,21 +253,21 @@ def _polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     cofactors = torch.stack((_cross(e[3:6], e[6:]), _cross(e[6:], e[:3]), _cross(e[:3], e[3:6])))
     squares = cofactors * cofactors
     i, j = add_rows(squares.unbind(1)).max(0).indices, add_rows(squares).max(0).indices
-    v3 = _normalised(cofactors.gather(0, i[None, None].expand(1, 3, *i.shape))[0])
-    u3 = _normalised(cofactors.gather(1, j[None, None].expand(3, 1, *j.shape))[:, 0])
+    v3 = _normalised(cofactors.gather(0, i.expand(1, 3, -1))[0])
+    u3 = _normalised(cofactors.gather(1, j.expand(3, 1, -1))[:, 0])
     # A frame around u3 without branches (Duff et al. 2017).
     sign = torch.copysign(torch.ones_like(u3[2]), u3[2])
     a = -1 / (sign + u3[2])
     b = u3[0] * u3[1] * a
     u1 = (1 + sign * u3[0] * u3[0] * a, sign * b, -sign * u3[0])
     u2 = (b, sign + u3[1] * u3[1] * a, -u3[1])
-    rows = e.view(3, 3, *e.shape[1:])
+    rows = e.view(3, 3, -1)
     v1 = combine_rows(rows, u1)
     v1 = _normalised(v1 - v3 * combine_rows(v1, v3))
     v2 = _cross(v3, v1)
     v2 = v2 * torch.copysign(torch.ones_like(sign), combine_rows(combine_rows(rows, u2), v2))
     # The normals' products with the basis, by rows of the basis matrices: B v, then u' B v.
-    columns = basis.view(4, 3, 3, -1).permute(2, 1, 0, 3)[..., None, :]
+    columns = basis.view(4, 3, 3, -1).permute(2, 1, 0, 3)
     Bv1, Bv2, Bv3 = (combine_rows(columns, v) for v in (v1, v2, v3))
     p = combine_rows(Bv3, u3)
     q = combine_rows(Bv1, u1) - combine_rows(Bv2, u2)
