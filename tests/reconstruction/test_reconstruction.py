@@ -75,7 +75,8 @@ def test_dtype_moves_floats_only() -> None:
 def test_a_similarity_changes_no_residual() -> None:
     model = make()
     g = torch.Generator().manual_seed(1)
-    similarity = Similarity(torch.tensor(2.5).double(), random_rotation(generator=g, dtype=torch.float64), torch.tensor([1.0, -2.0, 3.0]).double())
+    R, t = random_rotation(generator=g, dtype=torch.float64), torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
+    similarity = Similarity(torch.tensor(2.5, dtype=torch.float64), R, t)
     moved = model.transform(similarity)
     assert torch.allclose(moved.residuals(), model.residuals(), atol=1e-9)
     assert torch.equal(moved.poses.R[3], torch.eye(3).double())
