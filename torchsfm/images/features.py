@@ -13,6 +13,8 @@ from torchsfm.images.reading import Photograph
 _SCALE = 0.5 * 2 ** (1 / 6)
 """OpenCV gives twice the smaller of two Gaussians, of ratio 2^(1/3), whose difference answers most to what lies between."""
 
+_CELLS = 24
+
 
 @dataclass(frozen=True)
 class Features:
@@ -47,14 +49,15 @@ def detect_features(
 
     Args:
         image: A photograph, or pixels in [0, 1], grey or red, green, blue.
-        max_features: How many points are kept at most: those of the highest contrast, which match best.
+        max_features: How many points are kept at most: those of high contrast, which match best, but from all over the image,
+            as poses want them. A point's contrast counts divided by its rank among those of its cell, of 24 along the image.
         contrast: Smallest contrast, in the units of OpenCV's `contrastThreshold`.
         edge: Points whose principal curvatures have a larger ratio than this lie on an edge and are dropped.
         max_size: Larger images are scaled down to this longer side for the detection; positions are those of the image given.
 
     Returns:
-        The points in descending order of contrast, on the CPU; always the same for the same image. An image without structure
-        has no points.
+        The points in the order in which they were chosen, on the CPU; always the same for the same image. An image without
+        structure has no points.
 
     Raises:
         ValueError: The shape of the image or an option is wrong.
@@ -69,13 +72,12 @@ def detect_features(
     if shrink < 1:
         gray = cv2.resize(gray, (max(1, round(width * shrink)), max(1, round(height * shrink))), interpolation=cv2.INTER_AREA)
     # Without the precise option OpenCV's first octave, and with it every point, is shifted by a quarter of a pixel.
-    sift = cv2.SIFT.create(max_features, 3, contrast, edge, 1.6, enable_precise_upscale=True)
-    keypoints, raw = sift.detectAndCompute(gray, None)
+    sift = cv2.SIFT.create(0, 3, contrast, edge, 1.6, enable_precise_upscale=True)
+    keypoints = sift.detect(gray, None)
     table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
-    raw = np.zeros((0, 128), np.float32) if raw is None else raw
-    # OpenCV keeps every point that ties with the last.
-    order = np.lexsort((table[:, 3], table[:, 2], table[:, 0], table[:, 1], -table[:, 4]))[:max_features]
-    table, raw = table[order], raw[order]
+    order = _spread(table, max(gray.shape) / _CELLS)[:max_features]
+    table = table[order]
+    raw = sift.compute(gray, [keypoints[i] for i in order])[1] if len(order) else np.zeros((0, 128), np.float32)
     zoom = np.array([width / gray.shape[1], height / gray.shape[0]])
     return Features(
         x=torch.from_numpy((table[:, :2] + 0.5) * zoom - 0.5).float(),
@@ -84,6 +86,17 @@ def detect_features(
         response=torch.from_numpy(table[:, 4]).float(),
         descriptors=_root_sift(torch.from_numpy(raw)),
     )
+
+
+def _spread(table: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
+    """The rows (x, y, size, angle, response) by response over rank in their cell."""
+    order = np.lexsort((table[:, 3], table[:, 2], table[:, 0], table[:, 1], -table[:, 4]))
+    row, column = (table[order, 1] // cell).astype(np.int64), (table[order, 0] // cell).astype(np.int64)
+    by_cell = np.lexsort((column, row))  # stable: strongest first in each cell
+    new = np.append(True, (np.diff(row[by_cell]) != 0) | (np.diff(column[by_cell]) != 0))[: len(order)]
+    rank = np.empty(len(order))
+    rank[by_cell] = np.arange(len(order)) - np.maximum.accumulate(np.where(new, np.arange(len(order)), 0)) + 1
+    return order[np.argsort(-table[order, 4] / rank, kind="stable")]
 
 
 def _gray_bytes(pixels: Tensor) -> NDArray[np.uint8]:
