@@ -46,7 +46,7 @@ def homography_4pt(
     """
     batch = check_tensors(x1=(x1, "4 2"), x2=(x2, "4 2"))
     with torch.no_grad():
-        rows1, rows2 = (x.detach().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0).contiguous() for x in (x1, x2))
+        rows1, rows2 = (x.detach().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0) for x in (x1, x2))
         starts = range(0, max(rows1.shape[-1], 1), _CHUNK)
         chunks = [_solve(rows1[..., i : i + _CHUNK], rows2[..., i : i + _CHUNK]) for i in starts]
         rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
@@ -57,45 +57,41 @@ def homography_4pt(
     return Solutions(H, valid)
 
 
-def _centred(x: Float[Tensor, "4 2 batch"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Three points (3, 2, batch) with the fourth at the origin and the largest coordinate 1; what undoes it; what is fine."""
-    origin = x[3]
-    offset = x[:3] - origin
-    size = offset.abs().amax((0, 1))
-    fine = torch.isfinite(size) & torch.isfinite(origin.abs().amax(0)) & (size > 0)
-    scale = 1 / torch.where(fine, size, 1)
-    return torch.where(fine, offset * scale, 0), torch.where(fine, origin, 0), scale, fine
-
-
-def _weights(y: Tensor) -> Tensor:
-    """The weights of three points in the fourth, which is the origin: 2x2 cross products."""
-    u, v = y.unbind(1)
-    return torch.stack((u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]))
-
-
 def _solve(x1: Float[Tensor, "4 2 batch"], x2: Float[Tensor, "4 2 batch"]) -> tuple[Tensor, Tensor]:
     """H as (9, batch) and valid as (batch)."""
-    y1, c1, s1, fine1 = _centred(x1)
-    y2, c2, s2, fine2 = _centred(x2)
-    l1, l2 = _weights(y1), _weights(y2)
-    w = l2 * torch.stack((l1[1] * l1[2], l1[2] * l1[0], l1[0] * l1[1]))
-    # Rows of adj [p1 p2 p3] times w, and with x1 in its own coordinates again: (a, b, c) -> (a, b, c / s - a c_u - b c_v).
-    u, v = y1.unbind(1)
-    first = torch.stack((v[1] - v[2], v[2] - v[0], v[0] - v[1])) * w
-    second = torch.stack((u[2] - u[1], u[0] - u[2], u[1] - u[0])) * w
-    third = l1 * w / s1 - first * c1[0] - second * c1[1]
-    q = torch.stack((first, second, third))
-    # Columns [p'1 p'2 p'3] in coordinates of the second image: (y / s + c, 1).
-    bottom = add_rows(q.unbind(1))
-    a, b = y2.unbind(1)
-    inverse = 1 / s2
-    top = combine_rows(q.unbind(1), a) * inverse + c2[0] * bottom
-    middle = combine_rows(q.unbind(1), b) * inverse + c2[1] * bottom
-    H = torch.cat((top, middle, bottom))
+    # Both images together, the fourth point at the origin and the largest coordinate 1. NaN and inf show in the size.
+    x = torch.stack((x1, x2), 2)
+    y = x[:3] - x[3]
+    size = y.abs().amax((0, 1))
+    fine = ((size > 0) & (size < torch.inf)).all(0)
+    u, v = (y * (1 / size)).unbind(1)
+    # The weights of three points in the fourth are 2x2 cross products.
+    (u0, u1, u2), (v0, v1, v2) = u.unbind(0), v.unbind(0)
+    weights = torch.stack((u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0))
+    areas = torch.cat((weights, add_rows(weights)[None])).abs().amin((0, 1))
+    # First image: u, v, weights k; second: a, b, weights m.
+    (k0, m0), (k1, m1), (k2, m2) = (row.unbind(0) for row in weights.unbind(0))
+    (u0, a0), (u1, a1), (u2, a2) = u0.unbind(0), u1.unbind(0), u2.unbind(0)
+    (v0, b0), (v1, b1), (v2, b2) = v0.unbind(0), v1.unbind(0), v2.unbind(0)
+    (cu, ca), (cv, cb) = x[3, 0].unbind(0), x[3, 1].unbind(0)
+    d1, d2 = size.unbind(0)
+    w0, w1, w2 = m0 * k1 * k2, m1 * k2 * k0, m2 * k0 * k1
+
+    def column(p: Tensor, q: Tensor, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The points of the second image with these weights, in its own coordinates."""
+        low = p + q + r
+        top, middle = combine_rows((a0, a1, a2), (p, q, r)), combine_rows((b0, b1, b2), (p, q, r))
+        return torch.addcmul(top * d2, ca, low), torch.addcmul(middle * d2, cb, low), low
+
+    # Columns of adj [p1 p2 p3]'; then (a, b, c) -> (a, b, c d - a cu - b cv) for the first image's own coordinates.
+    first = column((v1 - v2) * w0, (v2 - v0) * w1, (v0 - v1) * w2)
+    second = column((u2 - u1) * w0, (u0 - u2) * w1, (u1 - u0) * w2)
+    third = column(k0 * w0, k1 * w1, k2 * w2)
+    last = [c * d1 - a * cu - b * cv for a, b, c in zip(first, second, third, strict=True)]
+    H = torch.stack([entry for row in zip(first, second, last, strict=True) for entry in row])
     # The squares of small numbers must not vanish.
     H = H / H.abs().amax(0)
-    H = H * combine_rows(H, H).rsqrt()
-    areas = torch.cat((l1, l2, add_rows(l1)[None], add_rows(l2)[None])).abs().amin(0)
-    valid = fine1 & fine2 & (areas > 64 * torch.finfo(H.dtype).eps) & torch.isfinite(H).all(0)
+    square = combine_rows(H, H)
+    valid = fine & (areas > 64 * torch.finfo(H.dtype).eps) & torch.isfinite(square)
     identity = torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1) / 3**0.5
-    return torch.where(valid, H, identity), valid
+    return torch.where(valid, H * square.rsqrt(), identity), valid
