@@ -63,9 +63,6 @@ def fundamental_7pt(
 
 def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tuple[Tensor, Tensor]:
     """F as (9, 3, batch) and valid as (3, batch)."""
-    count = x1.shape[-1]
-    if count == 1:
-        x1, x2 = x1.repeat(1, 1, 2), x2.repeat(1, 1, 2)
     h1, c1, s1, fine1 = _normalised(x1)
     h2, c2, s2, fine2 = _normalised(x2)
     basis, pivot = nullspace_rows((h2[:, :, None] * h1[:, None]).flatten(1, 2))
@@ -93,7 +90,7 @@ def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tu
     valid = real & (fine1 & fine2 & (torch.minimum(pivot, some) > _INDEPENDENT)) & torch.isfinite(F).all(0)
     # An empty slot holds diag(1, 1, 0).
     empty = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=F.dtype, device=F.device)[:, None, None] / 2**0.5
-    return torch.where(valid, F, empty)[..., :count], valid[..., :count]
+    return torch.where(valid, F, empty), valid
 
 
 def _normalised(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
