@@ -83,7 +83,9 @@ def grow_model(
     empty = Mapping.start(mapping.graph, mapping.track, mapping.cameras, mapping.camera_index)
     best: tuple[Mapping, dict[int, str]] | None = None
     available = int((~mapping.registered).sum())
-    for start in starting_pairs(mapping, threshold=options.reprojection, generator=options.generator)[:MAX_STARTS]:
+    unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[mapping.camera_index]
+    starts = starting_pairs(mapping, unknown_focal, threshold=options.reprojection, generator=options.generator)
+    for start in starts[:MAX_STARTS]:
         model = place_start(empty, start, threshold=options.reprojection)
         model = adjust(model, free=(), tolerance=1e-4)
         model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -29,7 +29,12 @@ class Start:
 
 
 def starting_pairs(
-    mapping: Mapping, *, threshold: float, generator: torch.Generator | None, candidates: int = 16
+    mapping: Mapping,
+    unknown_focal: Bool[Tensor, "v"],
+    *,
+    threshold: float,
+    generator: torch.Generator | None,
+    candidates: int = 16,
 ) -> list[Start]:
     """Pairs of unregistered images to start from, the most promising first.
 
@@ -38,13 +43,14 @@ def starting_pairs(
 
     Args:
         mapping: A mapping; its registered images are not considered.
+        unknown_focal: Images whose focal length is only a guess.
         threshold: Largest distance of an inlier from the epipolar line in pixels.
         generator: Source of randomness.
         candidates: Number of pairs whose essential matrix is estimated.
     """
     graph = mapping.graph
     K = mapping.cameras.K[mapping.camera_index]
-    verdict = graph.verdicts(K)
+    verdict = graph.verdicts(K, unknown_focal)
     free = ~mapping.registered[graph.pairs].any(-1)
     usable = free & ((verdict == Verdict.GENERAL) | (verdict == Verdict.PLANAR))
     ratio = graph.homography_inliers / graph.fundamental_inliers.clamp(min=1)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
-from torchsfm.reconstruction.incremental import MappingOptions, grow_model
+from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, grow_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
@@ -86,7 +86,8 @@ def build_models(
                 _save_model(models[-1], stages.folder, len(models) - 1)
         models.sort(key=lambda model: (-model.num_registered, -model.num_points))
     progress("map", len(graph.names), len(graph.names))
-    verdict = graph.verdicts(cameras.K[camera_index])
+    unknown_focal = (focal_uncertainty(source) >= UNKNOWN_FOCAL)[camera_index]
+    verdict = graph.verdicts(cameras.K[camera_index], unknown_focal)
     pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
     images = _image_reports(graph, models, reasons, failures, order)
     return SfmResult(tuple(models), Report(images, pairs, dict(stages.seconds), source))
@@ -105,7 +106,7 @@ def _image_reports(
     order: Sequence[str],
 ) -> tuple[ImageReport, ...]:
     features = torch.bincount(graph.view, minlength=len(graph.names)).tolist()
-    related = graph.pairs[graph.fundamental_inliers >= MIN_INLIERS].flatten()
+    related = graph.pairs[torch.maximum(graph.fundamental_inliers, graph.homography_inliers) >= MIN_INLIERS].flatten()
     linked = torch.bincount(related, minlength=len(graph.names)).tolist()
     reports: list[ImageReport] = []
     position = 0

@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -71,18 +71,23 @@ class ViewGraph:
     match: Int[Tensor, "k 2"]
     match_pair: Int[Tensor, "k"]
 
-    def verdicts(self, K: Float[Tensor, "v 3 3"]) -> Int[Tensor, "q"]:
-        """The `Verdict` on each pair, given (roughly known) intrinsics of each image.
+    def verdicts(self, K: Float[Tensor, "v 3 3"], unknown_focal: Bool[Tensor, "v"]) -> Int[Tensor, "q"]:
+        """The `Verdict` on each pair, given intrinsics of each image, and where their focal length is only a guess.
 
         A pair is called planar or rotating when its homography explains at least 80 % of what the fundamental matrix does
-        (Schönberger & Frahm 2016, section 4.1); the singular values of `K2^-1 H K1` are equal for a rotation alone.
+        (Schönberger & Frahm 2016, section 4.1). The singular values of `K2^-1 H K1` are equal for a rotation alone; where the
+        focal length is a guess, equal at any focal length will do.
         """
-        related = self.fundamental_inliers >= MIN_INLIERS
+        related = torch.maximum(self.fundamental_inliers, self.homography_inliers) >= MIN_INLIERS
         flat = self.homography_inliers >= 0.8 * self.fundamental_inliers
-        K1, K2 = K[self.pairs[:, 0]], K[self.pairs[:, 1]]
+        scales = torch.logspace(-0.5, 0.5, 21, dtype=K.dtype)[:, None]
+        scales = torch.where(unknown_focal, scales, 1.0)
+        tried = K.repeat(len(scales), 1, 1, 1)
+        tried[..., :2, :2] *= scales[..., None, None]
+        K1, K2 = tried[:, self.pairs[:, 0]], tried[:, self.pairs[:, 1]]
         turn = torch.linalg.solve_ex(K2, self.H @ K1).result
         s = torch.linalg.svdvals(turn)
-        spread = s[:, 0] / s[:, 2].clamp(min=1e-12) - 1
+        spread = (s[..., 0] / s[..., 2].clamp(min=1e-12) - 1).amin(0)
         verdict = torch.where(flat, int(Verdict.PLANAR), int(Verdict.GENERAL))
         verdict = torch.where(flat & (spread < 0.05), int(Verdict.ROTATION), verdict)
         return torch.where(related, verdict, int(Verdict.UNRELATED))
@@ -135,14 +140,19 @@ def verify_pairs(
         epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, **options)
         F[block] = epipolar.model
         num_F[block] = epipolar.inliers.sum(-1) * (epipolar.status == Status.OK)
-        related = num_F[block] >= MIN_INLIERS
+        # Images that do not differ, or differ by a homography, may leave F undetermined and yet have all in common.
+        related = (num_F[block] >= MIN_INLIERS) | (epipolar.status == Status.DEGENERATE)
         if bool(related.any()):
             planar = estimate_homography(x1[related], x2[related], threshold=limit[related], mask=mask[related], **options)
             H[block[related]] = planar.model
             num_H[block[related]] = planar.inliers.sum(-1) * (planar.status == Status.OK)
+            planar_inliers = torch.zeros_like(mask)
+            planar_inliers[related] = planar.inliers
         for row, index in enumerate(block.tolist()):
             if num_F[index] >= MIN_INLIERS:
                 kept[index] = matches[index][epipolar.inliers[row, : len(matches[index])]]
+            elif num_H[index] >= MIN_INLIERS:
+                kept[index] = matches[index][planar_inliers[row, : len(matches[index])]]
     verified = sorted(kept)
     edges = [kept[index] + offset[pairs[index]] for index in verified]
     sizes = torch.tensor([len(e) for e in edges], dtype=torch.long)
