@@ -21,7 +21,7 @@ from torchsfm.motion import essential_5pt, fundamental_7pt, homography_4pt
 F64 = torch.float64
 K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=F64)
 Sample = tuple[Tensor, Tensor, Tensor]
-Solver = Callable[[Tensor, Tensor], list[Tensor]]
+Solver = Callable[[Tensor, Tensor], Any]
 SIZES = {"essential_5pt": 5, "fundamental_7pt": 7, "homography_4pt": 4}
 OURS = {"essential_5pt": essential_5pt, "fundamental_7pt": fundamental_7pt, "homography_4pt": homography_4pt}
 
@@ -58,9 +58,9 @@ def scene(name: str, family: str, count: int, seed: int = 0) -> Sample:
 def ours(name: str) -> Solver:
     """One batched call; invalid slots as NaN."""
 
-    def solve(x1: Tensor, x2: Tensor) -> list[Tensor]:
+    def solve(x1: Tensor, x2: Tensor) -> Tensor:
         solutions = OURS[name](x1, x2)
-        return list(torch.where(solutions.valid[..., None, None], solutions.model, torch.nan))
+        return torch.where(solutions.valid[..., None, None], solutions.model, torch.nan)
 
     return solve
 
@@ -95,9 +95,9 @@ def peers(name: str) -> dict[str, Solver]:
         from kornia.geometry.homography import find_homography_dlt
 
         found["kornia"] = {
-            "essential_5pt": lambda a, b: list(find_essential(a[..., :2], b[..., :2])),
-            "fundamental_7pt": lambda a, b: list(find_fundamental(a, b, method="7POINT")),
-            "homography_4pt": lambda a, b: list(find_homography_dlt(a, b)),
+            "essential_5pt": lambda a, b: find_essential(a[..., :2], b[..., :2]),
+            "fundamental_7pt": lambda a, b: find_fundamental(a, b, method="7POINT"),
+            "homography_4pt": find_homography_dlt,
         }[name]
     except ImportError:
         pass
@@ -107,7 +107,7 @@ def peers(name: str) -> dict[str, Solver]:
 def one_by_one(function: Callable[..., Any], unit: bool = False, single: bool = False) -> Solver:
     """A solver for one sample of numpy arrays, called in a loop."""
 
-    def solve(x1: Tensor, x2: Tensor) -> list[Tensor]:
+    def solve(x1: Tensor, x2: Tensor) -> list[Any]:
         if unit:
             x1, x2 = (torch.nn.functional.normalize(x, dim=-1) for x in (x1, x2))
         if single:
@@ -118,7 +118,7 @@ def one_by_one(function: Callable[..., Any], unit: bool = False, single: bool = 
     return solve
 
 
-def distances(models: list[Any], truth: Tensor) -> Tensor:
+def distances(models: Any, truth: Tensor) -> Tensor:
     """Of the nearest solution from the truth, 2 where there is none."""
     result = torch.full((len(models),), 2.0, dtype=F64)
     truth = truth / truth.norm(dim=(-2, -1), keepdim=True)
@@ -179,7 +179,7 @@ def test_speed(benchmark: Any, name: str, batch: int) -> None:
     x1, x2, truth = scene(name, "random", batch)
     solutions = benchmark(OURS[name], x1, x2)
     models = torch.where(solutions.valid[..., None, None], solutions.model, torch.nan)
-    assert (distances(list(models), truth) < 1e-6).double().mean() > 0.99
+    assert (distances(models, truth) < 1e-6).double().mean() > 0.99
 
 
 if __name__ == "__main__":
