@@ -198,6 +198,8 @@ def test_focal_follows_max_size(tmp_path: Path, picture: np.ndarray) -> None:
     averaged = torch.nn.functional.avg_pool2d(whole.pixels, 2)
     assert (small.pixels - averaged).abs().max() < 1 / 255
     assert read_image(tmp_path / "a.jpg", max_size=100).pixels.shape == (3, 48, 80)
+    with pytest.raises(ValueError, match="max_size"):
+        read_image(tmp_path / "a.jpg", max_size=0)
 
 
 @pytest.mark.parametrize("tags", [{FOCAL_35MM: 0}, {FOCAL_35MM: 65535}, {FOCAL: (5, 0)}, {FOCAL: (5, 1), X_RESOLUTION: (0, 1)}])
@@ -278,6 +280,9 @@ def test_forbidden_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(Path, "read_bytes", refuse)
     with pytest.raises(ImageError, match=r"cannot be read \(Permission denied"):
         read_image(tmp_path / "a.png")
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(ImageError, match=r"cannot be read \(Permission denied"):
+        list_images(tmp_path)
 
 
 def test_a_thumbnail_does_not_hide_a_cut(tmp_path: Path, picture: np.ndarray) -> None:

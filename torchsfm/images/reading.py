@@ -67,12 +67,15 @@ def list_images(folder: str | os.PathLike[str]) -> list[Path]:
     """The image files in a folder (not in its subfolders), in natural order: `view2.jpg` before `view10.jpg`.
 
     Raises:
-        ImageError: There is no such folder.
+        ImageError: There is no such folder, or it cannot be read.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise ImageError(f"{folder}: no such folder" if not folder.exists() else f"{folder}: not a folder")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+    try:
+        found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+    except OSError as error:
+        raise ImageError(f"{folder}: cannot be read ({error.strerror or error})") from None
     return sorted((path for path in found if path.is_file()), key=_natural)
 
 
@@ -97,7 +100,10 @@ def read_image(path: str | os.PathLike[str], *, gray: bool = False, max_size: in
 
     Raises:
         ImageError: The file is missing, unreadable, empty, cut short, or no image.
+        ValueError: `max_size` is not positive.
     """
+    if max_size is not None and max_size < 1:
+        raise ValueError(f"max_size: wanted at least 1, got {max_size}")
     path = Path(path)
     data = _read_bytes(path)
     array, white = _decode(data, path, gray=gray)
