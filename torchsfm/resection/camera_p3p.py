@@ -15,8 +15,30 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.optim import wants_derivative
+from torchsfm.resection._vectors import (
+    Rows,
+    Vector,
+    across,
+    chosen,
+    combined,
+    cross,
+    detached,
+    dot,
+    each,
+    fma,
+    fms,
+    largest,
+    minus,
+    scaled,
+    together,
+    triad,
+    vector,
+    vectors,
+)
 
 SQRT2 = 2.0**0.5
+PIECE = 2048
+"""Problems solved at a time, so that what is in use stays in the cache."""
 
 
 def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"]) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
@@ -40,43 +62,35 @@ def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"])
         ValueError: Shapes, dtypes or devices do not fit.
     """
     batch = check_tensors(d=(d, "3 3"), X=(X, "3 3"))
-    dtype = d.dtype
-    # Structure of arrays: (point, coordinate, problem).
-    rays = d.double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0).contiguous()
-    points = X.double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0).contiguous()
-    sound = _sound(rays.detach(), points.detach(), torch.finfo(dtype).eps)
-    safe = rays.new_tensor(_SAFE)[..., None]
-    rays, points = torch.where(sound, rays, safe), torch.where(sound, points, safe)
+    rays, points = (a.double().expand(*batch, 3, 3).reshape(batch.numel(), 9) for a in (d, X))
+    eps, differentiable = torch.finfo(d.dtype).eps, wants_derivative(d, X)
+    if len(rays) <= PIECE or torch.compiler.is_compiling():
+        model, valid = _solve(rays, points, eps, differentiable)
+    else:
+        starts = range(0, len(rays), PIECE)
+        pieces = [_solve(rays[i : i + PIECE], points[i : i + PIECE], eps, differentiable) for i in starts]
+        model, valid = (torch.cat(parts) for parts in zip(*pieces, strict=True))
+    return Solutions(model.to(d.dtype).reshape(*batch, 4, 3, 4), valid.reshape(*batch, 4))
 
-    u = rays * (rays * rays).sum(1, keepdim=True).rsqrt()
+
+def _solve(rays: Tensor, points: Tensor, eps: float, differentiable: bool) -> tuple[Tensor, Tensor]:
+    """Poses (problem, 48) and validity (problem, slot) of rays and points (problem, 9) of precision eps."""
+    # Structure of arrays: (point and coordinate, problem).
+    rays, points = rays.t().contiguous(), points.t().contiguous()
+    sound = _sound(rays.detach(), points.detach(), eps)
+    safe = rays.new_tensor(_SAFE)[:, None]
+    u = [scaled(ray, dot(ray, ray).rsqrt()) for ray in vectors(torch.where(sound, rays, safe))]
+    X = vectors(torch.where(sound, points, safe))
     with torch.no_grad():
-        triangle = _Triangle(u.detach(), points.detach())
-        depths, valid = triangle.depths()
-        depths, valid = triangle.polish(depths, valid & sound)
-    differentiable = wants_derivative(d, X)
+        triangle = _Triangle([detached(v) for v in u], [detached(v) for v in X])
+        solved = [triangle.polish(depths, valid & sound) for depths, valid in triangle.candidates()]
     if differentiable:
-        # Two Newton steps from the solution: no change of value, and derivatives exact to second order.
-        triangle = _Triangle(u, points)
-        rows = depths.unbind(0)
-        for _ in range(2):
-            rows, _ = triangle.newton(rows, valid)
-        moved = torch.stack(rows)
-        depths = depths + (moved - moved.detach())
-
-    # (slot, point, coordinate, problem)
-    Y = depths.transpose(0, 1)[:, :, None] * u
-    if differentiable:
-        Y = torch.where(valid[:, None, None], Y, Y.detach())
-    X0, X1, X2 = points.unbind(0)
-    Y0, Y1, Y2 = Y.unbind(1)
-    a1, a2, a3 = _triad(X1 - X0, X2 - X0, 0)
-    b1, b2, b3 = _triad(Y1 - Y0, Y2 - Y0, 1)
-    R = torch.addcmul(torch.addcmul(b1[:, :, None] * a1, b2[:, :, None], a2), b3[:, :, None], a3)
-    m = X0 + X1 + X2
-    moved = torch.addcmul(torch.addcmul(b1 * (a1 * m).sum(0), b2, (a2 * m).sum(0)), b3, (a3 * m).sum(0))
-    t = (Y0 + Y1 + Y2 - moved) / 3
-    model = torch.cat((R, t[:, :, None]), 2).reshape(48, -1).t()
-    return Solutions(model.to(dtype).reshape(*batch, 4, 3, 4), valid.t().reshape(*batch, 4))
+        triangle = _Triangle(u, X)
+        solved = [(triangle.follow(depths, valid), valid) for depths, valid in solved]
+    poses = [_pose(u, X, depths, valid if differentiable else None) for depths, valid in solved]
+    # (row, column, slot, problem) to (problem, slot, row, column)
+    model = torch.cat(poses, 2).permute(2, 0, 1, 3).reshape(48, sound.shape[0]).t()
+    return model, torch.cat([valid if valid.ndim > 1 else valid[None] for _, valid in solved]).t()
 
 
 def equations(
@@ -92,216 +106,219 @@ def equations(
     rows, columns = torch.triu_indices(3, 3, device=R.device)
     Y = X @ R.mT + t[..., None, :]
     u = d / torch.linalg.vector_norm(d, dim=-1, keepdim=True)
-    across = [(Y * e).sum(-1) / torch.linalg.vector_norm(Y.detach(), dim=-1) for e in _across(u.unbind(-1), -1)]
-    shape = torch.broadcast_shapes(gram.shape[:-2], across[0].shape[:-1])  # type: ignore[no-untyped-call]
-    return torch.cat([g.expand(*shape, -1) for g in (gram[..., rows, columns], *across)], -1)
+    sideways = [dot(Y.unbind(-1), e) / torch.linalg.vector_norm(Y.detach(), dim=-1) for e in across(u.unbind(-1))]
+    shape = torch.broadcast_shapes(gram.shape[:-2], sideways[0].shape[:-1])  # type: ignore[no-untyped-call]
+    return torch.cat([g.expand(*shape, -1) for g in (gram[..., rows, columns], *sideways)], -1)
 
 
-_SAFE = ((1.0, 0.0, 1.0), (0.0, 1.0, 1.0), (-1.0, 0.0, 1.0))
+_SAFE = (1.0, 0.0, 1.0, 0.0, 1.0, 1.0, -1.0, 0.0, 1.0)
 """A harmless triangle, put where the data are not usable."""
 
 
 def _sound(rays: Tensor, points: Tensor, eps: float) -> Tensor:
     """Finite data, rays with a direction, points not in a line; (problem)."""
-    # What is not finite is not equal to itself when subtracted from itself.
-    zero = (rays - rays).sum((0, 1)) + (points - points).sum((0, 1))
-    X0, X1, X2 = points.unbind(0)
-    e1, e2, e3 = X1 - X0, X2 - X0, X2 - X1
-    normal = _cross(e1, e2, 0)
-    longest = torch.maximum(torch.maximum((e1 * e1).sum(0), (e2 * e2).sum(0)), (e3 * e3).sum(0))
+    # What is not finite is not 0 when subtracted from itself.
+    zero = ((rays - rays) + (points - points)).sum(0)
+    X0, X1, X2 = vectors(points)
+    e1, e2, e3 = minus(X1, X0), minus(X2, X0), minus(X2, X1)
+    normal = cross(e1, e2)
+    longest = torch.maximum(torch.maximum(dot(e1, e1), dot(e2, e2)), dot(e3, e3))
     # Twice the area against the longest side squared; rounding of far coordinates also counts.
-    rounding = eps * points.abs().amax((0, 1)) * longest.sqrt()
-    area = (normal * normal).sum(0).sqrt()
-    pointed = (rays * rays).sum(1).amin(0) > 1e-200
-    return (zero == 0) & (area > 16 * eps * longest) & (area > 4 * rounding) & pointed
+    reach = (points * points).sum(0)
+    area = dot(normal, normal)
+    flat = (area <= (16 * eps * longest) ** 2) | (area <= (4 * eps) ** 2 * reach * longest)
+    r0, r1, r2 = (dot(ray, ray) for ray in vectors(rays))
+    return (zero == 0) & ~flat & (torch.minimum(torch.minimum(r0, r1), r2) > 1e-200)
 
 
-def _cross(a: Tensor, b: Tensor, dim: int) -> Tensor:
-    """The cross product along a dimension."""
-    a0, a1, a2 = a.unbind(dim)
-    b0, b1, b2 = b.unbind(dim)
-    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0), dim)
-
-
-def _triad(a: Tensor, b: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The orthonormal frame of `a` and the normal of `a` and `b`, vectors along a dimension."""
-    normal = _cross(a, b, dim)
-    first = a * (a * a).sum(dim, keepdim=True).clamp_min(1e-300).rsqrt()
-    third = normal * (normal * normal).sum(dim, keepdim=True).clamp_min(1e-300).rsqrt()
-    return first, _cross(third, first, dim), third
-
-
-def _across(u: tuple[Tensor, ...], dim: int) -> tuple[Tensor, Tensor]:
-    """Two unit vectors orthogonal to a unit vector given by components, and to each other (Duff et al. 2017)."""
-    x, y, z = u
-    s = torch.copysign(torch.ones_like(z), z)
-    a = -1 / (s + z)
-    b = x * y * a
-    return torch.stack((1 + s * x * x * a, s * b, -s * x), dim), torch.stack((b, s + y * y * a, -y), dim)
-
-
-def _fma(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """`a b + c` in one pass over memory, which is what this solver's time goes to."""
-    return torch.addcmul(c, a, b)
-
-
-def _fms(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """`c - a b`."""
-    return torch.addcmul(c, a, b, value=-1)
+def _pose(u: list[Vector], X: list[Vector], depths: Rows, valid: Tensor | None) -> Tensor:
+    """`[R | t]` (3, 4, slot, problem) that takes the triangle X to the one at the depths; slots not `valid` detached."""
+    X, u = ([together([v])[0] for v in vectors] for vectors in (X, u))
+    Y = [scaled(ray, depth) for ray, depth in zip(u, depths, strict=True)]
+    if valid is not None:
+        Y = [chosen(valid, v, detached(v)) for v in Y]
+    a = triad(minus(X[1], X[0]), minus(X[2], X[0]))
+    b = triad(minus(Y[1], Y[0]), minus(Y[2], Y[0]))
+    columns = [each(lambda x, y, z, j=j: fma(x, a[0][j], fma(y, a[1][j], z * a[2][j])), *b) for j in range(3)]
+    m = each(lambda x, y, z: (x + y + z) * (1 / 3), *X)
+    t = each(lambda x, y, z: (x + y + z) * (1 / 3), *Y)
+    for j in range(3):
+        t = each(lambda x, y, j=j: fms(y, m[j], x), t, columns[j])
+    stacked = [v if isinstance(v, Tensor) else torch.stack(v) for v in (*columns, t)]
+    return torch.stack([v if v.ndim > 2 else v[:, None] for v in stacked], 1)
 
 
 class _Triangle:
-    """The three quadrics in the depths, for rays `u` and points `X` as (point, coordinate, problem).
+    """The three quadrics in the depths.
 
     Pairs of points come in the order 01, 02, 12. Every form is written with `1 - u_i'u_j` taken from the difference of
     the rays: for narrow fields of view the scalar product itself has lost the angle.
     """
 
-    def __init__(self, u: Tensor, X: Tensor) -> None:
-        edge = torch.stack((X[0] - X[1], X[0] - X[2], X[1] - X[2]))
-        chord = torch.stack((u[0] - u[1], u[0] - u[2], u[1] - u[2]))
-        self.u = u
-        self.a = (edge * edge).sum(1)
-        self.n2 = (chord * chord).sum(1)
+    def __init__(self, u: list[Vector], X: list[Vector]) -> None:
+        edges = minus(X[0], X[1]), minus(X[0], X[2]), minus(X[1], X[2])
+        chords = minus(u[0], u[1]), minus(u[0], u[2]), minus(u[1], u[2])
+        self.a = tuple(dot(e, e) for e in edges)
+        self.n2 = tuple(dot(c, c) for c in chords)
+        self.volume = dot(u[0], cross(u[1], u[2]))
 
-    def depths(self) -> tuple[Tensor, Tensor]:
-        """Candidates (point, slot, problem) for the depths and which of them are real and positive."""
-        a, n = self.a, 0.5 * self.n2
-        total = a.sum(0)
-        a0, a1, a2 = (a / total).unbind(0)
-        # Orthonormal directions of the pencil: weights of the three forms that cancel the right-hand sides.
-        root = _fma(a0, a0, a1 * a1).rsqrt()
+    def candidates(self) -> list[tuple[Rows, Tensor]]:
+        """Slots for the depths, four in all, and which of them are real and positive."""
+        p, q = self._pencil()
+        n = each(lambda m: 0.5 * m, vector(*self.n2))
+        s = each(lambda k: k * (2 - k), n)
+        mixed = fms(self.volume, self.volume, s[0] + s[1] + s[2])
+
+        def determinant(w: Vector) -> Tensor:
+            w0, w1, w2 = w
+            f = fma(w0 + w1, w2 * w2 * s[2], (w1 + w2) * (w0 * w0 * s[0]))
+            return fma(w0 * w1 * w2, mixed, fma(w0 + w2, w1 * w1 * s[1], f))
+
+        # The cubic along the pencil from four directions, the one with the largest value turned to infinity.
+        u, v = each(lambda x, y: (x + y) * (1 / SQRT2), p, q), each(lambda x, y: (y - x) * (1 / SQRT2), p, q)
+        values = [determinant(w) for w in together([p, u, q, v])]
+        f0, f1, f2, f3 = values if len(values) == 4 else values[0].unbind(0)
+        diagonal = torch.maximum(f1.abs(), f3.abs()) > torch.maximum(f0.abs(), f2.abs())
+        p, q = chosen(diagonal, u, p), chosen(diagonal, v, q)
+        g: list[Tensor] = [torch.where(diagonal, x, y) for x, y in ((f1, f0), (f2, f1), (f3, f2), (-f0, f3))]
+        swap = g[2].abs() > g[0].abs()
+        p, q = chosen(swap, q, p), chosen(swap, each(lambda x: -x, p), q)
+        g = [torch.where(swap, x, y) for x, y in ((g[2], g[0]), (g[3], g[1]), (-g[0], g[2]), (-g[1], g[3]))]
+        inverse = 1 / g[0]
+        c2, c1 = SQRT2 * (g[1] + g[3]) - g[2], SQRT2 * (g[1] - g[3]) - g[0]
+        root = _separate_root(c2 * inverse, c1 * inverse, g[2] * inverse)
+        size = fma(root, root, torch.ones_like(root)).rsqrt()
+        w = each(lambda x, y: fma(root, x, y) * size, p, q)
+        other = each(lambda x, y: fms(root, y, x) * size, p, q)
+        total = self.a[0] + self.a[1] + self.a[2]
+        slots = [slot for line in together(list(self._lines(w, n))) for slot in self._meet(line, other, n, total)]
+        if torch.compiler.is_compiling():
+            return slots
+        parts = zip(*((*depths, real) for depths, real in slots), strict=True)
+        l0, l1, l2, real = (torch.cat(part) for part in parts)
+        return [((l0, l1, l2), real)]
+
+    def _pencil(self) -> tuple[Vector, Vector]:
+        """Orthonormal weights of the three forms that cancel the right-hand sides."""
+        a0, a1, a2 = self.a
+        root = fma(a0, a0, a1 * a1).rsqrt()
         p0, p1 = a1 * root, -a0 * root
-        q0, q1, q2 = -a2 * p1, a2 * p0, _fms(a1, p0, a0 * p1)
-        root = _fma(q0, q0, _fma(q1, q1, q2 * q2)).rsqrt()
-        p = torch.stack((p0, p1, torch.zeros_like(p0)))
-        q = torch.stack((q0, q1, q2)) * root
-        turned = torch.stack((p, (p + q) * (1 / SQRT2), q, (q - p) * (1 / SQRT2)), 1)
+        q = vector(-a2 * p1, a2 * p0, fms(a1, p0, a0 * p1))
+        return vector(p0, p1, torch.zeros_like(p0)), scaled(q, dot(q, q).rsqrt())
 
-        # The determinant of a member of the pencil, and its cubic along the pencil from four values.
-        s = n * (2 - n)
-        u0, u1, u2 = self.u.unbind(0)
-        volume = (u0 * _cross(u1, u2, 0)).sum(0)
-        w0, w1, w2 = turned.unbind(0)
-        b0, b1, b2 = (turned * turned * s[:, None]).unbind(0)
-        f = _fma(w0 + w1, b2, _fma(w0 + w2, b1, (w1 + w2) * b0))
-        f = _fma(w0 * w1 * w2, _fms(volume, volume, s.sum(0)), f)
-        pick = f.abs().max(0, keepdim=True).indices
-        g0, g1, g2, g3 = torch.cat((f, -f[:3])).gather(0, pick + torch.arange(4, device=f.device)[:, None]).unbind(0)
-        both = torch.cat((turned, -turned[:, :2]), 1)
-        at = pick.expand(3, -1)[:, None]
-        p, q = both.gather(1, at)[:, 0], both.gather(1, at + 2)[:, 0]
-        inverse = 1 / g0
-        c1 = torch.sub(SQRT2 * (g1 - g3), g0)
-        c2 = torch.sub(SQRT2 * (g1 + g3), g2)
-        root = _separate_root(c2 * inverse, c1 * inverse, g2 * inverse)
-        size = _fma(root, root, torch.ones_like(root)).rsqrt()
-        w, other = _fma(root, p, q) * size, _fms(root, q, p) * size
-
-        lines = self._lines(w, n)
-        e1, e2 = _across(lines.unbind(0), 0)
-        # The other member on the line: q11 x^2 + 2 q12 x y + q22 y^2.
-        q12 = self._form(other, n, e1, e2)
-        q11, q22 = self._square(other, torch.stack((e1, e2), 1)).unbind(0)
-        product = q11 * q22
-        discriminant = _fma(q12, q12, -product)
-        slack = _fma(q12, q12, product.abs())
-        z = -(q12 + torch.copysign(discriminant.clamp_min(0).sqrt(), q12))
-        depths = torch.cat((_fma(z, e1, q11 * e2), _fma(q22, e1, z * e2)), 1)
-        real = discriminant >= -1e-9 * slack
-        # All of one sign, and of the size that the sides of the triangle ask for.
-        size = torch.copysign((total / self._square(None, depths)).sqrt(), depths.sum(0))
-        depths = depths * size
-        # False for NaN too.
-        valid = torch.cat((real, real)) & (depths.amin(0) > 0) & (depths.amax(0) < torch.inf)
-        return torch.where(valid, depths, 1.0), valid
-
-    def _lines(self, w: Tensor, n: Tensor) -> Tensor:
-        """The two lines (coordinate, line, problem) of the member of the pencil with weights w, which must be degenerate."""
-        w0, w1, w2 = w.unbind(0)
-        k0, k1, k2 = ((n - 1) * w).unbind(0)
+    def _lines(self, w: Vector, n: Vector) -> tuple[Vector, Vector]:
+        """The two lines of the member of the pencil with weights w, which must be degenerate."""
+        w0, w1, w2 = w
+        k0, k1, k2 = each(lambda m, x: fma(m, x, -x), n, w)
         d0, d1, d2 = w0 + w1, w0 + w2, w1 + w2
         # Minus the adjugate is v v' with v the common point of the lines; its diagonal without cancellation.
-        mixed = _fma(w0, d2, w1 * w2)
-        diagonal = -(mixed + (n * (2 - n) * w * w).flip(0))
-        b01, b02, b12 = _fms(k1, k2, k0 * d2), _fms(k0, k2, k1 * d1), _fms(k0, k1, k2 * d0)
-        columns = torch.stack((diagonal[0], b01, b02, b01, diagonal[1], b12, b02, b12, diagonal[2])).view(3, 3, -1)
-        largest, pick = diagonal.max(0)
-        best = columns.gather(0, pick.expand(1, 3, -1))[0]
-        v0, v1, v2 = best * largest.clamp_min(1e-300).rsqrt()
-        rank1 = torch.stack((d0, k0 - v2, k1 + v1, k0 + v2, d1, k2 - v0, k1 - v1, k2 + v0, d2)).view(3, 3, -1)
-        pick = (rank1 * rank1).sum(1).max(0).indices
-        row = rank1.gather(0, pick.expand(1, 3, -1))[0]
-        lines = torch.stack((row, (rank1 * row).sum(1)), 1)
-        return lines * (lines * lines).sum(0).clamp_min(1e-300).rsqrt()
+        mixed = fma(w0, d2, w1 * w2)
+        s0, s1, s2 = each(lambda m, x: -fma(m * (2 - m) * x, x, mixed), n, w)
+        b01, b02, b12 = fms(k1, k2, k0 * d2), fms(k0, k2, k1 * d1), fms(k0, k1, k2 * d0)
+        size, column = largest((s2, s1, s0), [vector(s2, b01, b02), vector(b01, s1, b12), vector(b02, b12, s0)])
+        v0, v1, v2 = scaled(column, size.clamp_min(1e-300).rsqrt())
+        rows = [vector(d0, k0 - v2, k1 + v1), vector(k0 + v2, d1, k2 - v0), vector(k1 - v1, k2 + v0, d2)]
+        size, row = largest(tuple(dot(r, r) for r in rows), rows)
+        first = scaled(row, size.clamp_min(1e-300).rsqrt())
+        second = vector(*(dot(r, first) for r in rows))
+        return first, scaled(second, dot(second, second).clamp_min(1e-300).rsqrt())
+
+    def _meet(self, line: Vector, w: Vector, n: Vector, total: Tensor) -> list[tuple[Rows, Tensor]]:
+        """The two points where a line meets the member of the pencil with weights w, scaled to the triangle, and if real."""
+        e1, e2 = across(line)
+        # q11 x^2 + 2 q12 x y + q22 y^2 along the line.
+        q11, q12, q22 = self._square(w, e1), self._bilinear(w, n, e1, e2), self._square(w, e2)
+        product = q11 * q22
+        discriminant = fma(q12, q12, -product)
+        real = discriminant >= -1e-9 * fma(q12, q12, product.abs())
+        z = -(q12 + torch.copysign(discriminant.clamp_min(0).sqrt(), q12))
+        slots: list[tuple[Rows, Tensor]] = []
+        for depths in together([combined(z, e1, q11, e2), combined(q22, e1, z, e2)]):
+            # All of one sign, and of the size that the sides of the triangle ask for.
+            l0, l1, l2 = depths
+            size = torch.copysign((total / self._square(None, depths)).sqrt(), l0 + l1 + l2)
+            rows = l0 * size, l1 * size, l2 * size
+            # False for NaN too.
+            ahead = (rows[0] > 0) & (rows[1] > 0) & (rows[2] > 0) & (rows[0] + rows[1] + rows[2] < torch.inf)
+            both = real if ahead.shape == real.shape else torch.cat((real, real))
+            slots.append((rows, both & ahead))
+        return slots
 
     @staticmethod
-    def _form(w: Tensor, n: Tensor, x: Tensor, y: Tensor) -> Tensor:
-        """The bilinear form with weights w of the three pairs, for x and y as (point, ..., problem)."""
-        x0, x1, x2 = x.unbind(0)
-        y0, y1, y2 = y.unbind(0)
-        f = w[0] * _fma(x0 - x1, y0 - y1, n[0] * _fma(x0, y1, x1 * y0))
-        f = _fma(w[1], _fma(x0 - x2, y0 - y2, n[1] * _fma(x0, y2, x2 * y0)), f)
-        return _fma(w[2], _fma(x1 - x2, y1 - y2, n[2] * _fma(x1, y2, x2 * y1)), f)
+    def _bilinear(w: Vector, n: Vector, x: Vector, y: Vector) -> Tensor:
+        """The bilinear form with weights w of the three pairs."""
+        x0, x1, x2 = x
+        y0, y1, y2 = y
+        f = w[0] * fma(x0 - x1, y0 - y1, n[0] * fma(x0, y1, x1 * y0))
+        f = fma(w[1], fma(x0 - x2, y0 - y2, n[1] * fma(x0, y2, x2 * y0)), f)
+        return fma(w[2], fma(x1 - x2, y1 - y2, n[2] * fma(x1, y2, x2 * y1)), f)
 
-    def _square(self, w: Tensor | None, x: Tensor) -> Tensor:
-        """The quadratic form with weights w, all 1 if not given, for x as (point, ..., problem)."""
-        x0, x1, x2 = x.unbind(0)
-        m0, m1, m2 = self.n2.unbind(0)
+    def _square(self, w: Vector | None, x: Vector) -> Tensor:
+        """The quadratic form with weights w, all 1 if not given."""
+        x0, x1, x2 = x
+        m = self.n2
         e0, e1, e2 = x0 - x1, x0 - x2, x1 - x2
-        f0, f1, f2 = _fma(e0, e0, m0 * x0 * x1), _fma(e1, e1, m1 * x0 * x2), _fma(e2, e2, m2 * x1 * x2)
-        return f0 + f1 + f2 if w is None else _fma(w[0], f0, _fma(w[1], f1, w[2] * f2))
+        f0, f1, f2 = fma(e0, e0, m[0] * x0 * x1), fma(e1, e1, m[1] * x0 * x2), fma(e2, e2, m[2] * x1 * x2)
+        return f0 + f1 + f2 if w is None else fma(w[0], f0, fma(w[1], f1, w[2] * f2))
 
-    def newton(self, depths: tuple[Tensor, ...], valid: Tensor | None = None) -> tuple[tuple[Tensor, ...], Tensor]:
-        """One Newton step on the three quadrics from depths given as rows, and how well they were met before it.
+    def newton(self, depths: Rows, valid: Tensor | None = None) -> tuple[Rows, Tensor]:
+        """One Newton step on the three quadrics and how well they were met before it.
 
         That is the largest error of a quadric relative to its side of the triangle. Slots that are not `valid`, if given,
         stay as they are and have no derivative; otherwise what divides by zero comes out as it does.
         """
         l0, l1, l2 = depths
-        m0, m1, m2 = self.n2.unbind(0)
+        m0, m1, m2 = self.n2
         e0, e1, e2 = l0 - l1, l0 - l2, l1 - l2
         m00, m01, m10, m12, m21, m22 = m0 * l0, m0 * l1, m1 * l0, m1 * l2, m2 * l1, m2 * l2
-        minus = -self.a
-        r0 = _fma(m00, l1, _fma(e0, e0, minus[0]))
-        r1 = _fma(m10, l2, _fma(e1, e1, minus[1]))
-        r2 = _fma(m21, l2, _fma(e2, e2, minus[2]))
+        r0 = fma(m00, l1, fma(e0, e0, -self.a[0]))
+        r1 = fma(m10, l2, fma(e1, e1, -self.a[1]))
+        r2 = fma(m21, l2, fma(e2, e2, -self.a[2]))
         a0, a1 = torch.add(m01, e0, alpha=2), torch.sub(m00, e0, alpha=2)
         b0, b2 = torch.add(m12, e1, alpha=2), torch.sub(m10, e1, alpha=2)
         c1, c2 = torch.add(m22, e2, alpha=2), torch.sub(m21, e2, alpha=2)
-        p, q, m = b2 * c1, b0 * c2, _fms(b2, r2, r1 * c2)
-        det = _fma(a0, p, a1 * q)
+        p, q, m = b2 * c1, b0 * c2, fms(b2, r2, r1 * c2)
+        det = fma(a0, p, a1 * q)
         if valid is not None:
             # At a double root there is no derivative to speak of.
-            valid = valid & (det.detach().abs() > 1e-13 * (_fma(a0, p, -a1 * q)).detach().abs())
+            valid = valid & (det.detach().abs() > 1e-13 * (fma(a0, p, -a1 * q)).detach().abs())
             det = torch.where(valid, det, 1.0)
         inverse = 1 / det if valid is None else torch.where(valid, 1 / det, 0.0)
-        s0, s1 = _fma(r0, p, a1 * m), _fms(a0, m, r0 * q)
-        s2 = _fms(_fms(a0, r1, r0 * b0), c1, a1 * b0 * r2)
-        new = _fms(s0, inverse, l0), _fms(s1, inverse, l1), _fms(s2, inverse, l2)
+        s0, s1 = fma(r0, p, a1 * m), fms(a0, m, r0 * q)
+        s2 = fms(fms(a0, r1, r0 * b0), c1, a1 * b0 * r2)
+        new = fms(s0, inverse, l0), fms(s1, inverse, l1), fms(s2, inverse, l2)
         return new, self._worst(r0, r1, r2)
 
     def _worst(self, r0: Tensor, r1: Tensor, r2: Tensor) -> Tensor:
-        b0, b1, b2 = (1 / self.a).unbind(0)
-        return torch.maximum(torch.maximum((r0 * b0).abs(), (r1 * b1).abs()), (r2 * b2).abs())
+        a0, a1, a2 = self.a
+        return torch.maximum(torch.maximum((r0 / a0).abs(), (r1 / a1).abs()), (r2 / a2).abs())
 
-    def polish(self, depths: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    def polish(self, depths: Rows, valid: Tensor) -> tuple[Rows, Tensor]:
         """Newton steps, unless they lead astray as at a double root; and which slots meet the quadrics in the end.
 
         Where two of the points are close to each other the start has a small error in the quadrics and a large one in the
         depths. The first step then trades one for the other, so that what counts is the error after three.
         """
-        rows, before = self.newton(depths.unbind(0))
+        rows, before = self.newton(depths)
         rows, _ = self.newton(rows)
         rows, _ = self.newton(rows)
         _, after = self.newton(rows)
-        polished = torch.stack(rows)
         # False for NaN too.
         better = after <= before
-        depths = torch.where(better, polished, depths)
-        size = 1e-10 + 1e-14 * (depths * depths).amax(0) / self.a.amin(0)
-        valid = valid & (torch.where(better, after, before) <= size) & (depths.amin(0) > 0)
-        return torch.where(valid, depths, 1.0), valid
+        l0, l1, l2 = (torch.where(better, new, old) for new, old in zip(rows, depths, strict=True))
+        reach = torch.maximum(torch.maximum(l0, l1), l2)
+        shortest = torch.minimum(torch.minimum(self.a[0], self.a[1]), self.a[2])
+        # Rounding of far points against a small triangle; but not so far that any depth would do.
+        rounding = (1e-14 * reach * reach / shortest).clamp_max(1e-5)
+        close = torch.where(better, after, before) <= 1e-10 + rounding
+        valid = valid & close & (l0 > 0) & (l1 > 0) & (l2 > 0)
+        return tuple(torch.where(valid, depth, 1.0) for depth in (l0, l1, l2)), valid
+
+    def follow(self, depths: Rows, valid: Tensor) -> Rows:
+        """The same depths with their derivatives: those of two Newton steps from the solution, exact to second order."""
+        rows, _ = self.newton(depths, valid)
+        rows, _ = self.newton(rows, valid)
+        return tuple(depth + (row - row.detach()) for depth, row in zip(depths, rows, strict=True))
 
 
 def _separate_root(a: Tensor, b: Tensor, c: Tensor) -> Tensor:

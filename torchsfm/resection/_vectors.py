@@ -1,0 +1,106 @@
+"""Three-vectors of rows: small formulas for thousands of problems, in as few passes over memory as possible."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Rows = tuple[Tensor, ...]
+Vector = Tensor | Rows
+"""Three numbers per problem, as a tensor (3, ..., problem) or as three tensors (..., problem).
+
+Eager mode wants few operations on stacked numbers, a compiler wants every number by itself; the formulas are the same for both.
+"""
+
+
+def vectors(block: Tensor) -> list[Vector]:
+    """Three vectors out of (9, problem)."""
+    if torch.compiler.is_compiling():
+        rows = block.unbind(0)
+        return [rows[:3], rows[3:6], rows[6:]]
+    return list(block.reshape(3, 3, block.shape[-1]).unbind(0))
+
+
+def vector(*rows: Tensor) -> Vector:
+    return rows if torch.compiler.is_compiling() else torch.stack(rows)
+
+
+def each(function: Callable[..., Tensor], *vectors: Vector) -> Vector:
+    """A function of numbers, applied to each of the three of vectors."""
+    if isinstance(vectors[0], Tensor):
+        return function(*vectors)
+    return tuple(function(*numbers) for numbers in zip(*vectors, strict=True))
+
+
+def together(vectors: list[Vector]) -> list[Vector]:
+    """Vectors to which the same is done, stacked into one (3, k, problem) if that helps."""
+    stacked = [v for v in vectors if isinstance(v, Tensor)]
+    return [torch.cat([v if v.ndim > 2 else v[:, None] for v in stacked], 1)] if stacked else vectors
+
+
+def detached(v: Vector) -> Vector:
+    return each(lambda x: x.detach(), v)
+
+
+def fma(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """`a b + c`."""
+    return torch.addcmul(c, a, b)
+
+
+def fms(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """`c - a b`."""
+    return torch.addcmul(c, a, b, value=-1)
+
+
+def minus(a: Vector, b: Vector) -> Vector:
+    return each(lambda x, y: x - y, a, b)
+
+
+def scaled(a: Vector, k: Tensor) -> Vector:
+    return each(lambda x: x * k, a)
+
+
+def combined(k: Tensor, a: Vector, m: Tensor, b: Vector) -> Vector:
+    """`k a + m b`."""
+    return each(lambda x, y: fma(k, x, m * y), a, b)
+
+
+def chosen(mask: Tensor, a: Vector, b: Vector) -> Vector:
+    return each(lambda x, y: torch.where(mask, x, y), a, b)
+
+
+def dot(a: Vector, b: Vector) -> Tensor:
+    if isinstance(a, Tensor) and isinstance(b, Tensor):
+        return (a * b).sum(0)
+    return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    a0, a1, a2 = a
+    b0, b1, b2 = b
+    return vector(fms(a2, b1, a1 * b2), fms(a0, b2, a2 * b0), fms(a1, b0, a0 * b1))
+
+
+def largest(keys: Vector, values: list[Vector]) -> tuple[Tensor, Vector]:
+    """The largest of three keys and the one of three vectors that belongs to it."""
+    second = keys[1] > keys[0]
+    key = torch.maximum(keys[0], keys[1])
+    value = chosen(second, values[1], values[0])
+    return torch.maximum(key, keys[2]), chosen(keys[2] > key, values[2], value)
+
+
+def triad(a: Vector, b: Vector) -> tuple[Vector, Vector, Vector]:
+    """The orthonormal frame of `a` and the normal of `a` and `b`."""
+    normal = cross(a, b)
+    first = scaled(a, dot(a, a).clamp_min(1e-300).rsqrt())
+    third = scaled(normal, dot(normal, normal).clamp_min(1e-300).rsqrt())
+    return first, cross(third, first), third
+
+
+def across(u: Vector) -> tuple[Vector, Vector]:
+    """Two unit vectors orthogonal to a unit vector and to each other (Duff et al. 2017)."""
+    x, y, z = u
+    s = torch.copysign(torch.ones_like(z), z)
+    a = -1 / (s + z)
+    b = x * y * a
+    return vector(1 + s * x * x * a, s * b, -s * x), vector(b, s + y * y * a, -y)
