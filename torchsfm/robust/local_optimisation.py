@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.scoring import squared_residual
+from torchsfm.robust.scoring import around_model, squared_residual
 
 M = TypeVar("M")
 
@@ -68,16 +68,13 @@ def polish(
         steps: Number of rounds.
     """
     k = estimator.codimension
-    near, far = 2.0, 6.0
-    # Size of the unit ball and surface of the standard Gaussian at 0, in k dimensions.
-    ball = math.pi ** (k / 2) / math.gamma(k / 2 + 1)
-    peak = (2 * math.pi) ** (-k / 2)
+    # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
+    peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
     present = inside[:, None]
     variance = number = None
     for _ in range(steps):
         ratio = squared_residual(estimator, model, *data) / limit[:, None, None]
-        between = ((ratio > near * near) & (ratio < far * far) & present).sum(-1, keepdim=True)
-        density = (between + 0.5) / (ball * (far**k - near**k))
+        density = around_model(ratio, present, k)[..., None]
         if variance is None or number is None:
             core = ((ratio < 1) & present).to(ratio.dtype)
             number = core.sum(-1, keepdim=True).clamp(min=1)

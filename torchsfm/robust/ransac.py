@@ -16,8 +16,8 @@ from torchsfm._types import Status, check_tensors, tensor_map
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import cast, zip_map
 from torchsfm.robust.problems import pack
-from torchsfm.robust.scoring import squared_residual
-from torchsfm.robust.search import ROUNDS, Options, no_model, search
+from torchsfm.robust.scoring import around_model, beyond_chance, squared_residual
+from torchsfm.robust.search import Options, no_model, search
 
 M = TypeVar("M")
 
@@ -32,8 +32,8 @@ class RobustResult(Generic[M]):
         score: Sum over the data of max(0, 1 - squared distance / squared threshold): a soft number of inliers.
         iterations: Number of samples drawn.
         status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample
-            determined a model; `NO_CONSENSUS`: no model was supported by more data than its own sample (model and inliers are
-            then those of the best one).
+            determined a model; `NO_CONSENSUS`: no model was supported by more data than its own sample or chance explain
+            (model and inliers are then those of the best one).
     """
 
     model: M
@@ -51,7 +51,7 @@ def ransac(
     scores: Float[Tensor, "*#batch n"] | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
-    min_iterations: int = ROUNDS[0],
+    min_iterations: int = 64,
     max_iterations: int = 10_000,
     scoring_dtype: torch.dtype | None = None,
 ) -> RobustResult[M]:
@@ -72,7 +72,7 @@ def ransac(
         generator: Source of randomness; PyTorch's global one if not given.
         confidence: Wanted probability of having drawn a sample without outliers.
         min_iterations: Fewest samples to draw for a problem.
-        max_iterations: Most samples to draw for a problem, rounded up to a whole round of at least 64.
+        max_iterations: Most samples to draw for a problem, rounded up to a whole round.
         scoring_dtype: Type for scoring hypotheses; that of the data if not given. float32 is enough for data of moderate size
             around 0.
 
@@ -118,8 +118,13 @@ def ransac(
             member = problems.member
             squared = squared_residual(problems.estimator, best.model, *problems.data)
             near = (squared < problems.limit[:, None]) & problems.inside
-            soft = torch.where(near, 1 - squared / problems.limit[:, None], 0).sum(-1)
-            fate = torch.where(best.support > estimator.sample_size, int(Status.OK), int(Status.NO_CONSENSUS))
+            ratio = squared / problems.limit[:, None]
+            soft = torch.where(near, 1 - ratio, 0).sum(-1)
+            expected = around_model(ratio, problems.inside, estimator.codimension)
+            agreed = (near.sum(-1) > estimator.sample_size) & beyond_chance(
+                soft, problems.count, expected, estimator.sample_size
+            )
+            fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
             status[member] = torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8)
             model = zip_map(lambda old, new: old.index_copy(0, member, new), model, best.model)  # noqa: B023
             inliers[member] = problems.scatter(near, n)

@@ -26,7 +26,12 @@ def hash_integers(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
 
 
 def draw_samples(
-    seed: int, count: Int[Tensor, "g"], first: Int[Tensor, "g"], hypotheses: int, size: int, pool: Int[Tensor, "g h"] | None = None
+    seed: int,
+    count: Int[Tensor, "g"],
+    first: Int[Tensor, "g"],
+    hypotheses: int,
+    size: int,
+    pool: Int[Tensor, "g h"] | None = None,
 ) -> Int[Tensor, "g size h"]:
     """Distinct indices below `count` for each problem and hypothesis, every subset equally likely (Floyd's algorithm).
 

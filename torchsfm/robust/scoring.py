@@ -1,5 +1,6 @@
 """How well models are supported: the truncated squared distance (MSAC), on more and more data for fewer and fewer models."""
 
+import math
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -104,3 +105,40 @@ def gather_valid(valid: Bool[Tensor, "g s"]) -> tuple[Int[Tensor, "g _"], Bool[T
     index.scatter_(1, position, torch.arange(slots, device=valid.device).expand(g, slots))
     filled = torch.arange(columns, device=valid.device) < rank[:, -1:]
     return index[:, :columns], filled
+
+
+def around_model(
+    ratio: Float[Tensor, "*batch n"], inside: Bool[Tensor, "*#batch n"], codimension: int
+) -> Float[Tensor, "*batch"]:
+    """How many data the threshold would take in if they were as dense there as between two and six thresholds from the model.
+
+    Args:
+        ratio: Squared distances in units of the squared threshold.
+        inside: Which slots hold data.
+        codimension: The number of dimensions across the model.
+    """
+    between = ((ratio > 4) & (ratio < 36) & inside).sum(-1)
+    return (between + 0.5) / (6**codimension - 2**codimension)
+
+
+def beyond_chance(
+    support: Float[Tensor, "p"], count: Int[Tensor, "p"], expected: Float[Tensor, "p"], size: int
+) -> Bool[Tensor, "p"]:
+    """Whether so much support is more than the best of all samples finds by chance (Moisan & Stival 2004, bounded by entropy).
+
+    If a datum fits with probability p, a share q of n data does with probability exp(-n KL(q || p)) at most (Sanov's bound), and
+    there are (n over size) samples to choose from.
+
+    Args:
+        support: Soft number of inliers.
+        count: Number of data.
+        expected: How many data would fit by chance.
+        size: Number of data in a sample.
+    """
+    n = (count - size).to(support.dtype)
+    q = ((support - size) / n.clamp(min=1)).clamp(1e-9, 1 - 1e-9)
+    p = (expected / count).to(support.dtype).clamp(1e-4, 1 - 1e-9)
+    entropy = torch.where(q > p, q * (q / p).log() + (1 - q) * ((1 - q) / (1 - p)).log(), 0)
+    samples = torch.lgamma(n + size + 1.0) - torch.lgamma(n + 1.0) - math.lgamma(size + 1)
+    # Where nearly all data agree, there is no other explanation, however few they are.
+    return (n * entropy > samples) | (q > 0.9)

@@ -16,7 +16,7 @@ from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import draw_samples, guided_pools
 from torchsfm.robust.scoring import gather_valid, losses, smallest, squared_residual, stages, truncated_loss
 
-ROUNDS = (64, 128, 256, 512, 1024, 2048)
+ROUNDS = (16, 32, 64, 128, 256, 512, 1024, 2048)
 """How many samples a round may draw for a problem."""
 SCORED = 8
 """Hypotheses of a round that are scored on all data."""
@@ -64,7 +64,8 @@ def search(problems: Problems, options: Options) -> Best:
     p, device = len(problems.count), problems.count.device
     infinite = torch.full((p,), torch.inf, dtype=options.dtype, device=device)
     none = torch.zeros(p, dtype=torch.long, device=device)
-    best = Best(cast(no_model(problems.estimator, problems.data, p), options.dtype), infinite, none, infinite, none > 0, none)
+    model = cast(no_model(problems.estimator, problems.data, p), options.dtype)
+    best = Best(model, infinite, none, infinite, none > 0, none)
     coarse = problems.cast(options.dtype)
     active = torch.arange(p, device=device)
     while len(active):
@@ -78,7 +79,7 @@ def search(problems: Problems, options: Options) -> Best:
 def _round_size(drawn: Int[Tensor, "g"], needed: Float[Tensor, "g"], options: Options) -> Int[Tensor, "g"]:
     """How many samples to draw next: as many as drawn so far, or the rest if that is fewer; 0 for a problem that is done."""
     rest = torch.maximum(needed, torch.full_like(needed, options.min_iterations)).clamp(max=options.max_iterations) - drawn
-    wanted = torch.minimum(rest, drawn.clamp(min=1).to(rest.dtype))
+    wanted = torch.minimum(rest, drawn.clamp(min=options.min_iterations).to(rest.dtype))
     sizes = torch.tensor(ROUNDS, device=drawn.device)
     size = sizes[torch.searchsorted(sizes, wanted.ceil().long()).clamp(max=len(ROUNDS) - 1)]
     return torch.where(rest > 0, size, 0)
@@ -110,7 +111,8 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
     for part in _split(index, number, _SAMPLES):
         models, valid = _hypotheses(fine.take(part), best.iterations[part], number, options.seed)
         parts.append((*_cascade(coarse.take(part), cast(models, options.dtype), valid), valid.any(-1)))
-    models, loss, solved = join([m for m, _, _ in parts]), torch.cat([x for _, x, _ in parts]), torch.cat([v for _, _, v in parts])
+    models = join([part[0] for part in parts])
+    loss, solved = (torch.cat([part[i] for part in parts]) for i in (1, 2))
     best = replace(
         best,
         solved=best.solved.index_put((index,), best.solved[index] | solved),
@@ -196,15 +198,12 @@ def _polished(problems: Problems, best: Best) -> Best:
         loss = truncated_loss(squared, some.limit, some.inside)
         support = ((squared < some.limit[:, None, None]) & some.inside[:, None]).sum(-1)
         winner = (loss[:, :1] > 1.02 * loss[:, 1:]).long()
-        model = tensor_map(lambda t: t[:, 0], take_slots(both, winner))
         parts.append(
-            Best(
-                model,
-                loss.gather(1, winner)[:, 0],
-                support.gather(1, winner)[:, 0],
-                old.minimal_loss,
-                old.solved,
-                old.iterations,
+            replace(
+                old,
+                model=tensor_map(lambda t: t[:, 0], take_slots(both, winner)),
+                loss=loss.gather(1, winner)[:, 0],
+                support=support.gather(1, winner)[:, 0],
             )
         )
     return join(parts)
