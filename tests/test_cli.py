@@ -152,6 +152,16 @@ def test_no_bars_and_no_colours_outside_a_terminal(finished: tuple[Path, str], c
     assert stderr.splitlines()[0] == "finding features ..."
 
 
+def test_the_core_dependencies_are_enough(courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for extra in ("pycolmap", "plotly", "matplotlib"):
+        monkeypatch.setitem(sys.modules, extra, None)
+    images = sorted(courtyard.glob("*.png"))[:2]
+    status, text, _ = torchsfm("reconstruct", *images, "--out", tmp_path)
+    assert status == 0
+    assert {"model.npz", "points.ply", "page.html", "report.md", "report.json"} <= {path.name for path in tmp_path.iterdir()}
+    assert "colmap  not written: the package pycolmap is not installed" in text
+
+
 def test_the_demonstration_finds_the_truth(tmp_path: Path) -> None:
     status, text, _ = torchsfm("demo", "--out", tmp_path, "--views", 5, "--width", 400)
     assert status == 0
