@@ -1,8 +1,8 @@
 """Robust estimation against PoseLib and OpenCV: time and error on simulated pairs.
 
-`python -m bench.ransac` prints a table; `pytest bench/ransac.py` times one case of each model. Times are of one thread, as CPU time, so
-that they mean something on a busy machine. The peers are asked for the same confidence; PoseLib runs with `dyn_num_trials_mult=1`
-and `min_iterations=100`, else it would draw three times the samples.
+`python -m bench.ransac` prints a table; `pytest bench/ransac.py` times one case of each model. Times are of one thread, as CPU
+time, so that they mean something on a busy machine. The peers are asked for the same confidence; PoseLib runs with
+`dyn_num_trials_mult=1` and `min_iterations=100`, else it would draw three times the samples.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from torch import Tensor
 from torchsfm.geometry import random_rotation, rotation_angle, rotation_from_rotvec
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography
 from torchsfm.resection import estimate_camera
-from torchsfm.tensors import pose_from_essential, essential_from_fundamental
+from torchsfm.tensors import essential_from_fundamental, pose_from_essential
 
 FOCAL, SIZE = 800.0, 1000.0
 CENTRE = SIZE / 2

@@ -1,9 +1,9 @@
 """Sampson's distance to an epipolar geometry and its Gauss-Newton equations, for points in a plane and for rays on a sphere.
 
-With the residual e = h2' F h1 and its gradient g over the tangents of both points, the distance is e / |g| (Sampson 1982; Luong
-& Faugeras 1996). Its derivative with respect to F is, up to second order in the distance, that of e alone at the points
-corrected to first order, divided by |g|: h2 (x) h1 / |g|. So the normal matrix is the sum of (h2 h2') (x) (h1 h1') / |g|^2, made
-of 6 x 6 sums. Everything is written in rows: one tensor for each coordinate of all points.
+With the residual e = h2' F h1 and its gradient g over the tangents of both points, the distance is e / |g| (Sampson 1982;
+Luong & Faugeras 1996). Its derivative with respect to F is, up to second order in the distance, that of e alone at the points
+corrected to first order, divided by |g|: h2 (x) h1 / |g|. So the normal matrix is the sum of (h2 h2') (x) (h1 h1') / |g|^2,
+made of 6 x 6 sums. Everything is written in rows: one tensor for each coordinate of all points.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def forms(A: Float[Tensor, "*#batch r 3"], h: Sequence[Tensor]) -> list[Tensor]:
     """The linear forms a'h of some points, one for each row a of A."""
     if one_data_set_for_many(A, h[0]):
         models, r = A.shape[-3], A.shape[-2]
-        product = A.reshape(*A.shape[:-3], models * r, 3) @ torch.cat(torch.broadcast_tensors(*h), -2)
+        product = A.reshape(*A.shape[:-3], models * r, 3) @ torch.cat(list(h), -2)
         return list(product.reshape(*product.shape[:-2], models, r, product.shape[-1]).unbind(-2))
     columns = [[A[..., i, j, None] for j in range(3)] for i in range(A.shape[-2])]
     return [a * h[0] + b * h[1] + c * h[2] for a, b, c in columns]
@@ -101,14 +101,26 @@ def normal_equations(
     p1 = [a - shift * b for a, b in zip(h1, l1, strict=False)] + list(h1[len(l1) :])
     p2 = [a - shift * b for a, b in zip(h2, l2, strict=False)] + list(h2[len(l2) :])
     x, y, z = p1
-    right = torch.stack(torch.broadcast_tensors(x * x, y * y, z * z, x * y, x * z, y * z), -2)
+    right = _stack([x * x, y * y, z * z, x * y, x * z, y * z])
     x, y, z = p2
     sx, sy, sz, se = scale * x, scale * y, scale * z, scale * e
-    left = torch.stack(torch.broadcast_tensors(sx * x, sy * y, sz * z, sx * y, sx * z, sy * z), -2)
+    left = _stack([sx * x, sy * y, sz * z, sx * y, sx * z, sy * z])
     moments = (left @ right.mT).double().flatten(-2)
-    A = moments.index_select(-1, torch.tensor(_KRONECKER, device=F.device)).unflatten(-1, (9, 9))
-    b = torch.stack(torch.broadcast_tensors(x * se, y * se, z * se), -2) @ torch.stack(torch.broadcast_tensors(*p1), -2).mT
+    A = matrices(moments.index_select(-1, torch.tensor(_KRONECKER, device=F.device)), 9)
+    b = _stack([x * se, y * se, z * se]) @ _stack(p1).mT
     return A, b.double().flatten(-2)
+
+
+def _stack(rows: Sequence[Tensor]) -> Tensor:
+    shape = max((row.shape for row in rows), key=len)
+    for row in rows:
+        shape = shape if row.shape == shape else torch.Size(max(a, b) for a, b in zip(shape, row.shape, strict=True))
+    return torch.stack([row.expand(shape) for row in rows], -2)
+
+
+def matrices(entries: Float[Tensor, "*batch nn"], n: int) -> Float[Tensor, "*batch n n"]:
+    """Square matrices from their entries, row by row."""
+    return entries.reshape(*entries.shape[:-1], n, n)
 
 
 def cofactor_rows(F: Float[Tensor, "*batch 3 3"]) -> list[list[Tensor]]:

@@ -136,9 +136,9 @@ def estimate_essential(
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The essential matrix of each pair of calibrated cameras, from corresponding rays of which many may be wrong.
 
-    LO-RANSAC over the poses of five-point samples, scored by Sampson's distance for rays that meet in front of both cameras, then
-    a robust minimum of that distance over the poses. `pose_from_essential` turns the result into a pose. A pure rotation leaves
-    E undetermined without a sign of it here: every translation then fits.
+    LO-RANSAC over the poses of five-point samples, scored by Sampson's distance for rays that meet in front of both cameras,
+    then a robust minimum of that distance over the poses. `pose_from_essential` turns the result into a pose. A pure rotation
+    leaves E undetermined without a sign of it here: every translation then fits.
 
     Args:
         d1: Rays of the first camera, of any length, pointing to the points.
@@ -157,11 +157,10 @@ def estimate_essential(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(d1=(d1, "n 3"), d2=(d2, "n 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    batch = check_tensors(d1=(d1, "n 3"), d2=(d2, "n 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
     length1, length2 = d1.double().norm(dim=-1, keepdim=True), d2.double().norm(dim=-1, keepdim=True)
     # A ray of length 0 becomes NaN, and is left out.
     slack = threshold.double() if isinstance(threshold, Tensor) else length1.new_tensor(threshold)
-    batch = torch.broadcast_shapes(d1.shape[:-2], d2.shape[:-2], slack.shape, () if mask is None else mask.shape[:-1])
     result = ransac(
         RelativePoseEstimator(slack.expand(batch)), d1 / length1, d2 / length2, threshold=slack, mask=mask,
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,

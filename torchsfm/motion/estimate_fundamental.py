@@ -13,6 +13,7 @@ from torchsfm.motion.epipolar_fit import (
     cofactor_rows,
     cross_rows,
     forms,
+    matrices,
     normal_equations,
     plane_rows,
     squared_distance,
@@ -89,7 +90,7 @@ class FundamentalEstimator:
         gap = (cofactors * f).sum(-1) / 3 - (cofactors * free).sum(-1)
         share = (cofactors * bound).sum(-1)
         f = f - free - (gap / torch.where(share > 0, share, torch.inf))[..., None] * bound
-        F = (f * (f * f).sum(-1, keepdim=True).rsqrt()).unflatten(-1, (3, 3))
+        F = matrices(f * (f * f).sum(-1, keepdim=True).rsqrt(), 3)
         turned = _left_epipole(F)
         turned = torch.where((turned * e).sum(-1, keepdim=True) < 0, -turned, turned)
         return torch.cat((F, turned[..., None]), -1).to(x1.dtype)
@@ -108,12 +109,12 @@ def _singular(F: Tensor) -> Tensor:
     """Move matrices of small determinant to determinant 0 by Newton steps along its gradient, and to norm 1."""
     f = F.flatten(-2)
     for _ in range(3):
-        c = torch.stack([c for row in cofactor_rows(f.unflatten(-1, (3, 3))) for c in row], -1)
+        c = torch.stack([c for row in cofactor_rows(matrices(f, 3)) for c in row], -1)
         square = (c * c).sum(-1)
         f = f - ((c * f).sum(-1) / 3 / torch.where(square > 0, square, 1))[..., None] * c
         size = (f * f).sum(-1, keepdim=True).sqrt()
         f = f / torch.where(size > 0, size, 1)
-    return f.unflatten(-1, (3, 3))
+    return matrices(f, 3)
 
 
 def estimate_fundamental(
@@ -129,9 +130,10 @@ def estimate_fundamental(
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The fundamental matrix of each pair of images, from correspondences of which many may be wrong.
 
-    LO-RANSAC over seven-point samples with the oriented epipolar constraint, then a robust minimum of Sampson's distance over the
-    matrices of rank 2. Computed in float64, hypotheses scored in float32. Points of one plane, or a pure rotation of the camera,
-    leave F undetermined without a sign of it here: compare with the inliers of `estimate_homography` at the same threshold.
+    LO-RANSAC over seven-point samples with the oriented epipolar constraint, then a robust minimum of Sampson's distance over
+    the matrices of rank 2. Computed in float64, hypotheses scored in float32. Points of one plane, or a pure rotation of the
+    camera, leave F undetermined without a sign of it here: compare with the inliers of `estimate_homography` at the same
+    threshold.
 
     Args:
         x1: Points in the first image.

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.motion.epipolar_fit import forms, plane_rows
+from torchsfm.motion.epipolar_fit import forms, matrices, plane_rows
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale
 from torchsfm.robust import RobustResult, damped_solve, ransac
@@ -22,9 +22,9 @@ _KRONECKER = [6 * _PAIR[i][k] + _PAIR[j][m] for i in range(3) for j in range(3) 
 class HomographyEstimator:
     """H with x2 ~ H x1, |H| = 1, from points of moderate size around 0. Distances are Sampson's, in the unit of the points.
 
-    With the constraint c = w x2 - y, where (y, w) = H x1, and its derivative B = x2 h3' - H_2x2 over x1 and w I over x2, the squared
-    distance is c' S^-1 c with S = B B' + w^2 I (Chum, Pajdla & Sturm 2005): to first order, the squared distance in both images
-    together to the nearest pair of points that corresponds exactly.
+    With the constraint c = w x2 - y, where (y, w) = H x1, and its derivative B = x2 h3' - H_2x2 over x1 and w I over x2, the
+    squared distance is c' S^-1 c with S = B B' + w^2 I (Chum, Pajdla & Sturm 2005): to first order, the squared distance in
+    both images together to the nearest pair of points that corresponds exactly.
     """
 
     model_name: ClassVar[str] = "homography"
@@ -80,8 +80,9 @@ class HomographyEstimator:
     ) -> Float[Tensor, "*batch 3 3"]:
         """A Gauss-Newton step on Sampson's distance along the matrices of norm 1.
 
-        Up to second order, the derivative of the distance is that of the constraint at the points corrected to first order, with
-        S held fixed. The constraint is [I, -x2] H x1, so the normal matrix is a sum of Kronecker products of 3 x 3 matrices.
+        Up to second order, the derivative of the distance is that of the constraint at the points corrected to first order,
+        with S held fixed. The constraint is [I, -x2] H x1, so the normal matrix is a sum of Kronecker products of 3 x 3
+        matrices.
         """
         c0, c1, w, (s00, s01, s11), B = _constraint(H, x1, x2)
         det = s00 * s11 - s01 * s01
@@ -97,12 +98,12 @@ class HomographyEstimator:
         z0, z1 = q00 * u + q01 * v, q01 * u + q11 * v
         metric = torch.stack((q00, q01, -z0, q11, -z1, z0 * u + z1 * v), -2)
         moments = (metric @ torch.stack((x * x, x * y, x, y * y, y, one), -2).mT).double().flatten(-2)
-        A = moments.index_select(-1, torch.tensor(_KRONECKER, device=H.device)).unflatten(-1, (9, 9))
+        A = matrices(moments.index_select(-1, torch.tensor(_KRONECKER, device=H.device)), 9)
         b = (torch.stack((-k0, -k1, k0 * u + k1 * v), -2) @ torch.stack((x, y, one), -2).mT).double().flatten(-2)
         h = H.double().flatten(-2)
         A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * h[..., :, None] * h[..., None, :]
         h = h - damped_solve(A, b[..., None])[..., 0]
-        return (h / h.norm(dim=-1, keepdim=True)).unflatten(-1, (3, 3)).to(x1.dtype)
+        return matrices(h / (h * h).sum(-1, keepdim=True).sqrt(), 3).to(x1.dtype)
 
 
 def _constraint(
@@ -138,8 +139,8 @@ def estimate_homography(
     Args:
         x1: Points in the first image.
         x2: The corresponding points in the second image, in the same unit.
-        threshold: Largest Sampson distance of an inlier, in the unit of the points. It counts errors in both images together: with the
-            same noise in both, a transfer error to one image is about 1.4 times larger.
+        threshold: Largest Sampson distance of an inlier, in the unit of the points. It counts errors in both images together:
+            with the same noise in both, a transfer error to one image is about 1.4 times larger.
         mask: Which correspondences exist. Rows that are not finite are left out too.
         scores: How much each correspondence can be trusted, the larger the more, in any unit.
         generator: Source of randomness.

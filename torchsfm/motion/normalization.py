@@ -56,4 +56,5 @@ def common_scale(
         T[..., :2, 2] = -scale[..., None] * centre
         T[..., 2, 2] = 1
         similarities.append(T)
-    return CommonScale((x1 - centres[0][..., None, :]) * s, (x2 - centres[1][..., None, :]) * s, *similarities, scale)
+    y1, y2 = (x1 - centres[0][..., None, :]) * s, (x2 - centres[1][..., None, :]) * s
+    return CommonScale(y1, y2, similarities[0], similarities[1], scale)

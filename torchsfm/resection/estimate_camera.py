@@ -113,8 +113,8 @@ def estimate_camera(
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The pose of each camera, from correspondences of image points with known points, of which many may be wrong.
 
-    LO-RANSAC over three-point samples, then a robust minimum of the reprojection error over the pose. Computed in float64, hypotheses
-    scored in float32 after centring and scaling the world.
+    LO-RANSAC over three-point samples, then a robust minimum of the reprojection error over the pose. Computed in float64,
+    hypotheses scored in float32 after centring and scaling the world.
 
     Args:
         x: Image points in pixels, without distortion.
@@ -134,7 +134,9 @@ def estimate_camera(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x=(x, "n 2"), X=(X, "n 3"), K=(K, "3 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    batch = check_tensors(
+        x=(x, "n 2"), X=(X, "n 3"), K=(K, "3 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n")
+    )
     dtype = x.dtype
     x, X, K = x.double(), X.double(), K.double()
     usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
@@ -149,7 +151,6 @@ def estimate_camera(
     intrinsics = torch.cat((intrinsics, torch.zeros_like(K[..., 2:, :])), -2)
     intrinsics[..., 2, 2] = 1
     Y = (X - centre[..., None, :]) / size[..., None, None]
-    batch = torch.broadcast_shapes(x.shape[:-2], X.shape[:-2], K.shape[:-2])
     result = ransac(
         CameraEstimator(intrinsics.expand(*batch, 3, 3)), y, Y, threshold=threshold / focal, mask=mask,
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,

@@ -54,10 +54,10 @@ def polish(
 ) -> M:
     """Reweighted least squares out to the distance where an outlier is as likely as an inlier.
 
-    The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, estimated with the probabilities
-    of being an inlier among Gaussian inliers and evenly spread outliers (expectation maximisation), and from the density of the
-    outliers, counted between two and six thresholds from the model. So the answer depends little on how well the threshold was
-    chosen. One Gauss-Newton step for each round of weights.
+    The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, estimated with the
+    probabilities of being an inlier among Gaussian inliers and evenly spread outliers (expectation maximisation), and from the
+    density of the outliers, counted between two and six thresholds from the model. So the answer depends little on how well
+    the threshold was chosen. One Gauss-Newton step for each round of weights.
 
     Args:
         estimator: The problem.

@@ -38,7 +38,8 @@ def draw_samples(
     Args:
         seed: Seed of the whole call.
         count: Number of data of each problem, at least `size`.
-        first: Number of the first hypothesis of each problem; the same hypothesis of the same problem always gets the same sample.
+        first: Number of the first hypothesis of each problem; the same hypothesis of the same problem always gets the same
+            sample.
         hypotheses: How many samples to draw for each problem.
         size: Number of indices in a sample.
         pool: Draw hypothesis by hypothesis from the first `pool` data instead of all.

@@ -118,7 +118,8 @@ def around_model(
         codimension: The number of dimensions across the model.
     """
     between = ((ratio > 4) & (ratio < 36) & inside).sum(-1)
-    return (between + 0.5) / (6**codimension - 2**codimension)
+    expected: Tensor = (between + 0.5) / (6**codimension - 2**codimension)
+    return expected
 
 
 def beyond_chance(
@@ -126,8 +127,8 @@ def beyond_chance(
 ) -> Bool[Tensor, "p"]:
     """Whether so much support is more than the best of all samples finds by chance (Moisan & Stival 2004, bounded by entropy).
 
-    If a datum fits with probability p, a share q of n data does with probability exp(-n KL(q || p)) at most (Sanov's bound), and
-    there are (n over size) samples to choose from.
+    If a datum fits with probability p, a share q of n data does with probability exp(-n KL(q || p)) at most (Sanov's bound),
+    and there are (n over size) samples to choose from.
 
     Args:
         support: Soft number of inliers.

@@ -3,5 +3,22 @@
 from torchsfm.triangulation.optimal_correction import correct_matches
 from torchsfm.triangulation.triangulate_points import Triangulation, triangulate_points
 from torchsfm.triangulation.triangulate_points_dlt import triangulate_points_dlt
+from torchsfm.triangulation.triangulate_points_robust import (
+    PointEstimator,
+    RobustTriangulation,
+    triangulate_points_robust,
+)
 
-__all__ = ["Triangulation", "correct_matches", "triangulate_points", "triangulate_points_dlt"]
+ESTIMATORS = (PointEstimator,)
+"""What `ransac` can estimate here; the contract tests run over them."""
+
+__all__ = [
+    "ESTIMATORS",
+    "PointEstimator",
+    "RobustTriangulation",
+    "Triangulation",
+    "correct_matches",
+    "triangulate_points",
+    "triangulate_points_dlt",
+    "triangulate_points_robust",
+]

@@ -1,0 +1,183 @@
+"""Points from many views of which some are wrong."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import Solutions, Status, check_tensors
+from torchsfm.robust import damped_solve, ransac
+from torchsfm.triangulation.triangulate_points import triangulate_points
+
+
+@dataclass(frozen=True)
+class PointEstimator:
+    """A point X seen in several views; a datum is an image point and the twelve entries of its camera.
+
+    Cameras are scaled so that the third coordinate of P X is the depth. Distances are reprojection errors in pixels, and
+    infinite behind the camera.
+    """
+
+    model_name: ClassVar[str] = "point"
+    data_names: ClassVar[tuple[str, ...]] = ("x", "P")
+    sample_size: ClassVar[int] = 2
+    max_solutions: ClassVar[int] = 1
+    codimension: ClassVar[int] = 2
+
+    def minimal(
+        self, x: Float[Tensor, "*#batch 2 2"], P: Float[Tensor, "*#batch 2 12"]
+    ) -> Solutions[Float[Tensor, "*batch 1 3"]]:
+        """The point nearest to two viewing rays, in the sense of linear least squares with rows of norm 1."""
+        p = P.unbind(-1)
+        # The coefficients of X and the constant, each for both equations of both views.
+        row = [torch.cat((x[..., 0] * p[8 + j] - p[j], x[..., 1] * p[8 + j] - p[4 + j]), -1) for j in range(4)]
+        inverse = 1 / (row[0] * row[0] + row[1] * row[1] + row[2] * row[2]).sqrt().clamp(min=1e-30)
+        ax, ay, az, right = row[0] * inverse, row[1] * inverse, row[2] * inverse, -row[3] * inverse
+        N = [(u * v).sum(-1) for u, v in ((ax, ax), (ax, ay), (ax, az), (ay, ay), (ay, az), (az, az))]
+        g = [(u * right).sum(-1) for u in (ax, ay, az)]
+        adjugate = (
+            N[3] * N[5] - N[4] * N[4], N[2] * N[4] - N[1] * N[5], N[1] * N[4] - N[2] * N[3],
+            N[0] * N[5] - N[2] * N[2], N[1] * N[2] - N[0] * N[4], N[0] * N[3] - N[1] * N[1],
+        )  # fmt: skip
+        det = N[0] * adjugate[0] + N[1] * adjugate[1] + N[2] * adjugate[2]
+        # The trace is 4; the smallest eigenvalue is about the squared angle between the rays.
+        valid = (det > 1e-12) & torch.isfinite(det)
+        inverse = torch.where(valid, 1 / torch.where(valid, det, 1), 0)
+        q = adjugate
+        X = torch.stack(
+            (
+                (q[0] * g[0] + q[1] * g[1] + q[2] * g[2]) * inverse,
+                (q[1] * g[0] + q[3] * g[1] + q[4] * g[2]) * inverse,
+                (q[2] * g[0] + q[4] * g[1] + q[5] * g[2]) * inverse,
+            ),
+            -1,
+        )
+        valid = valid & torch.isfinite(X).all(-1)
+        return Solutions(torch.where(valid[..., None], X, 0)[..., None, :], valid[..., None])
+
+    def squared_residual(
+        self, X: Float[Tensor, "*#batch 3"], x: Float[Tensor, "*#batch n 2"], P: Float[Tensor, "*#batch n 12"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Squared reprojection error; infinite behind the camera."""
+        u, v, depth = _project(X, P)
+        u, v = u / depth - x[..., 0], v / depth - x[..., 1]
+        return (u * u + v * v).masked_fill(~(depth > 0), torch.inf)
+
+    def residual(
+        self, X: Float[Tensor, "*#batch 3"], x: Float[Tensor, "*#batch n 2"], P: Float[Tensor, "*#batch n 12"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Reprojection error; infinite behind the camera."""
+        return self.squared_residual(X, x, P).sqrt()
+
+    def degenerate(self, x: Float[Tensor, "*#batch 2 2"], P: Float[Tensor, "*#batch 2 12"]) -> Bool[Tensor, "*batch"]:
+        """Whether both data are of one camera."""
+        return (P[..., 0, :] == P[..., 1, :]).all(-1) & torch.isfinite(x).all(-1).all(-1)
+
+    def refine(
+        self,
+        X: Float[Tensor, "*#batch 3"],
+        x: Float[Tensor, "*#batch n 2"],
+        P: Float[Tensor, "*#batch n 12"],
+        *,
+        weights: Float[Tensor, "*#batch n"],
+    ) -> Float[Tensor, "*batch 3"]:
+        """A Gauss-Newton step on the reprojection error."""
+        u, v, depth = _project(X, P)
+        good = (weights > 0) & (depth > 0)
+        inverse = torch.where(good, 1 / torch.where(good, depth, 1), 0)
+        root = torch.where(good, weights, 0).sqrt()
+        u, v = u * inverse, v * inverse
+        p = P.unbind(-1)
+        scale = inverse * root
+        ju = torch.stack([(p[j] - u * p[8 + j]) * scale for j in range(3)], -2)
+        jv = torch.stack([(p[4 + j] - v * p[8 + j]) * scale for j in range(3)], -2)
+        J = torch.cat((ju, jv), -1)
+        r = torch.cat(((u - x[..., 0]) * root, (v - x[..., 1]) * root), -1)
+        A, g = (J @ J.mT).double(), (J @ r[..., None]).double()
+        return (X - damped_solve(A, g)[..., 0]).to(x.dtype)
+
+
+def _project(X: Tensor, P: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    X0, X1, X2 = X[..., None].unbind(-2)
+    p = P.unbind(-1)
+    u, v, w = (p[i] * X0 + p[i + 1] * X1 + p[i + 2] * X2 + p[i + 3] for i in (0, 4, 8))
+    return u, v, w
+
+
+@dataclass(frozen=True)
+class RobustTriangulation:
+    """Points and which of their observations they agree with."""
+
+    model: Float[Tensor, "*batch n 3"]
+    """The points, finite always; where `status` is not OK they may mean little."""
+    inliers: Bool[Tensor, "*batch v n"]
+    """Which observations are nearer to the image of the point than the threshold."""
+    score: Float[Tensor, "*batch n"]
+    """Sum over the views of max(0, 1 - squared distance / squared threshold)."""
+    iterations: Int[Tensor, "*batch n"]
+    """Number of pairs of views tried."""
+    status: Int[Tensor, "*batch n"]
+    """OK; TOO_FEW: fewer than two observations; NOT_FINITE: fewer than two finite ones; DEGENERATE: no two rays meet at an
+    angle;
+    NO_CONSENSUS: no two views, or of three and more no three, agree on a point."""
+
+
+def triangulate_points_robust(
+    x: Float[Tensor, "*#batch v n 2"],
+    P: Float[Tensor, "*#batch v 3 4"],
+    *,
+    threshold: float | Float[Tensor, "*#batch n"],
+    visible: Bool[Tensor, "*#batch v n"] | None = None,
+    generator: torch.Generator | None = None,
+    confidence: float = 0.9999,
+    max_iterations: int = 256,
+) -> RobustTriangulation:
+    """Points from their images in known views, of which some may be wrong.
+
+    LO-RANSAC over pairs of views, for all points at once, each with its own views; then the least squares of
+    `triangulate_points` over the views that agree. With two views nothing can be called wrong but a distance beyond the
+    threshold.
+
+    Cameras per point (ragged tracks): let the points be the batch, `x (p, v, 1, 2)` and `P (p, v, 3, 4)`.
+
+    Args:
+        x: Image points, in the pixels of the cameras.
+        P: Cameras `K [R | t]`, of any scale and sign.
+        threshold: Largest reprojection error of an inlier, in pixels.
+        visible: Which views see which point; all by default. Observations that are not finite are left out too.
+        generator: Source of randomness.
+        confidence: Wanted probability of having tried a pair without wrong observations.
+        max_iterations: Most pairs to try for a point.
+
+    Returns:
+        The points with their inliers, score, iterations and status.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    batch = check_tensors(x=(x, "v n 2"), P=(P, "v 3 4"), threshold=(limit, "n"), visible=(visible, "v n: bool"))
+    dtype, (v, n) = x.dtype, x.shape[-3:-1]
+    x, P = x.double().expand(*batch, v, n, 2), P.double()
+    seen = torch.isfinite(x).all(-1) if visible is None else (visible & torch.isfinite(x).all(-1)).expand(*batch, v, n)
+    sign = torch.where(torch.linalg.det(P[..., :3]) < 0, -1.0, 1.0).to(P.dtype)
+    scale = sign / P[..., 2, :3].norm(dim=-1)
+    data = (P * scale[..., None, None]).flatten(-2).expand(*batch, v, 12)
+    found = ransac(
+        PointEstimator(), x.transpose(-3, -2), data[..., None, :, :].expand(*batch, n, v, 12),
+        threshold=threshold.double().expand(*batch, n) if isinstance(threshold, Tensor) else threshold,
+        mask=(seen if visible is None else visible.expand(*batch, v, n)).mT, generator=generator, confidence=confidence,
+        min_iterations=16, max_iterations=max_iterations,
+    )  # fmt: skip
+    inliers = found.inliers.mT
+    number = inliers.sum(-2)
+    # Two views agree by chance where their rays happen to meet, so out of more than two a third must confirm them.
+    agreed = (number >= 2) & ((number >= 3) | (seen.sum(-2) == 2))
+    status = torch.where((found.status == Status.NO_CONSENSUS) & agreed, int(Status.OK), found.status)
+    status = torch.where((status == Status.OK) & ~agreed, int(Status.NO_CONSENSUS), status)
+    final = triangulate_points(torch.where(inliers[..., None], x, 0), P, visible=inliers)
+    settled = (status == Status.OK) & (final.status == Status.OK)
+    model = torch.where(settled[..., None], final.model, found.model)
+    return RobustTriangulation(model.to(dtype), inliers, found.score.to(dtype), found.iterations, status)
