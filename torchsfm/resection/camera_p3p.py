@@ -37,7 +37,7 @@ from torchsfm.resection._vectors import (
 )
 
 SQRT2 = 2.0**0.5
-PIECE = 2048
+PIECE = 8192
 """Problems solved at a time, so that what is in use stays in the cache."""
 
 
