@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors, tensor_map
+from torchsfm._types import broadcast_shapes, check_tensors, tensor_map
 from torchsfm.geometry.distortion import Distortion, NoDistortion
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.poses import Index, index_batch
@@ -119,7 +119,7 @@ def camera_from_krt(
     """Multiply out `P = K [R | t]`."""
     check_tensors(K=(K, "3 3"), R=(R, "3 3"), t=(t, "3"))
     left, right = K @ R, K @ t[..., None]
-    batch = torch.broadcast_shapes(left.shape[:-2], right.shape[:-2])  # type: ignore[no-untyped-call]
+    batch = broadcast_shapes(left.shape[:-2], right.shape[:-2])
     return torch.cat([left.expand(*batch, 3, 3), right.expand(*batch, 3, 1)], -1)
 
 

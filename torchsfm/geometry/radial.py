@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from torchsfm._types import broadcast_shapes
 from torchsfm.linalg import solve_cubic
 
 GUARDED = 3
@@ -21,7 +22,7 @@ BLOCK = 32768
 
 def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arrays: Tensor) -> tuple[Tensor, ...]:
     """Call an elementwise function of broadcasting arrays block by block and join what it returns."""
-    shape = torch.broadcast_shapes(*(a.shape for a in arrays))  # type: ignore[no-untyped-call]
+    shape = broadcast_shapes(*(a.shape for a in arrays))
     count = shape.numel()
     if count <= BLOCK or any(a.is_cuda for a in arrays):
         return function(*arrays)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import broadcast_shapes, check_tensors
 from torchsfm.linalg import nearest_rank, null_vector
 
 
@@ -53,7 +53,7 @@ def _normalised(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor,
     """Both images in float64 with weighted centroid 0 and mean distance sqrt 2; root weights, T1, T2^-1, finite elements."""
     w = torch.ones_like(x1[..., 0]) if weights is None else weights
     w = w.double()
-    shape = torch.broadcast_shapes(x1.shape[:-1], x2.shape[:-1], w.shape)  # type: ignore[no-untyped-call]
+    shape = broadcast_shapes(x1.shape[:-1], x2.shape[:-1], w.shape)
     w = w.expand(shape)
     y1, y2 = x1.double().expand(*shape, 2), x2.double().expand(*shape, 2)
     absent = w == 0

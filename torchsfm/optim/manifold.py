@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm._types import broadcast_shapes
+
 
 @runtime_checkable
 class Manifold(Protocol):
@@ -70,7 +72,7 @@ class Subset:
     def retract(self, x: Float[Tensor, "*#b n"], delta: Float[Tensor, "*#b d"]) -> Float[Tensor, "*b n"]:
         """Addition in the free coordinates."""
         index = torch.tensor(self.free, dtype=torch.long, device=x.device)
-        shape = torch.broadcast_shapes(x.shape[:-1], delta.shape[:-1])  # type: ignore[no-untyped-call]
+        shape = broadcast_shapes(x.shape[:-1], delta.shape[:-1])
         step = torch.zeros((*shape, self.size), dtype=x.dtype, device=x.device)
         return x + step.index_add(-1, index, delta.expand(*shape, len(self.free)))
 

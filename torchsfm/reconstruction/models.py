@@ -1,6 +1,7 @@
 """From a view graph to finished models: first cameras, tracks, one model per component."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +15,14 @@ from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, g
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
-from torchsfm.reconstruction.stages import Stages
+from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
 
 MIN_IMAGES = 2
 """Smallest number of images of a model."""
+FEW_IMAGES = 60
+"""Models of so few images have matrices too small to share between threads."""
 MIN_FEATURES = 30
 """An image with fewer features shows nothing to match."""
 
@@ -59,7 +62,8 @@ def build_models(
     """
     if camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
-    with stages.timed("map"):
+    few = len(graph.names) <= FEW_IMAGES
+    with stages.timed("map"), one_thread() if few else nullcontext():
         camera_index = group_cameras(graph.image_size, labels, shared_camera)
         cameras, source = guess_cameras(graph, camera_index, model=camera, K=K, exif_focal=exif_focal)
         if track is None:

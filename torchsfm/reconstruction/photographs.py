@@ -8,18 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import ImageError, list_images, match_features, retrieve_pairs
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all, unpack
 from torchsfm.reconstruction.models import build_models
 from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
 from torchsfm.reconstruction.sequence import add_corners, sequence_pairs, track_corners
-from torchsfm.reconstruction.stages import Arrays, Stages, fingerprint
+from torchsfm.reconstruction.stages import Arrays, Stages, fingerprint, one_thread
 from torchsfm.reconstruction.view_graph import ViewGraph, verify_pairs
 
 MAX_IMAGES_ALL_PAIRS = 80
 """Up to this many images every pair is matched; beyond it, each image with those that look most alike."""
-_PAIRS_PER_STEP = 64
-"""Pairs matched between two signs of progress."""
 
 
 def reconstruct(
@@ -69,6 +68,8 @@ def reconstruct(
         ReconstructionError: Wrong input: no such folder, fewer than two readable images, an unknown camera model.
         ValueError: An argument has the wrong shape.
     """
+    if camera is not None and camera not in DISTORTION_MODELS:
+        raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
     report = progress or (lambda stage, done, total: None)
@@ -130,11 +131,8 @@ def _view_graph(
             pairs = torch.tensor(list(combinations(range(len(features)), 2)), dtype=torch.long).reshape(-1, 2)
         else:
             pairs = retrieve_pairs(features, neighbours=neighbours)
-        rows: list[Tensor] = []
-        for start in range(0, len(pairs), _PAIRS_PER_STEP):
-            progress("match", start, len(pairs))
-            rows += match_features(features, pairs[start : start + _PAIRS_PER_STEP])
-        progress("match", len(pairs), len(pairs))
+        progress("match", 0, len(pairs))
+        rows = match_features(features, pairs, progress=lambda done: progress("match", done, len(pairs)))
         return {
             "pairs": pairs,
             "count": torch.tensor([len(m) for m in rows], dtype=torch.long),
@@ -146,7 +144,7 @@ def _view_graph(
     x, color = [f.x for f in features], list(points.color)
     if sequence:
         add_corners(x, color, pairs, matches, stages.run("track", lambda: track_corners(points, progress)))
-    with stages.timed("verify"):
+    with stages.timed("verify"), one_thread():
         progress("verify", 0, len(matches))
         graph = verify_pairs(
             points.names,

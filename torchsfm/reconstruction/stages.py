@@ -85,6 +85,20 @@ class Stages:
         os.replace(partial, path)
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Compute on one thread: for thousands of small tensor operations, where handing over to a second one costs more.
+
+    On a busy machine it costs a multiple, as OpenMP's threads wait for each other at full speed.
+    """
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+
+
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` file, none of them pickled.
 

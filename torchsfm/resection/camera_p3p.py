@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.optim import wants_derivative
 from torchsfm.resection._vectors import (
     Rows,
@@ -107,7 +107,7 @@ def equations(
     Y = X @ R.mT + t[..., None, :]
     u = d / torch.linalg.vector_norm(d, dim=-1, keepdim=True)
     sideways = [dot(Y.unbind(-1), e) / torch.linalg.vector_norm(Y.detach(), dim=-1) for e in across(u.unbind(-1))]
-    shape = torch.broadcast_shapes(gram.shape[:-2], sideways[0].shape[:-1])  # type: ignore[no-untyped-call]
+    shape = broadcast_shapes(gram.shape[:-2], sideways[0].shape[:-1])
     return torch.cat([g.expand(*shape, -1) for g in (gram[..., rows, columns], *sideways)], -1)
 
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import broadcast_shapes, check_tensors
 from torchsfm.geometry.poses import Pose
 
 
@@ -30,7 +30,7 @@ def look_at(
     if up is None:
         up = centre.new_tensor([0.0, 0.0, 1.0])
     check_tensors(centre=(centre, "3"), target=(target, "3"), up=(up, "3"))
-    shape = torch.broadcast_shapes(centre.shape, target.shape, up.shape)  # type: ignore[no-untyped-call]
+    shape = broadcast_shapes(centre.shape, target.shape, up.shape)
     centre, target, up = centre.expand(shape), target.expand(shape), up.expand(shape)
     z_axis, x_axis = centre.new_tensor([0.0, 0.0, 1.0]), centre.new_tensor([1.0, 0.0, 0.0])
     forward = target - centre

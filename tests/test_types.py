@@ -1,0 +1,66 @@
+"""Shape checks and maps over tensors."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from torchsfm._types import Solutions, broadcast_shapes, check_tensors, tensor_map
+
+shapes = st.lists(st.lists(st.sampled_from([0, 1, 1, 2, 3]), max_size=3).map(tuple), max_size=4)
+
+
+@given(shapes)
+def test_shapes_broadcast_as_torch_has_it(many: list[tuple[int, ...]]) -> None:
+    try:
+        wanted = torch.broadcast_tensors(*(torch.empty(s) for s in many))[0].shape if many else torch.Size()
+    except RuntimeError:
+        with pytest.raises(ValueError, match="do not broadcast"):
+            broadcast_shapes(*many)
+    else:
+        assert broadcast_shapes(*many) == wanted
+
+
+def test_the_batch_shape_is_returned() -> None:
+    x, y = torch.zeros(4, 1, 7, 2), torch.zeros(3, 5, 2)
+    assert check_tensors(x=(x, "n>=5 2"), y=(y, "k 2"), z=(None, "3")) == (4, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"x": (torch.zeros(6, 2), "7 2")}, r"x: wanted shape \(\*batch, 7, 2\), got \(6, 2\)"),
+        ({"x": (torch.zeros(2), "n 2")}, "x: wanted shape"),
+        ({"x": (torch.zeros(6, 2), "n>=7 2")}, "n >= 7"),
+        ({"x": (torch.zeros(6, 2), "n 2"), "y": (torch.zeros(5, 2), "n 2")}, "y: wanted n = 6 as x has"),
+        ({"x": (torch.zeros(6, 2), "n 2"), "y": (torch.zeros(6, 2).double(), "n 2")}, "y: wanted dtype torch.float32"),
+        ({"x": (torch.zeros(6, 2).long(), "n 2")}, "x: wanted a floating point tensor"),
+        ({"m": (torch.zeros(6), "n: bool")}, "m: wanted a bool tensor"),
+        ({"i": (torch.zeros(6, dtype=torch.bool), "n: int")}, "i: wanted a int tensor"),
+        ({"x": (torch.zeros(6, device="meta"), "n"), "y": (torch.zeros(6), "n")}, "y: wanted device meta"),
+        ({"x": (torch.zeros(3, 6), "n"), "y": (torch.zeros(4, 6), "n")}, "batch dimensions do not broadcast"),
+        ({"x": ([1.0], "n")}, "x: wanted a torch.Tensor"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments: dict[str, tuple[Tensor, str]], message: str, unchecked: None) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_tensors(**arguments)
+
+
+@dataclass(frozen=True)
+class Nested:
+    a: Tensor
+    b: tuple[Tensor, int]
+    c: dict[str, list[Tensor]]
+
+
+def test_tensors_are_mapped_wherever_they_are() -> None:
+    one = torch.ones(2)
+    mapped = tensor_map(lambda t: t + 1, Nested(one, (one, 5), {"k": [one]}))
+    assert mapped.a.tolist() == mapped.b[0].tolist() == mapped.c["k"][0].tolist() == [2, 2]
+    assert mapped.b[1] == 5
+    solutions = tensor_map(lambda t: t[0], Solutions(torch.ones(2, 3), torch.ones(2, 3, dtype=torch.bool)))
+    assert solutions.model.shape == solutions.valid.shape == (3,)
