@@ -95,7 +95,7 @@ def ransac(
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
     with torch.no_grad():
         flat = [d.double().expand(*batch, n, d.shape[-1]).reshape(-1, n, d.shape[-1]) for d in data]
-        fields = tensor_map(lambda t: t.expand(*batch, *t.shape[len(batch) :]).reshape(-1, *t.shape[len(batch) :]), estimator)
+        fields = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(-1, *t.shape[len(batch) :]), estimator)
         fields = cast(fields, torch.float64)
         square = (limit.double() ** 2).expand(batch).reshape(-1)
         p = len(square)

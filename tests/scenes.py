@@ -1,0 +1,143 @@
+"""Random scenes for every estimator: measurements of a known model, in the estimator's own form of data and model."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import random_rotation, rotation_angle, rotation_from_rotvec
+
+FOCAL = 1.5
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A batch of problems for one estimator."""
+
+    estimator: Any
+    data: tuple[Tensor, ...]
+    model: Tensor
+    """The model behind the data, `(*batch, ...)`."""
+    error: Callable[[Tensor, Tensor], Tensor]
+    """Distance between two models, without unit, blind to scale and sign where they mean nothing."""
+    spoil: Callable[[tuple[Tensor, ...], Tensor, torch.Generator], tuple[Tensor, ...]]
+    """Replace the data where a mask says so by wrong ones."""
+    noise: float
+    """The noise in the data, a standard deviation per coordinate."""
+
+
+def make_scene(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float = 0.0) -> Scene:
+    """A scene for an estimator class, found by its `model_name`; float64, images about 2 wide."""
+    return _SCENES[kind.model_name](kind, batch, n, generator, noise)  # type: ignore[attr-defined]
+
+
+def _points(batch: tuple[int, ...], n: int, generator: torch.Generator) -> Tensor:
+    X = torch.rand(*batch, n, 3, generator=generator, dtype=torch.float64) * 4 - 2
+    return X + torch.tensor([0.0, 0.0, 6.0], dtype=torch.float64)
+
+
+def _motion(batch: tuple[int, ...], generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    w = (torch.rand(*batch, 3, generator=generator, dtype=torch.float64) - 0.5) * 0.8
+    t = torch.randn(*batch, 3, generator=generator, dtype=torch.float64)
+    return rotation_from_rotvec(w), t / t.norm(dim=-1, keepdim=True)
+
+
+def _image(X: Tensor, noise: float, generator: torch.Generator) -> Tensor:
+    x = X[..., :2] / X[..., 2:] * FOCAL
+    return x + noise * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+
+
+def _skew(t: Tensor) -> Tensor:
+    zero = torch.zeros_like(t[..., 0])
+    x, y, z = t.unbind(-1)
+    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).reshape(*t.shape[:-1], 3, 3)
+
+
+def _wrong_last(data: tuple[Tensor, ...], wrong: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Spread the second points over the image."""
+    first, second = data
+    anywhere = (torch.rand(second.shape, generator=generator, dtype=second.dtype) - 0.5) * 2
+    if second.shape[-1] == 3:
+        anywhere[..., 2] = 1
+        anywhere[..., :2] *= 0.7
+    return first, torch.where(wrong[..., None], anywhere, second)
+
+
+def _wrong_first(data: tuple[Tensor, ...], wrong: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Spread the image points over the image, and leave what they are matched with."""
+    second, first = _wrong_last((data[1], data[0]), wrong, generator)
+    return first, second
+
+
+def _up_to_scale(A: Tensor, B: Tensor) -> Tensor:
+    A, B = (M[..., :3].flatten(-2) for M in (A, B))
+    A, B = (v / v.norm(dim=-1, keepdim=True) for v in (A, B))
+    return torch.minimum((A - B).norm(dim=-1), (A + B).norm(dim=-1))
+
+
+def _pose_error(A: Tensor, B: Tensor) -> Tensor:
+    turn = rotation_angle(A[..., :3] @ B[..., :3].mT)
+    return torch.maximum(turn, (A[..., 3] - B[..., 3]).norm(dim=-1) / B[..., 3].norm(dim=-1))
+
+
+def _two_views(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    X = _points(batch, n, generator)
+    R, t = _motion(batch, generator)
+    x1, x2 = _image(X, noise, generator), _image(X @ R.mT + t[..., None, :], noise, generator)
+    if kind.model_name == "relative_pose":  # type: ignore[attr-defined]
+        data = tuple(torch.cat((x / FOCAL, torch.ones_like(x[..., :1])), -1) for x in (x1, x2))
+        slack = torch.full(batch, 1e-3, dtype=torch.float64)
+        return Scene(kind(slack), data, torch.cat((R, t[..., None]), -1), _pose_error, _wrong_last, noise / FOCAL)
+    K = torch.diag(torch.tensor([FOCAL, FOCAL, 1.0], dtype=torch.float64))
+    F = K.inverse() @ _skew(t) @ R @ K.inverse()
+    e = (K @ t[..., None])[..., 0]
+    # e2 x h2 ~ F h1 with a positive factor in front of both cameras: K^-T [t]x = [K t]x K up to det K.
+    scale = F.flatten(-2).norm(dim=-1)[..., None, None]
+    model = torch.cat((F / scale, (e / e.norm(dim=-1, keepdim=True))[..., None]), -1)
+    return Scene(kind(), (x1, x2), model, _up_to_scale, _wrong_last, noise)
+
+
+def _plane(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    normal = torch.randn(*batch, 3, generator=generator, dtype=torch.float64) * 0.3 + torch.tensor([0.0, 0.0, 1.0])
+    normal = normal / normal.norm(dim=-1, keepdim=True)
+    X = _points(batch, n, generator)
+    X = X * (6 / (X @ normal[..., None]))
+    R, t = _motion(batch, generator)
+    K = torch.diag(torch.tensor([FOCAL, FOCAL, 1.0], dtype=torch.float64))
+    H = K @ (R + t[..., :, None] * normal[..., None, :] / 6) @ K.inverse()
+    H = H / H.flatten(-2).norm(dim=-1)[..., None, None]
+    x1, x2 = _image(X, noise, generator), _image(X @ R.mT + t[..., None, :], noise, generator)
+    return Scene(kind(), (x1, x2), H, _up_to_scale, _wrong_last, noise)
+
+
+def _camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    Y = _points(batch, n, generator)
+    R = random_rotation(*batch, generator=generator, dtype=torch.float64)
+    t = torch.randn(*batch, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 6.0])
+    X = (Y - t[..., None, :]) @ R
+    K = torch.diag(torch.tensor([FOCAL, FOCAL, 1.0], dtype=torch.float64)).expand(*batch, 3, 3)
+    data = (_image(Y, noise, generator), X)
+    return Scene(kind(K), data, torch.cat((R, t[..., None]), -1), _pose_error, _wrong_first, noise)
+
+
+def _point(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    """A point seen by n cameras around it."""
+    X = torch.rand(*batch, 3, generator=generator, dtype=torch.float64) * 2 - 1
+    R = random_rotation(*batch, n, generator=generator, dtype=torch.float64)
+    t = torch.randn(*batch, n, 3, generator=generator, dtype=torch.float64) * 0.3 + torch.tensor([0.0, 0.0, 6.0])
+    K = torch.diag(torch.tensor([FOCAL, FOCAL, 1.0], dtype=torch.float64))
+    P = K @ torch.cat((R, t[..., None]), -1)
+    Y = (R @ X[..., None, :, None])[..., 0] + t
+    relative = lambda A, B: (A - B).norm(dim=-1) / 6  # noqa: E731
+    return Scene(kind(), (_image(Y, noise, generator), P.flatten(-2)), X, relative, _wrong_first, noise)
+
+
+_SCENES: dict[str, Callable[..., Scene]] = {
+    "oriented_fundamental": _two_views,
+    "relative_pose": _two_views,
+    "homography": _plane,
+    "camera": _camera,
+    "point": _point,
+}
