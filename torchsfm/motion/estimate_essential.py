@@ -112,7 +112,10 @@ class RelativePoseEstimator:
         step = -damped_solve(A, b)[..., 0]
         t = t + step[..., 3:]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
-        return torch.cat((rotation_from_rotvec(step[..., :3]) @ R, t[..., None]), -1).to(d1.dtype)
+        R = rotation_from_rotvec(step[..., :3]) @ R
+        # What a start in lower precision lacks to a rotation.
+        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
+        return torch.cat((R, t[..., None]), -1).to(d1.dtype)
 
     @staticmethod
     def _depths(R: Tensor, t: Tensor, h1: list[Tensor], h2: list[Tensor]) -> tuple[Tensor, Tensor]:

@@ -92,11 +92,11 @@ class CameraEstimator:
         moments = (full @ J.mT).double()
         A, g = moments[..., :6, :], moments[..., 6, :]
         step = -damped_solve(A, g[..., None])[..., 0]
-        pose = model.double()
-        R = rotation_from_rotvec(step[..., :3])
-        pose = R @ pose
-        pose = torch.cat((pose[..., :3], pose[..., 3:] + step[..., 3:, None]), -1)
-        return pose.to(x.dtype)
+        pose = rotation_from_rotvec(step[..., :3]) @ model.double()
+        R, t = pose[..., :3], pose[..., 3:] + step[..., 3:, None]
+        # What a start in lower precision lacks to a rotation.
+        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
+        return torch.cat((R, t), -1).to(x.dtype)
 
 
 def estimate_camera(

@@ -94,18 +94,19 @@ def ransac(
     dtype, device, n = data[0].dtype, data[0].device, data[0].shape[-2]
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
     with torch.no_grad():
-        flat = [d.double().expand(*batch, n, d.shape[-1]).reshape(-1, n, d.shape[-1]) for d in data]
-        fields = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(-1, *t.shape[len(batch) :]), estimator)
+        p = batch.numel()
+        flat = [d.double().expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
+        fields = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
         fields = cast(fields, torch.float64)
-        square = (limit.double() ** 2).expand(batch).reshape(-1)
-        p = len(square)
+        bound = limit.double().expand(batch).reshape(p)
+        square = bound * bound
         exists = torch.ones(p, n, dtype=torch.bool, device=device)
         exists = exists if mask is None else mask.expand(*batch, n).reshape(p, n)
         usable = exists
         for d in flat:
             usable = usable & torch.isfinite(d).all(-1)
         trust = None if scores is None else scores.expand(*batch, n).reshape(p, n)
-        enough = (usable.sum(-1) >= estimator.sample_size) & torch.isfinite(square) & (square > 0)
+        enough = (usable.sum(-1) >= estimator.sample_size) & torch.isfinite(square) & (bound > 0)
         status = torch.full((p,), int(Status.NOT_FINITE), dtype=torch.int8, device=device)
         status[exists.sum(-1) < estimator.sample_size] = int(Status.TOO_FEW)
         model = no_model(fields, flat, p)
@@ -131,7 +132,7 @@ def ransac(
             score[member] = soft
             iterations[member] = best.iterations
         return RobustResult(
-            tensor_map(lambda t: t.to(dtype).reshape(*batch, *t.shape[1:]), model),
+            tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
             inliers.reshape(*batch, n),
             score.to(dtype).reshape(batch),
             iterations.reshape(batch),

@@ -63,7 +63,7 @@ def draw_samples(
 
 
 def guided_pools(
-    count: Int[Tensor, "g"], first: Int[Tensor, "g"], hypotheses: int, size: int, growth: int = 1000
+    count: Int[Tensor, "g"], first: Int[Tensor, "g"], hypotheses: int, size: int, growth: int = 20_000
 ) -> Int[Tensor, "g hypotheses"]:
     """From how many of the best-scored data each hypothesis draws: PROSAC's growing pool for odd ones, all data for even ones.
 

@@ -168,7 +168,7 @@ def triangulate_points_robust(
     found = ransac(
         PointEstimator(), x.transpose(-3, -2), data[..., None, :, :].expand(*batch, n, v, 12),
         threshold=threshold.double().expand(*batch, n) if isinstance(threshold, Tensor) else threshold,
-        mask=(seen if visible is None else visible.expand(*batch, v, n)).mT, generator=generator, confidence=confidence,
+        mask=None if visible is None else visible.expand(*batch, v, n).mT, generator=generator, confidence=confidence,
         min_iterations=16, max_iterations=max_iterations,
     )  # fmt: skip
     inliers = found.inliers.mT
