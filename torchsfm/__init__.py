@@ -184,10 +184,12 @@ from torchsfm.tensors import (
     poses_from_fundamental,
 )
 from torchsfm.triangulation import (
+    RobustTriangulation,
     Triangulation,
     correct_matches,
     triangulate_points,
     triangulate_points_dlt,
+    triangulate_points_robust,
 )
 
 __all__ = [
@@ -235,6 +237,7 @@ __all__ = [
     "Report",
     "RigidMotion",
     "RobustResult",
+    "RobustTriangulation",
     "Rotation",
     "SfmResult",
     "Similarity",
@@ -349,6 +352,7 @@ __all__ = [
     "transform_points",
     "triangulate_points",
     "triangulate_points_dlt",
+    "triangulate_points_robust",
     "up_direction",
     "write_colmap",
     "write_page",
