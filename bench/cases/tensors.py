@@ -1,0 +1,5 @@
+"""Multilinear tensors."""
+
+from bench.cases.case import Case
+
+CASES: tuple[Case, ...] = ()

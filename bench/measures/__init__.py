@@ -1,0 +1,1 @@
+"""What the solver bench measures, one thing a file."""
