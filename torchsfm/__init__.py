@@ -8,7 +8,9 @@ from torchsfm.autocalibration import (
 from torchsfm.bundle import (
     BundleCovariance,
     BundleResult,
+    ProjectiveBundleResult,
     bundle_adjust,
+    bundle_adjust_projective,
     bundle_covariance,
 )
 from torchsfm.formats import (
@@ -228,6 +230,7 @@ __all__ = [
     "Photograph",
     "PointCloud",
     "Pose",
+    "ProjectiveBundleResult",
     "Radial",
     "Reconstruction",
     "ReconstructionError",
@@ -261,6 +264,7 @@ __all__ = [
     "attach_optimum",
     "bifocal_tensors",
     "bundle_adjust",
+    "bundle_adjust_projective",
     "bundle_covariance",
     "camera_centre",
     "camera_dlt",

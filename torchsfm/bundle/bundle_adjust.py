@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
+from torchsfm.bundle.checks import check_index
 from torchsfm.bundle.projection import Projection, camera_from_rows, camera_rows, free_columns
 from torchsfm.geometry import Camera, Pose
 from torchsfm.optim import Block, Loss, RigidMotion, Subset, Term, sparse_levenberg_marquardt
@@ -238,11 +239,5 @@ def check_bundle(
                 f"camera_index: wanted the camera of each view, since there are {groups} cameras and {views} views"
             )
         camera_index = torch.arange(views, device=X.device) if groups == views else view.new_zeros(views)
-    for name, index, limit in (
-        ("view", view, views),
-        ("point", point, X.shape[0]),
-        ("camera_index", camera_index, groups),
-    ):
-        if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < limit:
-            raise ValueError(f"{name}: wanted numbers from 0 to {limit - 1}, got {int(index.min())} to {int(index.max())}")
+    check_index(view=(view, views), point=(point, X.shape[0]), camera_index=(camera_index, groups))
     return camera_index

@@ -92,7 +92,7 @@ class NormalEquations:
     def split(self, kept: Tensor, point: Tensor) -> dict[str, Tensor]:
         """A vector of the size of the system by blocks, (free variables, tangent)."""
         layout = self.layout
-        ends = [*list(layout.first.values())[1:], layout.size]
+        ends = [*layout.first.values(), layout.size][1:]
         found = {
             name: kept[start:end].view(layout.free[name].numel(), -1)
             for (name, start), end in zip(layout.first.items(), ends, strict=True)
