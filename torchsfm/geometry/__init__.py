@@ -1,5 +1,6 @@
 """What are points, poses and cameras, and how far is a measurement from what they predict? Nothing is estimated here."""
 
+from torchsfm.geometry.bundle_problem import BundleProblem
 from torchsfm.geometry.cameras import (
     Camera,
     camera_centre,
@@ -43,6 +44,7 @@ from torchsfm.geometry.similarity import Similarity, similarity_from_points
 __all__ = [
     "DISTORTION_MODELS",
     "BrownConrady",
+    "BundleProblem",
     "Camera",
     "Distortion",
     "DistortionModel",

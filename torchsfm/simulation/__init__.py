@@ -1,5 +1,6 @@
 """What would the cameras see? Synthetic scenes, viewpoints, observations and images, with the truth known."""
 
+from torchsfm.simulation.bundle_problems import SimulatedBundle, random_bundle_problem
 from torchsfm.simulation.observations import SimulatedImages, random_intrinsics, random_points, simulate_images
 from torchsfm.simulation.rendering import RenderedSequence, render_sequence
 from torchsfm.simulation.textured_scene import TexturedScene, courtyard_scene
@@ -7,11 +8,13 @@ from torchsfm.simulation.viewpoints import look_at, orbit_poses, random_poses
 
 __all__ = [
     "RenderedSequence",
+    "SimulatedBundle",
     "SimulatedImages",
     "TexturedScene",
     "courtyard_scene",
     "look_at",
     "orbit_poses",
+    "random_bundle_problem",
     "random_intrinsics",
     "random_points",
     "random_poses",

@@ -1,0 +1,59 @@
+"""Cameras, poses, points and image points together: what bundle adjustment starts from and ends with."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm._types import check_tensors
+from torchsfm.geometry.cameras import Camera
+from torchsfm.geometry.poses import Pose
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Views of points, with estimates of everything; the smallest thing that can be adjusted.
+
+    A `Reconstruction` has the same members and more (names, sizes, colours).
+    """
+
+    poses: Pose
+    """Camera from world of each view, batch (v,)."""
+    cameras: Camera
+    """The distinct cameras, batch (g,)."""
+    camera_index: Int[Tensor, "v"]
+    """Which camera took each view."""
+    X: Float[Tensor, "n 3"]
+    """Points in the world."""
+    x: Float[Tensor, "m 2"]
+    """Image points, pixels."""
+    view: Int[Tensor, "m"]
+    """Which view shows each image point."""
+    point: Int[Tensor, "m"]
+    """Which point it shows."""
+
+    def __post_init__(self) -> None:
+        check_tensors(
+            poses=(self.poses.R, "v 3 3"),
+            cameras=(self.cameras.K, "g 3 3"),
+            camera_index=(self.camera_index, "v: int"),
+            X=(self.X, "n 3"),
+            x=(self.x, "m 2"),
+            view=(self.view, "m: int"),
+            point=(self.point, "m: int"),
+        )
+
+    def projections(self) -> Float[Tensor, "m 2"]:
+        """Where each observed point projects, in pixels; finite but meaningless behind the camera."""
+        X_cam = self.poses[self.view].transform(self.X[self.point, None])
+        return self.cameras[self.camera_index[self.view]].project(X_cam)[:, 0]
+
+    def residuals(self) -> Float[Tensor, "m"]:
+        """Distance of each observation from its point's projection, in pixels."""
+        distance: Tensor = torch.linalg.vector_norm(self.projections() - self.x, dim=-1)
+        return distance
+
+    def depths(self) -> Float[Tensor, "m"]:
+        """Depth of each observed point in its view, negative behind the camera."""
+        return self.poses[self.view].transform(self.X[self.point, None])[:, 0, 2]
