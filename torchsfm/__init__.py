@@ -155,6 +155,7 @@ from torchsfm.resection import (
     refine_camera,
 )
 from torchsfm.robust import (
+    Degeneracy,
     Estimator,
     RobustResult,
     ransac,
@@ -213,6 +214,7 @@ __all__ = [
     "CameraRefinement",
     "Cauchy",
     "Corners",
+    "Degeneracy",
     "Distortion",
     "DistortionModel",
     "Estimator",

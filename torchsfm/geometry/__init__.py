@@ -20,6 +20,7 @@ from torchsfm.geometry.distortion import (
     Radial,
     SimpleRadial,
 )
+from torchsfm.geometry.flatness import line_and_plane_distances
 from torchsfm.geometry.homogeneous import (
     from_homogeneous,
     normalize_sphere,
@@ -61,6 +62,7 @@ __all__ = [
     "from_homogeneous",
     "intrinsics",
     "krt_from_camera",
+    "line_and_plane_distances",
     "normalize_sphere",
     "normalizing_similarity",
     "point_depths",

@@ -1,10 +1,10 @@
 """The essential matrix from corresponding rays of which many are wrong."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
@@ -19,7 +19,9 @@ from torchsfm.motion.epipolar_fit import (
     squared_distance,
 )
 from torchsfm.motion.essential_5pt import essential_5pt
-from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, squared_transfer
+from torchsfm.optim import UnitSphere, rotation_exponential
+from torchsfm.robust import Degeneracy, RobustResult, damped_solve, push_forward, ransac
 from torchsfm.tensors import essential_from_pose
 
 
@@ -41,6 +43,7 @@ class RelativePoseEstimator:
     sample_size: ClassVar[int] = 5
     max_solutions: ClassVar[int] = 10
     codimension: ClassVar[int] = 1
+    dimension: ClassVar[int] = 5
 
     def minimal(
         self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]
@@ -117,6 +120,31 @@ class RelativePoseEstimator:
         R = 1.5 * R - 0.5 * (R @ R.mT @ R)
         return torch.cat((R, t[..., None]), -1).to(d1.dtype)
 
+    def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 5"]) -> Float[Tensor, "*batch 3 4"]:
+        """R <- exp(w) R, and t along the unit sphere."""
+        R = rotation_exponential(step[..., :3]) @ model[..., :3]
+        return torch.cat((R, UnitSphere(3).retract(model[..., 3], step[..., 3:])[..., None]), -1)
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """ROTATION: R alone relates the inliers but so few as chance explains, so that t is open; PLANAR: R + t n' does."""
+        R, t, h1, h2 = model[..., :3], model[..., 3], sphere_rows(d1), sphere_rows(d2)
+        limit = 4 * threshold * threshold
+        turned = inliers & (squared_transfer(R, h1, h2, sphere=True) < limit[..., None])
+        rotation = turned.any(-1) & ~more_than_chance((inliers & ~turned).sum(-1), chance, 2)
+        _, on = dominant_plane(R, t, h1, h2, inliers, limit, sphere=True)
+        planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
+        code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
+        return torch.where(rotation, int(Degeneracy.ROTATION), code).to(torch.int8)
+
     @staticmethod
     def _depths(R: Tensor, t: Tensor, h1: list[Tensor], h2: list[Tensor]) -> tuple[Tensor, Tensor]:
         """The depths along unit rays, times the squared sine of the angle between them."""
@@ -136,12 +164,13 @@ def estimate_essential(
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
+    covariance: bool = False,
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The essential matrix of each pair of calibrated cameras, from corresponding rays of which many may be wrong.
 
     LO-RANSAC over the poses of five-point samples, scored by Sampson's distance for rays that meet in front of both cameras,
-    then a robust minimum of that distance over the poses. `pose_from_essential` turns the result into a pose. A pure rotation
-    leaves E undetermined without a sign of it here: every translation then fits.
+    then a robust minimum of that distance over the poses. `pose_from_essential` turns the result into a pose. After a pure
+    rotation every translation fits, and points of one plane may fit two poses: `degeneracy` says so.
 
     Args:
         d1: Rays of the first camera, of any length, pointing to the points.
@@ -152,22 +181,46 @@ def estimate_essential(
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
+        covariance: Compute the covariance of the entries of E, row by row.
 
     Returns:
-        E with d2' E d1 = 0, |E|^2 = 2 and singular values (1, 1, 0); inliers, score, iterations, status.
+        E with d2' E d1 = 0, |E|^2 = 2 and singular values (1, 1, 0); inliers, score, iterations, status, degeneracy
+        (ROTATION: a rotation relates all inliers but so few as chance explains, and the translation means nothing; PLANAR: a
+        homography does, and a second pose may fit as well), covariance (9 x 9, of rank 5). E carries its derivatives with
+        respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
     batch = check_tensors(d1=(d1, "n 3"), d2=(d2, "n 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
-    length1, length2 = d1.double().norm(dim=-1, keepdim=True), d2.double().norm(dim=-1, keepdim=True)
-    # A ray of length 0 becomes NaN, and is left out.
-    slack = threshold.double() if isinstance(threshold, Tensor) else length1.new_tensor(threshold)
+    h1, h2 = _unit(d1.double()), _unit(d2.double())
+    slack = threshold.double() if isinstance(threshold, Tensor) else h1.new_tensor(threshold)
+    estimator = RelativePoseEstimator(slack.expand(batch))
     result = ransac(
-        RelativePoseEstimator(slack.expand(batch)), d1 / length1, d2 / length2, threshold=slack, mask=mask,
+        estimator, h1, h2, threshold=slack, mask=mask,
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32,
+        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
-    E = essential_from_pose(result.model[..., :3], result.model[..., 3])
-    return RobustResult(E.to(d1.dtype), result.inliers, result.score.to(d1.dtype), result.iterations, result.status)
+
+    def essential(model: Tensor) -> Tensor:
+        return essential_from_pose(model[..., :3], model[..., 3])
+
+    spread = None
+    if result.covariance is not None:
+        found = result.model.detach()
+        spread = push_forward(lambda step: essential(estimator.retract(found, step)).flatten(-2), result.covariance)
+    return replace(
+        result,
+        model=essential(result.model).to(d1.dtype),
+        score=result.score.to(d1.dtype),
+        covariance=None if spread is None else spread.to(d1.dtype),
+    )
+
+
+def _unit(d: Tensor) -> Tensor:
+    """Rays of length 1; NaN for those without direction, so that they are left out."""
+    square = (d * d).sum(-1, keepdim=True).detach()
+    good = torch.isfinite(square) & (square > 0)
+    safe = torch.where(good, d, 1)
+    return torch.where(good, safe * (safe * safe).sum(-1, keepdim=True).rsqrt(), torch.nan)

@@ -1,10 +1,10 @@
 """The fundamental matrix from correspondences of which many are wrong."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
@@ -19,8 +19,9 @@ from torchsfm.motion.epipolar_fit import (
     squared_distance,
 )
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
-from torchsfm.motion.normalization import common_scale
-from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.motion.normalization import common_scale, largest_positive
+from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance
+from torchsfm.robust import Degeneracy, RobustResult, damped_solve, push_forward, ransac
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class FundamentalEstimator:
     sample_size: ClassVar[int] = 7
     max_solutions: ClassVar[int] = 3
     codimension: ClassVar[int] = 1
+    dimension: ClassVar[int] = 7
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]
@@ -91,9 +93,32 @@ class FundamentalEstimator:
         share = (cofactors * bound).sum(-1)
         f = f - free - (gap / torch.where(share > 0, share, torch.inf))[..., None] * bound
         F = matrices(f * (f * f).sum(-1, keepdim=True).rsqrt(), 3)
-        turned = _left_epipole(F)
-        turned = torch.where((turned * e).sum(-1, keepdim=True) < 0, -turned, turned)
-        return torch.cat((F, turned[..., None]), -1).to(x1.dtype)
+        return _with_epipole(F, e).to(x1.dtype)
+
+    def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
+        """F moved along a basis of the tangent space, then to determinant 0 up to fourth order, and to norm 1."""
+        f = model[..., :3].detach().flatten(-2)
+        normals = torch.stack((f, _cofactors(f)), -2)
+        basis = torch.linalg.svd(normals, full_matrices=True)[2][..., 2:, :]
+        f = model[..., :3].flatten(-2) + (step[..., None, :] @ basis)[..., 0, :]
+        return _with_epipole(matrices(_determinant_step(f), 3), model[..., 3])
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """PLANAR: a homography relates all inliers but so few as chance explains, so that F is open in two dimensions."""
+        F, e = model[..., :3], model[..., 3]
+        limit = 4 * threshold * threshold
+        _, on = dominant_plane(cross_rows(e, F), e, plane_rows(x1), plane_rows(x2), inliers, limit, sphere=False)
+        planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
+        return torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE)).to(torch.int8)
 
 
 def _left_epipole(F: Tensor) -> Tensor:
@@ -105,15 +130,30 @@ def _left_epipole(F: Tensor) -> Tensor:
     return e * square.gather(-1, best).clamp(min=1e-200).rsqrt()
 
 
+def _with_epipole(F: Tensor, e: Tensor) -> Tensor:
+    """F and its left null vector, on the side of a given one."""
+    turned = _left_epipole(F)
+    return torch.cat((F, torch.where((turned * e).sum(-1, keepdim=True) < 0, -turned, turned)[..., None]), -1)
+
+
+def _cofactors(f: Tensor) -> Tensor:
+    return torch.stack([c for row in cofactor_rows(matrices(f, 3)) for c in row], -1)
+
+
+def _determinant_step(f: Tensor) -> Tensor:
+    """Move matrices of small determinant towards determinant 0 by a Newton step along its gradient, and to norm 1."""
+    c = _cofactors(f)
+    square = (c * c).sum(-1)
+    f = f - ((c * f).sum(-1) / 3 / torch.where(square > 0, square, 1))[..., None] * c
+    square = (f * f).sum(-1, keepdim=True)
+    return f * torch.where(square > 0, square, 1).rsqrt()
+
+
 def _singular(F: Tensor) -> Tensor:
-    """Move matrices of small determinant to determinant 0 by Newton steps along its gradient, and to norm 1."""
+    """The matrix of determinant 0 and norm 1 near a matrix of small determinant."""
     f = F.flatten(-2)
     for _ in range(3):
-        c = torch.stack([c for row in cofactor_rows(matrices(f, 3)) for c in row], -1)
-        square = (c * c).sum(-1)
-        f = f - ((c * f).sum(-1) / 3 / torch.where(square > 0, square, 1))[..., None] * c
-        size = (f * f).sum(-1, keepdim=True).sqrt()
-        f = f / torch.where(size > 0, size, 1)
+        f = _determinant_step(f)
     return matrices(f, 3)
 
 
@@ -127,13 +167,13 @@ def estimate_fundamental(
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
+    covariance: bool = False,
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The fundamental matrix of each pair of images, from correspondences of which many may be wrong.
 
     LO-RANSAC over seven-point samples with the oriented epipolar constraint, then a robust minimum of Sampson's distance over
     the matrices of rank 2. Computed in float64, hypotheses scored in float32. Points of one plane, or a pure rotation of the
-    camera, leave F undetermined without a sign of it here: compare with the inliers of `estimate_homography` at the same
-    threshold.
+    camera, leave F open in two dimensions: `degeneracy` says so.
 
     Args:
         x1: Points in the first image.
@@ -144,9 +184,13 @@ def estimate_fundamental(
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
+        covariance: Compute the covariance of the entries of F, row by row.
 
     Returns:
-        F with x2' F x1 = 0, |F| = 1 (Frobenius) and det F = 0; inliers, score, iterations, status.
+        F with x2' F x1 = 0, |F| = 1 (Frobenius), det F = 0 and its largest entry positive; inliers, score, iterations, status,
+        degeneracy (PLANAR: a homography relates all inliers but so few as chance explains: a planar scene, or a camera that
+        only turned; F is then one of many), covariance (9 x 9, of rank 7). F carries its derivatives with respect to the
+        inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
@@ -154,10 +198,23 @@ def estimate_fundamental(
     limit = threshold if isinstance(threshold, Tensor) else None
     check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
     y = common_scale(x1.double(), x2.double(), mask)
+    estimator = FundamentalEstimator()
     result = ransac(
-        FundamentalEstimator(), y.x1, y.x2, threshold=y.scale * threshold, mask=mask,
+        estimator, y.x1, y.x2, threshold=y.scale * threshold, mask=mask,
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32,
+        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
-    F = _singular(y.T2.mT @ _singular(result.model[..., :3]) @ y.T1)
-    return RobustResult(F.to(x1.dtype), result.inliers, result.score.to(x1.dtype), result.iterations, result.status)
+
+    def in_pixels(model: Tensor) -> Tensor:
+        return largest_positive(_singular(y.T2.mT @ _singular(model[..., :3]) @ y.T1))
+
+    spread = None
+    if result.covariance is not None:
+        found = result.model.detach()
+        spread = push_forward(lambda step: in_pixels(estimator.retract(found, step)).flatten(-2), result.covariance)
+    return replace(
+        result,
+        model=in_pixels(result.model).to(x1.dtype),
+        score=result.score.to(x1.dtype),
+        covariance=None if spread is None else spread.to(x1.dtype),
+    )

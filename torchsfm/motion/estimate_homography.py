@@ -4,14 +4,17 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.geometry import line_and_plane_distances
 from torchsfm.motion.epipolar_fit import forms, matrices, plane_rows
 from torchsfm.motion.homography_4pt import homography_4pt
-from torchsfm.motion.normalization import common_scale
-from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.motion.normalization import common_scale, largest_positive
+from torchsfm.motion.plane_and_parallax import more_than_chance
+from torchsfm.optim import UnitSphere
+from torchsfm.robust import Degeneracy, RobustResult, damped_solve, push_forward, ransac
 
 # Where entry ((i, j), (k, l)) of a sum of Kronecker products is among 6 x 6 products, both in the order 00, 01, 02, 11, 12, 22.
 _PAIR = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
@@ -32,6 +35,7 @@ class HomographyEstimator:
     sample_size: ClassVar[int] = 4
     max_solutions: ClassVar[int] = 1
     codimension: ClassVar[int] = 2
+    dimension: ClassVar[int] = 8
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]
@@ -105,6 +109,28 @@ class HomographyEstimator:
         h = h - damped_solve(A, b[..., None])[..., 0]
         return matrices(h / (h * h).sum(-1, keepdim=True).sqrt(), 3).to(x1.dtype)
 
+    def retract(self, H: Float[Tensor, "*#batch 3 3"], step: Float[Tensor, "*#batch 8"]) -> Float[Tensor, "*batch 3 3"]:
+        """H moved along the unit sphere."""
+        return matrices(UnitSphere(9).retract(H.flatten(-2), step), 3)
+
+    def degeneracy(
+        self,
+        H: Float[Tensor, "*#batch 3 3"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """COLLINEAR: no two inliers more than chance explains are off a line, in one of the images."""
+        bad = torch.zeros_like(inliers[..., 0])
+        for x in (x1, x2):
+            off, _ = line_and_plane_distances(x, inliers)
+            number = (inliers & (off > 2 * threshold[..., None])).sum(-1)
+            bad = bad | ~more_than_chance(number, chance, -1)
+        return torch.where(bad, int(Degeneracy.COLLINEAR), int(Degeneracy.NONE)).to(torch.int8)
+
 
 def _constraint(
     H: Tensor, x1: Tensor, x2: Tensor
@@ -130,6 +156,7 @@ def estimate_homography(
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
+    covariance: bool = False,
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The homography between each pair of images, from correspondences of which many may be wrong.
 
@@ -146,9 +173,12 @@ def estimate_homography(
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
+        covariance: Compute the covariance of the entries of H, row by row.
 
     Returns:
-        H with x2 ~ H x1 and |H| = 1 (Frobenius); inliers, score, iterations, status.
+        H with x2 ~ H x1, |H| = 1 (Frobenius) and its largest entry positive; inliers, score, iterations, status, degeneracy
+        (COLLINEAR: the inliers are on a line but for so few as chance explains), covariance (9 x 9, of rank 8). H carries its
+        derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
@@ -156,13 +186,26 @@ def estimate_homography(
     limit = threshold if isinstance(threshold, Tensor) else None
     check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
     y = common_scale(x1.double(), x2.double(), mask)
+    estimator = HomographyEstimator()
     result = ransac(
-        HomographyEstimator(), y.x1, y.x2, threshold=y.scale * threshold, mask=mask,
+        estimator, y.x1, y.x2, threshold=y.scale * threshold, mask=mask,
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32,
+        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
     back = torch.linalg.inv_ex(y.T2)[0]
-    H = back @ result.model @ y.T1
-    size = H.flatten(-2).norm(dim=-1)[..., None, None]
-    H = H / torch.where(size > 0, size, 1)
-    return replace(result, model=H.to(x1.dtype), score=result.score.to(x1.dtype))
+
+    def in_pixels(model: Tensor) -> Tensor:
+        H = back @ model @ y.T1
+        size = (H * H).sum(-1, keepdim=True).sum(-2, keepdim=True)
+        return largest_positive(H * torch.where(size > 0, size, 1).rsqrt())
+
+    spread = None
+    if result.covariance is not None:
+        found = result.model.detach()
+        spread = push_forward(lambda step: in_pixels(estimator.retract(found, step)).flatten(-2), result.covariance)
+    return replace(
+        result,
+        model=in_pixels(result.model).to(x1.dtype),
+        score=result.score.to(x1.dtype),
+        covariance=None if spread is None else spread.to(x1.dtype),
+    )

@@ -32,6 +32,8 @@ def common_scale(
 
     Bounding boxes, because they do not depend on the order of the points or on how many absent ones surround them, bit for bit.
     """
+    # The similarity is held when the points move.
+    x1, x2, free1, free2 = x1.detach(), x2.detach(), x1, x2
     usable = torch.isfinite(x1).all(-1) & torch.isfinite(x2).all(-1)
     if mask is not None:
         usable = usable & mask
@@ -56,5 +58,12 @@ def common_scale(
         T[..., :2, 2] = -scale[..., None] * centre
         T[..., 2, 2] = 1
         similarities.append(T)
-    y1, y2 = (x1 - centres[0][..., None, :]) * s, (x2 - centres[1][..., None, :]) * s
+    y1, y2 = (free1 - centres[0][..., None, :]) * s, (free2 - centres[1][..., None, :]) * s
     return CommonScale(y1, y2, similarities[0], similarities[1], scale)
+
+
+def largest_positive(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The matrix or its negative, so that its entry of largest modulus is positive: one sign for one homogeneous matrix."""
+    entries = M.flatten(-2)
+    first = entries.detach().abs().argmax(-1, keepdim=True)
+    return torch.where((entries.gather(-1, first) < 0)[..., None], -M, M)

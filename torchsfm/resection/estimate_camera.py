@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.geometry import rotation_from_rotvec
+from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
+from torchsfm.optim import rotation_exponential
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.robust import Degeneracy, RobustResult, damped_solve, ransac
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class CameraEstimator:
     sample_size: ClassVar[int] = 3
     max_solutions: ClassVar[int] = 4
     codimension: ClassVar[int] = 2
+    dimension: ClassVar[int] = 6
 
     def minimal(
         self, x: Float[Tensor, "*#batch 3 2"], X: Float[Tensor, "*#batch 3 3"]
@@ -98,6 +100,31 @@ class CameraEstimator:
         R = 1.5 * R - 0.5 * (R @ R.mT @ R)
         return torch.cat((R, t), -1).to(x.dtype)
 
+    def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3 4"]:
+        """[R | t] <- exp(w) [R | t] + [0 | v], as `Pose.retract`."""
+        moved = rotation_exponential(step[..., :3]) @ model
+        return torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:, None]), -1)
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """COLLINEAR: all inliers but so few as chance explains are on a line, as far as can be seen; PLANAR: in a plane."""
+        line, plane = line_and_plane_distances(X, inliers)
+        focal = (self.K[..., 0, 0] * self.K[..., 1, 1]).abs().sqrt()
+        depth = (X @ model[..., 2, :3, None])[..., 0] + model[..., 2, 3:]
+        # Rounding counts too: where no sample determined a pose, there is no depth to judge by.
+        visible = 2 * threshold[..., None] * depth.abs() / focal[..., None] + 1e-9 * X.abs().amax(-1)
+        off_line, off_plane = ((inliers & (distance > visible)).sum(-1) > 2 + chance for distance in (line, plane))
+        code = torch.where(off_plane, int(Degeneracy.NONE), int(Degeneracy.PLANAR))
+        return torch.where(off_line, code, int(Degeneracy.COLLINEAR)).to(torch.int8)
+
 
 def estimate_camera(
     x: Float[Tensor, "*#batch n 2"],
@@ -110,6 +137,7 @@ def estimate_camera(
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
+    covariance: bool = False,
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The pose of each camera, from correspondences of image points with known points, of which many may be wrong.
 
@@ -126,9 +154,14 @@ def estimate_camera(
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
+        covariance: Compute the covariance of the pose.
 
     Returns:
-        The pose `[R | t]`, `X_cam = R X + t`; inliers (in front of the camera), score, iterations, status.
+        The pose `[R | t]`, `X_cam = R X + t`; inliers (in front of the camera), score, iterations, status, degeneracy
+        (COLLINEAR: all inliers but so few as chance explains are on a line, and the pose may turn about it; PLANAR: they are in
+        a plane, which determines the pose, though a second one may fit nearly as well), covariance (6 x 6, of a perturbation
+        (w, v) in the camera's frame as in `Pose.retract`). The pose carries its derivatives with respect to the inliers and K
+        (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
@@ -142,23 +175,30 @@ def estimate_camera(
     usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
     if mask is not None:
         usable = usable & mask
-    centre, size = _middle(X, usable)
-    focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt()
+    centre, size = _middle(X.detach(), usable)
+    focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt().detach()
     focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
     # Pixels from the principal point, in focal lengths.
-    y = (x - K[..., None, :2, 2]) / focal[..., None, None]
-    intrinsics = torch.cat((K[..., :2, :2] / focal[..., None, None], torch.zeros_like(K[..., :2, 2:])), -1)
-    intrinsics = torch.cat((intrinsics, torch.zeros_like(K[..., 2:, :])), -2)
-    intrinsics[..., 2, 2] = 1
+    middle = K[..., :2, 2].detach()
+    y = (x - middle[..., None, :]) / focal[..., None, None]
+    right = (K[..., :2, 2] - middle)[..., None]
+    intrinsics = torch.cat((K[..., :2, :2] / focal[..., None, None], right / focal[..., None, None]), -1)
+    last = torch.eye(3, dtype=K.dtype, device=K.device)[2:].expand(*K.shape[:-2], 1, 3)
+    intrinsics = torch.cat((intrinsics, last), -2)
     Y = (X - centre[..., None, :]) / size[..., None, None]
     result = ransac(
         CameraEstimator(intrinsics.expand(*batch, 3, 3)), y, Y, threshold=threshold / focal, mask=mask,
         scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32,
+        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
     R = result.model[..., :3]
     t = result.model[..., 3] * size[..., None] - (R @ centre[..., None])[..., 0]
-    return replace(result, model=torch.cat((R, t[..., None]), -1).to(dtype), score=result.score.to(dtype))
+    spread = result.covariance
+    if spread is not None:
+        # [R | t] <- exp(w) [R | t] + [0 | v] in the scaled world is the same in the world, with v scaled back.
+        unit = torch.cat((torch.ones_like(centre), size[..., None].expand_as(centre)), -1)
+        spread = (spread * unit[..., :, None] * unit[..., None, :]).to(dtype)
+    return replace(result, model=torch.cat((R, t[..., None]), -1).to(dtype), score=result.score.to(dtype), covariance=spread)
 
 
 def _middle(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,7 +1,9 @@
 """Engine: which model do most of the data agree on? It knows no model; the rooms that do bring an `Estimator`."""
 
+from torchsfm.robust.degeneracy import Degeneracy
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.local_optimisation import damped_solve
+from torchsfm.robust.optimum import push_forward
 from torchsfm.robust.ransac import RobustResult, ransac
 
-__all__ = ["Estimator", "RobustResult", "damped_solve", "ransac"]
+__all__ = ["Degeneracy", "Estimator", "RobustResult", "damped_solve", "push_forward", "ransac"]

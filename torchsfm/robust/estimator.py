@@ -23,7 +23,15 @@ class Estimator(Protocol[M]):
 
     The signatures below are as wide as they are so that implementations can name their data.
 
-    An implementation may also define `squared_residual(model, *data)`: the square of `residual`, where that is cheaper.
+    An implementation may also define
+
+    - `squared_residual(model, *data)`: the square of `residual`, where that is cheaper;
+    - `dimension: ClassVar[int]` and `retract(model, step)`: the model moved by a step `(*batch, dimension)` along its manifold,
+      smooth in the step, `retract(model, 0) == model`. They give refined models derivatives and covariance, for which
+      `residual` (or its square) must be differentiable with respect to the model and the data;
+    - `degeneracy(model, *data, inliers, threshold, chance)`: a `Degeneracy` `(*batch)` as int8 for models `(*batch, ...)` with
+      their `inliers (*batch, n)`, `threshold (*batch)`, and how many inliers `chance (*batch)` explains. Where no sample
+      determined a model, `inliers` are all data and the model is zero.
     """
 
     sample_size: ClassVar[int]

@@ -17,6 +17,8 @@ LOCAL_STEPS = (9.0, 4.0, 1.5, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 _LEAST = 1e-6
 """Smallest variance of the noise in units of the squared threshold."""
+SCALE_STEPS, FIXED_STEPS = 5, 5
+"""Rounds of the final refinement that estimate the scale of the noise, and rounds that hold it."""
 LOCAL_DATA = 512
 """Local optimisation looks at this many data at most."""
 
@@ -50,8 +52,7 @@ def polish(
     data: Sequence[Tensor],
     limit: Float[Tensor, "g"],
     inside: Bool[Tensor, "g n"],
-    steps: int,
-) -> M:
+) -> tuple[M, Float[Tensor, "g"]]:
     """Reweighted least squares out to the distance where an outlier is as likely as an inlier.
 
     The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, estimated with the
@@ -59,20 +60,25 @@ def polish(
     density of the outliers, counted between two and six thresholds from the model. So the answer depends little on how well
     the threshold was chosen. One Gauss-Newton step for each round of weights.
 
+    The last rounds hold the reach, rounded to a coarse grid. So the model is the optimum of one fixed loss, also when the data
+    move a little: it has a derivative.
+
     Args:
         estimator: The problem.
         model: One model of each problem, `(g, 1, ...)`.
         data: The data, each `(g, 1, n, d)`.
         limit: Squared threshold.
         inside: Which slots hold data.
-        steps: Number of rounds.
+
+    Returns:
+        The model, and the square of its reach in units of the squared threshold.
     """
     k = estimator.codimension
     # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
     peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
     present = inside[:, None]
     variance = number = None
-    for _ in range(steps):
+    for step in range(SCALE_STEPS):
         ratio = squared_residual(estimator, model, *data) / limit[:, None, None]
         density = around_model(ratio, present, k)[..., None]
         if variance is None or number is None:
@@ -82,13 +88,21 @@ def polish(
             variance = (1.6 / k * (core * ratio.clamp(max=1)).sum(-1, keepdim=True) / number).clamp(_LEAST, 1)
         inlying = number * peak * variance ** (-k / 2)
         reach = 1.6 * k * variance * (inlying / density).clamp(min=3).log()
+        if step == SCALE_STEPS - 1:
+            break
         weights = torch.where(present, (1 - ratio / reach).clamp(min=0), 0)
         model = estimator.refine(model, *data, weights=weights)
         odds = density / inlying * torch.exp((0.5 * ratio / variance).clamp(max=60))
         likely = torch.where(present & (ratio < 9), 1 / (1 + odds), 0)
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1)
-    return model
+    reach = torch.exp2((4 * reach.log2()).round() / 4)
+    for step in range(FIXED_STEPS):
+        if step > 0:
+            ratio = squared_residual(estimator, model, *data) / limit[:, None, None]
+        weights = torch.where(present, (1 - ratio / reach).clamp(min=0), 0)
+        model = estimator.refine(model, *data, weights=weights)
+    return model, reach[:, 0, 0]
 
 
 def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"]) -> Float[Tensor, "*batch k r"]:

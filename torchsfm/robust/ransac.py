@@ -13,11 +13,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm.robust.degeneracy import Degeneracy
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import cast, zip_map
-from torchsfm.robust.problems import pack
+from torchsfm.robust.optimum import attach_derivative, has_manifold, step_covariance
+from torchsfm.robust.problems import Problems, pack
 from torchsfm.robust.scoring import around_model, beyond_chance, squared_residual
-from torchsfm.robust.search import Options, no_model, search
+from torchsfm.robust.search import Best, Options, no_model, search
 
 M = TypeVar("M")
 
@@ -34,6 +36,10 @@ class RobustResult(Generic[M]):
         status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample
             determined a model; `NO_CONSENSUS`: no model was supported by more data than its own sample or chance explain
             (model and inliers are then those of the best one).
+        degeneracy: Whether the inliers, although they agree, leave the model open: a `Degeneracy` each. Which of them are
+            looked for is said where the model is estimated.
+        covariance: If asked for, that of the model by the scatter of the data around it: of its entries, row by row, unless
+            said otherwise where the model is estimated. Zero where the model is no optimum or not determined.
     """
 
     model: M
@@ -41,6 +47,8 @@ class RobustResult(Generic[M]):
     score: Float[Tensor, "*batch"]
     iterations: Int[Tensor, "*batch"]
     status: Int[Tensor, "*batch"]
+    degeneracy: Int[Tensor, "*batch"]
+    covariance: Float[Tensor, "*batch k k"] | None = None
 
 
 def ransac(
@@ -54,6 +62,7 @@ def ransac(
     min_iterations: int = 64,
     max_iterations: int = 10_000,
     scoring_dtype: torch.dtype | None = None,
+    covariance: bool = False,
 ) -> RobustResult[M]:
     """Estimate a model for each problem of a batch from data of which many may be wrong.
 
@@ -75,9 +84,13 @@ def ransac(
         max_iterations: Most samples to draw for a problem, rounded up to a whole round.
         scoring_dtype: Type for scoring hypotheses; that of the data if not given. float32 is enough for data of moderate size
             around 0.
+        covariance: Compute the covariance of the step, in the sense of the estimator's `retract`, that leads from the refined
+            model to the true one.
 
     Returns:
-        Model, inliers, score, iterations and status of each problem.
+        Model, inliers, score, iterations, status and degeneracy of each problem. Where the estimator has `retract`, the model
+        carries its derivatives with respect to the inliers, and to fields of the estimator: those of the optimum of the final
+        refinement, whose data and scale are held. They are zero where the model is not such an optimum.
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
@@ -88,16 +101,19 @@ def ransac(
         raise ValueError(f"confidence: wanted a number between 0 and 1, got {confidence}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations: wanted a positive number, got {max_iterations}")
+    if covariance and not has_manifold(estimator):
+        raise ValueError(f"covariance: {type(estimator).__name__} does not say how its models move (`retract`)")
     known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
     limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(threshold)
     batch = check_tensors(**known, threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
     dtype, device, n = data[0].dtype, data[0].device, data[0].shape[-2]
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
+    p = batch.numel()
+    graph = [d.double().expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
+    own = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
+    own = cast(own, torch.float64)
     with torch.no_grad():
-        p = batch.numel()
-        flat = [d.double().expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
-        fields = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
-        fields = cast(fields, torch.float64)
+        flat, fields = [d.detach() for d in graph], tensor_map(Tensor.detach, own)
         bound = limit.double().expand(batch).reshape(p)
         square = bound * bound
         exists = torch.ones(p, n, dtype=torch.bool, device=device)
@@ -113,6 +129,8 @@ def ransac(
         inliers = torch.zeros(p, n, dtype=torch.bool, device=device)
         score = torch.zeros(p, dtype=torch.float64, device=device)
         iterations = torch.zeros(p, dtype=torch.long, device=device)
+        degeneracy = torch.full((p,), int(Degeneracy.TOO_FEW), dtype=torch.int8, device=device)
+        selected, reach = torch.zeros_like(inliers), torch.ones_like(score)
         options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype)
         for problems in pack(fields, flat, usable, enough, square, trust):
             best = search(problems, options)
@@ -131,10 +149,34 @@ def ransac(
             inliers[member] = problems.scatter(near, n)
             score[member] = soft
             iterations[member] = best.iterations
-        return RobustResult(
-            tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
-            inliers.reshape(*batch, n),
-            score.to(dtype).reshape(batch),
-            iterations.reshape(batch),
-            status.reshape(batch),
+            degeneracy[member] = _degeneracy(problems, best, near, expected)
+            optimal = agreed & best.solved & (best.reach > 0)
+            within = (squared < best.reach[:, None]) & problems.inside & optimal[:, None]
+            selected[member] = problems.scatter(within, n)
+            reach[member] = torch.where(optimal, best.reach, 1)
+        ones = torch.ones_like(usable, dtype=torch.float64)
+    spread = step_covariance(fields, model, flat, ones, selected, reach) if covariance else None
+    model = attach_derivative(own, model, graph, ones, selected, reach)
+    return RobustResult(
+        tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
+        inliers.reshape(*batch, n),
+        score.to(dtype).reshape(batch),
+        iterations.reshape(batch),
+        status.reshape(batch),
+        degeneracy.reshape(batch),
+        None if spread is None else spread.to(dtype).reshape(*batch, *spread.shape[1:]),
+    )
+
+
+def _degeneracy(problems: Problems, best: Best, near: Bool[Tensor, "p n"], chance: Float[Tensor, "p"]) -> Int[Tensor, "p"]:
+    """What the inliers lack, or all data where no sample determined a model."""
+    estimator, solved = problems.estimator, best.solved
+    code = torch.where(solved, int(Degeneracy.NONE), int(Degeneracy.UNDETERMINED)).to(torch.int8)
+    if hasattr(estimator, "degeneracy"):
+        looked_at = torch.where(solved[:, None], near, problems.inside)
+        found = estimator.degeneracy(
+            best.model, *problems.data, inliers=looked_at, threshold=problems.limit.sqrt(), chance=chance
         )
+        code = torch.where(solved | (found != Degeneracy.NONE), found, code)
+    few = (solved & (near.sum(-1) <= estimator.sample_size)) | (problems.count <= estimator.sample_size)
+    return torch.where(few, int(Degeneracy.TOO_FEW), code).to(torch.int8)

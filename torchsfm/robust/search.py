@@ -22,7 +22,6 @@ SCORED = 8
 """Hypotheses of a round that are scored on all data."""
 OPTIMISED = 3
 """Hypotheses of a round that are optimised locally."""
-POLISH_STEPS = 6
 _SAMPLES, _NUMBERS = 1 << 12, 1 << 15
 """Samples to solve at a time, and numbers in one row of all data of several models, on a CPU: what fits its cache."""
 
@@ -49,6 +48,7 @@ class Best:
         minimal_loss: The least loss of a model straight from a sample.
         solved: Whether any sample had a solution.
         iterations: Number of samples drawn.
+        reach: The squared distance at which weights vanish in the loss of which the model is the optimum; 0 if it is none.
     """
 
     model: Any
@@ -57,6 +57,7 @@ class Best:
     minimal_loss: Float[Tensor, "p"]
     solved: Bool[Tensor, "p"]
     iterations: Int[Tensor, "p"]
+    reach: Float[Tensor, "p"]
 
 
 def search(problems: Problems, options: Options) -> Best:
@@ -65,7 +66,7 @@ def search(problems: Problems, options: Options) -> Best:
     infinite = torch.full((p,), torch.inf, dtype=options.dtype, device=device)
     none = torch.zeros(p, dtype=torch.long, device=device)
     model = cast(no_model(problems.estimator, problems.data, p), options.dtype)
-    best = Best(model, infinite, none, infinite, none > 0, none)
+    best = Best(model, infinite, none, infinite, none > 0, none, torch.zeros_like(infinite))
     coarse = problems.cast(options.dtype)
     active = torch.arange(p, device=device)
     while len(active):
@@ -192,18 +193,20 @@ def _polished(problems: Problems, best: Best) -> Best:
         some, old = problems.take(part), cast(_take(best, part), torch.float64)
         wide = some.spread()
         start = tensor_map(lambda t: t[:, None], old.model)
-        model = polish(wide.estimator, start, wide.data, some.limit, some.inside, POLISH_STEPS)
+        model, reach = polish(wide.estimator, start, wide.data, some.limit, some.inside)
         both = join([model, start], 1)
         squared = squared_residual(wide.estimator, both, *wide.data)
         loss = truncated_loss(squared, some.limit, some.inside)
         support = ((squared < some.limit[:, None, None]) & some.inside[:, None]).sum(-1)
-        winner = (loss[:, :1] > 1.02 * loss[:, 1:]).long()
+        # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
+        winner = (loss[:, :1] > 1.02 * loss[:, 1:] + 1).long()
         parts.append(
             replace(
                 old,
                 model=tensor_map(lambda t: t[:, 0], take_slots(both, winner)),
                 loss=loss.gather(1, winner)[:, 0],
                 support=support.gather(1, winner)[:, 0],
+                reach=torch.where(winner[:, 0] == 0, reach * some.limit, 0),
             )
         )
     return join(parts)

@@ -1,0 +1,131 @@
+"""The plane that most points of an epipolar geometry lie in, and the geometry of a plane and two points aside.
+
+With x2 ~ A x1 + (v' x1) e2, the homographies that agree with an epipolar geometry are H = A + e2 v': A is R, e2 is t for a
+calibrated pair; A = [e2]x F else (HZ 13.1). A point determines v' x1, three points v. Given H, two points off the plane
+determine the epipole: it lies on the lines through x2 and H x1 (Chum, Werner & Matas 2005).
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.motion.epipolar_fit import cross_rows, forms
+from torchsfm.robust import damped_solve
+
+_TRIPLES, _JUDGES = 32, 96
+
+
+def squared_transfer(
+    H: Float[Tensor, "*#batch 3 3"], h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool
+) -> Float[Tensor, "*batch n"]:
+    """The squared distance of the second points from the transferred first ones, on the plane or on the sphere."""
+    y0, y1, y2 = forms(H, h1)
+    if sphere:
+        c0, c1, c2 = _cross((y0, y1, y2), h2)
+        squared = (c0 * c0 + c1 * c1 + c2 * c2) / (y0 * y0 + y1 * y1 + y2 * y2).clamp(min=1e-30)
+        facing = y0 * h2[0] + y1 * h2[1] + y2 * h2[2] > 0
+        return torch.where(facing, squared, torch.inf)
+    inverse = 1 / y2
+    u, v = y0 * inverse - h2[0], y1 * inverse - h2[1]
+    return (u * u + v * v).nan_to_num(nan=torch.inf)
+
+
+def dominant_plane(
+    A: Float[Tensor, "*batch 3 3"],
+    e: Float[Tensor, "*batch 3"],
+    h1: Sequence[Tensor],
+    h2: Sequence[Tensor],
+    inliers: Bool[Tensor, "*batch n"],
+    limit: Float[Tensor, "*batch"],
+    sphere: bool,
+) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch n"]]:
+    """The homography A + e v' that most inliers agree with, and which do.
+
+    Tries planes through triples of inliers: the data come in an order of which any part is spread over all of them.
+
+    Args:
+        A: One homography that agrees with the epipolar geometry.
+        e: The epipole in the second image.
+        h1: The rows of the first points.
+        h2: The rows of the second points.
+        inliers: Which points agree with the epipolar geometry.
+        limit: Squared largest transfer error.
+        sphere: Whether points are unit rays.
+
+    Returns:
+        The homography, and the inliers that agree with it; zeros and none where no three inliers determine a plane.
+    """
+    n = inliers.shape[-1]
+    if n < 3:
+        return torch.zeros_like(A), torch.zeros_like(inliers)
+    depth, weight = _parallax(A, e, h1, h2)
+    few = min(_JUDGES, n)
+    # The first inliers, in their order.
+    index = inliers.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., :few]
+    there = inliers.gather(-1, index)
+    count = there.sum(-1, keepdim=True).clamp(min=1)
+    triple = torch.arange(3 * _TRIPLES, device=index.device) % count
+    corner = index.gather(-1, triple)
+    shape = (*corner.shape[:-1], _TRIPLES, 3)
+    rows = torch.stack([h.expand(inliers.shape) for h in h1], -2)
+    picked = [row.gather(-1, corner).reshape(shape) for row in rows.unbind(-2)]
+    right = depth.gather(-1, corner).reshape(shape)
+    v = _solve3(torch.stack(picked, -1), right)
+    H = A[..., None, :, :] + e[..., None, :, None] * v[..., None, :]
+    g1, g2 = ([h.expand(inliers.shape).gather(-1, index)[..., None, :] for h in rows] for rows in (h1, h2))
+    loss = (squared_transfer(H, g1, g2, sphere) / limit[..., None, None]).clamp(max=1).nan_to_num(nan=1.0)
+    best = torch.where(there[..., None, :], loss, 0).sum(-1).argmin(-1, keepdim=True)
+    v = v.gather(-2, best[..., None].expand(*best.shape, 3))[..., 0, :]
+    for _ in range(2):
+        on = inliers & (squared_transfer(A + e[..., :, None] * v[..., None, :], h1, h2, sphere) < limit[..., None])
+        w = torch.where(on, weight, 0)
+        normal = (rows * w[..., None, :]) @ rows.mT
+        refined = damped_solve(normal.double(), ((rows * w[..., None, :]) @ depth[..., None]).double())[..., 0].to(v.dtype)
+        v = torch.where((on.sum(-1) >= 3)[..., None], refined, v)
+    H = A + e[..., :, None] * v[..., None, :]
+    return H, inliers & (squared_transfer(H, h1, h2, sphere) < limit[..., None])
+
+
+def fundamentals_of_parallax(
+    H: Float[Tensor, "*#batch 3 3"], h1: Float[Tensor, "*#batch 2 3"], h2: Float[Tensor, "*#batch 2 3"]
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
+    """F of norm 1 and its second epipole, from the homography of a plane and two points off it; zeros where they are on it."""
+    y = h1 @ H.mT
+    lines = torch.linalg.cross(h2, y)
+    e = torch.linalg.cross(lines[..., 0, :], lines[..., 1, :])
+    size = (e * e).sum(-1, keepdim=True)
+    e = e * torch.where(size > 1e-30, size, torch.inf).rsqrt()
+    F = cross_rows(e, H)
+    size = (F * F).sum(-1).sum(-1)[..., None, None]
+    return F * torch.where(size > 1e-30, size, torch.inf).rsqrt(), e
+
+
+def more_than_chance(number: Int[Tensor, "*batch"], chance: Float[Tensor, "*batch"], free: int) -> Bool[Tensor, "*batch"]:
+    """Whether so many points agree with a model of which the others leave `free` dimensions open, rather than by chance."""
+    return number > free + 2 + chance + 3 * chance.sqrt()
+
+
+def _parallax(A: Tensor, e: Tensor, h1: Sequence[Tensor], h2: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Of each point, v' x1 and the square of how far the second point moves with it."""
+    y = forms(A, h1)
+    a = _cross(h2, y)
+    b = _cross(h2, [e[..., i, None] for i in range(3)])
+    square = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+    depth = -(a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / square.clamp(min=1e-30)
+    y = [a + depth * e[..., i, None] for i, a in enumerate(y)]
+    return depth, square / (y[0] * y[0] + y[1] * y[1] + y[2] * y[2]).clamp(min=1e-12)
+
+
+def _cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _solve3(M: Tensor, right: Tensor) -> Tensor:
+    """Solve 3 x 3 systems by cofactors; zeros where singular."""
+    r0, r1, r2 = M.unbind(-2)
+    c0, c1, c2 = torch.linalg.cross(r1, r2), torch.linalg.cross(r2, r0), torch.linalg.cross(r0, r1)
+    det = (r0 * c0).sum(-1, keepdim=True)
+    x = c0 * right[..., :1] + c1 * right[..., 1:2] + c2 * right[..., 2:]
+    return torch.where(det.abs() > 1e-12, x / torch.where(det == 0, 1, det), 0)
