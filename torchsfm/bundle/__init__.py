@@ -3,11 +3,20 @@
 from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
 from torchsfm.bundle.bundle_adjust_projective import ProjectiveBundleResult, bundle_adjust_projective
 from torchsfm.bundle.bundle_covariance import BundleCovariance, bundle_covariance
+from torchsfm.bundle.gauge import Gauge
+from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior
+from torchsfm.bundle.rig import Rig
 
 __all__ = [
     "BundleCovariance",
     "BundleResult",
+    "CentrePrior",
+    "Gauge",
+    "PointPrior",
+    "PosePrior",
+    "Prior",
     "ProjectiveBundleResult",
+    "Rig",
     "bundle_adjust",
     "bundle_adjust_projective",
     "bundle_covariance",

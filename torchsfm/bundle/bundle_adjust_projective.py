@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
-from torchsfm.bundle.checks import check_index
+from torchsfm.bundle.blocks import check_index
 from torchsfm.bundle.projection import NEAREST
 from torchsfm.geometry import normalize_sphere
 from torchsfm.optim import Block, Loss, Term, UnitSphere, sparse_levenberg_marquardt

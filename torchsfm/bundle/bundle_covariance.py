@@ -7,7 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.bundle.bundle_adjust import bundle_problem, check_bundle
+from torchsfm.bundle.blocks import Bundle
+from torchsfm.bundle.priors import Prior
+from torchsfm.bundle.rig import Rig
 from torchsfm.geometry import Camera, Pose
 from torchsfm.optim import Loss, SparseCovariance, sparse_covariance
 
@@ -23,13 +25,15 @@ class BundleCovariance:
     something else is not determined either. `everything` is the engine's own result, with cross-covariances, for sigma = 1.
     """
 
-    poses: Float[Tensor, "v 6 6"]
+    poses: Float[Tensor, "f 6 6"]
     cameras: Float[Tensor, "g k k"]
     X: Float[Tensor, "n 3 3"]
     determined_points: Bool[Tensor, "n"]
     sigma: float
     nullity: int
     everything: SparseCovariance
+    sensors: Float[Tensor, "s 6 6"] | None = None
+    """Of each place on the rig, (w, v), where there is a rig."""
 
 
 def bundle_covariance(
@@ -42,11 +46,14 @@ def bundle_covariance(
     *,
     camera_index: Int[Tensor, "v"] | None = None,
     free: Sequence[str] = ("focal",),
-    fixed_poses: Bool[Tensor, "v"] | None = None,
+    fixed_poses: Bool[Tensor, "f"] | None = None,
     fixed_points: Bool[Tensor, "n"] | None = None,
     fixed_cameras: Bool[Tensor, "g"] | None = None,
+    rig: Rig | None = None,
+    fixed_sensors: Bool[Tensor, "k"] | None = None,
     weights: Float[Tensor, "m"] | None = None,
     loss: Loss | None = None,
+    priors: Sequence[Prior] = (),
     sigma: float | None = None,
 ) -> BundleCovariance:
     """Compute the covariance of an adjusted bundle, by the arguments of `bundle_adjust` at its result.
@@ -65,8 +72,12 @@ def bundle_covariance(
         fixed_poses: Views that did not move.
         fixed_points: Points that did not move.
         fixed_cameras: Cameras that did not change.
+        rig: The adjusted rig.
+        fixed_sensors: Sensors whose place on the rig did not change.
         weights: Weights of the observations, inverse variances up to `sigma`.
         loss: The robust loss; observations count by its slope.
+        priors: What was known of poses and points. Their covariances count in the unit of the observations, as in
+            `bundle_adjust`: where `sigma` is not 1, all of them grow by its square.
         sigma: Standard deviation of an image coordinate of weight 1, pixels; estimated from the residuals if not given.
 
     Returns:
@@ -75,11 +86,14 @@ def bundle_covariance(
     Raises:
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
-    fixed = (fixed_poses, fixed_points, fixed_cameras)
-    index = check_bundle(poses, cameras, X, x, view, point, camera_index, *fixed, weights)
+    bundle = Bundle(
+        poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras, fixed_sensors,
+        weights, loss, priors,
+    )  # fmt: skip
     with torch.no_grad():
-        blocks, term = bundle_problem(poses, cameras, X, x, view, point, index, free, *fixed, weights, loss)
-        unit = sparse_covariance(blocks, [term], eliminate="point")
+        blocks, terms = bundle.problem()
+        unit = sparse_covariance(blocks, terms, eliminate="point")
     scale = sigma if sigma is not None else (unit.square_sum / max(unit.redundancy, 1)) ** 0.5
     pose, camera, points = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
-    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity, unit)
+    sensor = None if rig is None else unit.blocks["sensor"] * scale**2
+    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity, unit, sensor)

@@ -55,7 +55,11 @@ class Projection:
 
     def residual(self, pose: Tensor, camera: Tensor, point: Tensor, x: Tensor) -> Tensor:
         """Predicted minus measured image points, pixels; finite for all finite points, also behind the camera."""
-        moved, k = _transform(pose, point), camera.mT[5:]
+        return self.residual_of(transform(pose, point), camera, x)
+
+    def residual_of(self, moved: Tensor, camera: Tensor, x: Tensor) -> Tensor:
+        """The residual of points in camera coordinates, (3, m)."""
+        k = camera.mT[5:]
         if issubclass(self.model, RADIAL):
             uv, _, s = _flatten(moved)
             if len(k):
@@ -66,12 +70,22 @@ class Projection:
 
     def linearize(self, pose: Tensor, camera: Tensor, point: Tensor, x: Tensor, out: list[Tensor | None]) -> Tensor:
         """Residuals; `out` gets their derivatives by pose step, free camera numbers and point: the chain rule, written out."""
-        moved, rows = _transform(pose, point), camera.mT
+        moved = transform(pose, point)
         by_pose, by_intrinsics, by_point = (None if o is None else o.permute(1, 2, 0) for o in out)
         # Pixels by camera coordinates, which is pixels by translation: (2, 3, m).
         by_camera = (
             torch.empty((2, 3, moved.shape[1]), dtype=moved.dtype, device=moved.device) if by_pose is None else by_pose[:, 3:]
         )
+        residual = self.linearize_at(moved, camera, x, by_camera, by_intrinsics)
+        if by_pose is not None:
+            turn_derivative(moved, by_camera, by_pose)
+        if by_point is not None:
+            turn_back(pose, by_camera, by_point)
+        return residual
+
+    def linearize_at(self, moved: Tensor, camera: Tensor, x: Tensor, by_camera: Tensor, by_intrinsics: Tensor | None) -> Tensor:
+        """Residuals of points in camera coordinates (3, m), and their derivatives by those and by free camera numbers."""
+        rows = camera.mT
         if issubclass(self.model, RADIAL):
             uv, by_parameter = _differentiate_radial(moved, rows[5:], by_camera)
         else:
@@ -82,16 +96,8 @@ class Projection:
         by_camera *= focal[:, None]
         if shear is not None:
             by_camera[0] += shear
-        if by_pose is not None:
-            # A small turn w moves the point by w x X, so the derivative is X x gradient.
-            for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-                torch.mul(by_camera[:, k], moved[j], out=by_pose[:, i]).addcmul_(by_camera[:, j], moved[k], value=-1)
         if by_intrinsics is not None:
             self._by_intrinsics(uv, rows, focal, by_parameter, by_intrinsics)
-        if by_point is not None:
-            R = pose.mT[:9].reshape(3, 3, -1)
-            torch.mul(by_camera[:, :1], R[0], out=by_point)
-            by_point.addcmul_(by_camera[:, 1:2], R[1]).addcmul_(by_camera[:, 2:], R[2])
         return residual.mT
 
     def _pixels(self, uv: Tensor, rows: Tensor, x: Tensor, focal: Tensor) -> Tensor:
@@ -131,11 +137,24 @@ def _focal(rows: Tensor) -> Tensor:
     return torch.stack((rows[0], rows[0] * rows[1]))
 
 
-def _transform(pose: Tensor, point: Tensor) -> Tensor:
-    """Points in camera coordinates, (3, m)."""
+def transform(pose: Tensor, point: Tensor) -> Tensor:
+    """Points (m, 3) after motions (m, 12), as (3, m)."""
     p = pose.mT
     X, Y, Z = point.unbind(-1)
     return torch.addcmul(torch.addcmul(torch.addcmul(p[9:], p[0:9:3], X), p[1:9:3], Y), p[2:9:3], Z)
+
+
+def turn_derivative(moved: Float[Tensor, "3 m"], by_place: Float[Tensor, "2 3 m"], out: Float[Tensor, "2 6 m"]) -> None:
+    """Fill the first three rows: a small turn w moves a point by w x X, so the derivative is X x gradient."""
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        torch.mul(by_place[:, k], moved[j], out=out[:, i]).addcmul_(by_place[:, j], moved[k], value=-1)
+
+
+def turn_back(pose: Float[Tensor, "m 12"], by_place: Float[Tensor, "2 3 m"], out: Float[Tensor, "2 3 m"]) -> None:
+    """The derivative by a point before the motion."""
+    R = pose.mT[:9].reshape(3, 3, -1)
+    torch.mul(by_place[:, :1], R[0], out=out)
+    out.addcmul_(by_place[:, 1:2], R[1]).addcmul_(by_place[:, 2:], R[2])
 
 
 def _flatten(moved: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,0 +1,144 @@
+"""What is known beforehand of poses and points: positions of camera centres (GPS), whole poses, control points.
+
+A prior adds `(v - v0)' C^-1 (v - v0) / 2` to the cost, C the covariance given. An observation's squared distance counts in
+units of 1 pixel there: where image points have a standard deviation s other than 1 pixel, give observations the weight 1 / s^2.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm._types import check_tensors
+from torchsfm.geometry import Pose, rotvec_from_rotation
+from torchsfm.optim import Loss, Term
+
+Sigma = float | Tensor
+
+
+@runtime_checkable
+class Prior(Protocol):
+    """A residual over one block of a bundle, written in units of its standard deviation."""
+
+    @property
+    def index(self) -> Tensor:
+        """Which poses or points it speaks of."""
+
+    @property
+    def block(self) -> str:
+        """Which block: "pose" or "point"."""
+
+    def term(self) -> Term:
+        """The prior as a term of the optimiser."""
+
+
+@dataclass(frozen=True)
+class CentrePrior:
+    """Known camera centres: GPS, or a surveyed track. With rigs, those of the rig's own origin."""
+
+    index: Int[Tensor, "k"]
+    """Which poses."""
+    centre: Float[Tensor, "k 3"]
+    """Where they are, in the world."""
+    sigma: Sigma
+    """Standard deviation in the unit of the world: one number, one for each (k, 1) or for each axis (3,) or (k, 3)."""
+    covariance: Float[Tensor, "k 3 3"] | None = None
+    """Whole covariances, instead of `sigma`."""
+    loss: Loss | None = None
+    """Robust loss of the squared, whitened error."""
+    block = "pose"
+
+    def __post_init__(self) -> None:
+        check_tensors(index=(self.index, "k: int"), centre=(self.centre, "k 3"), covariance=(self.covariance, "k 3 3"))
+
+    def term(self) -> Term:
+        """The prior as a term of the optimiser."""
+
+        def residual(pose: Tensor, centre: Tensor, white: Tensor) -> Tensor:
+            R, t = _split(pose)
+            return _apply(white, -(R.mT @ t[:, :, None])[:, :, 0] - centre)
+
+        white = _whitener(self.sigma, self.covariance, self.centre)
+        return Term(residual, ("pose",), (self.index,), (self.centre, white), self.loss)
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """Known poses: an inertial unit, an earlier adjustment."""
+
+    index: Int[Tensor, "k"]
+    """Which poses."""
+    poses: Pose
+    """What they are, batch (k,)."""
+    sigma: Sigma
+    """Standard deviations of (w, v) as in `Pose.retract`, radians and the unit of the world: one number, (6,) or (k, 6)."""
+    covariance: Float[Tensor, "k 6 6"] | None = None
+    """Whole covariances of (w, v), instead of `sigma`; `BundleCovariance.poses` is one."""
+    loss: Loss | None = None
+    """Robust loss of the squared, whitened error."""
+    block = "pose"
+
+    def __post_init__(self) -> None:
+        check_tensors(index=(self.index, "k: int"), poses=(self.poses.R, "k 3 3"), covariance=(self.covariance, "k 6 6"))
+
+    def term(self) -> Term:
+        """The prior as a term of the optimiser."""
+
+        def residual(pose: Tensor, known: Tensor, white: Tensor) -> Tensor:
+            (R, t), (R0, t0) = _split(pose), _split(known)
+            turn = R @ R0.mT
+            v = t - (turn @ t0[:, :, None])[:, :, 0]
+            return _apply(white, torch.cat((rotvec_from_rotation(turn), v), -1))
+
+        known = torch.cat((self.poses.R.flatten(1), self.poses.t), 1)
+        white = _whitener(self.sigma, self.covariance, known[:, :6])
+        return Term(residual, ("pose",), (self.index,), (known, white), self.loss)
+
+
+@dataclass(frozen=True)
+class PointPrior:
+    """Known points: ground control, markers that were measured."""
+
+    index: Int[Tensor, "k"]
+    """Which points."""
+    X: Float[Tensor, "k 3"]
+    """Where they are, in the world."""
+    sigma: Sigma
+    """Standard deviation in the unit of the world: one number, one for each (k, 1) or for each axis (3,) or (k, 3)."""
+    covariance: Float[Tensor, "k 3 3"] | None = None
+    """Whole covariances, instead of `sigma`."""
+    loss: Loss | None = None
+    """Robust loss of the squared, whitened error."""
+    block = "point"
+
+    def __post_init__(self) -> None:
+        check_tensors(index=(self.index, "k: int"), X=(self.X, "k 3"), covariance=(self.covariance, "k 3 3"))
+
+    def term(self) -> Term:
+        """The prior as a term of the optimiser."""
+
+        def residual(point: Tensor, X: Tensor, white: Tensor) -> Tensor:
+            return _apply(white, point - X)
+
+        white = _whitener(self.sigma, self.covariance, self.X)
+        return Term(residual, ("point",), (self.index,), (self.X, white), self.loss)
+
+
+def _whitener(sigma: Sigma, covariance: Tensor | None, like: Tensor) -> Tensor:
+    """Matrices (k, d, d) that turn errors into units of standard deviations; NaN, which counts as absent, if there is none."""
+    if covariance is None:
+        given = torch.as_tensor(sigma, dtype=like.dtype, device=like.device).expand(like.shape)
+        return torch.diag_embed(torch.where(given > 0, 1 / given, torch.nan))
+    lower, info = torch.linalg.cholesky_ex(covariance)
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device).expand_as(covariance)
+    return torch.where((info == 0)[:, None, None], torch.linalg.solve_triangular(lower, eye, upper=False), torch.nan)
+
+
+def _apply(white: Tensor, error: Tensor) -> Tensor:
+    return (white @ error[:, :, None])[:, :, 0]
+
+
+def _split(pose: Tensor) -> tuple[Tensor, Tensor]:
+    return pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
