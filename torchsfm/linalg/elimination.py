@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.linalg.rows import combine_rows
+
 
 def cross(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
     """The cross product along the last dimension, with broadcasting."""
@@ -40,3 +42,27 @@ def solve(
     x, info = torch.linalg.solve_ex(A, b)
     good = (info == 0) & torch.isfinite(x).all(-1).all(-1)
     return torch.where(good[..., None, None], x, 0.0), good
+
+
+def least_squares_rows(J: Float[Tensor, "m k batch"], r: Float[Tensor, "m batch"]) -> Float[Tensor, "k batch"]:
+    """The x with the smallest `|J x - r|`, for a batch in the last dimension, by the normal equations with a unit diagonal.
+
+    Where the columns are dependent or not finite x is not finite or means nothing.
+    """
+    k = J.shape[1]
+    scale = combine_rows(J, J).rsqrt()
+    J = J * scale
+    # The lower triangle of J'J and J'r as a last row; then Cholesky, column by column.
+    columns = [*J.unbind(1), r]
+    A = [torch.stack([*(combine_rows(c, columns[i]) for c in columns[i:])]) for i in range(k)]
+    for i in range(k):
+        A[i] = A[i] * A[i][0].rsqrt()
+        for j in range(i + 1, k):
+            A[j] = torch.addcmul(A[j], A[i][j - i :], A[i][j - i], value=-1)
+    x: list[Tensor] = []
+    for i in range(k - 1, -1, -1):
+        total = A[i][-1]
+        for value, entry in zip(x, A[i][1:-1], strict=True):
+            total = torch.addcmul(total, value, entry, value=-1)
+        x.insert(0, total / A[i][0])
+    return torch.stack(x) * scale

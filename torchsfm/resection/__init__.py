@@ -1,7 +1,11 @@
 """The structure is known: where is the camera? Absolute pose, PnP; resection in photogrammetry."""
 
 from torchsfm.resection.camera_dlt import CameraEstimate, camera_dlt
+from torchsfm.resection.camera_gp3p import camera_gp3p
 from torchsfm.resection.camera_p3p import camera_p3p
+from torchsfm.resection.camera_p4pf import camera_p4pf
+from torchsfm.resection.camera_p35pf import camera_p35pf
+from torchsfm.resection.camera_up2p import camera_up2p
 from torchsfm.resection.estimate_camera import CameraEstimator, estimate_camera
 from torchsfm.resection.refine_camera import CameraRefinement, refine_camera
 
@@ -14,7 +18,11 @@ __all__ = [
     "CameraEstimator",
     "CameraRefinement",
     "camera_dlt",
+    "camera_gp3p",
     "camera_p3p",
+    "camera_p4pf",
+    "camera_p35pf",
+    "camera_up2p",
     "estimate_camera",
     "refine_camera",
 ]
