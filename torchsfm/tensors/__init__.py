@@ -1,4 +1,4 @@
-"""What ties views together whatever the scene: bifocal tensors, from cameras and to cameras."""
+"""What ties views together whatever the scene: bifocal, trifocal and quadrifocal tensors, from cameras and to cameras."""
 
 from torchsfm.tensors.bifocal import (
     RelativePose,
@@ -15,22 +15,127 @@ from torchsfm.tensors.bifocal import (
     poses_from_essential,
     poses_from_fundamental,
 )
-from torchsfm.tensors.focals import Focals, focals_from_fundamental
+from torchsfm.tensors.canonical import (
+    canonical_cameras,
+)
+from torchsfm.tensors.constraints import (
+    essential_constraints,
+    fundamental_constraint,
+    quadrifocal_constraints,
+    trifocal_constraints,
+)
+from torchsfm.tensors.conversions import (
+    cameras_from_fundamentals,
+    fundamentals_from_quadrifocal,
+    quadrifocal_from_trifocals,
+    reordered_trifocal,
+    trifocal_from_fundamentals,
+)
+from torchsfm.tensors.coordinates import (
+    basis_homography,
+    reduced_fundamental,
+    reduced_quadrifocal,
+    reduced_trifocal,
+    transform_fundamental,
+    transform_quadrifocal,
+    transform_trifocal,
+)
+from torchsfm.tensors.focals import (
+    Focals,
+    focals_from_fundamental,
+)
+from torchsfm.tensors.incidence import (
+    quadrifocal_lll,
+    quadrifocal_llll,
+    quadrifocal_plll,
+    quadrifocal_ppll,
+    quadrifocal_pppl,
+    quadrifocal_pppp,
+    trifocal_lll,
+    trifocal_pll,
+    trifocal_plp,
+    trifocal_ppl,
+    trifocal_ppp,
+)
+from torchsfm.tensors.quadrifocal import (
+    cameras_from_quadrifocal,
+    quadrifocal_from_cameras,
+    quadrifocal_tensors,
+    trifocal_from_quadrifocal,
+)
+from torchsfm.tensors.transfer import (
+    homographies_from_trifocal,
+    transfer_lines_quadrifocal,
+    transfer_lines_trifocal,
+    transfer_points_quadrifocal,
+    transfer_points_trifocal,
+)
+from torchsfm.tensors.trifocal import (
+    ProjectiveCameras,
+    cameras_from_trifocal,
+    fundamentals_from_trifocal,
+    trifocal_epipoles,
+    trifocal_from_cameras,
+    trifocal_tensors,
+)
 
 __all__ = [
     "Focals",
+    "ProjectiveCameras",
     "RelativePose",
+    "basis_homography",
     "bifocal_tensors",
     "cameras_from_fundamental",
+    "cameras_from_fundamentals",
+    "cameras_from_quadrifocal",
+    "cameras_from_trifocal",
+    "canonical_cameras",
     "epipolar_lines",
     "epipoles",
+    "essential_constraints",
     "essential_from_fundamental",
     "essential_from_pose",
     "focals_from_fundamental",
+    "fundamental_constraint",
     "fundamental_from_cameras",
     "fundamental_from_essential",
     "fundamental_from_pose",
+    "fundamentals_from_quadrifocal",
+    "fundamentals_from_trifocal",
+    "homographies_from_trifocal",
     "pose_from_essential",
     "poses_from_essential",
     "poses_from_fundamental",
+    "quadrifocal_constraints",
+    "quadrifocal_from_cameras",
+    "quadrifocal_from_trifocals",
+    "quadrifocal_lll",
+    "quadrifocal_llll",
+    "quadrifocal_plll",
+    "quadrifocal_ppll",
+    "quadrifocal_pppl",
+    "quadrifocal_pppp",
+    "quadrifocal_tensors",
+    "reduced_fundamental",
+    "reduced_quadrifocal",
+    "reduced_trifocal",
+    "reordered_trifocal",
+    "transfer_lines_quadrifocal",
+    "transfer_lines_trifocal",
+    "transfer_points_quadrifocal",
+    "transfer_points_trifocal",
+    "transform_fundamental",
+    "transform_quadrifocal",
+    "transform_trifocal",
+    "trifocal_constraints",
+    "trifocal_epipoles",
+    "trifocal_from_cameras",
+    "trifocal_from_fundamentals",
+    "trifocal_from_quadrifocal",
+    "trifocal_lll",
+    "trifocal_pll",
+    "trifocal_plp",
+    "trifocal_ppl",
+    "trifocal_ppp",
+    "trifocal_tensors",
 ]

@@ -1,0 +1,141 @@
+"""From tensors of fewer views to tensors of more, and back: F, T and Q by way of the cameras they allow."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import Status, check_tensors
+from torchsfm.linalg import null_vector, solve
+from torchsfm.tensors.bifocal import bifocal_tensors, cameras_from_fundamental, unit_rank_2
+from torchsfm.tensors.minors import cyclic_pairs, dual_matrix, split_last
+from torchsfm.tensors.quadrifocal import cameras_from_quadrifocal, quadrifocal_from_cameras
+from torchsfm.tensors.trifocal import ProjectiveCameras, cameras_from_trifocal, trifocal_from_cameras, unit_tensor
+
+
+def cameras_from_fundamentals(
+    F12: Float[Tensor, "*#batch 3 3"], F13: Float[Tensor, "*#batch 3 3"], F23: Float[Tensor, "*#batch 3 3"]
+) -> ProjectiveCameras:
+    """Three projective cameras from the fundamental matrices of their pairs (HZ 15.4).
+
+    P1 and P2 as of `cameras_from_fundamental`; P3 makes P3' F13 P1 and P3' F23 P2 antisymmetric, which are linear equations.
+    Where the three matrices are not compatible, P3 is their least-squares solution.
+
+    Args:
+        F12: x2' F12 x1 = 0.
+        F13: x3' F13 x1 = 0.
+        F23: x3' F23 x2 = 0.
+
+    Returns:
+        The cameras (*batch, 3 views, 3, 4) and the status: DEGENERATE where the centres are on one line, so that the three
+        matrices leave a family of cameras, or where a matrix has rank below 2. Differentiable.
+
+    Raises:
+        ValueError: Wrong shape, dtype or device.
+    """
+    batch = check_tensors(F12=(F12, "3 3"), F13=(F13, "3 3"), F23=(F23, "3 3"))
+    F12, F13, F23 = (F.expand(*batch, 3, 3) for F in (F12, F13, F23))
+    finite = torch.stack([torch.isfinite(F).all(-1).all(-1) for F in (F12, F13, F23)]).all(0)
+    # A rank-2 stand-in where there is no F.
+    stand_in = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=F12.dtype, device=F12.device))
+    P1, P2 = cameras_from_fundamental(torch.where(finite[..., None, None], F12, stand_in))
+    eye = torch.eye(4, dtype=F12.dtype, device=F12.device)
+    blocks = []
+    for F, P in ((F13, P1), (F23, P2)):
+        M = unit_rank_2(F) @ P
+        # (P3' M)_ij + (P3' M)_ji for i <= j, by the entries P3[r, c].
+        B = torch.einsum("...rj,ic->...ijrc", M, eye)
+        i, j = torch.triu_indices(4, 4, device=M.device)
+        blocks.append((B + B.transpose(-4, -3))[..., i, j, :, :].flatten(-2))
+    A = torch.cat(blocks, -2)
+    p, _ = null_vector(A)
+    with torch.no_grad():
+        values = torch.linalg.svdvals(torch.where(finite[..., None, None], A.detach(), 0))
+        rank2 = torch.stack([torch.linalg.svdvals(unit_rank_2(F.detach()))[..., 1] for F in (F12, F13, F23)]).amin(0)
+        floor = 256 * torch.finfo(F12.dtype).eps
+        determined = (values[..., -2] > floor * values[..., 0]) & (rank2 > floor)
+    P = torch.stack((P1, P2, split_last(p, 3, 4)), -3)
+    status = torch.where(determined, Status.OK, Status.DEGENERATE)
+    return ProjectiveCameras(P, torch.where(finite, status, Status.NOT_FINITE).to(torch.int8))
+
+
+def trifocal_from_fundamentals(
+    F12: Float[Tensor, "*#batch 3 3"], F13: Float[Tensor, "*#batch 3 3"], F23: Float[Tensor, "*#batch 3 3"]
+) -> Float[Tensor, "*batch 3 3 3"]:
+    """The trifocal tensor of three views from the fundamental matrices of their pairs.
+
+    Args:
+        F12: x2' F12 x1 = 0.
+        F13: x3' F13 x1 = 0.
+        F23: x3' F23 x2 = 0.
+
+    Returns:
+        T with norm 1, of `cameras_from_fundamentals`, which also says where the result means nothing: three centres on one
+        line have tensors that their fundamental matrices do not determine.
+    """
+    T = trifocal_from_cameras(*cameras_from_fundamentals(F12, F13, F23).P.unbind(-3))
+    return unit_tensor(T, 3)[0]
+
+
+def reordered_trifocal(T: Float[Tensor, "*batch 3 3 3"], views: tuple[int, int, int]) -> Float[Tensor, "*batch 3 3 3"]:
+    """The trifocal tensor of the same cameras in another order.
+
+    The first view plays another part than the other two, so this is no permutation of the entries: it goes by way of
+    `cameras_from_trifocal`.
+
+    Args:
+        T: Trifocal tensors of any scale.
+        views: The new order, a permutation of (0, 1, 2): view `views[0]` becomes the first.
+
+    Returns:
+        T with norm 1. Differentiable.
+
+    Raises:
+        ValueError: Wrong shape or dtype, or `views` is no permutation.
+    """
+    if sorted(views) != [0, 1, 2]:
+        raise ValueError(f"views: wanted a permutation of (0, 1, 2), got {views}")
+    P = cameras_from_trifocal(T).P
+    return unit_tensor(trifocal_from_cameras(*(P[..., k, :, :] for k in views)), 3)[0]
+
+
+def quadrifocal_from_trifocals(
+    T123: Float[Tensor, "*#batch 3 3 3"], T124: Float[Tensor, "*#batch 3 3 3"]
+) -> Float[Tensor, "*batch 3 3 3 3"]:
+    """The quadrifocal tensor from two trifocal tensors with the first two views in common.
+
+    The first gives three cameras, and in their frame the second is linear in the fourth camera.
+
+    Args:
+        T123: Trifocal tensors of views 1, 2, 3, of any scale.
+        T124: Trifocal tensors of views 1, 2, 4.
+
+    Returns:
+        Q with norm 1; zero where a tensor is not finite, without meaning where the first two centres coincide. Differentiable.
+
+    Raises:
+        ValueError: Wrong shape, dtype or device.
+    """
+    batch = check_tensors(T123=(T123, "3 3 3"), T124=(T124, "3 3 3"))
+    three, second = cameras_from_trifocal(T123), unit_tensor(T124, 3)[0].expand(*batch, 3, 3, 3)
+    P1, P2, P3 = (three.P[..., k, :, :].expand(*batch, 3, 4) for k in range(3))
+    K = torch.einsum("...iab,...ja->...ijb", dual_matrix(cyclic_pairs(P1)).mT, P2).flatten(-3, -2)
+    N, right = K.mT @ K, second.flatten(-3, -2)
+    P4, _ = solve(N, K.mT @ right)
+    # The normal equations square the condition number; their correction does not.
+    P4 = P4 + solve(N, K.mT @ (right - K @ P4))[0]
+    good = (three.status != Status.NOT_FINITE)[..., None, None, None, None]
+    Q = quadrifocal_from_cameras(P1, P2, P3, P4.mT)
+    return unit_tensor(torch.where(good, Q, 0), 4)[0]
+
+
+def fundamentals_from_quadrifocal(Q: Float[Tensor, "*batch 3 3 3 3"]) -> Float[Tensor, "*batch 6 3 3"]:
+    """The fundamental matrices of the pairs (1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4) of four views.
+
+    Args:
+        Q: Quadrifocal tensors of any scale.
+
+    Returns:
+        F (*batch, pair, 3, 3) with norm 1, x_j' F x_i = 0 for the pair (i, j), of `cameras_from_quadrifocal`.
+    """
+    pairs = torch.tensor([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], device=Q.device)
+    return unit_tensor(bifocal_tensors(cameras_from_quadrifocal(Q).P, pairs), 2)[0]
