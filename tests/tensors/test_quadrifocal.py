@@ -143,15 +143,16 @@ def test_degenerate_and_bad_input_leave_neighbours_alone(generator: torch.Genera
     reference = cameras_from_quadrifocal(Q)
     Q[1], Q[2] = torch.inf, 0
     M = torch.randn(3, 3, generator=generator, dtype=F64)
-    # Two centres in one place, the first two and the last two.
+    # Two centres in one place: the first two are not found, the last two are.
     Q[3] = quadrifocal_from_cameras(P[3, 0], M @ P[3, 0], P[3, 2], P[3, 3])
     Q[4] = quadrifocal_from_cameras(P[3, 0], P[3, 1], P[3, 2], M @ P[3, 2])
     Q.requires_grad_()
     found = cameras_from_quadrifocal(Q)
-    wanted = [Status.OK, Status.NOT_FINITE, Status.DEGENERATE, Status.DEGENERATE, Status.DEGENERATE, Status.OK]
+    wanted = [Status.OK, Status.NOT_FINITE, Status.DEGENERATE, Status.DEGENERATE, Status.OK, Status.OK]
     assert found.status.tolist() == wanted
     assert torch.isfinite(found.P).all()
     assert torch.equal(found.P[[0, 5]], reference.P[[0, 5]])
+    assert up_to_scale(quadrifocal_from_cameras(*found.P[4]), Q[4], 4) < 1e-9
     found.P.sum().backward()
     assert Q.grad is not None
     assert torch.isfinite(Q.grad).all()

@@ -108,7 +108,8 @@ def cameras_from_quadrifocal(Q: Float[Tensor, "*batch 3 3 3 3"]) -> ProjectiveCa
             entries alike.
 
     Returns:
-        The cameras (*batch, 4 views, 3, 4) and the status: DEGENERATE where Q does not determine them (centres that coincide).
+        The cameras (*batch, 4 views, 3, 4) and the status: DEGENERATE where the first centre coincides with
+        the second or third, or Q leaves the cameras open otherwise.
         Differentiable; the derivative is that of a Gauss-Newton step, exact where Q is a quadrifocal tensor.
 
     Raises:
