@@ -40,6 +40,7 @@ from torchsfm.geometry.rotations import (
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
+from torchsfm.geometry.shape import affine_shape, balanced_frame, depth_space, normalize_shape, principal_angles
 from torchsfm.geometry.similarity import Similarity, similarity_from_points
 
 __all__ = [
@@ -55,17 +56,22 @@ __all__ = [
     "Radial",
     "Similarity",
     "SimpleRadial",
+    "affine_shape",
+    "balanced_frame",
     "camera_centre",
     "camera_from_krt",
     "cross_matrix",
+    "depth_space",
     "epipolar_distance",
     "from_homogeneous",
     "intrinsics",
     "krt_from_camera",
     "line_and_plane_distances",
+    "normalize_shape",
     "normalize_sphere",
     "normalizing_similarity",
     "point_depths",
+    "principal_angles",
     "project_points",
     "quaternion_wxyz_from_rotation",
     "random_rotation",

@@ -4,6 +4,7 @@ from torchsfm.motion.essential_5pt import essential_5pt
 from torchsfm.motion.estimate_essential import RelativePoseEstimator, estimate_essential
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_fundamental
 from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
+from torchsfm.motion.factorization_points import Factorization, factorize_points
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.fundamental_8pt import fundamental_8pt
 from torchsfm.motion.homography_4pt import homography_4pt
@@ -14,6 +15,7 @@ ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator)
 
 __all__ = [
     "ESTIMATORS",
+    "Factorization",
     "FundamentalEstimator",
     "HomographyEstimator",
     "RelativePoseEstimator",
@@ -21,6 +23,7 @@ __all__ = [
     "estimate_essential",
     "estimate_fundamental",
     "estimate_homography",
+    "factorize_points",
     "fundamental_7pt",
     "fundamental_8pt",
     "homography_4pt",

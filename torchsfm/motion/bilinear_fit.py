@@ -1,0 +1,289 @@
+"""Rays, cameras and points with `depth a = P u`: the least-squares problems behind projective factorisation, many at once.
+
+Two measures of the misfit of a unit ray a and its prediction y = P u, both blind to rotations of the image's frame:
+
+- with a prior on the depths, `|(I - a a') y|^2 + prior (a' y - 1)^2`: bilinear in P and u, so that the points can be eliminated
+  exactly (variable projection: Golub & Pereyra 1973; Hong & Zach 2018 for its convergence from anywhere). With `prior = 1` it
+  is the factorisation of the rays themselves to rank 4;
+- the squared sine of the angle between a and y, which knows no depth.
+
+Both have Hessians `B = alpha I - sum_k q_k q_k'` in y (Gauss-Newton), so one Schur complement serves both. Arrays are
+(problem, view, coordinate, point), with the points last.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Unit rays in each view, 0 where there is none, and their weights."""
+
+    a: Float[Tensor, "p v 3 n"]
+    w: Float[Tensor, "p v n"]
+
+    def take(self, index: Tensor) -> "Rays":
+        """Some of the problems."""
+        return Rays(self.a[index], self.w[index])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Cameras and points, and the misfit: the mean over the weights is 1 for a perfect miss."""
+
+    P: Float[Tensor, "p v 3 4"]
+    u: Float[Tensor, "p 4 n"]
+    cost: Float[Tensor, "p"]
+
+
+@dataclass(frozen=True)
+class _Linearisation:
+    """Gradient in y and the Gauss-Newton Hessian `alpha I - sum_k q_k q_k'`, weights included; for unknown P and u."""
+
+    P: Tensor
+    u: Tensor
+    slope: Float[Tensor, "p v 3 n"]
+    alpha: Float[Tensor, "p v n"]
+    q: Float[Tensor, "p v k 3 n"]
+
+
+def rank_four(rays: Rays) -> Float[Tensor, "p v 3 4"]:
+    """Cameras whose joint column space holds most of the rays: the start of everything."""
+    p, v, _, n = rays.a.shape
+    M = (rays.a * rays.w[:, :, None]).reshape(p, 3 * v, n)
+    basis = torch.linalg.eigh(M @ M.mT)[1][..., -4:]
+    P: Tensor = basis.reshape(p, v, 3, 4) * v**0.5
+    return P
+
+
+def fit_with_prior(
+    rays: Rays, P: Float[Tensor, "p v 3 4"], prior: float, steps: int, tolerance: float
+) -> tuple[Float[Tensor, "p v 3 4"], Float[Tensor, "p 4 n"]]:
+    """Minimise the misfit with a prior over cameras and points, from given cameras."""
+    P = _balanced(P)
+    u, cost = _best_points(rays, P, prior)
+    damping, growth, total = torch.full_like(cost, 1e-4), torch.full_like(cost, 2), _total(rays)
+    done = torch.zeros_like(cost, dtype=torch.bool)
+    for _ in range(steps):
+        y = P @ u[:, None]
+        along = (rays.a * y).sum(2, keepdim=True)
+        w = rays.w[:, :, None]
+        slope = w * (y - ((1 - prior) * along + prior) * rays.a)
+        q = ((1 - prior) * w).sqrt() * rays.a
+        system = _Linearisation(P, u, slope, rays.w, q[:, :, None])
+        step, _, solved, promise = _step(system, damping, points=False)
+        trial = _balanced(P + step)
+        v, trial_cost = _best_points(rays, trial, prior)
+        better, cost_before = solved & (trial_cost < cost) & ~done, cost
+        small = cost - trial_cost <= tolerance * cost
+        P = torch.where(better[:, None, None, None], trial, P)
+        u = torch.where(better[:, None, None], v, u)
+        done = done | (better & small) | (damping > 1e8)
+        cost = torch.where(better, trial_cost, cost)
+        damping, growth = _next(damping, growth, better, (cost_before - trial_cost) * total / promise)
+        if bool(done.all()):
+            break
+    return P, u
+
+
+def fit_angles(
+    rays: Rays, P: Float[Tensor, "p v 3 4"], u: Float[Tensor, "p 4 n"], steps: int
+) -> tuple[Fit, list[Tensor], Tensor]:
+    """Minimise the squared sines over cameras and points; also the cost after each step, and which problems came to an end."""
+    P, u = _unit(P, u)
+    cost = sine_cost(rays, P, u)
+    history = [cost]
+    damping, growth, total = torch.full_like(cost, 1e-4), torch.full_like(cost, 2), _total(rays)
+    done = cost == 0
+    still = torch.zeros_like(done)
+    for _ in range(steps):
+        step, move, solved, promise = _step(_angles(rays, P, u), damping, points=True)
+        Q, v = _unit(P + step, u + move)
+        trial = sine_cost(rays, Q, v)
+        better = solved & (trial < cost) & ~done
+        # Twice in a row: a first small step may be one that was damped hard.
+        small = better & (cost - trial <= 1e-10 * cost)
+        done = done | (small & still) | (~better & (damping > 1e6)) | (better & (trial < 1e-30))
+        still = small
+        P = torch.where(better[:, None, None, None], Q, P)
+        u = torch.where(better[:, None, None], v, u)
+        cost = torch.where(better, trial, cost)
+        history.append(cost)
+        damping, growth = _next(damping, growth, better, (history[-2] - trial) * total / promise)
+        if bool(done.all()):
+            break
+    return Fit(P, u, cost), history, done
+
+
+def sine_cost(rays: Rays, P: Tensor, u: Tensor) -> Float[Tensor, "p"]:
+    """The weighted mean of the squared sines of the angles between rays and predictions."""
+    return (rays.w * squared_sines(rays, P, u)).sum((-2, -1)) / _total(rays)
+
+
+def squared_sines(rays: Rays, P: Tensor, u: Tensor) -> Float[Tensor, "p v n"]:
+    """The squared sine of the angle between each ray and its prediction."""
+    unit = torch.nn.functional.normalize(P @ u[:, None], dim=2)
+    rest = unit - rays.a * (rays.a * unit).sum(2, keepdim=True)
+    return rest.square().sum(2)
+
+
+def information(rays: Rays, fit: Fit) -> Float[Tensor, "p k"]:
+    """The eigenvalues, ascending, of the Gauss-Newton Hessian of the sines over the cameras, points eliminated.
+
+    The scale of each camera is held. Of each problem, fifteen are zero: a projective change of space costs nothing.
+    """
+    S = _reduced(_angles(rays, fit.P, fit.u), torch.zeros_like(fit.cost), points=True)[0]
+    values: Tensor = torch.linalg.eigvalsh(torch.where(torch.isfinite(S), S, 0))
+    return values
+
+
+def with_derivative(rays: Rays, fit: Fit) -> tuple[Tensor, Tensor]:
+    """Attach to cameras and points their derivatives with respect to the rays and weights, to first order in the misfit.
+
+    A Gauss-Newton step from the minimum is zero in value and has this derivative.
+    """
+    with torch.no_grad():
+        held = _angles(Rays(rays.a.detach(), rays.w.detach()), fit.P, fit.u)
+    system = replace(held, slope=_angles(rays, fit.P, fit.u).slope)
+    S, right, F, rest = _reduced(system, torch.zeros_like(fit.cost), points=True)
+    values, vectors = torch.linalg.eigh(S)
+    free = values <= values[:, 14:15].clamp_min(0) + 1e-13 * values[:, -1:]
+    inverse = torch.where(free, 0, 1 / torch.where(free, 1, values))
+    step = -(vectors * inverse[:, None]) @ (vectors.mT @ right[..., None])
+    move = _back(F, rest, step)
+    step = step.reshape(fit.P.shape)
+    return fit.P + (step - step.detach()), fit.u + (move - move.detach())
+
+
+def _angles(rays: Rays, P: Tensor, u: Tensor) -> _Linearisation:
+    y = P @ u[:, None]
+    size = torch.linalg.vector_norm(y, dim=2, keepdim=True).clamp_min(1e-100)
+    y = y / size
+    cosine = (rays.a * y).sum(2, keepdim=True)
+    p = rays.a - cosine * y
+    w = rays.w[:, :, None]
+    scale = w.sqrt() / size
+    return _Linearisation(P, u, -w * cosine * p / size, scale[:, :, 0].square(), torch.stack((scale * y, scale * p), 2))
+
+
+def _total(rays: Rays) -> Tensor:
+    return rays.w.sum((-2, -1)).clamp_min(1e-100)
+
+
+def _best_points(rays: Rays, P: Tensor, prior: float) -> tuple[Tensor, Tensor]:
+    """The points that minimise the misfit with a prior for given cameras, and the misfit."""
+    seen = P.mT @ rays.a
+    H = _point_hessians(P, rays.w, ((1 - prior) * rays.w).sqrt()[:, :, None] * seen)
+    right = prior * (rays.w[:, :, None] * seen).sum(1).mT
+    L = torch.linalg.cholesky_ex(_regular(H))[0]
+    u = torch.cholesky_solve(right[..., None], L)[..., 0].mT
+    y = P @ u[:, None]
+    along = (rays.a * y).sum(2)
+    misfit = y.square().sum(2) - along.square() + prior * ((along - 1).square() + rays.a.square().sum(2) - 1)
+    return u, (rays.w * misfit).sum((-2, -1)) / _total(rays)
+
+
+def _point_hessians(P: Tensor, alpha: Tensor, m: Tensor) -> Float[Tensor, "p n 4 4"]:
+    """`sum_v alpha P'P - sum_vk m m'` for each point, with m (p, v, k 4, n) or (p, v, 4, n)."""
+    p, v, _, n = m.shape
+    G = (P.mT @ P).reshape(p, v, 16)
+    H = (alpha.mT @ G).reshape(p, n, 4, 4)
+    rows = m.reshape(p, m.shape[1] * m.shape[2] // 4, 4, n).permute(0, 3, 2, 1).contiguous()
+    return H - rows @ rows.mT
+
+
+def _regular(H: Tensor) -> Tensor:
+    """Add what rounding may take away; points without rays get the identity."""
+    trace = H.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    eye = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
+    return H + torch.where(trace > 0, 1e-14 * trace, 1.0) * eye
+
+
+def _reduced(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The Schur complement over the cameras, its right-hand side, and what back-substitution needs.
+
+    With `points`, these have a gradient of their own and are damped, and scales of cameras and points are held.
+    """
+    P, u, alpha, q = system.P, system.u, system.alpha, system.q
+    p, v, k, _, n = q.shape
+    m = P.mT[:, :, None] @ q
+    H = _point_hessians(P, alpha, m.flatten(2, 3))
+    size = H.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    eye4 = torch.eye(4, dtype=P.dtype, device=P.device)
+    if points:
+        H = H + size * u.mT[..., :, None] * u.mT[..., None, :] + damping[:, None, None, None] * size * eye4
+    L = torch.linalg.cholesky_ex(_regular(H))[0]
+    inverse = torch.linalg.solve_triangular(L, eye4.expand_as(L), upper=False).permute(0, 2, 3, 1)
+    # B P, times L^-T over its last index, times u: half of the coupling (12 v, 4 n), in one contiguous array.
+    BP = alpha[:, :, None, None] * P[..., None]
+    for i in range(k):
+        BP = BP - q[:, :, i, :, None] * m[:, :, i, None]
+    C = sum(BP[:, :, :, None, c] * inverse[:, None, None, :, c] for c in range(4))
+    assert isinstance(C, Tensor)
+    F = (C[:, :, :, None] * u[:, None, None, :, None]).reshape(p, 12 * v, 4 * n)
+    B = alpha[:, :, None, None] * torch.eye(3, dtype=P.dtype, device=P.device)[..., None]
+    for i in range(k):
+        B = B - q[:, :, i, :, None] * q[:, :, i, None]
+    uu = (u[:, :, None] * u[:, None]).reshape(p, 16, n)
+    A = (B.reshape(p, 9 * v, n) @ uu.mT).reshape(p, v, 3, 3, 4, 4).transpose(3, 4).reshape(p, v, 12, 12)
+    scale = A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+    if points:
+        flat = P.reshape(p, v, 12)
+        A = A + 12 * scale * flat[..., :, None] * flat[..., None, :]
+    A = A + damping[:, None, None, None] * scale.clamp_min(1e-100) * torch.eye(12, dtype=P.dtype, device=P.device)
+    S = -(F @ F.mT)
+    S.view(p, v, 12, v, 12).diagonal(dim1=1, dim2=3).add_(A.permute(0, 2, 3, 1))
+    right = (system.slope @ u.mT[:, None]).reshape(p, 12 * v)
+    g = torch.zeros(p, 4, n, dtype=P.dtype, device=P.device)
+    if points:
+        g = (P.mT @ system.slope).sum(1)
+        g = (inverse * g[:, None]).sum(2)
+        right = right - (F @ g.reshape(p, 4 * n, 1))[..., 0]
+    return S, right, F, torch.stack((g, *inverse.unbind(1)), 1)
+
+
+def _step(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Tensor, Tensor, Bool[Tensor, "p"], Tensor]:
+    """A damped Gauss-Newton step of cameras and points, and where it could be solved."""
+    p, v, _ = system.alpha.shape
+    S, right, F, rest = _reduced(system, damping, points)
+    factor, info = torch.linalg.cholesky_ex(S)
+    step = -torch.cholesky_solve(right[..., None], factor)
+    solved = (info == 0) & torch.isfinite(step).all(-1).all(-1)
+    step = torch.where(solved[:, None, None], step, 0)
+    g, move = rest[:, 0], _back(F, rest, step)
+    # The model: right' step + step' S step / 2 and what the points alone bring; twice that in units of the cost.
+    promise = -(right * step[..., 0]).sum(-1) + g.square().sum((-2, -1))
+    return step.reshape(p, v, 3, 4), move, solved, promise.clamp_min(1e-300)
+
+
+def _back(F: Tensor, rest: Tensor, step: Tensor) -> Float[Tensor, "p 4 n"]:
+    """The step of the points that goes with a step of the cameras."""
+    g, inverse = rest[:, 0], rest[:, 1:]
+    back = g + (F.mT @ step).reshape(g.shape)
+    return -(inverse * back[:, :, None]).sum(1)
+
+
+def _next(damping: Tensor, growth: Tensor, better: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
+    """Nielsen's rule (1999)."""
+    factor = (1 - (2 * gain.clamp(0, 1) - 1) ** 3).clamp_min(1 / 3)
+    factor = torch.where(gain > 0.9, 0.1, factor)
+    return torch.where(better, damping * factor, damping * growth).clamp(min=1e-14), torch.where(better, 2, 2 * growth)
+
+
+def _balanced(P: Tensor) -> Tensor:
+    """The same column space with orthonormal columns, of a norm that does not depend on the number of views."""
+    p, v = P.shape[:2]
+    Q: Tensor = torch.linalg.qr(P.reshape(p, 3 * v, 4))[0].reshape(p, v, 3, 4) * v**0.5
+    return Q
+
+
+def _unit(P: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """The frame in which the cameras' joint columns are orthonormal; then each camera and point of norm 1."""
+    p, v = P.shape[:2]
+    Q, R = torch.linalg.qr(P.reshape(p, 3 * v, 4))
+    P, u = Q.reshape(p, v, 3, 4), R @ u
+    P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-100)
+    return P, torch.nn.functional.normalize(u, dim=1)
