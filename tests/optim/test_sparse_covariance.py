@@ -144,7 +144,9 @@ class TestDerivative:
         def function(d: Tensor, weights: Tensor, station: Tensor) -> Tensor:
             moved = blocks | {"station": Block(station, None, fixed)}
             term = dataclasses.replace(terms[0], data=(d,), weights=weights, loss=loss)
-            result = sparse_levenberg_marquardt(moved, [term], eliminate="mark", function_tolerance=1e-15, max_iterations=200)
+            result = sparse_levenberg_marquardt(
+                moved, [term], eliminate="mark", function_tolerance=1e-15, step_tolerance=1e-14, max_iterations=200
+            )
             return (torch.cat((result.x["station"], result.x["mark"])) * away).sum()
 
         # Start where it ends, so that all converge to the same place; only the fixed stations' values matter.

@@ -17,6 +17,7 @@ from torchsfm.optim import (
     UnitSphere,
     coupling_groups,
     coupling_pairs,
+    coupling_rows,
     layout,
     schur,
     sparse_levenberg_marquardt,
@@ -128,6 +129,7 @@ def test_small_chunks_change_nothing(scene: Scene, monkeypatch: pytest.MonkeyPat
     for seconds in (0.0, torch.inf):
         monkeypatch.setattr(schur, "CHUNK", 7)
         monkeypatch.setattr(coupling_groups, "CHUNK", 7)
+        monkeypatch.setattr(coupling_rows, "CHUNK", 7)
         monkeypatch.setattr(coupling_pairs, "BATCH", 16)
         monkeypatch.setattr(schur, "estimate_pairs", lambda layout, seconds=seconds: seconds)
         cut = sparse_levenberg_marquardt(scene.blocks(), [scene.term(loss=Cauchy(1.0))], eliminate="point", max_iterations=4)

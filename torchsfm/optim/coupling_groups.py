@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.terms import Workspace
+from torchsfm.optim.triangle import Triangle
 
 CACHE = 100_000
 """Numbers worked on at once, to stay in the cache."""
@@ -67,9 +68,8 @@ class GroupCoupling:
                 product.addcmul_(J[k], P[k, a])
             self._W[a].scatter_add_(0, target, product.view(-1))
 
-    def reduce(self, S: Tensor, L: list[list[Tensor]], z: Tensor) -> Tensor:
-        """Subtract `W V^-1 W'` from S, with `V = L L'`; return `W L'^-1 z`."""
-        right = S.new_zeros(S.shape[0])
+    def reduce(self, S: Tensor, L: Triangle, z: Tensor) -> None:
+        """Subtract `W V^-1 W'` from S, with `V = L L'`, and `W L'^-1 z` from its column `size`."""
         for group in self.groups:
             columns = group.columns.numel()
             square, part = S.new_zeros((columns, columns)), S.new_zeros(columns)
@@ -82,11 +82,10 @@ class GroupCoupling:
                     part.addmv_(Y[a], z[a, first:last])
             if group.everything:
                 S[: self.size, : self.size] -= square
-                right[: self.size] += part
+                S[: self.size, self.size] -= part
             else:
                 S[group.columns[:, None], group.columns] -= square
-                right[group.columns] += part
-        return right
+                S[group.columns, self.size] -= part
 
     def product(self, kept: Tensor) -> Tensor:
         """`W' kept`."""
@@ -103,7 +102,7 @@ class GroupCoupling:
             out[group.columns] += torch.bmm(W, point[:, group.start : group.end, None])[:, :, 0].sum(0)
         return out
 
-    def add_spread(self, out: Tensor, L: list[list[Tensor]], kept: Tensor) -> None:
+    def add_spread(self, out: Tensor, L: Triangle, kept: Tensor) -> None:
         """Add `Y' C Y` of each point to `out` (q, q, points), with `Y = W L'^-1` and C (size, size) of the retained."""
         full = torch.nn.functional.pad(kept, (0, 2, 0, 2))
         for group in self.groups:
@@ -117,7 +116,7 @@ class GroupCoupling:
                     for b in range(self.q):
                         out[a, b, first:last] += (CY * Y[b]).sum(0)
 
-    def _whiten(self, group: _Group, first: int, last: int, L: list[list[Tensor]]) -> Tensor:
+    def _whiten(self, group: _Group, first: int, last: int, L: Triangle) -> Tensor:
         """`W L'^-1` of some points of a group, (q, columns, points)."""
         W, span = self._matrix(group)[:, :, first - group.start : last - group.start], slice(first, last)
         Y = self._work.get("Y", *W.shape)

@@ -56,7 +56,7 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
         counted = [to_double(t) for t in terms]
         counted = [t.select(usable(t, x).nonzero()[:, 0]) for t in counted]
         layout = lay_out(double, counted, eliminate)
-        engine = Elimination(double, layout, dense=True)
+        engine = Elimination(double, layout, "dense", spread=True)
         inverse = engine.linearize(x).invert()
         free_points = inverse.point_covariance() if inverse.L else None
         squares = sum((_square_sum(part.term, x) for part in engine.parts), 0.0)

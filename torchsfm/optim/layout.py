@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchsfm.optim.terms import Block, Term
 
-CHUNK = 4096
-"""Residuals linearised at once: few enough for temporaries to stay in the cache (and below malloc's mmap threshold)."""
+CHUNK = 10000
+"""Residuals linearised at once: few enough for temporaries to stay in the cache. Rows of a power of two would collide."""
 
 
 @dataclass(frozen=True)

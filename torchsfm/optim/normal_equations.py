@@ -8,47 +8,52 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsfm.optim.conjugate_gradients import Clusters, solve_reduced
 from torchsfm.optim.coupling_groups import GroupCoupling
 from torchsfm.optim.coupling_pairs import PairCoupling
+from torchsfm.optim.coupling_rows import RowCoupling
 from torchsfm.optim.layout import Layout
+from torchsfm.optim.squares import Squares
+from torchsfm.optim.triangle import Triangle, backward, diagonal, factor, floor, forward, place
 
-Triangle = list[list[Tensor]]
-"""Lower triangular factors of all eliminated blocks, entry by entry, with the reciprocals of the diagonal in its place."""
 NULL = 1e-11
 """Eigenvalues of the reduced system, scaled to unit diagonal of U, that count as zero: directions of gauge."""
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """`U` with the gradient as column `size`, `V`, and the coupling `W`.
+    """`U` with the gradient, `V`, and the coupling `W`.
 
     `V` holds the distinct entries of the blocks row by row, each row followed by its entry of the gradient.
     """
 
     layout: Layout
-    coupling: GroupCoupling | PairCoupling | None
-    U: Tensor
+    coupling: GroupCoupling | PairCoupling | RowCoupling | None
+    squares: Squares
     V: Tensor
+    clusters: Clusters | None
+    """The preconditioner's blocks where the reduced system is not formed."""
+    diagonal: Tensor
+    """Of U."""
+    slope: Tensor
+    """The gradient by retained variables."""
 
     def step(self, damping: float) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-        """The step for `damping` times the diagonal, the decrease the model promises, and whether the system was solved."""
-        size, q = self.layout.size, self.layout.point_size
-        weight = damping * _floor(self.U.diagonal()[:size])
-        S, right = self.U.clone(), self.U[:size, size].clone()
-        S.diagonal()[:size] += weight
+        """The step for `damping` times the diagonal, the decrease the model promises, and whether the system was solved.
+
+        The promise holds for steps of conjugate gradients too: their residual is orthogonal to the step.
+        """
+        q = self.layout.point_size
+        weight = damping * floor(self.diagonal)
         h = self.point_gradient()
         point_weight, z = h, h
         L: Triangle = []
         if q:
-            point_weight = damping * _floor(self.V[[_place(a, a, q) for a in range(q)]])
+            point_weight = damping * floor(diagonal(self.V, q))
             L = factor(self.V, point_weight, q)
             z = forward(L, h)
-            if self.coupling is not None:
-                right -= self.coupling.reduce(S, L, z)[:size]
-        lower, info = torch.linalg.cholesky_ex(S[:size, :size])
-        kept = -torch.cholesky_solve(right[:, None], lower)[:, 0] if size else right
-        solved = (info == 0) & kept.isfinite().all()
-        promise = kept @ (weight * kept - self.U[:size, size])
+        kept, solved = self._reduced(weight, L, z)
+        promise = kept @ (weight * kept - self.slope)
         point = h
         if q:
             if self.coupling is not None:
@@ -57,22 +62,42 @@ class NormalEquations:
             promise = promise + (point * (point_weight * point - h)).sum()
         return self.split(kept, point), promise / 2, solved
 
+    def _reduced(self, weight: Tensor, L: Triangle, z: Tensor) -> tuple[Tensor, Tensor]:
+        """The step of the retained variables, and whether there is one."""
+        size = self.layout.size
+        if self.clusters is not None:
+            assert self.coupling is None or isinstance(self.coupling, RowCoupling), "made so by Elimination"
+            kept, _ = solve_reduced(self.squares, self.coupling, self.clusters, L, z, weight)
+            return kept, kept.isfinite().all()
+        if not size:
+            return weight, torch.ones_like(weight, dtype=torch.bool).all()
+        S = self.squares.dense()
+        S.diagonal()[:size] += weight
+        if self.coupling is not None:
+            assert not isinstance(self.coupling, RowCoupling), "made so by Elimination"
+            self.coupling.reduce(S, L, z)
+        lower, info = torch.linalg.cholesky_ex(S[:size, :size])
+        half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
+        kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
+        return kept, (info == 0) & kept.isfinite().all()
+
     def invert(self) -> "Inverse":
         """The inverse without damping; its pseudo-inverse where a gauge is free."""
         size, q = self.layout.size, self.layout.point_size
-        S = self.U.clone()
+        S = self.squares.dense()
         L: Triangle = []
         determined = torch.ones(self.V.shape[-1], dtype=torch.bool, device=S.device)
         if q:
-            diagonal = self.V[[_place(a, a, q) for a in range(q)]]
-            L = factor(self.V, torch.zeros_like(diagonal), q)
+            pivots = diagonal(self.V, q)
+            L = factor(self.V, torch.zeros_like(pivots), q)
             for a in range(q):
                 # Directions that no residual sees are left out: a basic solution.
-                L[a][a] = torch.where(L[a][a] * L[a][a] * diagonal[a] < 1e13, L[a][a], 0.0)
+                L[a][a] = torch.where(L[a][a] * L[a][a] * pivots[a] < 1e13, L[a][a], 0.0)
                 determined &= L[a][a] > 0
             if self.coupling is not None:
-                self.coupling.reduce(S, L, torch.zeros_like(diagonal))
-        scale = _floor(self.U.diagonal()[:size]).rsqrt()
+                assert not isinstance(self.coupling, RowCoupling), "asked for without conjugate gradients"
+                self.coupling.reduce(S, L, torch.zeros_like(pivots))
+        scale = floor(self.diagonal).rsqrt()
         values, vectors = torch.linalg.eigh(scale[:, None] * S[:size, :size] * scale)
         null = values <= NULL * values.amax(-1, keepdim=True) if size else values > 0
         inverse = torch.where(null, 0.0, 1 / torch.where(null, 1.0, values))
@@ -82,12 +107,11 @@ class NormalEquations:
     def point_gradient(self) -> Tensor:
         """`h`, (q, points)."""
         q = self.layout.point_size
-        return self.V[[_place(a, q, q) for a in range(q)]]
+        return self.V[[place(a, q, q) for a in range(q)]]
 
     def gradient(self) -> Tensor:
         """Largest absolute derivative of the cost."""
-        size = self.layout.size
-        return torch.cat((self.U[:size, size], self.point_gradient().flatten())).abs().amax()
+        return torch.cat((self.slope, self.point_gradient().flatten())).abs().amax()
 
     def split(self, kept: Tensor, point: Tensor) -> dict[str, Tensor]:
         """A vector of the size of the system by blocks, (free variables, tangent)."""
@@ -104,7 +128,7 @@ class NormalEquations:
     def join(self, parts: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """The inverse of `split`."""
         kept = [parts[name].reshape(-1) for name in self.layout.first]
-        empty = self.U.new_zeros(0)
+        empty = self.V.new_zeros(0)
         point = parts[self.layout.eliminated].mT if self.layout.eliminated is not None else self.point_gradient()
         return torch.cat((empty, *kept)), point
 
@@ -153,59 +177,3 @@ class Inverse:
 def extend(kept: Tensor) -> Tensor:
     """Zeros for the columns of the gradient and of fixed variables."""
     return torch.cat((kept, kept.new_zeros(2)))
-
-
-def _place(a: int, b: int, q: int) -> int:
-    """Row of V that holds entry (a, b >= a) of the blocks; b = q is the gradient."""
-    return a * (q + 1) - a * (a - 1) // 2 + b - a
-
-
-def _floor(diagonal: Tensor) -> Tensor:
-    """A variable that nothing depends on in some direction gets a damping of its own, and does not move."""
-    if diagonal.numel() == 0:
-        return diagonal
-    least = 1e-12 * diagonal.amax(0, keepdim=True)
-    return torch.where(least > 0, torch.maximum(diagonal, least), torch.ones_like(diagonal))
-
-
-def factor(V: Tensor, damping: Tensor, q: int) -> Triangle:
-    """Cholesky factors of all point blocks, elementwise, with the reciprocals of the diagonal in its place."""
-    L: Triangle = []
-    for a in range(q):
-        row: list[Tensor] = []
-        for b in range(a + 1):
-            value = V[_place(b, a, q)]
-            if a == b:
-                full = value + damping[a]
-                for c in range(b):
-                    value = value - row[c] * row[c]
-                # Rounding must not take the pivot below what the damping guarantees.
-                row.append(torch.maximum(value + damping[a], 1e-15 * full).rsqrt())
-            else:
-                for c in range(b):
-                    value = value - row[c] * L[b][c]
-                row.append(value * L[b][b])
-        L.append(row)
-    return L
-
-
-def forward(L: Triangle, z: Tensor) -> Tensor:
-    """`L^-1 z`."""
-    rows: list[Tensor] = []
-    for a, value in enumerate(z.unbind(0)):
-        for b in range(a):
-            value = value - L[a][b] * rows[b]
-        rows.append(value * L[a][a])
-    return torch.stack(rows)
-
-
-def backward(L: Triangle, z: Tensor) -> Tensor:
-    """`L'^-1 z`."""
-    q = len(L)
-    rows: list[Tensor] = [z[0]] * q
-    for a in reversed(range(q)):
-        value = z[a]
-        for b in range(a + 1, q):
-            value = value - L[b][a] * rows[b]
-        rows[a] = value * L[a][a]
-    return torch.stack(rows)

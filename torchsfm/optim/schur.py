@@ -12,15 +12,29 @@ per damping (`NormalEquations.step`), so that a rejected step costs only the las
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from torchsfm.optim.conjugate_gradients import Clusters, find_clusters
 from torchsfm.optim.coupling_groups import GroupCoupling, plan_groups
 from torchsfm.optim.coupling_pairs import PairCoupling, estimate_pairs
+from torchsfm.optim.coupling_rows import RowCoupling
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.normal_equations import NormalEquations
+from torchsfm.optim.runs import Runs, find_runs
+from torchsfm.optim.squares import Squares
 from torchsfm.optim.terms import Block, Term, Workspace, gather, lift_of, linearize, term_cost, term_residual
+
+LARGEST = 9000
+"""Columns of the largest reduced system formed without being asked: its square and factor take 1.3 GB."""
+FLOP = 1.3e-11
+"""Seconds per column cubed of a Cholesky factorisation, on a usual core."""
+PASS = 4e-6
+"""Seconds per residual of a solution by conjugate gradients, of some 100 iterations."""
+Solver = Literal["auto", "dense", "pcg"]
+"""How the reduced system is solved: by a dense Cholesky factor, or by conjugate gradients without forming it."""
 
 
 @dataclass(frozen=True)
@@ -36,31 +50,41 @@ class _Part:
     """Tangent coordinates of a slot."""
     components: int
     """Numbers in a residual."""
-    segments: list[tuple[int, int]]
-    """Where runs of one slot begin and end."""
-    places: Tensor
-    """Where the entries of each run's square go in U."""
+    runs: Runs
     point: Tensor | None
 
 
 class Elimination:
     """Normal equations of a laid-out problem, linearised at one place at a time."""
 
-    def __init__(self, blocks: dict[str, Block], layout: Layout, *, dense: bool = False) -> None:
+    def __init__(self, blocks: dict[str, Block], layout: Layout, solver: Solver = "auto", *, spread: bool = False) -> None:
+        """Plan what is done once per problem.
+
+        Args:
+            blocks: The variables.
+            layout: Who meets whom.
+            solver: How the reduced system is solved.
+            spread: Whether covariances of eliminated variables will be asked for.
+        """
         self.blocks = blocks
         self.layout = layout
         x = {name: b.x for name, b in blocks.items()}
-        self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, layout.size, x)]
+        self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, x)]
         some = next(iter(blocks.values())).x
-        q, n, size = layout.point_size, layout.points, layout.size
-        self.coupling: GroupCoupling | PairCoupling | None = None
-        if any(piece.coupled for piece in layout.pieces):
-            spans, seconds = plan_groups(layout)
-            dense = dense or seconds <= estimate_pairs(layout)
-            self.coupling = GroupCoupling(layout, spans, some) if dense else PairCoupling(layout, some)
-        self.U = some.new_empty((size + 2, size + 2))
+        q, n = layout.point_size, layout.points
+        self.squares = Squares(layout, some)
         self.V = some.new_empty((q * (q + 3) // 2, n))
         self.work = Workspace(some)
+        self.coupling: GroupCoupling | PairCoupling | RowCoupling | None = None
+        self.clusters: Clusters | None = None
+        coupled = any(piece.coupled for piece in layout.pieces)
+        if solver == "pcg" or (solver == "auto" and too_large(layout)):
+            rows = RowCoupling(layout, some) if coupled else None
+            self.coupling, self.clusters = rows, find_clusters(layout, rows)
+        elif coupled:
+            spans, seconds = plan_groups(layout)
+            grouped = spread or seconds <= estimate_pairs(layout)
+            self.coupling = GroupCoupling(layout, spans, some) if grouped else PairCoupling(layout, some)
 
     def cost(self, x: dict[str, Tensor]) -> Tensor:
         """The cost of all residuals that depend on something free."""
@@ -77,13 +101,16 @@ class Elimination:
             if w
         }
         lifts = {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
-        self.U.zero_()
+        self.squares.clear()
         self.V.zero_()
         if self.coupling is not None:
             self.coupling.clear()
         for part in self.parts:
             self._add(part, x, lifts)
-        return NormalEquations(self.layout, self.coupling, self.U, self.V)
+        squares = self.squares
+        return NormalEquations(
+            self.layout, self.coupling, squares, self.V, self.clusters, squares.diagonal(), squares.gradient()
+        )
 
     def _add(self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None]) -> None:
         """Add squares and products of a part's Jacobians to the system."""
@@ -106,8 +133,7 @@ class Elimination:
         if scale is not None:
             J *= scale
         if c:
-            squares = torch.stack([torch.bmm(J[:, :, a:b], J[:, :, a:b].mT) for a, b in part.segments]).sum(1)
-            self.U.view(-1).index_add_(0, part.places, squares.flatten())
+            self.squares.values[part.piece].index_add_(0, part.runs.slots, part.runs.squares(J))
         if part.point is None:
             return
         if scale is not None:
@@ -126,29 +152,18 @@ class Elimination:
             self.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
 
 
-def _parts(number: int, piece: Piece, size: int, x: dict[str, Tensor]) -> list[_Part]:
+def too_large(layout: Layout) -> bool:
+    """Whether a dense reduced system takes too much memory or time."""
+    rows = sum(piece.slots.numel() for piece in layout.pieces)
+    return layout.size > LARGEST or layout.size**3 * FLOP > rows * PASS
+
+
+def _parts(number: int, piece: Piece, x: dict[str, Tensor]) -> list[_Part]:
     """Cut a piece where the residuals linearised at once become too many."""
     m, width = piece.slots.numel(), piece.columns.shape[1]
-    ends = torch.bincount(piece.slots, minlength=piece.columns.shape[0]).cumsum(0).tolist()
-    # The residual is one more column, the gradient's.
-    extended = torch.cat((piece.columns, torch.full_like(piece.columns[:, :1], size).expand(-1, 1)), 1) if width else None
     parts = []
     components = term_residual(piece.term.select(piece.slots[:1] * 0), x).shape[1]
-    slot = 0
     for first, last in pairwise([*range(0, m, CHUNK), m]):
-        segments, slots = [], []
-        at = first
-        while at < last:
-            while ends[slot] <= at:
-                slot += 1
-            stop = min(ends[slot], last)
-            segments.append((at - first, stop - first))
-            slots.append(slot)
-            at = stop
-        places = piece.slots[:0]
-        if extended is not None:
-            columns = extended[slots]
-            places = (columns[:, :, None] * (size + 2) + columns[:, None]).flatten()
         rows = slice(first, last)
         term = replace(
             piece.term,
@@ -157,7 +172,8 @@ def _parts(number: int, piece: Piece, size: int, x: dict[str, Tensor]) -> list[_
             weights=None if piece.term.weights is None else piece.term.weights[rows],
         )
         point = None if piece.point is None else piece.point[rows]
-        parts.append(_Part(number, first, term, piece.wanted, width, components, segments, places, point))
+        runs = find_runs(piece.slots[rows])
+        parts.append(_Part(number, first, term, piece.wanted, width, components, runs, point))
     return parts
 
 

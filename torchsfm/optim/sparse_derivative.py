@@ -108,7 +108,7 @@ class _Optimum(torch.autograd.Function):
         layout = lay_out(problem.blocks, terms, problem.eliminate)
         if not layout.pieces:
             return _through(problem, layout, leaves, gradients, {})
-        inverse = Elimination(problem.blocks, layout).linearize(at).invert()
+        inverse = Elimination(problem.blocks, layout, "dense").linearize(at).invert()
         v = _pull(problem.blocks, layout, dict(zip(problem.blocks, gradients, strict=True)))
         u = _solve(problem, layout, inverse, terms, at, v)
         return _through(problem, layout, leaves, gradients, u)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torchsfm._types import Status
 from torchsfm.optim.covariance import to_double, usable
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
-from torchsfm.optim.schur import Elimination, move
+from torchsfm.optim.schur import Elimination, Solver, move
 from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
 from torchsfm.optim.terms import Block, Term, term_cost, term_residual
 
@@ -45,6 +46,7 @@ def sparse_levenberg_marquardt(
     gradient_tolerance: float = 1e-10,
     step_tolerance: float = 1e-10,
     initial_damping: float = 1e-4,
+    linear_solver: Solver = "auto",
     hessian: Hessian = "exact",
     progress: Callable[[int, float], None] | None = None,
 ) -> SparseResult:
@@ -62,6 +64,9 @@ def sparse_levenberg_marquardt(
         gradient_tolerance: End when no derivative of the cost is larger.
         step_tolerance: End when the step is shorter than this fraction of the variables' norm.
         initial_damping: Damping relative to the diagonal of the normal equations, at the start (1 / Ceres' radius).
+        linear_solver: "dense" forms the reduced system of the retained variables and factors it; "pcg" solves it by
+            preconditioned conjugate gradients without forming it, to a tenth of the decrease the model allows (inexact steps:
+            more of them, in memory that grows with the residuals alone); "auto" takes what the size suggests.
         hessian: Used for derivatives of the minimum only: "exact", or "gauss-newton", which leaves out second derivatives of
             the residuals and is some percent off where residuals are large.
         progress: Called with the number of iterations and the cost after each.
@@ -74,6 +79,8 @@ def sparse_levenberg_marquardt(
         ValueError: A term names an unknown block, its tensors disagree in length, or it depends on two eliminated variables.
     """
     _check(blocks, terms, eliminate)
+    if linear_solver not in get_args(Solver):
+        raise ValueError(f"linear_solver: wanted one of {get_args(Solver)}, got {linear_solver!r}")
     options = (max_iterations, function_tolerance, gradient_tolerance, step_tolerance, initial_damping, progress)
     with torch.no_grad():
         double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
@@ -85,7 +92,7 @@ def sparse_levenberg_marquardt(
         # A residual of fixed variables is a constant of the cost.
         constant = sum((float(term_cost(t, term_residual(t, x))) for t in layout.still), 0.0)
         if layout.pieces:
-            found = _descend(Elimination(double, layout), x, constant, *options)
+            found = _descend(Elimination(double, layout, linear_solver), x, constant, *options)
         else:
             none = any(u.numel() for u in used) and not any(bool(u.any()) for u in used)
             found = _End(x, constant, constant, 0, Status.NOT_FINITE if none else Status.TOO_FEW)
