@@ -1,0 +1,167 @@
+"""A projective reconstruction made ready for autocalibration: scaled images, signs, one frame, and weights."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.autocalibration.camera_information import camera_information, covariance_in_frame
+from torchsfm.autocalibration.orientation import orient_projective
+
+MAX_COUPLED = 120
+"""Beyond this many views the covariance between different cameras is left out: it grows with the square of their number."""
+NOISE_FLOOR = 0.01
+"""Image noise in pixels that is assumed at least: better measurements do not exist, and exact ones need a scale."""
+
+
+@dataclass(frozen=True)
+class PreparedCameras:
+    """Cameras and points of one flat batch in the frame where the first view is [I | 0].
+
+    The first view is the one with most points; `order` says which of the views given stands at each place. Image coordinates
+    are relative to the middle of the image, in units of its longer side.
+    """
+
+    P: Float[Tensor, "b v 3 4"]
+    X: Float[Tensor, "b n 4"]
+    frame: Float[Tensor, "b 4 4"]
+    """H with `T P H ~ P` of this class, where T scales the image."""
+    image: Float[Tensor, "b v 3 3"]
+    """T of every view."""
+    order: Int[Tensor, "b v"]
+    visible: Bool[Tensor, "b v n"]
+    present: Bool[Tensor, "b v"]
+    covariance: Tensor
+    noise: Float[Tensor, "b"]
+    """Standard deviation per image coordinate, pixels."""
+    consistent: Float[Tensor, "b"]
+    finite: Bool[Tensor, "b"]
+
+
+def image_scaling(image_size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 3"]:
+    """The similarity T that moves the middle of the image to the origin and makes its longer side 1."""
+    scale = 1 / image_size.amax(-1)
+    c = (image_size - 1) / 2
+    zero = torch.zeros_like(scale)
+    rows = (scale, zero, -scale * c[..., 0], zero, scale, -scale * c[..., 1], zero, zero, zero + 1)
+    return torch.stack(rows, -1).reshape(*scale.shape, 3, 3)
+
+
+def prepare_cameras(
+    P: Float[Tensor, "b v 3 4"],
+    X: Float[Tensor, "b n 4"],
+    x: Float[Tensor, "b v n 2"] | None,
+    visible: Bool[Tensor, "b v n"],
+    image_size: Float[Tensor, "b v 2"],
+    noise: Float[Tensor, "b"] | None,
+) -> PreparedCameras:
+    """Scale, orient and move cameras and points to the frame of the best view; weigh them by their covariance.
+
+    Args:
+        P: Cameras in pixels.
+        X: Homogeneous points.
+        x: Observations in pixels, of which only the noise is estimated.
+        visible: Which points each view sees.
+        image_size: Width and height.
+        noise: Standard deviation of the observations per coordinate, in pixels; from x if None, else 1.
+    """
+    b, v = visible.shape[:2]
+    point_good = torch.isfinite(X).all(-1) & (X != 0).any(-1)
+    view_good = torch.isfinite(P).flatten(-2).all(-1) & (P != 0).flatten(-2).any(-1)
+    visible = visible & point_good[:, None] & view_good[..., None]
+    if x is not None:
+        visible = visible & torch.isfinite(x).all(-1)
+    # A view needs as many points as a camera has unknowns.
+    present = visible.sum(-1) >= 6
+    visible = visible & present[..., None]
+    finite = present.any(-1)
+    X = torch.where(point_good[..., None], X, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=X.dtype, device=X.device))
+    P = torch.where(view_good[..., None, None], P, torch.eye(3, 4, dtype=P.dtype, device=P.device))
+    sigma = _noise(P, X, x, visible) if noise is None else noise
+    sigma = torch.where(torch.isfinite(sigma), sigma, 1.0).clamp_min(NOISE_FLOOR)
+
+    usable_size = torch.isfinite(image_size).all(-1) & (image_size > 0).all(-1)
+    image_size = torch.where(usable_size[..., None], image_size, 1.0)
+    finite = finite & (usable_size | ~present).all(-1)
+    T = image_scaling(image_size)
+    first = visible.sum(-1).argmax(-1)
+    order = torch.arange(v, device=P.device).expand(b, v).clone()
+    order.scatter_(1, first[:, None], 0)
+    order[:, 0] = first
+    rows = torch.arange(b, device=P.device)[:, None]
+    P, T, visible, present = P[rows, order], T[rows, order], visible[rows, order], present[rows, order]
+    Q = T @ P
+    Q = Q / Q.flatten(-2).norm(dim=-1)[..., None, None]
+    Y = X / X.norm(dim=-1, keepdim=True)
+    oriented = orient_projective(Q, Y, visible=visible)
+    Q, Y = oriented.P, oriented.X
+    frame, regular = _frame(Q, present)
+    Q = Q @ frame[:, None]
+    Q = Q * (3**0.5 / Q.flatten(-2).norm(dim=-1).clamp_min(1e-300))[..., None, None]
+    Q[:, 0] = torch.eye(3, 4, dtype=P.dtype, device=P.device)
+    Y = torch.linalg.solve_ex(frame, Y.mT).result.mT
+    Y = Y / Y.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+    finite = finite & regular & torch.isfinite(Q).flatten(1).all(-1) & torch.isfinite(Y).flatten(1).all(-1)
+    eye = torch.eye(3, 4, dtype=P.dtype, device=P.device)
+    # Problems that cannot be solved go through the motions with harmless numbers.
+    Q = torch.where((finite[:, None] & present)[..., None, None], Q, eye)
+    Y = torch.where(finite[:, None, None], Y, torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=X.dtype, device=X.device))
+    precision = (1 / (sigma[:, None] * T[..., 0, 0])).square()
+    weights = visible.to(P.dtype) * torch.where(present, precision, 0.0)[..., None]
+    if v <= MAX_COUPLED:
+        S = camera_information(Q, Y, weights)
+        covariance: Tensor = covariance_in_frame(Q, S, torch.zeros(b, dtype=torch.long, device=P.device))
+    else:
+        covariance = _separate(Q, camera_information(Q, Y, weights, coupled=False))
+    covariance = torch.where(torch.isfinite(covariance), covariance, 0.0)
+    return PreparedCameras(Q, Y, frame, T, order, visible, present, covariance, sigma, oriented.consistent, finite)
+
+
+def _frame(P: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
+    """H with `P_0 H = [I | 0]` that makes the last columns of the other cameras about as long as the first three."""
+    first = P[:, 0]
+    gram = first @ first.mT
+    left, info = torch.linalg.inv_ex(gram)
+    regular = (info == 0) & torch.isfinite(left).flatten(1).all(-1)
+    left = torch.where(regular[:, None, None], left, torch.eye(3, dtype=P.dtype, device=P.device))
+    pseudo = first.mT @ left
+    minors = [torch.linalg.det(first[:, :, [j for j in range(4) if j != i]]) * (-1) ** i for i in range(4)]
+    c = torch.stack(minors, -1)
+    c = c / c.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+    regular = regular & (torch.linalg.cond(gram) < 1e20)
+    blocks, columns = P @ pseudo[:, None], P @ c[:, None, :, None]
+    w = present.to(P.dtype)
+    w[:, 0] = 0
+    ratio = (blocks.square().flatten(-2).sum(-1) * w).sum(-1) / (
+        3 * (columns.square().flatten(-2).sum(-1) * w).sum(-1)
+    ).clamp_min(1e-300)
+    ratio = torch.where((ratio > 0) & (ratio < 1e24), ratio, 1.0).sqrt()
+    frame = torch.cat((pseudo, (c * ratio[:, None])[..., None]), -1)
+    eye = torch.eye(4, dtype=P.dtype, device=P.device)
+    return torch.where(regular[:, None, None], frame, eye), regular
+
+
+def _noise(P: Tensor, X: Tensor, x: Tensor | None, visible: Tensor) -> Tensor:
+    if x is None:
+        return torch.ones(len(P), dtype=P.dtype, device=P.device)
+    h = torch.einsum("bvij,bnj->bvni", P, X)
+    z = torch.where(h[..., 2] != 0, h[..., 2], 1.0)
+    square = (torch.where(visible[..., None], x, 0.0) - h[..., :2] / z[..., None]).square().sum(-1)
+    total = torch.where(visible, square, 0.0).sum((-2, -1))
+    views = (visible.sum(-1) > 0).sum(-1)
+    redundancy = 2 * visible.sum((-2, -1)) - 11 * views - 3 * (visible.sum(-2) > 1).sum(-1) + 15
+    return (total / redundancy.clamp_min(1)).sqrt()
+
+
+def _separate(P: Tensor, information: Tensor) -> Tensor:
+    """Covariance of each camera by itself, its scale held."""
+    unit = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp_min(1e-300)
+    p = P.flatten(-2)
+    p = p / p.norm(dim=-1, keepdim=True)
+    eye = torch.eye(12, dtype=P.dtype, device=P.device)
+    inverse, info = torch.linalg.inv_ex(information / unit + p[..., :, None] * p[..., None, :] + 1e-13 * eye)
+    good = (info == 0)[..., None, None]
+    covariance = torch.where(good, (inverse - p[..., :, None] * p[..., None, :]) / unit, 0.0)
+    covariance[:, 0] = 0
+    return covariance

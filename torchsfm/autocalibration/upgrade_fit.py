@@ -1,0 +1,171 @@
+"""Intrinsics and plane at infinity by weighted least squares.
+
+The departures of all cameras from metric ones are weighed with their covariance, to which the covariance of the projective
+cameras propagates. To first order this is what bundle adjustment over metric cameras finds, in as few unknowns as intrinsics
+and plane have, so that many starts of many problems fit in one batch; its singular values say what the data determine in units
+of their noise.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm.autocalibration.intrinsics_model import intrinsics_from_parameters
+from torchsfm.autocalibration.upgrade_residual import departure_derivatives
+from torchsfm.optim import levenberg_marquardt
+
+
+@dataclass(frozen=True)
+class UpgradeProblem:
+    """Cameras in the frame where the first is [I | 0], with what is needed to weigh them; one batch dimension."""
+
+    P: Float[Tensor, "b v 3 4"]
+    covariance: Float[Tensor, "b v 12 v 12"] | Float[Tensor, "b v 12 12"]
+    """Of the cameras' entries, of all views together or of each by itself."""
+    base: Float[Tensor, "b v 5"]
+    """Intrinsic parameters where the unknowns are zero."""
+    present: Float[Tensor, "b v"]
+    """1 for views that take part."""
+    spread: Float[Tensor, "v 5 q"]
+    """From unknowns to the parameters of every view."""
+
+    def intrinsics(self, unknowns: Float[Tensor, "b *k q"]) -> Float[Tensor, "b *k v 3 3"]:
+        """K of every view."""
+        parameters = torch.einsum("vmq,...q->...vm", self.spread, unknowns)
+        base = self.base.reshape(len(self.base), *([1] * (unknowns.ndim - 2)), *self.base.shape[1:])
+        return intrinsics_from_parameters(base + parameters)
+
+    def select(self, index: Tensor) -> "UpgradeProblem":
+        """Some of the problems."""
+        return UpgradeProblem(self.P[index], self.covariance[index], self.base[index], self.present[index], self.spread)
+
+
+@dataclass(frozen=True)
+class UpgradeFit:
+    """Solutions of a batch of problems."""
+
+    unknowns: Float[Tensor, "b q"]
+    plane: Float[Tensor, "b 3"]
+    cost: Float[Tensor, "b"]
+    """Sum of the squared weighted departures, of the data alone: chi squared."""
+    objective: Float[Tensor, "b"]
+    """With what was expected of the unknowns."""
+    status: Tensor
+    iterations: Tensor
+
+
+def fit_upgrade(
+    problem: UpgradeProblem,
+    unknowns: Float[Tensor, "b k q"],
+    plane: Float[Tensor, "b k 3"],
+    mean: Float[Tensor, "b #k q"],
+    precision: Float[Tensor, "b #k q"],
+    *,
+    coupled: bool,
+    max_iterations: int,
+) -> UpgradeFit:
+    """Minimise from k starts each; the result has (b, k) in front.
+
+    Args:
+        problem: The cameras.
+        unknowns: Intrinsic unknowns at the start.
+        plane: Planes at infinity at the start.
+        mean: What is expected of the unknowns.
+        precision: One over the standard deviation of that.
+        coupled: Weigh with the covariance of all views together; else view by view, which is cheaper and less exact.
+        max_iterations: Most steps.
+    """
+    b, k, q = unknowns.shape
+    v = problem.P.shape[1]
+    size = (b, k)
+    covariance = problem.covariance
+    coupled = coupled and covariance.ndim == 5
+    if not coupled and covariance.ndim == 5:
+        covariance = covariance.diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+    shared = [
+        t[:, None].expand(*size, *t.shape[1:]).flatten(0, 1) for t in (problem.P, covariance, problem.base, problem.present)
+    ]
+    expected = [t.expand(b, k, q).flatten(0, 1) for t in (mean, precision)]
+    linearize = _linearization(problem.spread, coupled)
+    start = torch.cat((unknowns, plane), -1).flatten(0, 1)
+    result = levenberg_marquardt(
+        lambda x, *data: linearize(x, *data)[0],
+        start,
+        *shared,
+        *expected,
+        linearize=linearize,
+        max_iterations=max_iterations,
+        function_tolerance=1e-9,
+        step_tolerance=1e-9,
+        initial_damping=1e-3,
+    )
+    residual = linearize(result.x, *shared, *expected)[0]
+    cost = residual[:, : 5 * v, 0].square().sum(-1)
+    bad = torch.finfo(cost.dtype).max / 4
+    cost = torch.nan_to_num(cost, bad, bad, bad)
+    x = torch.nan_to_num(result.x).reshape(b, k, -1)
+    return UpgradeFit(
+        x[..., :q],
+        x[..., q:],
+        cost.reshape(size),
+        torch.nan_to_num(2 * result.cost, bad, bad, bad).reshape(size),
+        result.status.reshape(size),
+        result.iterations.reshape(size),
+    )
+
+
+def fit_information(
+    problem: UpgradeProblem, unknowns: Float[Tensor, "b q"], plane: Float[Tensor, "b 3"]
+) -> Float[Tensor, "b q+3 q+3"]:
+    """The information of the data on the unknowns and the plane, `J' C^-1 J`."""
+    zero = torch.zeros_like(unknowns)
+    x = torch.cat((unknowns, plane), -1)
+    data = (problem.P, problem.covariance, problem.base, problem.present, zero, zero)
+    _, J = _linearization(problem.spread, problem.covariance.ndim == 5)(x, *data)
+    J = torch.nan_to_num(J[:, :, 0], 0.0, 0.0, 0.0)
+    return J.mT @ J
+
+
+def _linearization(spread: Tensor, coupled: bool) -> Callable[..., tuple[Tensor, Tensor]]:
+    v, _, q = spread.shape
+
+    def linearize(
+        x: Tensor, P: Tensor, covariance: Tensor, base: Tensor, present: Tensor, mean: Tensor, precision: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        unknowns, p = x[:, :q], x[:, q:]
+        b = len(x)
+        K = intrinsics_from_parameters(base + torch.einsum("vmq,bq->bvm", spread, unknowns))
+        g, by_camera, own, reference, by_plane = departure_derivatives(P, K, K[:, 0], p)
+        J = torch.cat((own @ spread + reference @ spread[0], by_plane), -1)
+        # The first view is metric by the choice of frame; absent ones say nothing.
+        counts = present.clone()
+        counts[:, 0] = 0
+        g, J = g * counts[..., None], J * counts[..., None, None]
+        by_camera = by_camera * counts[..., None, None]
+        idle = (1 - counts)[..., None].expand(b, v, 5)
+        if coupled:
+            half = (by_camera @ covariance.reshape(b, v, 12, 12 * v)).reshape(b, 5 * v, v, 12)
+            C = torch.einsum("brvi,bvmi->brvm", half, by_camera).reshape(b, 5 * v, 5 * v)
+            C = 0.5 * (C + C.mT)
+            idle = idle.reshape(b, 5 * v)
+            g, J = g.reshape(b, 5 * v), J.reshape(b, 5 * v, -1)
+        else:
+            C = by_camera @ covariance @ by_camera.mT
+        diagonal = C.diagonal(dim1=-2, dim2=-1)
+        floor = 1e-10 * diagonal.sum(-1, keepdim=True) / diagonal.shape[-1] + 1e-200
+        C = C + torch.diag_embed(idle + floor)
+        scale = C.diagonal(dim1=-2, dim2=-1).rsqrt()
+        L, info = torch.linalg.cholesky_ex(scale[..., :, None] * C * scale[..., None, :])
+        # A covariance that is none makes the residual infinite, and the step is not taken.
+        wrong = torch.where(info == 0, 0.0, torch.nan)[..., None, None]
+        whole = torch.cat((g[..., None], J), -1) * scale[..., None] + wrong
+        whole = torch.linalg.solve_triangular(L, whole, upper=False).reshape(b, 5 * v, -1)
+        expected = (unknowns - mean) * precision
+        tail = torch.cat((torch.diag_embed(precision), precision.new_zeros(b, q, 3)), -1)
+        r = torch.cat((whole[..., 0], expected), -1)
+        return r[..., None], torch.cat((whole[..., 1:], tail), -2)[..., None, :]
+
+    return linearize
