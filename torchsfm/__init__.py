@@ -2,8 +2,18 @@
 
 from torchsfm._types import Solutions, Status
 from torchsfm.autocalibration import (
+    Assumption,
+    AssumptionFit,
+    Autocalibration,
     FocalEstimate,
+    Motion,
+    Orientation,
+    autocalibrate_points,
+    diagnose_motion,
     focal_from_fundamentals,
+    metric_upgrade,
+    orient_projective,
+    plane_at_infinity_from_intrinsics,
 )
 from torchsfm.bundle import (
     BundleCovariance,
@@ -263,6 +273,9 @@ from torchsfm.triangulation import (
 
 __all__ = [
     "DISTORTION_MODELS",
+    "Assumption",
+    "AssumptionFit",
+    "Autocalibration",
     "Block",
     "BrownConrady",
     "BundleCovariance",
@@ -297,7 +310,9 @@ __all__ = [
     "LeastSquaresResult",
     "Loss",
     "Manifold",
+    "Motion",
     "NoDistortion",
+    "Orientation",
     "PairReport",
     "Photograph",
     "PointCloud",
@@ -341,6 +356,7 @@ __all__ = [
     "affine_shape",
     "attach_implicit",
     "attach_optimum",
+    "autocalibrate_points",
     "balanced_frame",
     "basis_homography",
     "bifocal_tensors",
@@ -366,6 +382,7 @@ __all__ = [
     "depth_space",
     "detect_corners",
     "detect_features",
+    "diagnose_motion",
     "epipolar_distance",
     "epipolar_lines",
     "epipoles",
@@ -401,10 +418,13 @@ __all__ = [
     "look_at",
     "match_descriptors",
     "match_features",
+    "metric_upgrade",
     "normalize_shape",
     "normalize_sphere",
     "normalizing_similarity",
     "orbit_poses",
+    "orient_projective",
+    "plane_at_infinity_from_intrinsics",
     "plot_cameras",
     "plot_epipolar_lines",
     "plot_matches",

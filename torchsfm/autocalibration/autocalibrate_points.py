@@ -157,31 +157,36 @@ def autocalibrate_points(
     if v < 2:
         raise ValueError(f"P: wanted at least 2 views, got {v}")
 
+    count = math.prod(batch)
+
     def flat(t: Tensor, *rest: int) -> Tensor:
-        return (
-            t.detach().expand(*batch, *rest).reshape(-1, *rest).double()
-            if t.is_floating_point()
-            else t.expand(*batch, *rest).reshape(-1, *rest)
-        )
+        whole = t.detach().expand(*batch, *rest).reshape(count, *rest)
+        return whole.double() if t.is_floating_point() else whole
 
     with torch.no_grad():
         seen = torch.ones(v, n, dtype=torch.bool, device=P.device) if visible is None else visible
         data = [flat(P, v, 3, 4), flat(X, n, 4), flat(seen, v, n), flat(sizes, v, 2)]
         data += [] if x is None else [flat(x, v, n, 2)]
         data += [] if K is None else [flat(K, v, 3, 3)]
-        count = len(data[0])
+        if count == 0:
+            # The shapes of the answer come from one problem of zeros.
+            data = [t.new_zeros(1, *t.shape[1:]) for t in data]
         per_problem = (12 * v) ** 2 * (2 + _FINALISTS) if v <= MAX_COUPLED else 144 * v * _STARTS
         chunk = max(1, _DOUBLES // max(per_problem, 1))
         pieces = []
-        for start in range(0, max(count, 1), chunk):
+        for start in range(0, len(data[0]), chunk):
             part = [t[start : start + chunk] for t in data]
             rest = part[4:]
             observed = rest.pop(0) if x is not None else None
             expected = rest.pop(0) if K is not None else None
             pieces.append(_solve(part[0], part[1], observed, part[2], part[3], expected, options, noise, max_deviation))
         whole = pieces[0] if len(pieces) == 1 else _concatenate(pieces)
-    shape = lambda t: t.reshape(*batch, *t.shape[1:])  # noqa: E731
-    return tensor_map(lambda t: shape(t).to(P.dtype) if t.is_floating_point() else shape(t), whole)
+
+    def restored(t: Tensor) -> Tensor:
+        shaped = t[:count].reshape((*batch, *t.shape[1:]))
+        return shaped.to(P.dtype) if t.is_floating_point() else shaped
+
+    return tensor_map(restored, whole)
 
 
 def _concatenate(pieces: list[Autocalibration]) -> Autocalibration:

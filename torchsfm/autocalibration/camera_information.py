@@ -14,7 +14,7 @@ _ENTRIES = 2_000_000
 
 def camera_information(
     P: Float[Tensor, "b v 3 4"], X: Float[Tensor, "b n 4"], weights: Float[Tensor, "b v n"], *, coupled: bool = True
-) -> Float[Tensor, "b 12v 12v"] | Float[Tensor, "b v 12 12"]:
+) -> Float[Tensor, "b r r"] | Float[Tensor, "b v 12 12"]:
     """The information matrix of the entries of all cameras, for image noise of standard deviation 1.
 
     Args:
@@ -26,7 +26,7 @@ def camera_information(
     b, v, n = weights.shape
     blocks = P.new_zeros(b, v, 12, 12)
     S = P.new_zeros(b, 12 * v, 12 * v) if coupled else blocks
-    step = max(1, _ENTRIES // (48 * b * v)) if n else 1
+    step = max(1, _ENTRIES // max(1, 48 * b * v)) if n else 1
     for start in range(0, n, step):
         part = slice(start, start + step)
         Y, w = X[:, part], weights[:, :, part]
@@ -53,7 +53,7 @@ def camera_information(
         L = torch.where(good, L, torch.eye(4, dtype=P.dtype, device=P.device))
         W = (J.mT @ DP).transpose(1, 2) * good[..., None]
         Z = torch.linalg.solve_triangular(L[:, :, None], W.mT, upper=False)
-        Z = Z.permute(0, 2, 4, 1, 3).reshape(b, 12 * v, -1)
+        Z = Z.permute(0, 2, 4, 1, 3).reshape(b, 12 * v, 4 * Y.shape[1])
         S -= Z @ Z.mT
     if coupled:
         diagonal = S.view(b, v, 12, v, 12).diagonal(dim1=1, dim2=3)
@@ -62,7 +62,7 @@ def camera_information(
 
 
 def covariance_in_frame(
-    P: Float[Tensor, "b v 3 4"], S: Float[Tensor, "b 12v 12v"], reference: Tensor
+    P: Float[Tensor, "b v 3 4"], S: Float[Tensor, "b r r"], reference: Tensor
 ) -> Float[Tensor, "b v 12 v 12"]:
     """The covariance of the cameras when the reference camera is held at [I | 0].
 
@@ -97,7 +97,7 @@ def covariance_in_frame(
     S = S.reshape(b, 12 * v, 12 * v)
     present = (~absent).sum(-1).clamp_min(1)
     unit = (S.diagonal(dim1=-2, dim2=-1).sum(-1) / (12 * present))[:, None, None].clamp_min(1e-300)
-    fill = torch.where(absent, 1.0, 1e-12)[..., None].expand(b, v, 12).reshape(b, -1)
+    fill = torch.where(absent, 1.0, 1e-12)[..., None].expand(b, v, 12).flatten(1)
     system = S / unit + N @ N.mT + torch.diag_embed(fill)
     system = torch.where(
         torch.isfinite(system).all(-1).all(-1)[:, None, None], system, torch.eye(12 * v, dtype=P.dtype, device=P.device)

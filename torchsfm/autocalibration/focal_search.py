@@ -56,7 +56,7 @@ def search_focal(
     F, J, S = len(first), partner.shape[1], len(second)
     log1 = first[:, None, None].expand(F, J, S).reshape(1, -1)
     log2 = (second if varying else first[:, None, None]).expand(F, J, S).reshape(1, -1)
-    other = partner[:, None, :, None].expand(b, F, J, S).reshape(b, -1)
+    other = partner[:, None, :, None].expand(b, F, J, S).flatten(1)
     k = F * J * S
     chunk = max(1, _VIEWS // (k * v))
     pieces = []

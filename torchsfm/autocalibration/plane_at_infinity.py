@@ -48,7 +48,7 @@ def plane_at_infinity_from_intrinsics(
 
 
 def metric_upgrade(K: Float[Tensor, "*#batch 3 3"], p: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 4 4"]:
-    """The homography H that makes (p, 1) the plane at infinity of cameras whose first is [I | 0] with intrinsics K: `P H` is metric.
+    """The homography H with `P H` metric, for cameras whose first is [I | 0] with intrinsics K.
 
     Hartley & Zisserman 2004, 19.1: `H = [[K, 0], [-p'K, 1]]`. Points go by its inverse.
 

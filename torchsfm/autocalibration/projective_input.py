@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsfm.autocalibration.camera_information import camera_information, covariance_in_frame
 from torchsfm.autocalibration.orientation import orient_projective
+from torchsfm.geometry import camera_centre
 
 MAX_COUPLED = 120
 """Beyond this many views the covariance between different cameras is left out: it grows with the square of their number."""
@@ -119,25 +120,34 @@ def prepare_cameras(
 
 
 def _frame(P: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    """H with `P_0 H = [I | 0]` that makes the last columns of the other cameras about as long as the first three."""
+    """H with `P_0 H = [I | 0]`, the rest of it chosen so that it does not matter which frame P came in.
+
+    With every other camera `[A | a]` scaled to |a| = 1, adding multiples of a to the columns of A makes A as short as it can
+    be; then the last column gets about the length of the others.
+    """
     first = P[:, 0]
     gram = first @ first.mT
     left, info = torch.linalg.inv_ex(gram)
     regular = (info == 0) & torch.isfinite(left).flatten(1).all(-1)
     left = torch.where(regular[:, None, None], left, torch.eye(3, dtype=P.dtype, device=P.device))
-    pseudo = first.mT @ left
-    minors = [torch.linalg.det(first[:, :, [j for j in range(4) if j != i]]) * (-1) ** i for i in range(4)]
-    c = torch.stack(minors, -1)
-    c = c / c.norm(dim=-1, keepdim=True).clamp_min(1e-300)
     regular = regular & (torch.linalg.cond(gram) < 1e20)
-    blocks, columns = P @ pseudo[:, None], P @ c[:, None, :, None]
+    pseudo = first.mT @ left
+    c = camera_centre(first, homogeneous=True)
+    A, a = P @ pseudo[:, None], (P @ c[:, None, :, None])[..., 0]
     w = present.to(P.dtype)
     w[:, 0] = 0
-    ratio = (blocks.square().flatten(-2).sum(-1) * w).sum(-1) / (
-        3 * (columns.square().flatten(-2).sum(-1) * w).sum(-1)
-    ).clamp_min(1e-300)
-    ratio = torch.where((ratio > 0) & (ratio < 1e24), ratio, 1.0).sqrt()
-    frame = torch.cat((pseudo, (c * ratio[:, None])[..., None]), -1)
+    length = a.norm(dim=-1)
+    # A camera at the first one's place has no baseline to scale by.
+    apart = length > 1e-12 * A.flatten(-2).norm(dim=-1)
+    w = torch.where(apart, w, 0.0) / torch.where(apart, length, 1.0)
+    A, a = A * w[..., None, None], a * w[..., None]
+    number = a.square().sum((-2, -1))
+    some = number > 0
+    q = -torch.einsum("bvi,bvij->bj", a, A) / torch.where(some, number, 1.0)[:, None]
+    A = A + a[..., None] * q[:, None, None]
+    ratio = A.square().sum((-3, -2, -1)) / (3 * torch.where(some, number, 1.0))
+    ratio = torch.where(some & (ratio > 0) & torch.isfinite(ratio), ratio, 1.0).sqrt()
+    frame = torch.cat((pseudo + c[..., None] * q[:, None], (c * ratio[:, None])[..., None]), -1)
     eye = torch.eye(4, dtype=P.dtype, device=P.device)
     return torch.where(regular[:, None, None], frame, eye), regular
 

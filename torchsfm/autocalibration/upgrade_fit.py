@@ -45,16 +45,14 @@ class UpgradeProblem:
 
 @dataclass(frozen=True)
 class UpgradeFit:
-    """Solutions of a batch of problems."""
+    """Solutions of a batch of problems, from k starts each."""
 
-    unknowns: Float[Tensor, "b q"]
-    plane: Float[Tensor, "b 3"]
-    cost: Float[Tensor, "b"]
+    unknowns: Float[Tensor, "b k q"]
+    plane: Float[Tensor, "b k 3"]
+    cost: Float[Tensor, "b k"]
     """Sum of the squared weighted departures, of the data alone: chi squared."""
-    objective: Float[Tensor, "b"]
+    objective: Float[Tensor, "b k"]
     """With what was expected of the unknowns."""
-    status: Tensor
-    iterations: Tensor
 
 
 def fit_upgrade(
@@ -67,7 +65,7 @@ def fit_upgrade(
     coupled: bool,
     max_iterations: int,
 ) -> UpgradeFit:
-    """Minimise from k starts each; the result has (b, k) in front.
+    """Minimise from k starts each.
 
     Args:
         problem: The cameras.
@@ -112,8 +110,6 @@ def fit_upgrade(
         x[..., q:],
         cost.reshape(size),
         torch.nan_to_num(2 * result.cost, bad, bad, bad).reshape(size),
-        result.status.reshape(size),
-        result.iterations.reshape(size),
     )
 
 

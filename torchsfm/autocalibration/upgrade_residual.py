@@ -40,7 +40,8 @@ def departure(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 5"]:
     a, b, c = S[..., 0, 0], S[..., 1, 1], S[..., 2, 2]
     root = math.sqrt(2)
     parts = ((a - b) * _R2, (a + b - 2 * c) * _R6, root * S[..., 0, 1], root * S[..., 0, 2], root * S[..., 1, 2])
-    return torch.stack(parts, -1) / size
+    g: Tensor = torch.stack(parts, -1) / size
+    return g
 
 
 def departure_derivatives(
