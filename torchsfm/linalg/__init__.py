@@ -4,6 +4,7 @@ from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3, so
 from torchsfm.linalg.nullspace import null_vector, nullspace_rows, orthonormal_nullspace
 from torchsfm.linalg.polynomial import companion_roots, evaluate, solve_cubic, solve_quadratic
 from torchsfm.linalg.projections import nearest_psd, nearest_rank, nearest_rotation
+from torchsfm.linalg.quartic import solve_quartic
 from torchsfm.linalg.real_roots import real_roots
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "solve",
     "solve_cubic",
     "solve_quadratic",
+    "solve_quartic",
 ]
