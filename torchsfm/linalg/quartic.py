@@ -1,8 +1,8 @@
 """Real roots of batched quartics in closed form, by elementwise arithmetic alone.
 
-A depressed quartic is the product of two quadratics y^2 + u y + s and y^2 - u y + t, where u^2 is a root of a cubic (Descartes;
-Ferrari). The largest root of that cubic is positive unless the quartic has no real root to speak of. Newton steps on the quartic
-itself make up for what the closed form loses.
+A depressed quartic is the product of two quadratics y^2 + u y + s and y^2 - u y + t, where u^2 is a root of a cubic
+(Descartes; Ferrari). The largest root of that cubic is positive unless the quartic has no real root to speak of. Newton steps
+on the quartic itself make up for what the closed form loses.
 """
 
 import torch

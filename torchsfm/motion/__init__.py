@@ -1,14 +1,20 @@
 """From images alone: how did the camera move?"""
 
 from torchsfm.motion.essential_5pt import essential_5pt
+from torchsfm.motion.essential_6pt import essential_6pt
 from torchsfm.motion.estimate_essential import RelativePoseEstimator, estimate_essential
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_fundamental
 from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
 from torchsfm.motion.factorization_points import Factorization, factorize_points
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.fundamental_8pt import fundamental_8pt
+from torchsfm.motion.fundamental_affine_4pt import fundamental_affine_4pt
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.homography_dlt import homography_dlt
+from torchsfm.motion.motions_from_homography import PlaneMotion, SelectedMotion, motion_from_homography, motions_from_homography
+from torchsfm.motion.relative_6pt_focal import FocalMotion, relative_6pt_focal
+from torchsfm.motion.relative_known_rotation_2pt import relative_known_rotation_2pt
+from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
 
 ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
@@ -16,16 +22,26 @@ ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator)
 __all__ = [
     "ESTIMATORS",
     "Factorization",
+    "FocalMotion",
     "FundamentalEstimator",
     "HomographyEstimator",
+    "PlaneMotion",
     "RelativePoseEstimator",
+    "SelectedMotion",
     "essential_5pt",
+    "essential_6pt",
     "estimate_essential",
     "estimate_fundamental",
     "estimate_homography",
     "factorize_points",
     "fundamental_7pt",
     "fundamental_8pt",
+    "fundamental_affine_4pt",
     "homography_4pt",
     "homography_dlt",
+    "motion_from_homography",
+    "motions_from_homography",
+    "relative_6pt_focal",
+    "relative_known_rotation_2pt",
+    "relative_upright_3pt",
 ]

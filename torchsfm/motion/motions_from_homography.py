@@ -1,6 +1,6 @@
 """The motion behind a homography between two images of a plane.
 
-With both calibrations known a plane n'X = 1 / |d| gives H ~ R + t n' (t in units of the plane's distance). The singular values of
+With both calibrations known a plane n'X = d gives H ~ R + t n', t in units of the distance d. The singular values of
 R + t n' are (s1, 1, s3): the middle one gives the scale. The two circles of vectors whose length H keeps give the two rotations
 (Faugeras & Lustman 1988; Ma, Soatto, Kosecka & Sastry 2004, 5.3.3; Malis & Vargas 2007 have the same in closed form).
 """
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, Status, check_tensors
 from torchsfm.linalg import cross, determinant_3x3, solve
+from torchsfm.motion.epipolar_fit import matrices
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _SINGULAR = 1e-10
@@ -25,8 +26,8 @@ _TOGETHER = 1e-6
 class PlaneMotion:
     """The pose of a second camera relative to a first, and the plane both look at.
 
-    `d2 ~ R d1 + t`; the plane is `normal' X = 1` in the coordinates of the first camera once lengths are measured by its distance
-    from that camera, so that |normal| = 1 and t is in units of that distance. H ~ R + t normal'.
+    The plane is `normal' X = 1` in the frame of the first camera, with its distance from that camera as the unit of length;
+    |normal| = 1. In that unit X2 = R X1 + t. H ~ R + t normal'.
     """
 
     R: Float[Tensor, "*batch 3 3"]
@@ -38,10 +39,10 @@ class PlaneMotion:
 class SelectedMotion:
     """The motion chosen by the points, and what speaks for it.
 
-    `in_front` says which points lie on the plane in front of both cameras. `alternative` is the other motion, and `alternative_fits`
-    whether it has as many points in front: then the points do not decide. `status` is OK; DEGENERATE where the camera only turned
-    (R is right, t = 0, the normal means nothing) or H is singular; TOO_FEW (no finite point has weight); BEHIND (half of the
-    weight or less is in front); NOT_FINITE (H or a calibration).
+    `in_front` says which points lie on the plane in front of both cameras. `alternative` is the other motion, and
+    `alternative_fits` whether it has as many points in front: then the points do not decide. `status` is OK; DEGENERATE where
+    the camera only turned (R is right, t = 0, the normal means nothing) or H is singular; TOO_FEW (no finite point has weight);
+    BEHIND (half of the weight or less is in front); NOT_FINITE (H).
     """
 
     model: PlaneMotion
@@ -53,7 +54,7 @@ class SelectedMotion:
 
 def equations(y: Float[Tensor, "*#batch 16"], H: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "*batch 16"]:
     """The sixteen equations of y = (R, t, n, s): H = s (R + t n'), R'R = I and |n|^2 = 1."""
-    R, t, n, s = y[..., :9].unflatten(-1, (3, 3)), y[..., 9:12], y[..., 12:15], y[..., 15]
+    R, t, n, s = matrices(y[..., :9], 3), y[..., 9:12], y[..., 12:15], y[..., 15]
     gap = (s[..., None, None] * (R + t[..., :, None] * n[..., None, :]) - H).flatten(-2)
     i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
     orthogonal = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device))[..., i, j]
@@ -62,7 +63,9 @@ def equations(y: Float[Tensor, "*#batch 16"], H: Float[Tensor, "*#batch 3 3"]) -
 
 
 def motions_from_homography(
-    H: Float[Tensor, "*#batch 3 3"], K1: Float[Tensor, "*#batch 3 3"] | None = None, K2: Float[Tensor, "*#batch 3 3"] | None = None
+    H: Float[Tensor, "*#batch 3 3"],
+    K1: Float[Tensor, "*#batch 3 3"] | None = None,
+    K2: Float[Tensor, "*#batch 3 3"] | None = None,
 ) -> Solutions[PlaneMotion]:
     """The two motions of a camera that looks at a plane, from the homography x2 ~ H x1 between its images.
 
@@ -76,8 +79,8 @@ def motions_from_homography(
         K2: Calibration of the second camera.
 
     Returns:
-        Two slots. Where the camera moves along the normal both are the same and one is valid. Where it only turned, one is valid,
-        with t = 0 and normal = (0, 0, 1) without meaning. None is valid where H is singular or a number is not finite.
+        Two slots. Where the camera moves along the normal both are the same and one is valid. Where it only turned, one is
+        valid, with t = 0 and normal = (0, 0, 1) without meaning. None is valid where H is singular or a number is not finite.
         Computed in float64 whatever the dtype. Differentiable where the two motions differ.
 
     Raises:
@@ -104,7 +107,7 @@ def motions_from_homography(
     eye = torch.eye(3, dtype=y.dtype, device=y.device)
     empty = torch.cat((eye.flatten(), eye.new_zeros(3), eye[2], eye.new_ones(1)))
     y = torch.where(valid[..., None], y, empty).to(H.dtype)
-    return Solutions(PlaneMotion(y[..., :9].unflatten(-1, (3, 3)), y[..., 9:12], y[..., 12:15]), valid)
+    return Solutions(PlaneMotion(matrices(y[..., :9], 3), y[..., 9:12], y[..., 12:15]), valid)
 
 
 def _solve(H: Tensor) -> tuple[Tensor, Tensor]:
@@ -199,7 +202,9 @@ def motion_from_homography(
     model = PlaneMotion(motions.model.R, factor * motions.model.t, factor * motions.model.normal)
     chosen, other = _slot(model, winner), _slot(model, 1 - winner)
     in_front = front.movedim(-3, -2).flatten(-3, -2)
-    in_front = in_front.gather(-2, (2 * winner + sign.gather(-1, winner[..., None])[..., 0])[..., None, None].expand(*batch, 1, n))
+    in_front = in_front.gather(
+        -2, (2 * winner + sign.gather(-1, winner[..., None])[..., 0])[..., None, None].expand(*batch, 1, n)
+    )
     in_front = in_front[..., 0, :]
     status = torch.full(batch, Status.OK, dtype=torch.int8, device=H.device)
     enough = torch.where(in_front, w, 0).sum(-1) > 0.5 * w.sum(-1)

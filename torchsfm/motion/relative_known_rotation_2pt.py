@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg import cross
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.sample_rows import cross_columns, in_chunks, longest_vector, rows_of, towards_the_front, unit_rays
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -25,9 +26,7 @@ def equations(
     R: Float[Tensor, "*#batch 3 3"],
 ) -> Float[Tensor, "*batch 3"]:
     """The three equations of t: d2' [t]x R d1 = 0 for both rays and |t|^2 = 1."""
-    turned = d1 @ R.mT
-    y, z = torch.broadcast_tensors(turned, d2)  # type: ignore[no-untyped-call]
-    epipolar = (torch.linalg.cross(y, z) * t[..., None, :]).sum(-1)
+    epipolar = (cross(d1 @ R.mT, d2) * t[..., None, :]).sum(-1)
     gauge = (t * t).sum(-1, keepdim=True) - 1
     return torch.cat((epipolar, gauge.expand(*epipolar.shape[:-1], 1)), -1)
 
@@ -43,10 +42,10 @@ def relative_known_rotation_2pt(
         R: The rotation of the second camera relative to the first.
 
     Returns:
-        One slot, with the R that came. Of t and -t the one is returned for which more of the four depths are positive. Not valid
-        where the epipolar planes coincide (the second ray lies in the plane of the first and the baseline, the rays coincide),
-        where a ray has no parallax (no baseline, a point at infinity), or where a number is not finite. Computed in float64
-        whatever the dtype. Differentiable in all arguments.
+        One slot, with the R that came. Of t and -t the one is returned for which more of the four depths are positive. Not
+        valid where the epipolar planes coincide (both rays in a plane with the baseline, the rays coincide), where a ray has no
+        parallax (no baseline, a point at infinity), or where a number is not finite. Computed in float64 whatever the dtype.
+        Differentiable in all arguments.
 
     Raises:
         ValueError: Wrong shape, dtype or device.

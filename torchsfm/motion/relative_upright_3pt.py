@@ -2,8 +2,8 @@
 
 In frames whose third axis is the vertical, R turns about that axis by an angle a. The three vectors (R d1) x d2 are
 perpendicular to t, so their determinant vanishes: a trigonometric polynomial of a, of degree two once c^2 + s^2 = 1 is used
-(Fraundorfer, Tanskanen & Pollefeys 2010; Sweeney, Flynn & Turk 2014). Five values give its coefficients, and in tan(a / 2) it is
-a quartic. All arithmetic has the batch in the last dimension.
+(Fraundorfer, Tanskanen & Pollefeys 2010; Sweeney, Flynn & Turk 2014). Five values give its coefficients, and in tan(a / 2) it
+is a quartic. All arithmetic has the batch in the last dimension.
 """
 
 import math
@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg import cross
 from torchsfm.linalg.quartic import quartic_rows
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.sample_rows import cross_columns, in_chunks, rows_of, unit_rays
@@ -21,12 +22,11 @@ from torchsfm.optim import attach_implicit, wants_derivative
 _CHUNK = 2048
 """Problems at a time: their numbers fit the cache."""
 _NOTHING = 1e-13
-"""A polynomial, or a direction of translation, this small is zero."""
+"""A polynomial this small is zero."""
+_PARALLAX = 1e-9
+"""Product of two parallaxes, in radians, of rays that have none to rounding."""
 _ANGLES = [2 * math.pi * k / 5 for k in range(5)]
-_FOURIER = [
-    (0.2, *(0.4 * wave(k * angle) for k in (1, 2) for wave in (math.cos, math.sin)))
-    for angle in _ANGLES
-]
+_FOURIER = [(0.2, *(0.4 * wave(k * angle) for k in (1, 2) for wave in (math.cos, math.sin))) for angle in _ANGLES]
 """Weights of a value in the mean and in the cosines and sines of the angle and its double."""
 
 
@@ -39,7 +39,7 @@ def equations(
 ) -> Float[Tensor, "*batch 13"]:
     """Thirteen equations of rank 12 of [R | t]: d2' [t]x R d1 = 0, R'R = I, R g1 = g2 for unit g, and |t|^2 = 1."""
     R, t = pose[..., :3], pose[..., 3]
-    normal = torch.linalg.cross(d1 @ R.mT, d2.expand(torch.broadcast_shapes(d1.shape, d2.shape, pose.shape[:-2] + (1, 1))))
+    normal = cross(d1 @ R.mT, d2)
     epipolar = (normal * t[..., None, :]).sum(-1)
     i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
     orthogonal = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device))[..., i, j]
@@ -70,8 +70,7 @@ def relative_upright_3pt(
     Returns:
         Four slots. Of t and -t the one is returned for which more of the six depths are positive; whether all are is not asked.
         None is valid where a ray or direction is zero or not finite, or the rays determine nothing: no baseline, coinciding
-        rays. Not determined either, but for rounding, is a translation between three rays of a plane with the vertical that
-        contains both centres. Computed in float64 whatever the dtype. Differentiable in all arguments.
+        rays. Computed in float64 whatever the dtype. Differentiable in all arguments.
 
     Raises:
         ValueError: Wrong shape, dtype or device.
@@ -130,7 +129,7 @@ def _solve(d1: Tensor, d2: Tensor, g1: Tensor, g2: Tensor) -> tuple[Tensor, Tens
     n0, n1, n2 = (C[i][:, None] * cosine + S[i][:, None] * sine + rest[i][:, None] for i in range(3))
     crosses = torch.stack([_cross(p, q) for p, q in ((n0, n1), (n1, n2), (n2, n0))])
     square, best = combine_rows(crosses.unbind(1), crosses.unbind(1)).max(0)
-    long = square > _NOTHING**2
+    long = square > _PARALLAX**2
     t = crosses.gather(0, best[None, None].expand(1, 3, *best.shape))[0] * torch.where(long, square, 1).rsqrt()
     # Depths along the rays in the turned frames: positive with t or with -t.
     votes = torch.zeros_like(square)

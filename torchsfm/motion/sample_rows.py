@@ -52,7 +52,7 @@ def longest_vector(v: Float[Tensor, "k 3 batch"]) -> tuple[Float[Tensor, "3 batc
 def towards_the_front(
     t: Float[Tensor, "3 batch"], turned: Float[Tensor, "n 3 batch"], d2: Float[Tensor, "n 3 batch"]
 ) -> Float[Tensor, "3 batch"]:
-    """t or -t, with which more depths along the rays R d1 and d2 are positive."""
+    """T or -t, with which more depths along the rays R d1 and d2 are positive."""
     normal = cross_columns(turned, d2)
     votes = torch.zeros_like(t[0])
     for d in (d2, turned):
