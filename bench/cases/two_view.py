@@ -340,7 +340,8 @@ CASES: tuple[Case, ...] = (
         scene=focal_points,
         error=focal_error,
         equations=focal_equations,
-        families=scenes.HARD,
+        # Turning about the optical axis is critical; forward motion, here turning by about 2 degrees, nearly so.
+        families=tuple(f for f in scenes.HARD if f != "90 degree rotation"),
         peers={"PoseLib": Peer("poselib", poselib_focal)},
     ),
     Case(

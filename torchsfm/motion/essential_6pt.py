@@ -209,7 +209,7 @@ def _descend(E: Tensor, d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _cost(R: Tensor, t: Tensor, d1: Tensor, d2: Tensor) -> Tensor:
-    error = (torch.linalg.cross(d1 @ R.mT, d2) @ t[..., None])[..., 0]
+    error: Tensor = (torch.linalg.cross(d1 @ R.mT, d2) @ t[..., None])[..., 0]
     return (error * error).sum(-1)
 
 
