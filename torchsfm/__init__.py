@@ -16,7 +16,9 @@ from torchsfm.autocalibration import (
     plane_at_infinity_from_intrinsics,
 )
 from torchsfm.bundle import (
+    AdjustedModel,
     BundleCovariance,
+    BundleModel,
     BundleResult,
     CentrePrior,
     Gauge,
@@ -26,6 +28,7 @@ from torchsfm.bundle import (
     ProjectiveBundleResult,
     Rig,
     bundle_adjust,
+    bundle_adjust_model,
     bundle_adjust_projective,
     bundle_covariance,
 )
@@ -286,9 +289,11 @@ __all__ = [
     "Assumption",
     "AssumptionFit",
     "Autocalibration",
+    "AdjustedModel",
     "Block",
     "BrownConrady",
     "BundleCovariance",
+    "BundleModel",
     "BundleProblem",
     "BundleResult",
     "Camera",
@@ -374,6 +379,7 @@ __all__ = [
     "basis_homography",
     "bifocal_tensors",
     "bundle_adjust",
+    "bundle_adjust_model",
     "bundle_adjust_projective",
     "bundle_covariance",
     "camera_centre",

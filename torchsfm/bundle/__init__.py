@@ -1,6 +1,7 @@
 """Which poses, cameras and structure, all together, explain the images best?"""
 
 from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
+from torchsfm.bundle.bundle_adjust_model import AdjustedModel, BundleModel, bundle_adjust_model
 from torchsfm.bundle.bundle_adjust_projective import ProjectiveBundleResult, bundle_adjust_projective
 from torchsfm.bundle.bundle_covariance import BundleCovariance, bundle_covariance
 from torchsfm.bundle.gauge import Gauge
@@ -8,7 +9,9 @@ from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior
 from torchsfm.bundle.rig import Rig
 
 __all__ = [
+    "AdjustedModel",
     "BundleCovariance",
+    "BundleModel",
     "BundleResult",
     "CentrePrior",
     "Gauge",
@@ -18,6 +21,7 @@ __all__ = [
     "ProjectiveBundleResult",
     "Rig",
     "bundle_adjust",
+    "bundle_adjust_model",
     "bundle_adjust_projective",
     "bundle_covariance",
 ]

@@ -114,6 +114,13 @@ class Bundle:
         return blocks, [term, *(prior.term() for prior in self.priors)]
 
 
+def cheapest_elimination(blocks: Mapping[str, Block]) -> str:
+    """Points, unless eliminating poses leaves a system of less than half the size: film of few points."""
+    sizes = {name: block.x.shape[0] * block.tangent for name, block in blocks.items()}
+    rest = sum(size for name, size in sizes.items() if name not in ("pose", "point"))
+    return "pose" if 2 * (sizes["point"] + rest) < sizes["pose"] + rest else "point"
+
+
 def check_index(**indices: tuple[Tensor, int]) -> None:
     """See that index tensors, each given with its limit, point at something.
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle.blocks import Bundle, intrinsics_prior, moved_cameras, moved_poses
+from torchsfm.bundle.blocks import Bundle, cheapest_elimination, intrinsics_prior, moved_cameras, moved_poses
 from torchsfm.bundle.gauge import Gauge, restore_gauge
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.rig import Rig
@@ -68,11 +68,12 @@ def bundle_adjust(
 ) -> BundleResult:
     """Minimise the reprojection error over poses, cameras and points together (Triggs et al. 2000; HZ 18.1).
 
-    Points are eliminated by the Schur complement. Seven dimensions of gauge (place, orientation, size of the world) are free
-    unless something holds them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does
-    no harm: the damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Fixed
-    and unobserved poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a
-    pinhole shows them mirrored): leave them out, or use a loss. Computed in float64.
+    Points are eliminated by the Schur complement (poses, where there are many more poses than points). Seven dimensions of
+    gauge (place, orientation, size of the world) are free unless something holds them: fixed poses or points, priors, a rig of
+    known size (which holds the size). A free gauge does no harm: the damping takes the shortest step, and the model stays about
+    where it was; see `gauge` for other wishes. Fixed and unobserved poses, cameras and points come back bit for bit.
+    Observations behind a camera count by the formula (a pinhole shows them mirrored): leave them out, or use a loss. Computed
+    in float64.
 
     Args:
         poses: Camera from world, batch (v,); with a rig, rig from world, batch (f,).
@@ -125,7 +126,7 @@ def bundle_adjust(
     result = sparse_levenberg_marquardt(
         blocks,
         terms,
-        eliminate="point",
+        eliminate=cheapest_elimination(blocks),
         max_iterations=max_iterations,
         function_tolerance=tolerance,
         hessian=hessian,

@@ -7,6 +7,7 @@ from typing import Annotated
 import torch
 import typer
 
+from torchsfm.cli.bundle import bundle
 from torchsfm.cli.inputs import prepare_folder, read_intrinsics, warn_about_intrinsics
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.results import VERSION, compare, finish
@@ -154,3 +155,6 @@ def info(
             for name, registered, count, mean in zip(model.names, model.registered.tolist(), counts, errors, strict=True):
                 typer.echo(f"{name:<{width}}  " + (f"{count:>12}  {mean:>14.3f}" if registered else "not registered"))
             typer.echo("")
+
+
+app.command()(bundle)

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from torchsfm.reconstruction import ReconstructionError, SfmResult, reconstruct
 
-WRONG, INTERRUPTED = 2, 130
+NOTHING, WRONG, INTERRUPTED = 1, 2, 130
 
 LABELS = {
     "render": "rendering the scene",
@@ -27,6 +27,7 @@ LABELS = {
     "verify": "checking epipolar geometry",
     "map": "building the model",
     "refine": "refining the model",
+    "bundle": "adjusting",
     "write": "writing results",
 }
 

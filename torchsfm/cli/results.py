@@ -15,7 +15,7 @@ import typer
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.cli.job import Job
+from torchsfm.cli.job import NOTHING, Job
 from torchsfm.formats import write_colmap, write_ply
 from torchsfm.geometry import Pose
 from torchsfm.plot import write_page
@@ -23,7 +23,6 @@ from torchsfm.reconstruction import Reconstruction, SfmResult
 from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_rmse
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 
-NOTHING = 1
 OWN_FILES = re.compile(r"page\.html|(model|points)(-\d+)?\.(npz|ply)")
 VERSION = metadata.version("torchsfm")
 

@@ -1,0 +1,134 @@
+"""Whole models in one argument: of any kind that has the members; film of few points; real problems."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.bundle import Rig, bundle_adjust, bundle_adjust_model
+from torchsfm.bundle.blocks import cheapest_elimination
+from torchsfm.formats import read_libmv
+from torchsfm.geometry import BundleProblem, Camera, Pose
+from torchsfm.optim import Block, RigidMotion, Subset
+from torchsfm.reconstruction import Reconstruction
+from torchsfm.simulation import random_bundle_problem
+
+F64 = torch.float64
+
+
+@pytest.fixture(scope="module")
+def problem() -> BundleProblem:
+    return random_bundle_problem(6, 80, 260, layout="path", generator=torch.Generator().manual_seed(3)).problem
+
+
+def test_a_problem_is_adjusted_as_its_parts(problem: BundleProblem) -> None:
+    options = {"free": ("focal", "k1", "k2"), "tolerance": 1e-9}
+    whole = bundle_adjust_model(problem, **options)
+    p = problem
+    parts = bundle_adjust(p.poses, p.cameras, p.X, p.x, p.view, p.point, camera_index=p.camera_index, **options)
+    assert whole.result.cost == parts.cost
+    assert isinstance(whole.model, BundleProblem)
+    assert torch.equal(whole.model.X, parts.X)
+    torch.testing.assert_close(whole.model.residuals(), whole.result.residuals, rtol=1e-9, atol=1e-9)
+    assert torch.equal(problem.X, p.X)
+
+
+def test_a_reconstruction_keeps_the_rest(problem: BundleProblem) -> None:
+    """A camera that two images share, an image that was not placed, names and colours."""
+    views = 7
+    index = torch.tensor([0, 0, 1, 2, 3, 4, 4])
+    poses = Pose(
+        torch.cat((problem.poses.R, torch.eye(3, dtype=F64)[None])),
+        torch.cat((problem.poses.t, torch.zeros(1, 3, dtype=F64))),
+    )
+    model = Reconstruction(
+        tuple("abcdefg"), torch.full((views, 2), 2000), problem.cameras, index, poses, torch.arange(views) < 6,
+        problem.X, torch.rand(80, 3, dtype=F64), problem.x, problem.view, problem.point,
+    )  # fmt: skip
+    adjusted = bundle_adjust_model(model, free=("focal",))
+    new = adjusted.model
+    assert isinstance(new, Reconstruction)
+    assert new.names == model.names
+    assert new.color is model.color
+    assert torch.equal(new.poses.R[6], model.poses.R[6])
+    assert new.residuals().square().mean() < 0.1 * model.residuals().square().mean()
+    torch.testing.assert_close(new.residuals(), adjusted.result.residuals, rtol=1e-9, atol=1e-9)
+
+
+def test_any_dataclass_with_the_members(problem: BundleProblem) -> None:
+    @dataclass(frozen=True)
+    class Mine:
+        poses: Pose
+        cameras: Camera
+        camera_index: Tensor
+        X: Tensor
+        x: Tensor
+        view: Tensor
+        point: Tensor
+        note: str
+
+    mine = Mine(*vars(problem).values(), note="here")
+    adjusted = bundle_adjust_model(mine, free=("focal", "k1", "k2"))
+    assert adjusted.model.note == "here"
+    assert adjusted.result.cost < 0.01 * adjusted.result.initial_cost
+
+
+def test_a_rig_starts_from_the_views(problem: BundleProblem) -> None:
+    """Pairs of views as frames of a stereo rig; views come back where the rig has them."""
+    pairs = torch.tensor([0, 0, 1, 1, 2, 2])
+    sensor = torch.tensor([0, 1] * 3)
+    between = problem.poses[1] @ problem.poses[0].inverse()
+    places = Pose(torch.stack((torch.eye(3, dtype=F64), between.R)), torch.stack((torch.zeros(3, dtype=F64), between.t)))
+    adjusted = bundle_adjust_model(problem, free=(), rig=Rig(places, sensor, pairs), fixed_sensors=sensor[:2] == 0)
+    result, poses = adjusted.result, adjusted.model.poses
+    assert result.poses.shape == (3,)
+    assert result.rig is not None
+    relative = [poses[2 * k + 1] @ poses[2 * k].inverse() for k in range(3)]
+    for pose in relative:
+        torch.testing.assert_close(pose.R, result.rig.cam_from_rig.R[1], rtol=0, atol=1e-9)
+        torch.testing.assert_close(pose.t, result.rig.cam_from_rig.t[1], rtol=0, atol=1e-9)
+    torch.testing.assert_close(adjusted.model.residuals(), result.residuals, rtol=1e-9, atol=1e-9)
+
+
+def test_poses_are_eliminated_where_they_are_many() -> None:
+    """And the answer is the same, with points held, too."""
+    made = random_bundle_problem(30, 40, 400, generator=torch.Generator().manual_seed(0))
+    p = made.problem
+    shared = Camera(p.cameras.K[:1], type(p.cameras.distortion)(p.cameras.distortion.k1[:1], p.cameras.distortion.k2[:1]))
+    blocks = {
+        "pose": Block(torch.zeros(30, 12), RigidMotion()),
+        "camera": Block(torch.zeros(1, 7), Subset(7, (0,))),
+        "point": Block(torch.zeros(20, 3)),
+    }
+    assert cheapest_elimination(blocks) == "pose"
+    blocks["point"] = Block(torch.zeros(60, 3))
+    assert cheapest_elimination(blocks) == "point"
+    few = p.point < 20
+    fixed = torch.arange(40) < 3
+    args = (p.poses, shared, p.X, p.x[few], p.view[few], p.point[few])
+    one = bundle_adjust(*args, fixed_points=fixed, tolerance=1e-10, max_iterations=200)
+    # Points that nobody sees change what is eliminated, and nothing else.
+    more = torch.cat((p.X, torch.zeros(60, 3, dtype=F64)))
+    two = bundle_adjust(*args[:2], more, *args[3:], fixed_points=torch.arange(100) < 3, tolerance=1e-10, max_iterations=200)
+    assert one.status == two.status == Status.OK
+    np.testing.assert_allclose(one.cost, two.cost, rtol=1e-8)
+    torch.testing.assert_close(one.residuals, two.residuals, rtol=1e-3, atol=1e-3)
+
+
+def test_film_with_shared_intrinsics(data: Path) -> None:
+    """333 frames of one camera, 26 points in long tracks."""
+    problem = read_libmv(data / "bal/libmv_problem_01.bin")
+    adjusted = bundle_adjust_model(problem, free=("focal", "k1", "k2"), max_iterations=100)
+    result = adjusted.result
+    assert result.status == Status.OK
+    assert float((2 * result.initial_cost / 5421) ** 0.5) == pytest.approx(1.304, abs=5e-4)
+    assert result.cost < 4531
+    everything = bundle_adjust_model(
+        problem, free=("focal", "principal_point", "k1", "k2", "p1", "p2", "k3"), max_iterations=30
+    )
+    assert everything.result.cost < result.cost
+    assert adjusted.model.cameras.K.shape == (1, 3, 3)

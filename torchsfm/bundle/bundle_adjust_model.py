@@ -1,0 +1,106 @@
+"""Bundle adjustment of a whole model: a `Reconstruction`, a `BundleProblem`, or whatever else has the same members."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic, Protocol, TypedDict, TypeVar, Unpack, runtime_checkable
+
+from torch import Tensor
+
+from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
+from torchsfm.bundle.gauge import Gauge
+from torchsfm.bundle.priors import Prior
+from torchsfm.bundle.rig import Rig
+from torchsfm.geometry import Camera, Pose
+from torchsfm.optim import Loss
+from torchsfm.optim.sparse_derivative import Hessian
+
+
+@runtime_checkable
+class BundleModel(Protocol):
+    """What a model must have: a frozen dataclass with these members, and any others."""
+
+    @property
+    def poses(self) -> Pose:
+        """Camera from world of each view, batch (v,)."""
+
+    @property
+    def cameras(self) -> Camera:
+        """The distinct cameras, batch (g,)."""
+
+    @property
+    def camera_index(self) -> Tensor:
+        """Which camera took each view, (v)."""
+
+    @property
+    def X(self) -> Tensor:
+        """Points, (n, 3)."""
+
+    @property
+    def x(self) -> Tensor:
+        """Observations in pixels, (m, 2)."""
+
+    @property
+    def view(self) -> Tensor:
+        """The view of each observation, (m)."""
+
+    @property
+    def point(self) -> Tensor:
+        """The point of each observation, (m)."""
+
+
+M = TypeVar("M", bound=BundleModel)
+
+
+class BundleOptions(TypedDict, total=False):
+    """The options of `bundle_adjust`, where they are described."""
+
+    free: Sequence[str]
+    fixed_poses: Tensor | None
+    fixed_points: Tensor | None
+    fixed_cameras: Tensor | None
+    rig: Rig | None
+    fixed_sensors: Tensor | None
+    weights: Tensor | None
+    loss: Loss | None
+    intrinsics_sigma: Mapping[str, float] | None
+    intrinsics_mean: Camera | None
+    priors: Sequence[Prior]
+    gauge: Gauge
+    max_iterations: int
+    tolerance: float
+    hessian: Hessian
+    progress: Callable[[int, float], None] | None
+
+
+@dataclass(frozen=True)
+class AdjustedModel(Generic[M]):
+    """A model with adjusted poses, cameras and points, and how the adjustment went."""
+
+    model: M
+    result: BundleResult
+
+
+def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedModel[M]:
+    """Minimise the reprojection error over all poses, cameras and points of a model; `bundle_adjust` in one argument.
+
+    Everything else in the model (names, colours, observations) stays. Views without observations keep their poses.
+
+    Args:
+        model: A `Reconstruction`, a `BundleProblem`, or a frozen dataclass with their members.
+        **options: Those of `bundle_adjust`. With `rig`, the model's poses are still those of its views: the rig starts, frame
+            by frame, where its first view is, and `fixed_poses` goes by frames.
+
+    Returns:
+        The new model, of the same kind, and the result with costs, residuals and status.
+
+    Raises:
+        ValueError: Shapes, dtypes, indices or names do not fit.
+    """
+    rig = options.get("rig")
+    poses = model.poses if rig is None else rig.frame_poses(model.poses)
+    result = bundle_adjust(
+        poses, model.cameras, model.X, model.x, model.view, model.point, camera_index=model.camera_index, **options
+    )
+    poses = result.poses if result.rig is None else result.rig.view_poses(result.poses)
+    whole: Any = model
+    return AdjustedModel(replace(whole, poses=poses, cameras=result.cameras, X=result.X), result)
