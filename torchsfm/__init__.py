@@ -286,10 +286,10 @@ from torchsfm.triangulation import (
 
 __all__ = [
     "DISTORTION_MODELS",
+    "AdjustedModel",
     "Assumption",
     "AssumptionFit",
     "Autocalibration",
-    "AdjustedModel",
     "Block",
     "BrownConrady",
     "BundleCovariance",
