@@ -108,6 +108,7 @@ from torchsfm.images import (
     track_sequence,
 )
 from torchsfm.motion import (
+    AffineFactorization,
     Factorization,
     FocalMotion,
     FundamentalEstimator,
@@ -120,6 +121,7 @@ from torchsfm.motion import (
     estimate_essential,
     estimate_fundamental,
     estimate_homography,
+    factorize_affine,
     factorize_points,
     fundamental_7pt,
     fundamental_8pt,
@@ -287,6 +289,7 @@ from torchsfm.triangulation import (
 __all__ = [
     "DISTORTION_MODELS",
     "AdjustedModel",
+    "AffineFactorization",
     "Assumption",
     "AssumptionFit",
     "Autocalibration",
@@ -414,6 +417,7 @@ __all__ = [
     "estimate_essential",
     "estimate_fundamental",
     "estimate_homography",
+    "factorize_affine",
     "factorize_points",
     "focal_from_fundamentals",
     "focals_from_fundamental",

@@ -5,6 +5,7 @@ from torchsfm.motion.essential_6pt import essential_6pt
 from torchsfm.motion.estimate_essential import RelativePoseEstimator, estimate_essential
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_fundamental
 from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
+from torchsfm.motion.factorization_affine import AffineFactorization, factorize_affine
 from torchsfm.motion.factorization_points import Factorization, factorize_points
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.fundamental_8pt import fundamental_8pt
@@ -21,6 +22,7 @@ ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator)
 
 __all__ = [
     "ESTIMATORS",
+    "AffineFactorization",
     "Factorization",
     "FocalMotion",
     "FundamentalEstimator",
@@ -33,6 +35,7 @@ __all__ = [
     "estimate_essential",
     "estimate_fundamental",
     "estimate_homography",
+    "factorize_affine",
     "factorize_points",
     "fundamental_7pt",
     "fundamental_8pt",

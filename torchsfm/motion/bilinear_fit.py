@@ -50,6 +50,18 @@ class _Linearisation:
     q: Float[Tensor, "p v k 3 n"]
 
 
+def core(w: Float[Tensor, "p v n"], enough: int) -> tuple[Bool[Tensor, "p v"], Bool[Tensor, "p n"]]:
+    """Views with enough points that at least two such views see, and these points."""
+    seen = w > 0
+    while True:
+        view = seen.sum(-1) >= enough
+        point = (seen & view[..., None]).sum(-2) >= 2
+        rest = seen & view[..., None] & point[:, None]
+        if bool((rest == seen).all()):
+            return view, point
+        seen = rest
+
+
 def rank_four(rays: Rays) -> Float[Tensor, "p v 3 4"]:
     """Cameras whose joint column space holds most of the rays: the start of everything."""
     p, v, _, n = rays.a.shape
@@ -61,8 +73,11 @@ def rank_four(rays: Rays) -> Float[Tensor, "p v 3 4"]:
 
 def fit_with_prior(
     rays: Rays, P: Float[Tensor, "p v 3 4"], prior: float, steps: int, tolerance: float
-) -> tuple[Float[Tensor, "p v 3 4"], Float[Tensor, "p 4 n"]]:
-    """Minimise the misfit with a prior over cameras and points, from given cameras."""
+) -> tuple[Float[Tensor, "p v 3 4"], Float[Tensor, "p 4 n"], Bool[Tensor, "p"]]:
+    """Minimise the misfit with a prior over cameras and points, from given cameras; also, which problems came to an end.
+
+    With `prior = 1` the rays may be any vectors: what is minimised is the sum of `w |a - P u|^2`.
+    """
     P = _balanced(P)
     u, cost = _best_points(rays, P, prior)
     damping, growth, total = torch.full_like(cost, 1e-4), torch.full_like(cost, 2), _total(rays)
@@ -86,7 +101,7 @@ def fit_with_prior(
         damping, growth = _next(damping, growth, better, (cost_before - trial_cost) * total / promise)
         if bool(done.all()):
             break
-    return P, u
+    return P, u, done
 
 
 def fit_angles(
@@ -181,8 +196,9 @@ def _best_points(rays: Rays, P: Tensor, prior: float) -> tuple[Tensor, Tensor]:
     L = torch.linalg.cholesky_ex(_regular(H))[0]
     u = torch.cholesky_solve(right[..., None], L)[..., 0].mT
     y = P @ u[:, None]
-    along = (rays.a * y).sum(2)
-    misfit = y.square().sum(2) - along.square() + prior * ((along - 1).square() + rays.a.square().sum(2) - 1)
+    # Both parts as one vector, whose square does not suffer from cancellation.
+    along = (rays.a * y).sum(2, keepdim=True)
+    misfit = (y - ((1 - prior**0.5) * along + prior**0.5) * rays.a).square().sum(2)
     return u, (rays.w * misfit).sum((-2, -1)) / _total(rays)
 
 

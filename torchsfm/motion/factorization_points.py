@@ -25,6 +25,7 @@ from torchsfm.geometry.shape import balanced_frame
 from torchsfm.motion.bilinear_fit import (
     Fit,
     Rays,
+    core,
     fit_angles,
     fit_with_prior,
     information,
@@ -129,7 +130,7 @@ def factorize_points(
 def _factorize(x: Tensor, w: Tensor, robust: bool, steps: int) -> tuple[Tensor, ...]:
     """The fields of `Factorization` for a flat batch."""
     with torch.no_grad():
-        view, point = _core(w)
+        view, point = core(w, _ENOUGH)
         counts = (w > 0) & view[..., None] & point[:, None]
         frame, balanced = balanced_frame(x, w * counts)
         rays = _rays(x, w * counts, frame)
@@ -160,23 +161,11 @@ def _rays(x: Tensor, w: Tensor, frame: Tensor) -> Rays:
     return Rays(torch.where(w[..., None] > 0, a, 0).mT.contiguous(), w)
 
 
-def _core(w: Tensor) -> tuple[Tensor, Tensor]:
-    """Views with enough points that other such views see, and these points."""
-    seen = w > 0
-    while True:
-        view = seen.sum(-1) >= _ENOUGH
-        point = (seen & view[..., None]).sum(-2) >= 2
-        rest = seen & view[..., None] & point[:, None]
-        if bool((rest == seen).all()):
-            return view, point
-        seen = rest
-
-
 def _search(rays: Rays, robust: bool, steps: int, again: bool = True) -> tuple[Fit, list[Tensor], Tensor, Tensor]:
     """The fit, its cost after each step, whether it converged, and how far each observation is trusted."""
     P, trust = rank_four(rays), torch.ones_like(rays.w)
     for prior in _PRIORS:
-        P, u = fit_with_prior(Rays(rays.a, rays.w * trust), P, prior, steps, 1e-5)
+        P, u, _ = fit_with_prior(Rays(rays.a, rays.w * trust), P, prior, steps, 1e-5)
         if robust:
             trust = _trust(rays, P, u, _SCALES[0])
     for scale in _SCALES[1:] if robust else ():
