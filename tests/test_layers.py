@@ -21,7 +21,7 @@ ALLOWED: dict[str, set[str]] = {
     "resection": {"linalg", "optim", "robust", "geometry", "tensors"},
     "bundle": {"linalg", "optim", "geometry"},
     "motion": {"linalg", "optim", "robust", "geometry", "tensors", "triangulation"},
-    "autocalibration": {"linalg", "optim", "robust", "geometry", "tensors"},
+    "autocalibration": {"linalg", "optim", "robust", "geometry", "tensors", "motion"},
     "reconstruction": {
         "linalg", "optim", "robust", "geometry", "tensors", "images",
         "triangulation", "resection", "motion", "autocalibration", "bundle",

@@ -1,6 +1,7 @@
 """From projective to metric: what are the cameras like inside, as far as the images alone tell?"""
 
 from torchsfm.autocalibration.autocalibrate_points import AssumptionFit, Autocalibration, autocalibrate_points
+from torchsfm.autocalibration.calibrate_planes import PlaneCalibration, calibrate_planes
 from torchsfm.autocalibration.diagnosis import Motion, diagnose_motion
 from torchsfm.autocalibration.focal_from_fundamentals import FocalEstimate, focal_from_fundamentals
 from torchsfm.autocalibration.intrinsics_model import Assumption
@@ -14,7 +15,9 @@ __all__ = [
     "FocalEstimate",
     "Motion",
     "Orientation",
+    "PlaneCalibration",
     "autocalibrate_points",
+    "calibrate_planes",
     "diagnose_motion",
     "focal_from_fundamentals",
     "metric_upgrade",

@@ -1,0 +1,322 @@
+"""Calibration from views of a known plane, such as a chessboard.
+
+Zhang, "A flexible new technique for camera calibration", PAMI 2000: the homography of each view constrains the image of the
+absolute conic, `h1' w h2 = 0` and `h1' w h1 = h2' w h2`; then all intrinsics, distortion and poses are adjusted to the least
+reprojection error.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, Int8
+from torch import Tensor
+
+from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm.geometry import Camera, Distortion, Pose, Radial
+from torchsfm.linalg import cross, nearest_rotation, null_vector
+from torchsfm.motion import homography_dlt
+from torchsfm.optim import levenberg_marquardt, rotation_exponential
+
+_COLUMNS = {"focal": 0, "aspect": 1, "skew": 2, "principal_point": 3}
+_PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
+"""Order of the six entries of a conic."""
+MAX_DEVIATION = 0.3
+"""Standard deviation of the logarithm of the focal length beyond which the views do not determine it."""
+
+
+@dataclass(frozen=True)
+class PlaneCalibration:
+    """A calibrated camera and its poses before the plane z = 0."""
+
+    camera: Camera
+    poses: Pose
+    """Camera from plane, batch (*batch, v)."""
+    rms: Float[Tensor, "*batch"]
+    """Root mean square distance between observation and projection, pixels."""
+    view_rms: Float[Tensor, "*batch v"]
+    used: Bool[Tensor, "*batch v"]
+    """Views with at least four points that are not on a line."""
+    parameter_names: tuple[str, ...]
+    covariance: Float[Tensor, "*batch q q"]
+    """Of the free parameters in the order of `parameter_names`: "fx", "fy" (one of them stands for both without "aspect"),
+    "skew", "cx", "cy" in pixels, and the distortion, from the residuals' own noise."""
+    pose_covariance: Float[Tensor, "*batch v 6 6"]
+    """Of each pose, rotation vector and translation from the left."""
+    iterations: Int[Tensor, "*batch"]
+    status: Int8[Tensor, "*batch"]
+    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance); TOO_FEW: no view,
+    or fewer measurements than unknowns; NOT_CONVERGED."""
+
+    @property
+    def deviation(self) -> Float[Tensor, "*batch q"]:
+        """Standard deviations of the free parameters."""
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+
+
+@dataclass(frozen=True)
+class _Unknowns:
+    intrinsics: Tensor
+    """fx, fy, skew, cx, cy and the distortion."""
+    R: Tensor
+    t: Tensor
+
+
+def calibrate_planes(
+    x: Float[Tensor, "*#batch v n 2"],
+    X: Float[Tensor, "*#batch n 2"],
+    *,
+    image_size: tuple[float, float] | None = None,
+    visible: Bool[Tensor, "*#batch v n"] | None = None,
+    distortion: type[Distortion] = Radial,
+    free: Sequence[str] = ("focal", "aspect", "principal_point"),
+    max_iterations: int = 60,
+) -> PlaneCalibration:
+    """Calibrate a camera from views of points on a plane, whose places on it are known.
+
+    Needs three views of different directions, or fewer with fewer free parameters. Views parallel to the image, or to each
+    other, add nothing. Where x or X require a gradient the answer carries its derivative, that of the optimum.
+
+    Args:
+        x: Image points in pixels.
+        X: Points on the plane, in any unit.
+        image_size: Width and height in pixels, whose middle is the first guess of the principal point, and stays it where that
+        is not
+            free; the middle of the observations by default.
+        visible: Which points each view sees; all by default. What stands elsewhere is not looked at.
+        distortion: The distortion model.
+        free: Which of "focal" (always), "aspect", "skew", "principal_point" are estimated; all of the distortion is.
+        max_iterations: Most steps of the optimiser.
+
+    Returns:
+        Camera, poses, residuals, covariance and status.
+
+    Raises:
+        ValueError: Shapes, dtypes, devices or names do not fit.
+    """
+    batch = check_tensors(x=(x, "v n>=4 2"), X=(X, "n 2"), visible=(visible, "v n : bool"))
+    if wrong := set(free) - set(_COLUMNS):
+        raise ValueError(f"free: no intrinsic parameter {sorted(wrong)}; there are {', '.join(_COLUMNS)}")
+    if "focal" not in free:
+        raise ValueError("free: wanted 'focal' among the free parameters")
+    v, n = x.shape[-3:-1]
+    seen = torch.ones(v, n, dtype=torch.bool, device=x.device) if visible is None else visible
+    x64, X64 = (t.double().expand(*batch, *rest) for t, rest in ((x, (v, n, 2)), (X, (n, 2))))
+    seen = seen.expand(*batch, v, n) & torch.isfinite(x64).all(-1) & torch.isfinite(X64).all(-1)[..., None, :]
+    x64 = torch.where(seen[..., None], x64, 0.0)
+    X64 = torch.where(torch.isfinite(X64).all(-1, keepdim=True), X64, 0.0)
+    with torch.no_grad():
+        used = (seen.sum(-1) >= 4) & _spread_out(X64, seen)
+        seen = seen & used[..., None]
+        start = _start(x64, X64, seen, used, image_size, distortion.num_parameters)
+    tangent = _tangent(free, distortion, x64)
+    q = tangent.shape[0]
+    weights = seen.double().flatten(-2)
+    problem = _Problem(distortion, tangent)
+    result = levenberg_marquardt(
+        problem.residual,
+        start,
+        x64,
+        X64,
+        retract=problem.retract,
+        size=q + 6 * v,
+        weights=weights,
+        linearize=problem.linearize,
+        max_iterations=max_iterations,
+        function_tolerance=1e-12,
+        step_tolerance=1e-12,
+    )
+    found = result.x
+    with torch.no_grad():
+        settled = tensor_map(torch.Tensor.detach, found)
+        flat = tensor_map(lambda a: a.reshape(-1, *a.shape[len(batch) :]), (settled, x64.detach(), X64.detach(), weights))
+        residual, J = problem.linearize(flat[0], flat[1], flat[2])
+        covariance, pose_covariance = _covariance(residual, J, flat[3], q, v, used.reshape(-1, v))
+        square = residual.square().sum(-1) * flat[3]
+        rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
+        view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
+        focal = settled.intrinsics[..., 0].abs().clamp_min(1e-12)
+        unsure = covariance[..., 0, 0].reshape(batch).clamp_min(0).sqrt() > MAX_DEVIATION * focal
+        measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
+        status = torch.where(result.status == Status.NOT_CONVERGED, int(Status.NOT_CONVERGED), int(Status.OK))
+        status = torch.where(unsure, int(Status.DEGENERATE), status)
+        status = torch.where((measured < unknowns) | ~used.any(-1), int(Status.TOO_FEW), status).to(torch.int8)
+    dtype = x.dtype
+    K = _matrix(found.intrinsics[..., :5]).to(dtype)
+    camera = Camera(K, distortion.from_parameters(found.intrinsics[..., 5:].to(dtype)))
+    return PlaneCalibration(
+        camera=camera,
+        poses=Pose(found.R.to(dtype), found.t.to(dtype)),
+        rms=rms.to(dtype),
+        view_rms=view_rms.to(dtype),
+        used=used,
+        parameter_names=_names(free) + distortion.parameter_names,
+        covariance=covariance.reshape(*batch, q, q).to(dtype),
+        pose_covariance=pose_covariance.reshape(*batch, v, 6, 6).to(dtype),
+        iterations=result.iterations,
+        status=status,
+    )
+
+
+def _names(free: Sequence[str]) -> tuple[str, ...]:
+    names: tuple[str, ...] = ("fx", "fy") if "aspect" in free else ("fx",)
+    names += ("skew",) if "skew" in free else ()
+    return names + (("cx", "cy") if "principal_point" in free else ())
+
+
+def _tangent(free: Sequence[str], distortion: type[Distortion], like: Tensor) -> Tensor:
+    """The directions (q, 5 + d) in which fx, fy, skew, cx, cy and the distortion move."""
+    d = distortion.num_parameters
+    eye = torch.eye(5 + d, dtype=like.dtype, device=like.device)
+    rows = [eye[0], eye[1]] if "aspect" in free else [eye[0] + eye[1]]
+    rows += [eye[2]] if "skew" in free else []
+    rows += [eye[3], eye[4]] if "principal_point" in free else []
+    return torch.stack([*rows, *eye[5:]])
+
+
+def _matrix(intrinsics: Tensor) -> Tensor:
+    fx, fy, s, cx, cy = intrinsics.unbind(-1)
+    zero = torch.zeros_like(fx)
+    return torch.stack((fx, s, cx, zero, fy, cy, zero, zero, zero + 1), -1).reshape(*fx.shape, 3, 3)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Reprojection of the plane's points, and its derivatives."""
+
+    distortion: type[Distortion]
+    tangent: Tensor
+
+    def retract(self, u: _Unknowns, delta: Tensor) -> _Unknowns:
+        q = self.tangent.shape[0]
+        pose = delta[..., q:].reshape(*u.t.shape[:-1], 6)
+        turn = rotation_exponential(pose[..., :3])
+        moved = (turn @ u.t[..., None])[..., 0] + pose[..., 3:]
+        return _Unknowns(u.intrinsics + delta[..., :q] @ self.tangent, turn @ u.R, moved)
+
+    def residual(self, u: _Unknowns, x: Tensor, X: Tensor) -> Tensor:
+        difference: Tensor = (self._project(u.intrinsics[..., None, :], u.R, u.t, X) - x).flatten(-3, -2)
+        return difference
+
+    def _project(self, intrinsics: Tensor, R: Tensor, t: Tensor, X: Tensor) -> Tensor:
+        Y = X[..., None, :, :] @ R[..., :2].mT + t[..., None, :]
+        fx, fy, s, cx, cy, *lens = (p[..., None] for p in intrinsics.unbind(-1))
+        a, b = self.distortion.project_rows(*Y.unbind(-1), *lens)
+        return torch.stack((fx * a + s * b + cx, fy * b + cy), -1)
+
+    def linearize(self, u: _Unknowns, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals and Jacobian; every view depends on its own pose alone, so that all poses are differentiated at once."""
+        b, v, n = x.shape[:3]
+        q = self.tangent.shape[0]
+        with torch.enable_grad():
+            delta = x.new_zeros(b, v, q + 6).requires_grad_()
+            turn = rotation_exponential(delta[..., q : q + 3])
+            moved = (turn @ u.t.detach()[..., None])[..., 0] + delta[..., q + 3 :]
+            intrinsics = u.intrinsics.detach()[:, None] + delta[..., :q] @ self.tangent
+            value = self._project(intrinsics, turn @ u.R.detach(), moved, X.detach()) - x.detach()
+            seed = torch.zeros_like(value).requires_grad_()
+            (pulled,) = torch.autograd.grad(value, delta, seed, create_graph=True)
+            columns = [torch.autograd.grad(pulled[..., i].sum(), seed, retain_graph=True)[0] for i in range(q + 6)]
+        local = torch.stack(columns, -1)
+        J = x.new_zeros(b, v, n, 2, q + 6 * v)
+        J[..., :q] = local[..., :q]
+        for i in range(v):
+            J[:, i, :, :, q + 6 * i : q + 6 * i + 6] = local[:, i, :, :, q:]
+        return value.detach().flatten(1, 2), J.flatten(1, 2)
+
+
+def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
+    """Whether the visible points of each view span the plane."""
+    w = seen.to(X.dtype)[..., None]
+    mean = (X[..., None, :, :] * w).sum(-2, keepdim=True) / w.sum(-2, keepdim=True).clamp_min(1)
+    D = (X[..., None, :, :] - mean) * w
+    values = torch.linalg.eigvalsh(D.mT @ D)
+    spans: Tensor = values[..., 0] > 1e-10 * values[..., 1].clamp_min(1e-300)
+    return spans
+
+
+def _start(x: Tensor, X: Tensor, seen: Tensor, used: Tensor, size: tuple[float, float] | None, lens: int) -> _Unknowns:
+    """The better of two: Zhang's linear intrinsics, and a focal length alone with the principal point in the middle."""
+    w = seen.to(x.dtype)
+    low = torch.where(seen[..., None], x, torch.inf).flatten(-3, -2).amin(-2)
+    high = torch.where(seen[..., None], x, -torch.inf).flatten(-3, -2).amax(-2)
+    some = seen.flatten(-2).any(-1)[..., None]
+    low, high = torch.where(some, low, 0.0), torch.where(some, high, 1.0)
+    middle = (low + high) / 2 if size is None else (torch.tensor(size, dtype=x.dtype, device=x.device) - 1) / 2 + 0 * low
+    scale = (high - low).amax(-1).clamp_min(1e-9)
+    y = (x - middle[..., None, None, :]) / scale[..., None, None, None]
+    H = homography_dlt(X[..., None, :, :].expand(*x.shape[:-3], x.shape[-3], *X.shape[-2:]), y, w)
+    H = torch.where(used[..., None, None], H, torch.eye(3, dtype=x.dtype, device=x.device))
+    # Columns of one size, so that no view outweighs the others.
+    H = H / H[..., :2].flatten(-2).norm(dim=-1)[..., None, None].clamp_min(1e-300)
+    h1, h2 = H[..., 0], H[..., 1]
+
+    def row(a: Tensor, b: Tensor) -> Tensor:
+        terms = [a[..., i] * b[..., j] + (a[..., j] * b[..., i] if i != j else 0) for i, j in _PAIRS]
+        return torch.stack(terms, -1) * used[..., None]
+
+    rows = torch.cat((row(h1, h2), row(h1, h1) - row(h2, h2)), -2)
+    # Square pixels and a centred principal point: w = diag(a, a, 1).
+    A, r = rows[..., 0] + rows[..., 2], -rows[..., 5]
+    a = (A * r).sum(-1) / A.square().sum(-1).clamp_min(1e-300)
+    f = torch.where(a > 1e-4, a, 1.0).rsqrt()
+    zero = torch.zeros_like(f)
+    simple = torch.stack((f, f, zero, zero, zero), -1)
+    # Without skew: w12 = 0.
+    b, _ = null_vector(torch.nn.functional.pad(rows[..., [0, 2, 3, 4, 5]], (0, 0, 0, 5)))
+    b = b * torch.where(b[..., :1] < 0, -1.0, 1.0)
+    w11, w22, w13, w23, w33 = b.unbind(-1)
+    fine = (w11 > 1e-9) & (w22 > 1e-9)
+    d1, d2 = torch.where(fine, w11, 1.0), torch.where(fine, w22, 1.0)
+    cx, cy = -w13 / d1, -w23 / d2
+    rest = w33 - w13**2 / d1 - w23**2 / d2
+    fine = fine & (rest > 0)
+    rest = torch.where(fine, rest, 1.0)
+    full = torch.stack(((rest / d1).sqrt(), (rest / d2).sqrt(), zero, cx, cy), -1)
+    fine = fine & ((full[..., :2] > 0.05) & (full[..., :2] < 200)).all(-1) & (full[..., 3:].abs() < 5).all(-1)
+    full = torch.where(fine[..., None], full, simple)
+
+    candidates = []
+    for intrinsics in (simple, full):
+        K = _matrix(intrinsics)
+        R, t = _poses(K, H)
+        image = (X[..., None, :, :] @ R[..., :2].mT + t[..., None, :]) @ K[..., None, :, :].mT
+        error = ((image[..., :2] / image[..., 2:] - y).square().sum(-1).clamp_max(1.0) * w).sum((-2, -1))
+        candidates.append((torch.nan_to_num(error, torch.inf), intrinsics, R, t))
+    (first, *one), (second, *two) = candidates
+    better = second < first
+    chosen, R, t = (
+        torch.where(better.reshape(*better.shape, *[1] * (a.ndim - better.ndim)), b, a) for a, b in zip(one, two, strict=True)
+    )
+    pixels = torch.cat((chosen[..., :3] * scale[..., None], chosen[..., 3:] * scale[..., None] + middle), -1)
+    return _Unknowns(torch.nn.functional.pad(pixels, (0, lens)), R, t)
+
+
+def _poses(K: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses of the plane whose homographies are H."""
+    M = torch.linalg.solve_ex(K[..., None, :, :].expand_as(H), H).result
+    # In front of the camera.
+    M = M * torch.where(M[..., 2, 2] < 0, -1.0, 1.0)[..., None, None]
+    size = 0.5 * (M[..., 0].norm(dim=-1) + M[..., 1].norm(dim=-1)).clamp_min(1e-300)
+    M = torch.nan_to_num(M / size[..., None, None])
+    r1, r2 = M[..., 0], M[..., 1]
+    return nearest_rotation(torch.stack((r1, r2, cross(r1, r2)), -1)), M[..., 2]
+
+
+def _covariance(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, used: Tensor) -> tuple[Tensor, Tensor]:
+    """Covariances of intrinsics and of each pose, scaled by the residuals."""
+    J = J * w[..., None, None]
+    A = J.flatten(1, 2)
+    information = A.mT @ A
+    scale = information.diagonal(dim1=-2, dim2=-1)
+    live = scale > 0
+    scale = torch.where(live, scale, 1.0).rsqrt()
+    information = scale[:, :, None] * information * scale[:, None]
+    eye = torch.eye(information.shape[-1], dtype=J.dtype, device=J.device)
+    inverse = torch.linalg.inv_ex(torch.nan_to_num(information) + (1e-13 + 1.0 * ~live[:, None, :]) * eye).inverse
+    inverse = inverse * scale[:, :, None] * scale[:, None]
+    redundancy = 2 * w.sum(-1) - q - 6 * used.sum(-1)
+    variance = (residual.square().sum(-1) * w).sum(-1) / redundancy.clamp_min(1)
+    inverse = torch.nan_to_num(inverse * variance[:, None, None], 0.0, 0.0, 0.0)
+    blocks = inverse[:, q:, q:].reshape(-1, v, 6, v, 6).diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
+    return inverse[:, :q, :q], blocks * used[..., None, None]
