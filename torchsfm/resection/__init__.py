@@ -5,6 +5,8 @@ from torchsfm.resection.camera_gp3p import camera_gp3p
 from torchsfm.resection.camera_p3p import camera_p3p
 from torchsfm.resection.camera_p4pf import camera_p4pf
 from torchsfm.resection.camera_p35pf import camera_p35pf
+from torchsfm.resection.camera_planar import PlanarPoses, camera_planar
+from torchsfm.resection.camera_pnp import PoseEstimate, camera_pnp
 from torchsfm.resection.camera_up2p import camera_up2p
 from torchsfm.resection.estimate_camera import CameraEstimator, estimate_camera
 from torchsfm.resection.refine_camera import CameraRefinement, refine_camera
@@ -17,11 +19,15 @@ __all__ = [
     "CameraEstimate",
     "CameraEstimator",
     "CameraRefinement",
+    "PlanarPoses",
+    "PoseEstimate",
     "camera_dlt",
     "camera_gp3p",
     "camera_p3p",
     "camera_p4pf",
     "camera_p35pf",
+    "camera_planar",
+    "camera_pnp",
     "camera_up2p",
     "estimate_camera",
     "refine_camera",
