@@ -31,8 +31,11 @@ def canonical_cameras(P: Float[Tensor, "*batch v 3 4"]) -> Float[Tensor, "*batch
     return canonical_frame(safe[..., 1:, :, :] @ H[..., None, :, :])
 
 
-def canonical_frame(P: Float[Tensor, "*batch u 3 4"]) -> Float[Tensor, "*batch u+1 3 4"]:
-    """The same from the cameras after the first, which is [I | 0]; the first is put in front of the result."""
+def canonical_frame(P: Float[Tensor, "*batch u 3 4"], signed: bool = True) -> Float[Tensor, "*batch u+1 3 4"]:
+    """The same from the cameras after the first, which is [I | 0]; the first is put in front of the result.
+
+    Unless `signed`, all signs stay as they are.
+    """
     A, e = P[..., 0, :, :3], P[..., 0, :, 3]
     square = (e * e).sum(-1)
     w = _over(e[..., None, :] @ A, square[..., None, None])[..., None, :, :]
@@ -45,6 +48,8 @@ def canonical_frame(P: Float[Tensor, "*batch u 3 4"]) -> Float[Tensor, "*batch u
     norm = torch.cat((size, _root((moved[..., 1:, :, :] ** 2).sum((-2, -1), keepdim=True))), -3)
     P1 = torch.eye(3, 4, dtype=P.dtype, device=P.device).expand(*P.shape[:-3], 1, 3, 4)
     moved = _over(moved, norm)
+    if not signed:
+        return torch.cat((P1, moved), -3)
     # Signs: of each camera, then of the fourth coordinate.
     moved = moved * _sign(moved[..., :3].flatten(-2))[..., None, None]
     side = _sign(moved[..., 0, :, 3])[..., None, None, None]

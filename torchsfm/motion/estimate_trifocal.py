@@ -1,0 +1,149 @@
+"""Three projective cameras from correspondences over three images of which many are wrong."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+from torchsfm.motion.multilinear_fit import frame_directions, inverse_similarity
+from torchsfm.motion.normalization import common_scale_of_views
+from torchsfm.motion.trifocal_6pt import trifocal_6pt
+from torchsfm.motion.trifocal_reprojection import normal_equations, squared_distance
+from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.tensors import canonical_cameras
+from torchsfm.tensors.canonical import canonical_frame
+
+
+@dataclass(frozen=True)
+class TrifocalEstimator:
+    """Three projective cameras, the first [I | 0]; models are the second and third (2, 3, 4) in the frame of `canonical_cameras`.
+
+    The points should be of moderate size around 0. The distance of a triplet is the root of the sum of squared distances in the
+    three images to those of one point in space, the best to first order from a linear start. It is infinite for points behind the
+    second or third camera, which are signed so that the points they come from are in front.
+    """
+
+    model_name: ClassVar[str] = "trifocal"
+    data_names: ClassVar[tuple[str, ...]] = ("x1", "x2", "x3")
+    sample_size: ClassVar[int] = 6
+    max_solutions: ClassVar[int] = 3
+    codimension: ClassVar[int] = 3
+
+    def minimal(
+        self, x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#batch 6 2"], x3: Float[Tensor, "*#batch 6 2"]
+    ) -> Solutions[Float[Tensor, "*batch 3 2 3 4"]]:
+        """The cameras of six points that can be in front of all three."""
+        x = torch.stack(torch.broadcast_tensors(x1, x2, x3), -3)  # type: ignore[no-untyped-call]
+        solutions = trifocal_6pt(x)
+        model = solutions.model[..., 1:, :, :]
+        _, depths = _points_at(model.detach(), *(y[..., None, :, :] for y in (x1, x2, x3)))
+        plus, minus = depths.amin(-1) > 0, depths.amax(-1) < 0
+        model = torch.where((minus & ~plus)[..., None, None], -model, model)
+        return Solutions(model, solutions.valid & (plus | minus).all(-1))
+
+    def squared_residual(
+        self,
+        model: Float[Tensor, "*#batch 2 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        x3: Float[Tensor, "*#batch n 2"],
+    ) -> Float[Tensor, "*batch n"]:
+        """Squared distance; infinite for points behind a camera."""
+        squared, front = squared_distance(model, [_rows(x) for x in (x1, x2, x3)])
+        return squared.masked_fill(~front, torch.inf)
+
+    def residual(
+        self,
+        model: Float[Tensor, "*#batch 2 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        x3: Float[Tensor, "*#batch n 2"],
+    ) -> Float[Tensor, "*batch n"]:
+        """Distance; infinite for points behind a camera."""
+        return self.squared_residual(model, x1, x2, x3).sqrt()
+
+    def degenerate(
+        self, x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#batch 6 2"], x3: Float[Tensor, "*#batch 6 2"]
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether the first two points coincide in an image."""
+        same = [(x[..., 0, :] == x[..., 1, :]).all(-1) for x in (x1, x2, x3)]
+        return same[0] | same[1] | same[2]
+
+    def refine(
+        self,
+        model: Float[Tensor, "*#batch 2 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        x3: Float[Tensor, "*#batch n 2"],
+        *,
+        weights: Float[Tensor, "*#batch n"],
+    ) -> Float[Tensor, "*batch 2 3 4"]:
+        """A Gauss-Newton step on the reprojection error over cameras and points, the frame and scales of the cameras held."""
+        A, b = normal_equations(model, [_rows(x) for x in (x1, x2, x3)], weights)
+        P = model.double()
+        G = frame_directions(P)
+        G = G / (G * G).sum(-2, keepdim=True).clamp(min=1e-200).sqrt()
+        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * (G @ G.mT)
+        step = damped_solve(A, b[..., None])[..., 0]
+        moved = canonical_frame(P - step.reshape(*step.shape[:-1], 2, 3, 4), signed=False)
+        return moved[..., 1:, :, :].to(x1.dtype)
+
+
+def _rows(x: Tensor) -> list[Tensor]:
+    return [x[..., 0], x[..., 1]]
+
+
+def _points_at(model: Tensor, x1: Tensor, x2: Tensor, x3: Tensor) -> tuple[Tensor, Tensor]:
+    """The linear points' fourth coordinate, and their depths (*batch, 2, n) in the second and third camera."""
+    from torchsfm.motion.trifocal_reprojection import _homogeneous, _start
+
+    X = _start(model, [_rows(x) for x in (x1, x2, x3)])
+    return X[3], torch.stack([_homogeneous(model[..., k, :, :], X)[2] for k in range(2)], -2)
+
+
+def estimate_trifocal(
+    x: Float[Tensor, "*#batch 3 n 2"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    scores: Float[Tensor, "*#batch n"] | None = None,
+    generator: torch.Generator | None = None,
+    confidence: float = 0.9999,
+    max_iterations: int = 10_000,
+) -> RobustResult[Float[Tensor, "*batch 3 3 4"]]:
+    """Three projective cameras for each triplet of images, from correspondences of which many may be wrong.
+
+    LO-RANSAC over six-point samples, then a robust minimum of the reprojection error over the cameras and all points. Computed
+    in float64, hypotheses scored in float32. `trifocal_from_cameras` makes the tensor of them. Points of one plane, or centres
+    that coincide, leave the cameras undetermined.
+
+    Args:
+        x: Points in the three images.
+        threshold: Largest distance of an inlier, in the unit of the points: the root of the sum of squared distances in the three
+            images to those of one point in space.
+        mask: Which correspondences exist. Rows that are not finite are left out too.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        generator: Source of randomness.
+        confidence: Wanted probability of having drawn a sample without outliers.
+        max_iterations: Most samples to draw.
+
+    Returns:
+        Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, score, iterations, status.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    check_tensors(x=(x, "3 n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), mask)
+    result = ransac(
+        TrifocalEstimator(), *y, threshold=scale * threshold, mask=mask,
+        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        max_iterations=max_iterations, scoring_dtype=torch.float32,
+    )  # fmt: skip
+    first = torch.eye(3, 4, dtype=torch.float64, device=x.device).expand(*result.model.shape[:-3], 1, 3, 4)
+    P = inverse_similarity(torch.stack(S, -3)) @ torch.cat((first, result.model), -3)
+    return replace(result, model=canonical_cameras(P).to(x.dtype), score=result.score.to(x.dtype))
