@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import random_rotation, rotation_angle, rotation_from_rotvec
+from torchsfm.tensors import trifocal_from_cameras
+from torchsfm.tensors.canonical import canonical_frame
 
 FOCAL = 1.5
 
@@ -99,6 +101,42 @@ def _two_views(kind: type, batch: tuple[int, ...], n: int, generator: torch.Gene
     return Scene(kind(), (x1, x2), model, _up_to_scale, _wrong_last, noise)
 
 
+def _three_views(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    """Uncalibrated, in the frame of the canonical cameras, signed so that the points are in front."""
+    X = _points(batch, n, generator)
+    K = torch.diag(torch.tensor([FOCAL, FOCAL, 1.0], dtype=torch.float64))
+    P, x = [K @ torch.eye(3, 4, dtype=torch.float64).expand(*batch, 3, 4)], [_image(X, noise, generator)]
+    for _ in range(2):
+        R, t = _motion(batch, generator)
+        P.append(K @ torch.cat((R, t[..., None]), -1))
+        x.append(_image(X @ R.mT + t[..., None, :], noise, generator))
+    # The first camera becomes [I | 0] by a map of space that keeps all points on their side.
+    H = torch.eye(4, dtype=torch.float64)
+    H[:3, :3] = K.inverse()
+    model = canonical_frame((torch.stack(P, -3) @ H)[..., 1:, :, :], signed=False)[..., 1:, :, :]
+    return Scene(kind(), tuple(x), model, _tensor_error, _wrong_last_of_three, noise)
+
+
+def _tensor_error(A: Tensor, B: Tensor) -> Tensor:
+    """Of trifocal tensors, and of the signs of the cameras."""
+    eye = torch.eye(3, 4, dtype=A.dtype)
+    T, S = (trifocal_from_cameras(eye, M[..., 0, :, :], M[..., 1, :, :]).flatten(-3) for M in (A, B))
+    T, S = (v / v.norm(dim=-1, keepdim=True) for v in (T, S))
+    # The left parts alone have signs that mean something.
+    left, right = (M[..., :3].flatten(-2) for M in (A, B))
+    same = ((left * right).sum(-1) > 0).all(-1)
+    return torch.minimum((T - S).norm(dim=-1), (T + S).norm(dim=-1)) + 10 * (~same)
+
+
+def _wrong_last_of_three(data: tuple[Tensor, ...], wrong: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Spread the points of the second or of the third image over it."""
+    first, second, third = data
+    half = torch.rand(wrong.shape, generator=generator) < 0.5
+    _, second = _wrong_last((first, second), wrong & half, generator)
+    _, third = _wrong_last((first, third), wrong & ~half, generator)
+    return first, second, third
+
+
 def _plane(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
     normal = torch.randn(*batch, 3, generator=generator, dtype=torch.float64) * 0.3 + torch.tensor([0.0, 0.0, 1.0])
     normal = normal / normal.norm(dim=-1, keepdim=True)
@@ -138,6 +176,7 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "oriented_fundamental": _two_views,
     "relative_pose": _two_views,
     "homography": _plane,
+    "trifocal": _three_views,
     "camera": _camera,
     "point": _point,
 }

@@ -5,6 +5,7 @@ from torchsfm.motion.essential_6pt import essential_6pt
 from torchsfm.motion.estimate_essential import RelativePoseEstimator, estimate_essential
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_fundamental
 from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
+from torchsfm.motion.estimate_trifocal import TrifocalEstimator, estimate_trifocal
 from torchsfm.motion.factorization_affine import AffineFactorization, factorize_affine
 from torchsfm.motion.factorization_points import Factorization, factorize_points
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
@@ -13,11 +14,14 @@ from torchsfm.motion.fundamental_affine_4pt import fundamental_affine_4pt
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.homography_dlt import homography_dlt
 from torchsfm.motion.motions_from_homography import PlaneMotion, SelectedMotion, motion_from_homography, motions_from_homography
+from torchsfm.motion.quadrifocal_6pt import QuadrifocalFit, quadrifocal_6pt
 from torchsfm.motion.relative_6pt_focal import FocalMotion, relative_6pt_focal
 from torchsfm.motion.relative_known_rotation_2pt import relative_known_rotation_2pt
 from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
+from torchsfm.motion.trifocal_6pt import trifocal_6pt
+from torchsfm.motion.trifocal_7pt import TrifocalFit, trifocal_7pt
 
-ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator)
+ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, TrifocalEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
 
 __all__ = [
@@ -28,13 +32,17 @@ __all__ = [
     "FundamentalEstimator",
     "HomographyEstimator",
     "PlaneMotion",
+    "QuadrifocalFit",
     "RelativePoseEstimator",
     "SelectedMotion",
+    "TrifocalEstimator",
+    "TrifocalFit",
     "essential_5pt",
     "essential_6pt",
     "estimate_essential",
     "estimate_fundamental",
     "estimate_homography",
+    "estimate_trifocal",
     "factorize_affine",
     "factorize_points",
     "fundamental_7pt",
@@ -44,7 +52,10 @@ __all__ = [
     "homography_dlt",
     "motion_from_homography",
     "motions_from_homography",
+    "quadrifocal_6pt",
     "relative_6pt_focal",
     "relative_known_rotation_2pt",
     "relative_upright_3pt",
+    "trifocal_6pt",
+    "trifocal_7pt",
 ]

@@ -11,7 +11,7 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.motion.multilinear_fit import frame_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
-from torchsfm.motion.trifocal_reprojection import normal_equations, squared_distance
+from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
 from torchsfm.robust import RobustResult, damped_solve, ransac
 from torchsfm.tensors import canonical_cameras
 from torchsfm.tensors.canonical import canonical_frame
@@ -19,11 +19,11 @@ from torchsfm.tensors.canonical import canonical_frame
 
 @dataclass(frozen=True)
 class TrifocalEstimator:
-    """Three projective cameras, the first [I | 0]; models are the second and third (2, 3, 4) in the frame of `canonical_cameras`.
+    """Three projective cameras, the first [I | 0]; models are the other two (2, 3, 4) in the frame of `canonical_cameras`.
 
-    The points should be of moderate size around 0. The distance of a triplet is the root of the sum of squared distances in the
-    three images to those of one point in space, the best to first order from a linear start. It is infinite for points behind the
-    second or third camera, which are signed so that the points they come from are in front.
+    The points should be of moderate size around 0. The distance of a triplet is the root of the sum of squared distances in
+    the three images to those of one point in space, the best to first order from a linear start. It is infinite for points
+    behind the second or third camera, which are signed so that the points they come from are in front.
     """
 
     model_name: ClassVar[str] = "trifocal"
@@ -39,7 +39,8 @@ class TrifocalEstimator:
         x = torch.stack(torch.broadcast_tensors(x1, x2, x3), -3)  # type: ignore[no-untyped-call]
         solutions = trifocal_6pt(x)
         model = solutions.model[..., 1:, :, :]
-        _, depths = _points_at(model.detach(), *(y[..., None, :, :] for y in (x1, x2, x3)))
+        seen = [_rows(view.detach()[..., None, :, :]) for view in (x1, x2, x3)]
+        depths = linear_depths(model.detach(), seen)
         plus, minus = depths.amin(-1) > 0, depths.amax(-1) < 0
         model = torch.where((minus & ~plus)[..., None, None], -model, model)
         return Solutions(model, solutions.valid & (plus | minus).all(-1))
@@ -96,14 +97,6 @@ def _rows(x: Tensor) -> list[Tensor]:
     return [x[..., 0], x[..., 1]]
 
 
-def _points_at(model: Tensor, x1: Tensor, x2: Tensor, x3: Tensor) -> tuple[Tensor, Tensor]:
-    """The linear points' fourth coordinate, and their depths (*batch, 2, n) in the second and third camera."""
-    from torchsfm.motion.trifocal_reprojection import _homogeneous, _start
-
-    X = _start(model, [_rows(x) for x in (x1, x2, x3)])
-    return X[3], torch.stack([_homogeneous(model[..., k, :, :], X)[2] for k in range(2)], -2)
-
-
 def estimate_trifocal(
     x: Float[Tensor, "*#batch 3 n 2"],
     *,
@@ -122,8 +115,8 @@ def estimate_trifocal(
 
     Args:
         x: Points in the three images.
-        threshold: Largest distance of an inlier, in the unit of the points: the root of the sum of squared distances in the three
-            images to those of one point in space.
+        threshold: Largest distance of an inlier, in the unit of the points: the root of the sum of squared distances in the
+            three images to those of one point in space.
         mask: Which correspondences exist. Rows that are not finite are left out too.
         scores: How much each correspondence can be trusted, the larger the more, in any unit.
         generator: Source of randomness.

@@ -131,7 +131,9 @@ def normalized_views(x: Tensor, l: Tensor, weights: Tensor | None, line_weights:
     some = (spread > 0) & (total > 0)
     s = torch.where(some, (torch.where(some, total, 1) / torch.where(some, spread, 1)).sqrt(), 1)
     zero = torch.zeros_like(s)
-    S = torch.stack((s, zero, -s * c[..., 0], zero, s, -s * c[..., 1], zero, zero, torch.ones_like(s)), -1).reshape(*s.shape, 3, 3)
+    S = torch.stack((s, zero, -s * c[..., 0], zero, s, -s * c[..., 1], zero, zero, torch.ones_like(s)), -1).reshape(
+        *s.shape, 3, 3
+    )
     lines = torch.cat((n, offset * s[..., None, None]), -1)
     return NormalizedViews(x * s[..., None, None], lines, _root(w), _root(k), S, finite)
 

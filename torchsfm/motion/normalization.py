@@ -1,5 +1,6 @@
 """Bringing two images to a common moderate scale, so that a threshold stays a threshold."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -32,23 +33,35 @@ def common_scale(
 
     Bounding boxes, because they do not depend on the order of the points or on how many absent ones surround them, bit for bit.
     """
+    (y1, y2), (T1, T2), scale = common_scale_of_views((x1, x2), mask)
+    return CommonScale(y1, y2, T1, T2, scale)
+
+
+def common_scale_of_views(
+    x: Sequence[Float[Tensor, "*#batch n 2"]], mask: Bool[Tensor, "*#batch n"] | None
+) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    """The same for any number of images: the points, the similarities, the common factor."""
     # The similarity is held when the points move.
-    x1, x2, free1, free2 = x1.detach(), x2.detach(), x1, x2
-    usable = torch.isfinite(x1).all(-1) & torch.isfinite(x2).all(-1)
+    fixed = [view.detach() for view in x]
+    usable = torch.isfinite(fixed[0]).all(-1)
+    for view in fixed[1:]:
+        usable = usable & torch.isfinite(view).all(-1)
     if mask is not None:
         usable = usable & mask
     usable = usable[..., None]
     some = usable.any(-2)
     centres, halves = [], []
-    for x in (x1, x2):
-        if x.shape[-2] == 0:
-            low = high = torch.where(some, torch.zeros_like(x.sum(-2)), 0)
+    for view in fixed:
+        if view.shape[-2] == 0:
+            low = high = torch.where(some, torch.zeros_like(view.sum(-2)), 0)
         else:
-            low = torch.where(some, torch.where(usable, x, torch.inf).amin(-2), 0)
-            high = torch.where(some, torch.where(usable, x, -torch.inf).amax(-2), 0)
+            low = torch.where(some, torch.where(usable, view, torch.inf).amin(-2), 0)
+            high = torch.where(some, torch.where(usable, view, -torch.inf).amax(-2), 0)
         centres.append((low + high) / 2)
         halves.append(((high - low) / 2).amax(-1))
-    size = torch.maximum(*halves)
+    size = halves[0]
+    for half in halves[1:]:
+        size = torch.maximum(size, half)
     scale = torch.where(torch.isfinite(size) & (size > 0), 1 / size, 1)
     s = scale[..., None, None]
     similarities = []
@@ -58,8 +71,7 @@ def common_scale(
         T[..., :2, 2] = -scale[..., None] * centre
         T[..., 2, 2] = 1
         similarities.append(T)
-    y1, y2 = (free1 - centres[0][..., None, :]) * s, (free2 - centres[1][..., None, :]) * s
-    return CommonScale(y1, y2, similarities[0], similarities[1], scale)
+    return [(view - centre[..., None, :]) * s for view, centre in zip(x, centres, strict=True)], similarities, scale
 
 
 def largest_positive(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -33,10 +33,11 @@ class QuadrifocalFit:
         Q: The tensor with norm 1, in the coordinates of the input; it is that of the cameras.
         P: The cameras in the frame of `canonical_cameras`.
         error: Root mean square of the algebraic residuals, without unit.
-        ambiguity: Singular value of the linear solution relative to the next, from 0 to 1: near 1 another tensor fits the linear
-            equations about as well.
+        ambiguity: Singular value of the linear solution relative to the next, from 0 to 1: near 1 another tensor fits the
+            linear equations about as well.
         status: OK; TOO_FEW points with weight; DEGENERATE: they leave more than one tensor (points in a plane, centres that
-            coincide), exactly or, ambiguity above 0.6, within their noise; NOT_CONVERGED; NOT_FINITE: numbers with weight that are not.
+            coincide), exactly or, ambiguity above 0.6, within their noise; NOT_CONVERGED; NOT_FINITE: numbers with weight that
+            are not.
     """
 
     Q: Float[Tensor, "*batch 3 3 3 3"]
@@ -61,7 +62,8 @@ def quadrifocal_6pt(
         max_iterations: Most steps of the minimisation.
 
     Returns:
-        Tensor, cameras, error, ambiguity and status; all finite always. Differentiable in points and weights through the minimum.
+        Tensor, cameras, error, ambiguity and status; all finite always. Differentiable in points and weights through the
+        minimum.
 
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 6.

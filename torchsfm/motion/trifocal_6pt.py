@@ -1,10 +1,10 @@
 """Six points in three uncalibrated images: the one or three projective reconstructions (Quan 1995; HZ 20.2.4).
 
-Four of the points are the projective basis of space and of every image. Then each camera is [diag(a) | d 1] with four unknowns,
-and the fifth point (1, 1, 1, 1) and the sixth X exchange roles with the cameras (Carlsson & Weinshall 1998): the images y5 and y6
-of one view satisfy y6' G y5 = 0 with one matrix G = -[p]x diag(X), p = X_4 - X_1..3, for all views. G has a zero diagonal and
-entries that sum to zero; three views leave s G0 + t G1, and det G = 0 is a cubic. All arithmetic has the batch in the last
-dimension.
+Four of the points are the projective basis of space and of every image. Then each camera is [diag(a) | d 1] with four
+unknowns, and the fifth point (1, 1, 1, 1) and the sixth X exchange roles with the cameras (Carlsson & Weinshall 1998): the
+images y5 and y6 of one view satisfy y6' G y5 = 0 with one matrix G = -[p]x diag(X), p = X_4 - X_1..3, for all views. G has a
+zero diagonal and entries that sum to zero; three views leave s G0 + t G1, and det G = 0 is a cubic. All arithmetic has the
+batch in the last dimension.
 """
 
 from itertools import combinations
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.polynomial import cubic_rows
 from torchsfm.linalg.rows import combine_rows
@@ -59,11 +59,11 @@ def trifocal_6pt(x: Float[Tensor, "*batch 3 6 2"]) -> Solutions[Float[Tensor, "*
         x: Six points in three images, in any unit.
 
     Returns:
-        Three slots of three cameras (*batch, slot, view, 3, 4), P1 = [I | 0], P2 = [A | e] with A'e = 0, |A| = |e| = 1,
-        |P3| = 1, signs as of `canonical_cameras`. None is valid where the points do not determine them (coinciding points, or so
-        few in general position that any four of them have three on a line in an image; six points in a plane) or a coordinate is
-        not finite. Where the four basis points are in a plane, which the images do not tell, the true cameras are not among the
-        solutions. Differentiable.
+        Three slots of three cameras (*batch, slot, view, 3, 4), P1 = [I | 0], P2 = [A | e] with A'e = 0, |A| = |e| = 1, |P3| =
+        1, signs as of `canonical_cameras`. None is valid where the points do not determine them (coinciding points, or so few
+        in general position that any four of them have three on a line in an image; six points in a plane) or a coordinate is
+        not finite. Where the four basis points are in a plane, which the images do not tell, the true cameras are not among
+        the solutions. Differentiable.
 
     Raises:
         ValueError: Wrong shape or dtype.
@@ -258,7 +258,7 @@ def _longest(candidates: tuple[Tensor, ...]) -> Tensor:
 
 def _null_3x3(rows: list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
     """The unit null vector of 3x3 matrices of rank 2 given by rows: (3, ...)."""
-    shape = torch.broadcast_shapes(*(e.shape for e in rows[0]))
+    shape = broadcast_shapes(*(e.shape for e in rows[0]))
     r = [torch.stack([e.expand(shape) for e in row]) for row in rows]
     n = _longest((_cross(r[0], r[1]), _cross(r[1], r[2]), _cross(r[2], r[0])))
     return n * combine_rows(n, n).clamp_min(1e-300).rsqrt()

@@ -32,10 +32,11 @@ class TrifocalFit:
         T: The tensor with norm 1, in the coordinates of the input; it meets all internal constraints.
         P: The cameras in the frame of `canonical_cameras`, whose tensor it is.
         error: Root mean square of the algebraic residuals, without unit.
-        ambiguity: Singular value of the linear solution relative to the next, from 0 to 1: near 1 another tensor fits the linear
-            equations about as well.
+        ambiguity: Singular value of the linear solution relative to the next, from 0 to 1: near 1 another tensor fits the
+            linear equations about as well.
         status: OK; TOO_FEW points and lines with weight; DEGENERATE: they leave more than one tensor (points in a plane,
-            centres that coincide, lines that meet), exactly or, ambiguity above 0.6, within their noise; NOT_CONVERGED; NOT_FINITE: numbers with weight that are not.
+            centres that coincide, lines that meet), exactly or, ambiguity above 0.6, within their noise; NOT_CONVERGED;
+            NOT_FINITE: numbers with weight that are not.
     """
 
     T: Float[Tensor, "*batch 3 3 3"]
@@ -56,8 +57,8 @@ def trifocal_7pt(
     """The trifocal tensor of least algebraic error among those that three cameras can have.
 
     Four equations a point and two a line, linear in T, in normalised coordinates; their least-squares solution is brought to
-    the nearest trifocal tensor, from where |A t| with |t| = 1 is minimised over the cameras (Levenberg-Marquardt; the minimum of
-    HZ's algorithm 16.2, with the cameras in place of the epipoles as parameters). Computed in float64 whatever the dtype.
+    the nearest trifocal tensor, from where |A t| with |t| = 1 is minimised over the cameras (Levenberg-Marquardt; the minimum
+    of HZ's algorithm 16.2, with the cameras in place of the epipoles as parameters). Computed in float64 whatever the dtype.
 
     Args:
         x: Points in the three images; n may be 0.

@@ -1,9 +1,9 @@
-"""The reprojection error of points in three views and its Gauss-Newton equations over the cameras, without triangulation by LAPACK.
+"""The reprojection error of points in three views and its Gauss-Newton equations over the cameras, without LAPACK.
 
-The first camera is [I | 0], so a point is X = (u, v, 1, r) with its first image (u, v). The other two images give r by linear least
-squares at the measured (u, v); one Gauss-Newton step then moves all three numbers towards the least sum of squared distances
-in the three images, and what is measured is the distance of the images of this very point. Everything is written in rows: one tensor
-for each coordinate of all points.
+The first camera is [I | 0], so a point is X = (u, v, 1, r) with its first image (u, v). The other two images give r by linear
+least squares at the measured (u, v); one Gauss-Newton step then moves all three numbers towards the least sum of squared
+distances in the three images, and what is measured is the distance of the images of this very point. Everything is written in
+rows: one tensor for each coordinate of all points.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm._types import broadcast_shapes
 from torchsfm.motion.epipolar_fit import forms
 
 Rows = Sequence[Tensor]
@@ -67,6 +68,12 @@ def squared_distance(model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows]) -
     return squared, front
 
 
+def linear_depths(model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows]) -> Float[Tensor, "*batch 2 n"]:
+    """The third homogeneous coordinates of the images of linearly triangulated points, in the second and third camera."""
+    X = _start(model, x)
+    return torch.stack([_homogeneous(model[..., k, :, :], X)[2] for k in range(2)], -2)
+
+
 def normal_equations(
     model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows], weights: Float[Tensor, "*#batch n"]
 ) -> tuple[Float[Tensor, "*batch 24 24"], Float[Tensor, "*batch 24"]]:
@@ -95,7 +102,7 @@ def normal_equations(
     for k, block in enumerate(D):
         for a in range(3):
             V.append(_forward(L, [J[2 * k][c] * block[a][0] + J[2 * k + 1][c] * block[a][1] for c in range(3)]))
-    shape = torch.broadcast_shapes(weights.shape, X[3].shape, X[0].shape)
+    shape = broadcast_shapes(weights.shape, X[3].shape, X[0].shape)
     X = [e.expand(shape) for e in X]
     left = []
     for a, b in _SIX:
@@ -106,8 +113,8 @@ def normal_equations(
     index = torch.tensor(_KRONECKER, device=moments.device)
     A = moments.double().flatten(-2).index_select(-1, index)
     pulled = [(block[a][0] * r[2 * k] + block[a][1] * r[2 * k + 1]) * weights for k, block in enumerate(D) for a in range(3)]
-    b = torch.stack([p.expand(shape) for p in pulled], -2) @ torch.stack(X, -2).mT
-    return A.reshape(*A.shape[:-1], 24, 24), b.double().flatten(-2)
+    slope = torch.stack([p.expand(shape) for p in pulled], -2) @ torch.stack(X, -2).mT
+    return A.reshape(*A.shape[:-1], 24, 24), slope.double().flatten(-2)
 
 
 def _start(model: Tensor, x: Sequence[Rows]) -> list[Tensor]:
