@@ -1,118 +1,132 @@
-"""Bundle adjustment against Ceres (through pycolmap) on the problems of Bundle Adjustment in the Large: time and final cost.
+"""Bundle adjustment against Ceres (through pycolmap) and SciPy: cost against time, and memory, from one start with one loss.
 
-`python -m bench.bundle FOLDER` prints a table for the `problem-*.txt*` files in the folder (default: `bal` in $TORCHSFM_DATA).
-Both start at the same numbers, use one thread and end at a relative decrease of 1e-6; runs alternate, and the least CPU time
-counts. COLMAP drops observations of points behind their camera, so where there are any the costs differ by those.
+`python -m bench.bundle` runs real problems (from `bal` in $TORCHSFM_DATA, where there is such) and generated ones with the
+statistics of Bundle Adjustment in the Large, every program in a process of its own, and prints a table; `--trace` adds the cost
+after every iteration, `--json FILE` writes all of it. `--problems C2000` is the one with 2,000 cameras.
+
+Cameras have f, k1 and k2 free. Observations of points behind their cameras are left out for all (COLMAP drops them anyway), but
+for the line `all`, which is this library's on everything. Runs alternate, and the one with least processor time (with one
+thread; else least time) counts. The memory is the peak during the solution above what the process held before, problem and
+imports included.
 """
 
 import argparse
-import gzip
+import json
 import os
-import time
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
-from torchsfm.bundle import bundle_adjust
-from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_from_rotvec
+from bench.bundle_programs import LOSSES, Run, in_front, run_ceres, run_scipy, run_torchsfm
+from torchsfm.formats import read_bal, read_libmv
+from torchsfm.geometry import BundleProblem
+from torchsfm.simulation import random_bundle_problem
 
-Problem = tuple[Pose, Camera, Tensor, Tensor, Tensor, Tensor]
-
-
-def read(path: Path) -> Problem:
-    """BAL cameras look down -z: turn them half a turn about x, and mirror image y."""
-    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    numbers = np.array(text.split(), dtype=np.float64)
-    v, n, m = numbers[:3].astype(int)
-    seen = torch.tensor(numbers[3 : 3 + 4 * m].reshape(m, 4))
-    camera = torch.tensor(numbers[3 + 4 * m : 3 + 4 * m + 9 * v].reshape(v, 9))
-    X = torch.tensor(numbers[3 + 4 * m + 9 * v :].reshape(n, 3))
-    flip = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    poses = Pose(flip[:, None] * rotation_from_rotvec(camera[:, :3]), flip * camera[:, 3:6])
-    cameras = Camera(intrinsics(camera[:, 6], torch.zeros(v, 2, dtype=torch.float64)), Radial(camera[:, 7], camera[:, 8]))
-    view, point = seen[:, :2].long().unbind(1)
-    return poses, cameras, X, seen[:, 2:] * flip[:2], view.clone(), point.clone()
-
-
-def to_pycolmap(problem: Problem) -> Any:
-    """The same problem as a COLMAP reconstruction, a camera and a rig of its own for every image."""
-    import pycolmap
-
-    poses, cameras, X, x, view, point = problem
-    reconstruction = pycolmap.Reconstruction()
-    order = torch.argsort(view, stable=True)
-    starts = torch.bincount(view, minlength=len(poses.t)).cumsum(0).tolist()
-    place = torch.empty_like(order)
-    begin = 0
-    for i, end in enumerate(starts):
-        rows = order[begin:end]
-        place[rows] = torch.arange(len(rows))
-        f, k1, k2 = (float(p[i]) for p in (cameras.K[:, 0, 0], cameras.distortion.k1, cameras.distortion.k2))
-        camera = pycolmap.Camera(camera_id=i + 1, model="RADIAL", width=2000, height=2000, params=[f, 0.0, 0.0, k1, k2])
-        reconstruction.add_camera_with_trivial_rig(camera)
-        image = pycolmap.Image(name=str(i), points2D=pycolmap.Point2DList([pycolmap.Point2D(p) for p in x[rows].numpy()]))
-        image.image_id, image.camera_id = i + 1, i + 1
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(poses.R[i].numpy()), poses.t[i].numpy())
-        reconstruction.add_image_with_trivial_frame(image, pose)
-        begin = end
-    tracks: list[list[Any]] = [[] for _ in range(len(X))]
-    for v, p, k in zip(view.tolist(), point.tolist(), place.tolist(), strict=True):
-        tracks[p].append(pycolmap.TrackElement(v + 1, k))
-    for position, elements in zip(X.numpy(), tracks, strict=True):
-        track = pycolmap.Track()
-        for element in elements:
-            track.add_element(element.image_id, element.point2D_idx)
-        reconstruction.add_point3D(position, track)
-    return reconstruction
+REAL = {
+    "ladybug-49": "problem-49-7776-pre.txt.gz",
+    "trafalgar-21": "problem-21-11315-pre.txt.gz",
+    "libmv": "libmv_problem_01.bin",
+}
+GENERATED: dict[str, tuple[int, int, int, str]] = {
+    "L49": (49, 7_700, 28_000, "path"),
+    "L138": (138, 20_000, 81_000, "path"),
+    "D16": (16, 22_000, 83_000, "dome"),
+    "D356": (356, 226_000, 1_250_000, "dome"),
+    "C2000": (2_000, 60_000, 300_000, "path"),
+}
+PROGRAMS: dict[str, Callable[[BundleProblem, int, str], Run]] = {
+    "torchsfm": run_torchsfm,
+    "all": run_torchsfm,
+    "ceres-dense": lambda problem, threads, loss: run_ceres(problem, threads, loss, "DENSE_SCHUR"),
+    "ceres-sparse": lambda problem, threads, loss: run_ceres(problem, threads, loss, "SPARSE_SCHUR"),
+    "ceres-iterative": lambda problem, threads, loss: run_ceres(problem, threads, loss, "ITERATIVE_SCHUR"),
+    "scipy": run_scipy,
+}
 
 
-def run_ceres(problem: Problem) -> tuple[float, float, int]:
-    """CPU seconds, final cost, iterations."""
-    import pycolmap
-
-    reconstruction = to_pycolmap(problem)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    solver = options.ceres.solver_options
-    solver.function_tolerance, solver.max_num_iterations, solver.num_threads = 1e-6, 100, 1
-    config = pycolmap.BundleAdjustmentConfig()
-    for image in reconstruction.images:
-        config.add_image(image)
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-    start = time.process_time()
-    summary = adjuster.solve()
-    seconds = time.process_time() - start
-    summary = getattr(summary, "ceres_summary", summary)
-    return seconds, summary.final_cost, summary.num_successful_steps + summary.num_unsuccessful_steps
+def load(name: str, folder: Path) -> BundleProblem:
+    """A problem by its name."""
+    if name in GENERATED:
+        *counts, layout = GENERATED[name]
+        return random_bundle_problem(*counts, layout=layout, generator=torch.Generator().manual_seed(0)).problem  # type: ignore[arg-type]
+    path = folder / REAL.get(name, name)
+    return read_libmv(path) if path.suffix == ".bin" else read_bal(path)
 
 
-def run_ours(problem: Problem) -> tuple[float, float, int]:
-    """CPU seconds, final cost, iterations."""
-    start = time.process_time()
-    result = bundle_adjust(*problem, free=("focal", "k1", "k2"), tolerance=1e-6, max_iterations=100)
-    return time.process_time() - start, result.cost, result.iterations
+def work(name: str, program: str, threads: int, loss: str, folder: Path) -> None:
+    """One run, printed as a line of JSON."""
+    problem = load(name, folder)
+    print(json.dumps(asdict(PROGRAMS[program](problem if program == "all" else in_front(problem), threads, loss))))
+
+
+def measure(name: str, program: str, threads: int, loss: str, folder: Path, limit: float) -> dict[str, Any]:
+    """A run in a process of its own."""
+    command = [sys.executable, "-m", "bench.bundle", "--folder", str(folder), "--worker", name, program, str(threads), loss]
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "MKL_NUM_THREADS": str(threads)}
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit, check=False)
+    except subprocess.TimeoutExpired:
+        return {"note": f"not within {limit:g} s"}
+    if done.returncode:
+        return {"note": (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1][:60]}
+    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return found
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", nargs="?", default=Path(os.environ.get("TORCHSFM_DATA", ".")) / "bal", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", default=Path(os.environ.get("TORCHSFM_DATA", ".")) / "bal", type=Path)
+    parser.add_argument("--problems", nargs="+", default=[*REAL, "L49", "L138", "D16"], help="names, or files in the folder")
+    parser.add_argument("--programs", nargs="+", default=[*PROGRAMS], choices=[*PROGRAMS])
+    parser.add_argument("--threads", nargs="+", type=int, default=[1])
+    parser.add_argument("--loss", default="squares", choices=[*LOSSES])
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--limit", type=float, default=600, help="most seconds a run may take")
+    parser.add_argument("--trace", action="store_true", help="print the cost after each iteration")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--worker", nargs=4, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    print(f"{'problem':24s} {'program':10s} {'cost':>14s} {'iterations':>10s} {'seconds':>8s} {'ms / iteration':>14s}")
-    for path in sorted(arguments.folder.glob("problem-*.txt*")):
-        problem = read(path)
-        runs = [(run_ours(problem), run_ceres(problem)) for _ in range(arguments.repeats)]
-        for name, results in zip(("torchsfm", "Ceres"), zip(*runs, strict=True), strict=True):
-            seconds, cost, iterations = min(results)
-            print(
-                f"{path.name.split('-pre')[0]:24s} {name:10s} {cost:14.3f} {iterations:10d} {seconds:8.3f}"
-                f" {1e3 * seconds / iterations:14.1f}"
-            )
+    if arguments.worker:
+        name, program, threads, loss = arguments.worker
+        work(name, program, int(threads), loss, arguments.folder)
+        return
+    record = []
+    head = f"{'problem':14s} {'program':16s} threads {'first cost':>13s} {'last cost':>13s} {'steps':>5s}"
+    print(f"{head} {'time, s':>8s} {'cpu, s':>8s} {'ms / step':>9s} {'MB':>7s}")
+    for name in arguments.problems:
+        if name in REAL and not (arguments.folder / REAL[name]).exists():
+            print(f"{name:14s} not in {arguments.folder}")
+            continue
+        for threads in arguments.threads:
+            runs: dict[str, list[dict[str, Any]]] = {program: [] for program in arguments.programs}
+            for _ in range(arguments.repeats):
+                for program, found in runs.items():
+                    if not found or "cost" in found[-1]:
+                        found.append(measure(name, program, threads, arguments.loss, arguments.folder, arguments.limit))
+            for program, found in runs.items():
+                good = [run for run in found if "cost" in run]
+                if not good:
+                    print(f"{name:14s} {program:16s} {threads:7d} {found[-1]['note']}")
+                    continue
+                best = min(good, key=lambda run: run["cpu" if threads == 1 else "seconds"])
+                record.append({"problem": name, "program": program, "threads": threads, **best})
+                first = best["trace"][0][1] if best["trace"] else float("nan")
+                step = 1e3 * best["seconds"] / max(best["iterations"], 1)
+                print(
+                    f"{name:14s} {program:16s} {threads:7d} {first:13.6g} {best['cost']:13.7g} {best['iterations']:5d}"
+                    f" {best['seconds']:8.3f} {best['cpu']:8.3f} {step:9.1f} {best['memory']:7.1f}",
+                    flush=True,
+                )
+                if arguments.trace:
+                    print("    " + "  ".join(f"{seconds:.3f}: {cost:.6g}" for seconds, cost in best["trace"]))
+    if arguments.json:
+        arguments.json.write_text(json.dumps(record, indent=1))
 
 
 if __name__ == "__main__":
