@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.geometry import Camera, DistortionModel, NoDistortion, Radial, SimpleRadial
+from torchsfm.geometry import BrownConrady, Camera, DistortionModel, NoDistortion, Radial, SimpleRadial
+from torchsfm.geometry.decentring import brown_jacobian
 
 COORDINATES: dict[str, tuple[int, ...]] = {"focal": (0,), "aspect": (1,), "principal_point": (2, 3), "skew": (4,)}
 """Columns of a camera row by the names users know."""
@@ -88,6 +89,8 @@ class Projection:
         rows = camera.mT
         if issubclass(self.model, RADIAL):
             uv, by_parameter = _differentiate_radial(moved, rows[5:], by_camera)
+        elif issubclass(self.model, BrownConrady):
+            uv, by_parameter = _differentiate_brown(moved, rows[5:], by_camera)
         else:
             uv, by_parameter = _differentiate(self.model, moved, rows[5:], by_camera)
         focal = _focal(rows)
@@ -192,6 +195,25 @@ def _differentiate_radial(moved: Tensor, k: Tensor, by_ray: Tensor) -> tuple[Ten
     torch.mul(uv, torch.addcmul(along, s, slope).neg_(), out=by_ray[:, 2])
     first = uv * s
     return uv * h, [first] if len(k) == 1 else [first, first * s]
+
+
+def _differentiate_brown(moved: Tensor, k: Tensor, by_ray: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """The same with decentring; the Jacobian by the flat coordinates is symmetric."""
+    uv, depth, s = _flatten(moved)
+    (x, y), (k1, k2, p1, p2, k3) = uv, k
+    L, jxx, jxy, jyy, _ = brown_jacobian(x, y, s, (k1, k2, k3), p1, p2)
+    torch.mul(jxx, depth, out=by_ray[0, 0])
+    torch.mul(jyy, depth, out=by_ray[1, 1])
+    torch.mul(jxy, depth, out=by_ray[0, 1])
+    by_ray[1, 0] = by_ray[0, 1]
+    torch.mul(by_ray[:, 0], -x, out=by_ray[:, 2]).addcmul_(by_ray[:, 1], y, value=-1)
+    first = uv * s
+    second = first * s
+    both = 2 * x * y
+    along = torch.stack((both, torch.addcmul(s, y, y, value=2)))
+    across = torch.stack((torch.addcmul(s, x, x, value=2), both))
+    distorted = torch.stack((torch.addcmul(x * L, p2, s), torch.addcmul(y * L, p1, s)))
+    return distorted, [first, second, along, across, second * s]
 
 
 def _differentiate(model: type[DistortionModel], moved: Tensor, k: Tensor, by_ray: Tensor) -> tuple[Tensor, list[Tensor]]:
