@@ -46,6 +46,13 @@ def test_differentiable_geometry(tmp_path: Path) -> None:
     assert number(r"weights of the network: median error ([\d.]+) px", text) < 3
 
 
+def test_train_match_weights(tmp_path: Path) -> None:
+    text = run("train_match_weights.py", tmp_path)
+    assert number(r"uniform samples: median error ([\d.]+) px", text) > 10
+    assert number(r"learned samples: median error ([\d.]+) px", text) < 3
+    assert number(r"with learned scores: median error ([\d.]+) px", text) < 1
+
+
 def test_no_example_is_forgotten() -> None:
     tested = set(re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text()))
     assert tested == {path.name for path in EXAMPLES.glob("*.py")}

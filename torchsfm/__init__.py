@@ -209,7 +209,7 @@ from torchsfm.resection import (
     estimate_camera,
     refine_camera,
 )
-from torchsfm.robust import (
+from torchsfm.robust import (SoftSelection, soft_ransac)
     Degeneracy,
     Estimator,
     RobustResult,
@@ -300,6 +300,8 @@ from torchsfm.triangulation import (
 )
 
 __all__ = [
+    "SoftSelection",
+    "soft_ransac",
     "DISTORTION_MODELS",
     "AdjustedModel",
     "AffineFactorization",

@@ -5,5 +5,6 @@ from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.local_optimisation import damped_solve
 from torchsfm.robust.optimum import push_forward
 from torchsfm.robust.ransac import RobustResult, ransac
+from torchsfm.robust.soft_selection import SoftSelection, soft_ransac
 
-__all__ = ["Degeneracy", "Estimator", "RobustResult", "damped_solve", "push_forward", "ransac"]
+__all__ = ["Degeneracy", "Estimator", "RobustResult", "SoftSelection", "damped_solve", "push_forward", "ransac", "soft_ransac"]
