@@ -209,11 +209,13 @@ from torchsfm.resection import (
     estimate_camera,
     refine_camera,
 )
-from torchsfm.robust import (SoftSelection, soft_ransac)
+from torchsfm.robust import (
     Degeneracy,
     Estimator,
     RobustResult,
+    SoftSelection,
     ransac,
+    soft_ransac,
 )
 from torchsfm.simulation import (
     RenderedSequence,
@@ -300,8 +302,6 @@ from torchsfm.triangulation import (
 )
 
 __all__ = [
-    "SoftSelection",
-    "soft_ransac",
     "DISTORTION_MODELS",
     "AdjustedModel",
     "AffineFactorization",
@@ -380,6 +380,7 @@ __all__ = [
     "SimulatedBundle",
     "SimulatedImages",
     "SoftL1",
+    "SoftSelection",
     "Solutions",
     "SparseCovariance",
     "SparseResult",
@@ -538,6 +539,7 @@ __all__ = [
     "show_scaled",
     "similarity_from_points",
     "simulate_images",
+    "soft_ransac",
     "sparse_covariance",
     "sparse_levenberg_marquardt",
     "to_homogeneous",
