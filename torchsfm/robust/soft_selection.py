@@ -4,8 +4,8 @@ Hypotheses come from samples drawn without replacement with probabilities q give
 number of inliers s, and is chosen with probability p = softmax(s / temperature) (DSAC: Brachmann et al. 2017). For losses l of
 the models, L = sum p l is a function of the data and the scores, and is differentiated as such, through the solver. The
 derivative by the logits is that of the expectation over samples: the sum over samples of (L - L') d log q, where L' is L
-without the sample. L' does not depend on the sample, so the estimate has no bias (Williams 1992; Brachmann & Rother 2019 have one
-baseline for all), and L - L' = p (l - L') is small for all samples but those that matter.
+without the sample. L' does not depend on the sample, so the estimate has no bias (Williams 1992; Brachmann & Rother 2019 have
+one baseline for all), and L - L' = p (l - L') is small for all samples but those that matter.
 """
 
 from dataclasses import dataclass
