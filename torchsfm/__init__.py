@@ -36,10 +36,12 @@ from torchsfm.bundle import (
 )
 from torchsfm.formats import (
     PointCloud,
+    VggScene,
     read_bal,
     read_colmap,
     read_libmv,
     read_ply,
+    read_vgg,
     write_bal,
     write_colmap,
     write_ply,
@@ -396,6 +398,7 @@ __all__ = [
     "Tukey",
     "UnitSphere",
     "Verdict",
+    "VggScene",
     "affine_shape",
     "attach_implicit",
     "attach_optimum",
@@ -514,6 +517,7 @@ __all__ = [
     "read_image",
     "read_libmv",
     "read_ply",
+    "read_vgg",
     "reconstruct",
     "reconstruct_tracks",
     "reduced_fundamental",

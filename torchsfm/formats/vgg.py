@@ -1,0 +1,105 @@
+"""The multi-view data sets of the Visual Geometry Group, Oxford: points, line segments and cameras of a few views, as text."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class VggScene:
+    """Matched points and line segments of several views, float64, with the cameras and structure published with them.
+
+    Attributes:
+        x: Image points; 0 where not visible.
+        visible: Which points were matched in which view.
+        P: Camera matrices. Signs are as published: det P[:, :3] may be negative.
+        X: Points in space.
+        segments: Image line segments, end points as (x, y) pairs; 0 where not visible. Its ends in different views need not correspond.
+        segments_visible: Which lines were matched in which view.
+        L: Line segments in space, their end points.
+    """
+
+    x: Float[Tensor, "v n 2"]
+    visible: Bool[Tensor, "v n"]
+    P: Float[Tensor, "v 3 4"]
+    X: Float[Tensor, "n 3"]
+    segments: Float[Tensor, "v k 2 2"]
+    segments_visible: Bool[Tensor, "v k"]
+    L: Float[Tensor, "k 2 3"]
+
+
+def read_vgg(folder: str | Path) -> VggScene:
+    """Read a data set with subfolders 2D and 3D, as "Model House", "Corridor", "Merton College" or "Wadham College".
+
+    Args:
+        folder: The folder of one data set. Where no lines come with it, there are none in the result.
+
+    Returns:
+        Points, lines and cameras, views in the order of their numbers.
+
+    Raises:
+        ValueError: A file is missing or damaged; one line that says which.
+    """
+    folder = Path(folder)
+    corners = sorted((folder / "2D").glob("*.corners"))
+    cameras = sorted((folder / "3D").glob("*.P")) or sorted((folder / "2D").glob("*.P"))
+    if not corners or len(corners) != len(cameras):
+        raise ValueError(f"{folder}: wanted as many cameras (*.P) as views (2D/*.corners), got {len(cameras)}, {len(corners)}")
+    matrices = [_numbers(path, 4) for path in cameras]
+    for path, matrix in zip(cameras, matrices, strict=True):
+        if len(matrix) != 3:
+            raise ValueError(f"{path}: wanted three rows of four numbers, got {len(matrix)}")
+    P = torch.stack(matrices)
+    x, visible = _matched(folder, corners, "corners", 2)
+    X = _numbers(_single(folder / "3D", "p3d"), 3)
+    lines = sorted((folder / "2D").glob("*.lines"))
+    if lines:
+        ends, seen = _matched(folder, lines, "lines", 4)
+        L = _numbers(_single(folder / "3D", "l3d"), 6).reshape(-1, 2, 3)
+    else:
+        ends, seen = x.new_zeros(len(P), 0, 4), visible[:, :0]
+        L = x.new_zeros(0, 2, 3)
+    for name, flat, found in (("points", X, visible), ("lines", L, seen)):
+        if len(flat) != found.shape[1]:
+            raise ValueError(f"{folder}: wanted as many {name} in 3D as in 2D, got {len(flat)} and {found.shape[1]}")
+    return VggScene(x, visible, P, X, ends.reshape(*ends.shape[:2], 2, 2), seen, L)
+
+
+def _single(folder: Path, ending: str) -> Path:
+    """The file `name.ending` or `ending` of a folder."""
+    found = [*folder.glob(f"*.{ending}"), *folder.glob(ending)]
+    if len(found) != 1:
+        raise ValueError(f"{folder}: wanted one file *{ending}, got {len(found)}")
+    return found[0]
+
+
+def _numbers(path: Path, columns: int) -> Tensor:
+    """The first numbers of every line."""
+    try:
+        rows = [[float(word) for word in line.split()[:columns]] for line in path.read_text().splitlines() if line.strip()]
+        table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
+    except (ValueError, UnicodeDecodeError, OSError) as error:
+        raise ValueError(f"{path}: wanted {columns} numbers on every line ({error})") from None
+    return torch.from_numpy(table)
+
+
+def _matched(folder: Path, paths: list[Path], kind: str, columns: int) -> tuple[Tensor, Tensor]:
+    """The features of all views in the order of the table of matches, and which of them there are."""
+    table = _single(folder / "2D", f"nview-{kind}")
+    try:
+        rows = [[-1 if word == "*" else int(word) for word in line.split()] for line in table.read_text().splitlines()]
+        index = torch.tensor([row for row in rows if row], dtype=torch.long).reshape(-1, len(paths)).T
+    except (ValueError, RuntimeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{table}: wanted {len(paths)} numbers on every line ({error})") from None
+    columns_of = []
+    for path, numbers in zip(paths, index, strict=True):
+        features = _numbers(path, columns)
+        if len(numbers) and int(numbers.max()) >= len(features):
+            raise ValueError(f"{table}: feature {int(numbers.max())} is not in {path.name}, which has {len(features)}")
+        padded = torch.cat((features.new_zeros(1, columns), features))
+        columns_of.append(padded[numbers.clamp_min(-1) + 1])
+    return torch.stack(columns_of), index >= 0
