@@ -18,7 +18,8 @@ class VggScene:
         visible: Which points were matched in which view.
         P: Camera matrices. Signs are as published: det P[:, :3] may be negative.
         X: Points in space.
-        segments: Image line segments, end points as (x, y) pairs; 0 where not visible. Its ends in different views need not correspond.
+        segments: Image line segments, end points as (x, y) pairs; 0 where not visible. Ends need not
+            correspond between views.
         segments_visible: Which lines were matched in which view.
         L: Line segments in space, their end points.
     """
