@@ -5,7 +5,15 @@ import math
 import pytest
 import torch
 
-from torchsfm.robust.sampling import compact, draw_samples, guided_pools, hash_integers
+from torchsfm.robust.sampling import (
+    PROSAC_SAMPLES,
+    compact,
+    draw_samples,
+    draw_weighted,
+    hash_integers,
+    prosac_growth,
+    prosac_pools,
+)
 
 
 def zeros(count: torch.Tensor) -> torch.Tensor:
@@ -53,14 +61,51 @@ def test_hash_spreads_single_bits() -> None:
     assert ((bits - 0.5).abs() < 0.05).all()
 
 
-def test_guided_pools_grow_from_the_best_to_all() -> None:
-    pools = guided_pools(torch.tensor([200]), torch.tensor([0]), 2000, 4)[0]
-    assert (pools[::2] == 200).all()
-    guided = pools[1::2]
-    assert guided[0] < 50
+def test_prosac_grows_as_published() -> None:
+    """T'_n by the recursion of the paper, in Python integers."""
+    size, count = 4, 60
+    growth = prosac_growth(torch.tensor([count]), 64, size)[0].tolist()
+    T, whole = float(PROSAC_SAMPLES), [1]
+    for i in range(size):
+        T *= (size - i) / (count - i)
+    for n in range(size, count):
+        grown = T * (n + 1) / (n + 1 - size)
+        whole.append(whole[-1] + math.ceil(grown - T - 1e-9))
+        T = grown
+    assert growth[: len(whole)] == whole
+    assert abs(T - PROSAC_SAMPLES) < 1e-3
+
+
+def test_prosac_draws_the_newest_of_a_growing_pool() -> None:
+    count, size, number = torch.tensor([200]), 4, 4000
+    growth = prosac_growth(count, 256, size)
+    pool, newest = prosac_pools(count, growth, torch.tensor([0]), number, size)
+    sample = draw_samples(3, count, torch.tensor([0]), number, size, pool, newest)[0]
+    assert (sample.sort(0).values.diff(dim=0) > 0).all()
+    pool, newest = pool[0], newest[0]
+    assert (pool[::2] == 200).all()
+    assert not newest[::2].any()
+    guided, own = pool[1::2], sample[:, 1::2]
     assert (guided.diff() >= 0).all()
-    assert guided[-1] > 100
-    assert guided.min() >= 4
+    assert guided[0] == 4
+    # Hypothesis t draws from n data while T'_{n-1} < t <= T'_n.
+    t = torch.arange(1, number // 2 + 1)
+    assert (growth[0, guided - size] >= t).all()
+    assert (growth[0, (guided - size - 1).clamp(min=0)] < t)[guided > size].all()
+    assert (own.amax(0) == guided - 1).all()
+
+
+def test_weighted_samples_follow_the_weights() -> None:
+    weight = torch.tensor([[0.0, 1.0, 2.0, 0.0, 4.0, 1.0, 0.0]], dtype=torch.float64)
+    sample = draw_weighted(1, weight, torch.tensor([4]), torch.tensor([0]), 200_000, 2)[0]
+    assert (sample[0] != sample[1]).all()
+    assert (weight[0][sample] > 0).all()
+    first = torch.bincount(sample[0], minlength=7) / 200_000
+    torch.testing.assert_close(first.double(), weight[0] / 8, atol=5e-3, rtol=0)
+    # Of what is left after datum 4, half is datum 2.
+    after = sample[1][sample[0] == 4]
+    assert abs((after == 2).double().mean() - 0.5) < 1e-2
+    assert draw_weighted(1, weight, torch.tensor([4]), torch.tensor([0]), 1000, 4)[0].sort(0).values.unique(dim=1).shape[1] == 1
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 30, 64, 97])

@@ -21,8 +21,11 @@ from torchsfm.motion.epipolar_fit import (
 from torchsfm.motion.essential_5pt import essential_5pt
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, squared_transfer
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import Degeneracy, RobustResult, damped_solve, push_forward, ransac
+from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
 from torchsfm.tensors import essential_from_pose
+
+_SLACK = 2e-3
+"""By which angle rays may miss the front where no threshold says how large the noise is, in radians."""
 
 
 @dataclass(frozen=True)
@@ -158,9 +161,11 @@ def estimate_essential(
     d1: Float[Tensor, "*#batch n 3"],
     d2: Float[Tensor, "*#batch n 3"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
@@ -176,8 +181,11 @@ def estimate_essential(
         d1: Rays of the first camera, of any length, pointing to the points.
         d2: The corresponding rays of the second camera.
         threshold: Largest Sampson distance of an inlier in radians: pixels divided by the focal length.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite or of length 0 are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
@@ -193,13 +201,24 @@ def estimate_essential(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    batch = check_tensors(d1=(d1, "n 3"), d2=(d2, "n 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    batch = check_tensors(
+        d1=(d1, "n 3"),
+        d2=(d2, "n 3"),
+        threshold=(limit, ""),
+        mask=(mask, "n: bool"),
+        scores=(scores, "n"),
+        weights=(weights, "n"),
+    )
     h1, h2 = _unit(d1.double()), _unit(d2.double())
-    slack = threshold.double() if isinstance(threshold, Tensor) else h1.new_tensor(threshold)
+    slack = threshold.double() if isinstance(threshold, Tensor) else h1.new_tensor(_SLACK if threshold is None else threshold)
     estimator = RelativePoseEstimator(slack.expand(batch))
+    if scores is not None:
+        scores = scores.double()
+    if weights is not None:
+        weights = weights.double()
     result = ransac(
-        estimator, h1, h2, threshold=slack, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        estimator, h1, h2, threshold=None if threshold is None else slack, mask=mask,
+        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
         max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
 
@@ -214,6 +233,7 @@ def estimate_essential(
         result,
         model=essential(result.model).to(d1.dtype),
         score=result.score.to(d1.dtype),
+        threshold=result.threshold.to(d1.dtype),
         covariance=None if spread is None else spread.to(d1.dtype),
     )
 

@@ -18,10 +18,11 @@ from torchsfm.motion.epipolar_fit import (
     plane_rows,
     squared_distance,
 )
+from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.normalization import common_scale, largest_positive
-from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance
-from torchsfm.robust import Degeneracy, RobustResult, damped_solve, push_forward, ransac
+from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, plane_rivals
+from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,19 @@ class FundamentalEstimator:
         f = model[..., :3].flatten(-2) + (step[..., None, :] @ basis)[..., 0, :]
         return _with_epipole(matrices(_determinant_step(f), 3), model[..., 3])
 
+    def rivals(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        *,
+        inside: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        seed: int,
+    ) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
+        """Where a plane holds most inliers: F of its homography and of two points off it (Chum, Werner & Matas 2005)."""
+        return plane_rivals(self, HomographyEstimator(), model, x1, x2, inside=inside, threshold=threshold, seed=seed)
+
     def degeneracy(
         self,
         model: Float[Tensor, "*#batch 3 4"],
@@ -161,9 +175,11 @@ def estimate_fundamental(
     x1: Float[Tensor, "*#batch n 2"],
     x2: Float[Tensor, "*#batch n 2"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
@@ -171,16 +187,20 @@ def estimate_fundamental(
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The fundamental matrix of each pair of images, from correspondences of which many may be wrong.
 
-    LO-RANSAC over seven-point samples with the oriented epipolar constraint, then a robust minimum of Sampson's distance over
-    the matrices of rank 2. Computed in float64, hypotheses scored in float32. Points of one plane, or a pure rotation of the
-    camera, leave F open in two dimensions: `degeneracy` says so.
+    LO-RANSAC over seven-point samples with the oriented epipolar constraint; where most inliers are in a plane, also over its
+    homography and pairs of points off it (DEGENSAC); then a robust minimum of Sampson's distance over the matrices of rank 2.
+    Computed in float64, hypotheses scored in float32. Points of one plane alone, or a pure rotation of the camera, leave F open
+    in two dimensions: `degeneracy` says so.
 
     Args:
         x1: Points in the first image.
         x2: The corresponding points in the second image, in the same unit.
         threshold: Largest Sampson distance of an inlier, in the unit of the points.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
@@ -196,12 +216,23 @@ def estimate_fundamental(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    check_tensors(
+        x1=(x1, "n 2"),
+        x2=(x2, "n 2"),
+        threshold=(limit, ""),
+        mask=(mask, "n: bool"),
+        scores=(scores, "n"),
+        weights=(weights, "n"),
+    )
     y = common_scale(x1.double(), x2.double(), mask)
     estimator = FundamentalEstimator()
+    if scores is not None:
+        scores = scores.double()
+    if weights is not None:
+        weights = weights.double()
     result = ransac(
-        estimator, y.x1, y.x2, threshold=y.scale * threshold, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        estimator, y.x1, y.x2, threshold=None if threshold is None else y.scale * threshold, mask=mask,
+        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
         max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
 
@@ -216,5 +247,6 @@ def estimate_fundamental(
         result,
         model=in_pixels(result.model).to(x1.dtype),
         score=result.score.to(x1.dtype),
+        threshold=(result.threshold / y.scale).to(x1.dtype),
         covariance=None if spread is None else spread.to(x1.dtype),
     )

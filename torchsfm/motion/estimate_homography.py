@@ -14,7 +14,7 @@ from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.plane_and_parallax import more_than_chance
 from torchsfm.optim import UnitSphere
-from torchsfm.robust import Degeneracy, RobustResult, damped_solve, push_forward, ransac
+from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
 
 # Where entry ((i, j), (k, l)) of a sum of Kronecker products is among 6 x 6 products, both in the order 00, 01, 02, 11, 12, 22.
 _PAIR = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
@@ -150,9 +150,11 @@ def estimate_homography(
     x1: Float[Tensor, "*#batch n 2"],
     x2: Float[Tensor, "*#batch n 2"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
@@ -168,8 +170,11 @@ def estimate_homography(
         x2: The corresponding points in the second image, in the same unit.
         threshold: Largest Sampson distance of an inlier, in the unit of the points. It counts errors in both images together:
             with the same noise in both, a transfer error to one image is about 1.4 times larger.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
@@ -184,12 +189,23 @@ def estimate_homography(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    check_tensors(
+        x1=(x1, "n 2"),
+        x2=(x2, "n 2"),
+        threshold=(limit, ""),
+        mask=(mask, "n: bool"),
+        scores=(scores, "n"),
+        weights=(weights, "n"),
+    )
     y = common_scale(x1.double(), x2.double(), mask)
     estimator = HomographyEstimator()
+    if scores is not None:
+        scores = scores.double()
+    if weights is not None:
+        weights = weights.double()
     result = ransac(
-        estimator, y.x1, y.x2, threshold=y.scale * threshold, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        estimator, y.x1, y.x2, threshold=None if threshold is None else y.scale * threshold, mask=mask,
+        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
         max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
     back = torch.linalg.inv_ex(y.T2)[0]
@@ -207,5 +223,6 @@ def estimate_homography(
         result,
         model=in_pixels(result.model).to(x1.dtype),
         score=result.score.to(x1.dtype),
+        threshold=(result.threshold / y.scale).to(x1.dtype),
         covariance=None if spread is None else spread.to(x1.dtype),
     )

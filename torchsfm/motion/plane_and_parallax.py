@@ -6,15 +6,21 @@ determine the epipole: it lies on the lines through x2 and H x1 (Chum, Werner & 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.motion.epipolar_fit import cross_rows, forms
+from torchsfm._types import Solutions
+from torchsfm.motion.epipolar_fit import cross_rows, forms, plane_rows
 from torchsfm.robust import damped_solve
+from torchsfm.robust.sampling import draw_samples
 
 _TRIPLES, _JUDGES = 32, 96
+"""Triples of inliers to put a plane through, and inliers to judge the planes by."""
+_PAIRS, _OFF_PLANE, _RIVALS = 1024, 256, 4
+"""Pairs of points off a plane, points off it to judge them by, and how many of the best to return."""
 
 
 def squared_transfer(
@@ -86,6 +92,73 @@ def dominant_plane(
         v = torch.where((on.sum(-1) >= 3)[..., None], refined, v)
     H = A + e[..., :, None] * v[..., None, :]
     return H, inliers & (squared_transfer(H, h1, h2, sphere) < limit[..., None])
+
+
+def plane_rivals(
+    estimator: Any,
+    plane_estimator: Any,
+    model: Float[Tensor, "p 3 4"],
+    x1: Float[Tensor, "p n 2"],
+    x2: Float[Tensor, "p n 2"],
+    *,
+    inside: Bool[Tensor, "p n"],
+    threshold: Float[Tensor, "p"],
+    seed: int,
+) -> Solutions[Float[Tensor, "p 4 3 4"]]:
+    """The best F of the dominant plane and two points off it, where half of the inliers of F or more are in one plane.
+
+    Pairs are drawn from all points off the plane, and judged by these: all pairs agree with the points of the plane.
+
+    Args:
+        estimator: Measures F.
+        plane_estimator: Measures and refines homographies.
+        model: The best F so far, with its second epipole.
+        x1: Points in the first image.
+        x2: Points in the second image.
+        inside: Which points exist.
+        threshold: Largest distance of an inlier.
+        seed: Seed for the pairs.
+    """
+    F, e, h1, h2 = model[..., :3], model[..., 3], plane_rows(x1), plane_rows(x2)
+    limit = threshold * threshold
+    near = (estimator.squared_residual(model, x1, x2) < limit[:, None]) & inside
+    H, on = dominant_plane(cross_rows(e, F), e, h1, h2, near, 4 * limit, sphere=False)
+    suspect = (2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)
+    out = model[:, None].expand(-1, _RIVALS, -1, -1).clone()
+    valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
+    row = suspect.nonzero()[:, 0]
+    if not len(row):
+        return Solutions(out, valid)
+    y1, y2, there, bound, H, on = x1[row], x2[row], inside[row], limit[row], H[row], on[row]
+    for _ in range(3):
+        H = plane_estimator.refine(H, y1, y2, weights=on.to(H.dtype))
+        on = there & (plane_estimator.squared_residual(H, y1, y2) < 4 * bound[:, None])
+    aside = there & ~on
+    count = aside.sum(-1)
+    # The points off the plane come first, in their order, of which any part is spread over all.
+    index = aside.to(torch.int8).argsort(dim=-1, descending=True, stable=True)
+    drawn = draw_samples(seed, count.clamp(min=2), torch.zeros_like(count), _PAIRS, 2)
+    pair = index.gather(1, drawn.flatten(1).clamp(max=index.shape[-1] - 1))
+    g1, g2 = (torch.cat((y, torch.ones_like(y[..., :1])), -1) for y in (y1, y2))
+    corners = [g.gather(1, pair[..., None].expand(-1, -1, 3)).reshape(len(row), 2, _PAIRS, 3).transpose(1, 2) for g in (g1, g2)]
+    found, epipole = fundamentals_of_parallax(H[:, None], *corners)
+    # Twice, with the epipole on either side: one of them has the points in front.
+    both = torch.cat([torch.cat((found, sign * epipole[..., None]), -1) for sign in (1, -1)], 1)
+    judges = index[:, :_OFF_PLANE, None].expand(-1, -1, 2)
+    z1, z2 = y1.gather(1, judges), y2.gather(1, judges)
+    counts = aside.gather(1, judges[..., 0])
+    # Problem by problem, or what is being computed leaves the cache.
+    loss = []
+    for i in range(len(row)):
+        squared = estimator.squared_residual(both[i : i + 1], z1[i : i + 1, None], z2[i : i + 1, None])
+        ratio = (squared / bound[i]).clamp(max=1).nan_to_num(nan=1.0)
+        loss.append((ratio * counts[i]).sum(-1))
+    # Two points on one epipolar line determine no F: zero, which everything would agree with.
+    nothing = (both == 0).all(-1).all(-1)
+    least = torch.where(nothing, torch.inf, torch.cat(loss)).topk(_RIVALS, dim=-1, largest=False)
+    out[row] = both.gather(1, least.indices[..., None, None].expand(-1, -1, 3, 4))
+    valid[row] = (least.values < counts.sum(-1, keepdim=True)) & (count >= 2)[:, None]
+    return Solutions(out, valid)
 
 
 def fundamentals_of_parallax(

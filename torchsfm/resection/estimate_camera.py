@@ -11,7 +11,7 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import Degeneracy, RobustResult, damped_solve, ransac
+from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, ransac
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,11 @@ def estimate_camera(
     X: Float[Tensor, "*#batch n 3"],
     K: Float[Tensor, "*#batch 3 3"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
@@ -149,8 +151,11 @@ def estimate_camera(
         X: The points in the world.
         K: Intrinsics, upper triangular with last row (0, 0, 1).
         threshold: Largest reprojection error of an inlier in pixels.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
@@ -168,7 +173,13 @@ def estimate_camera(
     """
     limit = threshold if isinstance(threshold, Tensor) else None
     batch = check_tensors(
-        x=(x, "n 2"), X=(X, "n 3"), K=(K, "3 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n")
+        x=(x, "n 2"),
+        X=(X, "n 3"),
+        K=(K, "3 3"),
+        threshold=(limit, ""),
+        mask=(mask, "n: bool"),
+        scores=(scores, "n"),
+        weights=(weights, "n"),
     )
     dtype = x.dtype
     x, X, K = x.double(), X.double(), K.double()
@@ -186,9 +197,14 @@ def estimate_camera(
     last = torch.eye(3, dtype=K.dtype, device=K.device)[2:].expand(*K.shape[:-2], 1, 3)
     intrinsics = torch.cat((intrinsics, last), -2)
     Y = (X - centre[..., None, :]) / size[..., None, None]
+    if scores is not None:
+        scores = scores.double()
+    if weights is not None:
+        weights = weights.double()
     result = ransac(
-        CameraEstimator(intrinsics.expand(*batch, 3, 3)), y, Y, threshold=threshold / focal, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        CameraEstimator(intrinsics.expand(*batch, 3, 3)), y, Y,
+        threshold=None if threshold is None else threshold / focal, mask=mask,
+        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
         max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
     R = result.model[..., :3]
@@ -198,7 +214,13 @@ def estimate_camera(
         # [R | t] <- exp(w) [R | t] + [0 | v] in the scaled world is the same in the world, with v scaled back.
         unit = torch.cat((torch.ones_like(centre), size[..., None].expand_as(centre)), -1)
         spread = (spread * unit[..., :, None] * unit[..., None, :]).to(dtype)
-    return replace(result, model=torch.cat((R, t[..., None]), -1).to(dtype), score=result.score.to(dtype), covariance=spread)
+    return replace(
+        result,
+        model=torch.cat((R, t[..., None]), -1).to(dtype),
+        score=result.score.to(dtype),
+        threshold=(result.threshold * focal).to(dtype),
+        covariance=spread,
+    )
 
 
 def _middle(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:

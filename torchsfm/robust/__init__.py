@@ -8,3 +8,18 @@ from torchsfm.robust.ransac import RobustResult, ransac
 from torchsfm.robust.soft_selection import SoftSelection, soft_ransac
 
 __all__ = ["Degeneracy", "Estimator", "RobustResult", "SoftSelection", "damped_solve", "push_forward", "ransac", "soft_ransac"]
+from torchsfm.robust.scores import InlierCount, LeastMedian, Magsac, Msac, Score
+
+__all__ = [
+    "Degeneracy",
+    "Estimator",
+    "InlierCount",
+    "LeastMedian",
+    "Magsac",
+    "Msac",
+    "RobustResult",
+    "Score",
+    "damped_solve",
+    "push_forward",
+    "ransac",
+]

@@ -29,6 +29,8 @@ class Estimator(Protocol[M]):
     - `dimension: ClassVar[int]` and `retract(model, step)`: the model moved by a step `(*batch, dimension)` along its manifold,
       smooth in the step, `retract(model, 0) == model`. They give refined models derivatives and covariance, for which
       `residual` (or its square) must be differentiable with respect to the model and the data;
+    - `rivals(model, *data, inside, threshold, seed)`: `Solutions` `(*batch, k)` that samples are unlikely to lead to, given the
+      best model `(*batch, ...)`, from the data where `inside (*batch, n)` (the others of a plane that won, ...);
     - `degeneracy(model, *data, inliers, threshold, chance)`: a `Degeneracy` `(*batch)` as int8 for models `(*batch, ...)` with
       their `inliers (*batch, n)`, `threshold (*batch)`, and how many inliers `chance (*batch)` explains. Where no sample
       determined a model, `inliers` are all data and the model is zero.

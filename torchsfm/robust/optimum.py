@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import tensor_map
 from torchsfm.optim import attach_optimum, wants_derivative
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.models import tensors_of
+from torchsfm.robust.models import tensors_of, zip_map
 from torchsfm.robust.scoring import squared_residual
 
 M = TypeVar("M")
@@ -57,8 +57,9 @@ def attach_derivative(
         return _losses(own, own.retract(model, step), inputs[:k], inputs[k], selected, reach).sum(-1)
 
     step = attach_optimum(objective, tangent, *safe, weights, *fields, valid=selected.any(-1))
+    # The value stays as it is, bit for bit.
     moved: M = estimator.retract(model, step)  # type: ignore[attr-defined]
-    return moved
+    return zip_map(lambda value, free: value + (free - free.detach()), model, moved)
 
 
 def step_covariance(

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import cast
-from torchsfm.robust.sampling import compact
+from torchsfm.robust.sampling import compact, prosac_growth
 
 SMALLEST_WIDTH = 8
 
@@ -27,6 +27,8 @@ class Problems:
         count: Number of data.
         limit: Squared threshold.
         ranking: Slots of the data from the most to the least trusted one, where the caller knows.
+        growth: How many samples to draw from the first m, m + 1, ... of these (PROSAC).
+        weight: What the data count, 0 in slots without; None if all count alike.
         source: Where in the caller's arrays the data of each slot are.
         member: Which problem of the caller each one is.
     """
@@ -37,6 +39,8 @@ class Problems:
     count: Int[Tensor, "p"]
     limit: Float[Tensor, "p"]
     ranking: Int[Tensor, "p width"] | None
+    growth: Int[Tensor, "p _"] | None
+    weight: Float[Tensor, "p width"] | None
     source: Int[Tensor, "p width"]
     member: Int[Tensor, "p"]
 
@@ -71,6 +75,7 @@ def pack(
     chosen: Bool[Tensor, "p"],
     limit: Float[Tensor, "p"],
     trust: Float[Tensor, "p n"] | None,
+    weights: Float[Tensor, "p n"] | None,
 ) -> Iterator[Problems]:
     """Sort the chosen problems by their number of usable data: one group for each power of two."""
     count = usable.sum(-1)
@@ -81,12 +86,16 @@ def pack(
         member = (chosen & (width == size)).nonzero()[:, 0]
         source = compact(usable[member], count[member], size)
         inside = torch.arange(size, device=count.device) < count[member, None]
-        ranking = None
+        ranking = growth = weight = None
+        if weights is not None:
+            weight = torch.where(inside, weights[member].gather(1, source), 0)
         if trust is not None:
             sorted_by = torch.where(inside, trust[member].gather(1, source), -torch.inf)
             ranking = sorted_by.argsort(dim=-1, descending=True, stable=True)
+            growth = prosac_growth(count[member], size, estimator.sample_size)
         packed = tuple(d[member].mT.gather(2, source[:, None].expand(-1, d.shape[-1], -1)).mT for d in data)
-        yield Problems(_at(estimator, member), packed, inside, count[member], limit[member], ranking, source, member)
+        own = _at(estimator, member)
+        yield Problems(own, packed, inside, count[member], limit[member], ranking, growth, weight, source, member)
 
 
 def _at(estimator: Estimator[Any], member: Tensor) -> Estimator[Any]:

@@ -1,11 +1,11 @@
 """Robust estimation of any model, for many problems at once.
 
-Sample, score, optimise locally, stop: LO-RANSAC (Chum, Matas & Kittler 2003) with the MSAC score. The batch is
+Sample, score, optimise locally, stop: LO-RANSAC (Chum, Matas & Kittler 2003). The batch is
 (problem, hypothesis); every problem has its own number of data and its own end. What becomes of a problem is a function of its
 data and the seed alone: the sizes of all arrays that touch a problem follow from its own number of data.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import torch
@@ -18,6 +18,7 @@ from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import cast, zip_map
 from torchsfm.robust.optimum import attach_derivative, has_manifold, step_covariance
 from torchsfm.robust.problems import Problems, pack
+from torchsfm.robust.scores import LeastMedian, Msac, Score
 from torchsfm.robust.scoring import around_model, beyond_chance, squared_residual
 from torchsfm.robust.search import Best, Options, no_model, search
 
@@ -32,6 +33,7 @@ class RobustResult(Generic[M]):
         model: The model; finite numbers without meaning where the status says that none was found.
         inliers: Which data are nearer to the model than the threshold.
         score: Sum over the data of max(0, 1 - squared distance / squared threshold): a soft number of inliers.
+        threshold: The largest distance of an inlier, given or estimated.
         iterations: Number of samples drawn.
         status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample
             determined a model; `NO_CONSENSUS`: no model was supported by more data than its own sample or chance explain
@@ -45,6 +47,7 @@ class RobustResult(Generic[M]):
     model: M
     inliers: Bool[Tensor, "*batch n"]
     score: Float[Tensor, "*batch"]
+    threshold: Float[Tensor, "*batch"]
     iterations: Int[Tensor, "*batch"]
     status: Int[Tensor, "*batch"]
     degeneracy: Int[Tensor, "*batch"]
@@ -54,9 +57,11 @@ class RobustResult(Generic[M]):
 def ransac(
     estimator: Estimator[M],
     *data: Float[Tensor, "*#batch n _"],
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     min_iterations: int = 64,
@@ -75,9 +80,14 @@ def ransac(
     Args:
         estimator: The problem: what to solve, measure and refine.
         *data: The data, `(*batch, n, d)` each, equally many; batch dimensions broadcast.
-        threshold: Largest distance of an inlier, in the unit of the estimator's residual; one number or one per problem.
+        threshold: Largest distance of an inlier, in the unit of the estimator's residual; one number or one per problem. None
+            where it is not known: the score must then be one that does without (`LeastMedian`, which is then the default).
         mask: Which data exist; all of them if not given. Problems of different size share a batch this way.
-        scores: How much each datum can be trusted, the larger the more, in any unit. Half of the samples then favour the best.
+        scores: How much each datum can be trusted, the larger the more, in any unit. Half of the samples then favour the best
+            (PROSAC, Chum & Matas 2005), and the search ends as soon as the samples of the best data suffice.
+        weights: For how many data each datum counts: in sampling (without `scores`), in comparing models, in refinement. 0 is
+            absent.
+        score: How models are compared: `Msac()` (the default), `Magsac()`, `InlierCount()`, `LeastMedian()`.
         generator: Source of randomness; PyTorch's global one if not given.
         confidence: Wanted probability of having drawn a sample without outliers.
         min_iterations: Fewest samples to draw for a problem.
@@ -88,9 +98,9 @@ def ransac(
             model to the true one.
 
     Returns:
-        Model, inliers, score, iterations, status and degeneracy of each problem. Where the estimator has `retract`, the model
-        carries its derivatives with respect to the inliers, and to fields of the estimator: those of the optimum of the final
-        refinement, whose data and scale are held. They are zero where the model is not such an optimum.
+        Model, inliers, score, threshold, iterations, status and degeneracy of each problem. Where the estimator has `retract`,
+        the model carries its derivatives with respect to the inliers, their weights, and fields of the estimator: those of the
+        optimum of the final refinement, whose data and scale are held. They are zero where the model is not such an optimum.
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
@@ -103,42 +113,52 @@ def ransac(
         raise ValueError(f"max_iterations: wanted a positive number, got {max_iterations}")
     if covariance and not has_manifold(estimator):
         raise ValueError(f"covariance: {type(estimator).__name__} does not say how its models move (`retract`)")
+    score = score or (LeastMedian() if threshold is None else Msac())
+    if threshold is None and score.needs_threshold:
+        raise ValueError(f"threshold: {type(score).__name__} wants one, got None")
     known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
-    limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(threshold)
-    batch = check_tensors(**known, threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(1.0 if threshold is None else threshold)
+    batch = check_tensors(**known, threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"), weights=(weights, "n"))
     dtype, device, n = data[0].dtype, data[0].device, data[0].shape[-2]
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
     p = batch.numel()
     graph = [d.double().expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
+    counts = None if weights is None else weights.double().expand(*batch, n).reshape(p, n)
     own = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
     own = cast(own, torch.float64)
     with torch.no_grad():
         flat, fields = [d.detach() for d in graph], tensor_map(Tensor.detach, own)
-        bound = limit.double().expand(batch).reshape(p)
+        bound = limit.double().expand(batch).reshape(p).clone()
         square = bound * bound
         exists = torch.ones(p, n, dtype=torch.bool, device=device)
         exists = exists if mask is None else mask.expand(*batch, n).reshape(p, n)
         usable = exists
         for d in flat:
             usable = usable & torch.isfinite(d).all(-1)
+        if counts is not None:
+            usable = usable & torch.isfinite(counts) & (counts > 0)
         trust = None if scores is None else scores.expand(*batch, n).reshape(p, n)
         enough = (usable.sum(-1) >= estimator.sample_size) & torch.isfinite(square) & (bound > 0)
         status = torch.full((p,), int(Status.NOT_FINITE), dtype=torch.int8, device=device)
         status[exists.sum(-1) < estimator.sample_size] = int(Status.TOO_FEW)
         model = no_model(fields, flat, p)
         inliers = torch.zeros(p, n, dtype=torch.bool, device=device)
-        score = torch.zeros(p, dtype=torch.float64, device=device)
+        support = torch.zeros(p, dtype=torch.float64, device=device)
         iterations = torch.zeros(p, dtype=torch.long, device=device)
         degeneracy = torch.full((p,), int(Degeneracy.TOO_FEW), dtype=torch.int8, device=device)
-        selected, reach = torch.zeros_like(inliers), torch.ones_like(score)
-        options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype)
-        for problems in pack(fields, flat, usable, enough, square, trust):
+        selected, reach = torch.zeros_like(inliers), torch.ones_like(support)
+        options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype, score)
+        given = None if counts is None else counts.detach()
+        for problems in pack(fields, flat, usable, enough, square, trust, given):
             best = search(problems, options)
+            problems = replace(problems, limit=best.limit)
             member = problems.member
+            bound[member] = best.limit.sqrt()
             squared = squared_residual(problems.estimator, best.model, *problems.data)
             near = (squared < problems.limit[:, None]) & problems.inside
             ratio = squared / problems.limit[:, None]
-            soft = torch.where(near, 1 - ratio, 0).sum(-1)
+            soft = torch.where(near, 1 - ratio, 0)
+            soft = (soft if problems.weight is None else soft * problems.weight).sum(-1)
             expected = around_model(ratio, problems.inside, estimator.codimension)
             agreed = (near.sum(-1) > estimator.sample_size) & beyond_chance(
                 soft, problems.count, expected, estimator.sample_size
@@ -147,20 +167,21 @@ def ransac(
             status[member] = torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8)
             model = zip_map(lambda old, new: old.index_copy(0, member, new), model, best.model)  # noqa: B023
             inliers[member] = problems.scatter(near, n)
-            score[member] = soft
+            support[member] = soft
             iterations[member] = best.iterations
             degeneracy[member] = _degeneracy(problems, best, near, expected)
             optimal = agreed & best.solved & (best.reach > 0)
             within = (squared < best.reach[:, None]) & problems.inside & optimal[:, None]
             selected[member] = problems.scatter(within, n)
             reach[member] = torch.where(optimal, best.reach, 1)
-        ones = torch.ones_like(usable, dtype=torch.float64)
-    spread = step_covariance(fields, model, flat, ones, selected, reach) if covariance else None
-    model = attach_derivative(own, model, graph, ones, selected, reach)
+    counts = torch.ones_like(usable, dtype=torch.float64) if counts is None else counts
+    spread = step_covariance(fields, model, flat, counts.detach(), selected, reach) if covariance else None
+    model = attach_derivative(own, model, graph, counts, selected, reach)
     return RobustResult(
         tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
         inliers.reshape(*batch, n),
-        score.to(dtype).reshape(batch),
+        support.to(dtype).reshape(batch),
+        bound.to(dtype).reshape(batch),
         iterations.reshape(batch),
         status.reshape(batch),
         degeneracy.reshape(batch),

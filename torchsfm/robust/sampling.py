@@ -5,7 +5,7 @@ generator (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011), 
 """
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -32,6 +32,7 @@ def draw_samples(
     hypotheses: int,
     size: int,
     pool: Int[Tensor, "g h"] | None = None,
+    newest: Bool[Tensor, "g h"] | None = None,
 ) -> Int[Tensor, "g size h"]:
     """Distinct indices below `count` for each problem and hypothesis, every subset equally likely (Floyd's algorithm).
 
@@ -43,38 +44,108 @@ def draw_samples(
         hypotheses: How many samples to draw for each problem.
         size: Number of indices in a sample.
         pool: Draw hypothesis by hypothesis from the first `pool` data instead of all.
+        newest: For which hypotheses the last datum of the pool belongs to the sample.
 
     Returns:
         The samples, indices first, so that one position of all samples is contiguous.
     """
     device = count.device
     limit = count[:, None] if pool is None else pool
-    counter = (first[:, None] + torch.arange(hypotheses, device=device)) * size
-    counter = counter[:, None] + torch.arange(size, device=device)[:, None]
-    key = hash_integers(_signed(seed * 0xD1342543DE82EF95 & ((1 << 64) - 1)) + count * _GOLDEN)
-    random = hash_integers(key[:, None, None] + counter * _GOLDEN)
-    random = (random >> 33) & 0x7FFFFFFF
+    random = random_integers(seed, count, first, hypotheses, size)
     below = limit[:, None] - size + 1 + torch.arange(size, device=device)[:, None]
     index = (random * below) >> 31
     for j in range(1, size):
         taken = (index[:, :j] == index[:, j : j + 1]).any(1)
         index[:, j] = torch.where(taken, below[:, j] - 1, index[:, j])
+    if newest is not None:
+        # The others are then a sample of the rest: Floyd's algorithm adds one datum to the pool at a time.
+        index[:, -1] = torch.where(newest, limit - 1, index[:, -1])
     return index
 
 
-def guided_pools(
-    count: Int[Tensor, "g"], first: Int[Tensor, "g"], hypotheses: int, size: int, growth: int = 20_000
-) -> Int[Tensor, "g hypotheses"]:
-    """From how many of the best-scored data each hypothesis draws: PROSAC's growing pool for odd ones, all data for even ones.
+def random_integers(
+    seed: int, count: Int[Tensor, "g"], first: Int[Tensor, "g"], hypotheses: int, size: int
+) -> Int[Tensor, "g size h"]:
+    """Integers of 31 random bits for each problem (known by the number of its data), hypothesis and position in a sample."""
+    device = count.device
+    counter = (first[:, None] + torch.arange(hypotheses, device=device)) * size
+    counter = counter[:, None] + torch.arange(size, device=device)[:, None]
+    key = hash_integers(_signed(seed * 0xD1342543DE82EF95 & ((1 << 64) - 1)) + count * _GOLDEN)
+    return (hash_integers(key[:, None, None] + counter * _GOLDEN) >> 33) & 0x7FFFFFFF
 
-    The pool of hypothesis t grows as t^(1/size), so that a pool of k data gets samples in the proportion that it would have
-    among `growth` samples of all data (Chum & Matas 2005). Half of the samples stay uniform, so that a misleading order of the
-    data costs at most a factor of two.
+
+def draw_weighted(
+    seed: int,
+    weight: Float[Tensor, "g n"],
+    count: Int[Tensor, "g"],
+    first: Int[Tensor, "g"],
+    hypotheses: int,
+    size: int,
+) -> Int[Tensor, "g size h"]:
+    """Distinct indices, drawn one after the other with probabilities in proportion to the weights of what is left.
+
+    Args:
+        seed: Seed of the whole call.
+        weight: Weights, 0 for what is not there; at least `size` positive ones.
+        count: Number of data of each problem.
+        first: Number of the first hypothesis of each problem.
+        hypotheses: How many samples to draw for each problem.
+        size: Number of indices in a sample.
+    """
+    weight = weight.double()
+    upper = (weight / weight.sum(-1, keepdim=True)).cumsum(-1)
+    weight = upper.diff(dim=-1, prepend=torch.zeros_like(upper[:, :1]))
+    random = (random_integers(seed, count, first, hypotheses, size).double() + 0.5) / (1 << 31)
+    last = (weight > 0).to(torch.int8).flip(-1).argmax(-1, keepdim=True)
+    last = weight.shape[-1] - 1 - last
+    drawn: list[Tensor] = []
+    for j in range(size):
+        # A number between 0 and the total of what is left, moved past what is taken, in ascending order.
+        place = random[:, j]
+        if drawn:
+            taken = torch.stack(drawn, 1).sort(dim=1).values
+            mass = weight.gather(1, taken.flatten(1)).reshape(taken.shape)
+            start = upper.gather(1, taken.flatten(1)).reshape(taken.shape) - mass
+            place = place * (upper[:, -1:] - mass.sum(1)).clamp(min=0)
+            for i in range(j):
+                place = torch.where(place >= start[:, i], place + mass[:, i], place)
+        index = torch.searchsorted(upper, place.contiguous(), right=True).clamp(max=weight.shape[-1] - 1)
+        drawn.append(torch.minimum(index, last))
+    return torch.stack(drawn, 1)
+
+
+PROSAC_SAMPLES = 200_000
+"""After so many samples PROSAC draws from all data (Chum & Matas 2005, 2.1)."""
+
+
+def prosac_growth(count: Int[Tensor, "g"], width: int, size: int) -> Int[Tensor, "g _"]:
+    """T'_n of PROSAC for n = size, size + 1, ..., width: how many samples are drawn before the pool grows beyond n data.
+
+    T_n = `PROSAC_SAMPLES` (n over size) / (count over size) and T'_{n+1} = T'_n + ceil(T_{n+1} - T_n), T'_size = 1.
+    """
+    n = torch.arange(size, width + 1, device=count.device)
+    total, chosen = count[:, None].double(), n.double()
+    steps = torch.arange(size, device=count.device)
+    samples = PROSAC_SAMPLES * ((chosen[:, None] - steps) / (total[..., None] - steps).clamp(min=1)).prod(-1)
+    grown = samples.diff(dim=-1).ceil()
+    return torch.cat((torch.ones_like(samples[:, :1]), 1 + grown.cumsum(-1)), -1).clamp(max=1 << 40).long()
+
+
+def prosac_pools(
+    count: Int[Tensor, "g"], growth: Int[Tensor, "g _"], first: Int[Tensor, "g"], hypotheses: int, size: int
+) -> tuple[Int[Tensor, "g hypotheses"], Bool[Tensor, "g hypotheses"]]:
+    """From how many of the best data each hypothesis draws, and whether the last of them is in the sample.
+
+    PROSAC for every other hypothesis, all data for the others: a misleading order of the data costs a factor of two at most.
     """
     t = first[:, None] + torch.arange(hypotheses, device=count.device)
-    fraction = ((t + 1) / growth).clamp(max=1) ** (1 / size)
-    grown = (count[:, None] * fraction).ceil().long().clamp(min=size)
-    return torch.where(t % 2 == 1, torch.minimum(grown, count[:, None]), count[:, None])
+    own = t // 2 + 1
+    grown = torch.searchsorted(growth, own).clamp(max=growth.shape[-1] - 1)
+    pool = torch.minimum(size + grown, count[:, None])
+    guided = t % 2 == 1
+    # With T'_{n-1} < t <= T'_n: the datum n and size - 1 before it.
+    newest = guided & (size + grown <= count[:, None]) & (growth.gather(1, grown) >= own)
+    return torch.where(guided, pool, count[:, None]), newest
 
 
 def compact(usable: Bool[Tensor, "p n"], count: Int[Tensor, "p"], width: int) -> Int[Tensor, "p width"]:

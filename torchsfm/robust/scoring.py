@@ -1,4 +1,4 @@
-"""How well models are supported: the truncated squared distance (MSAC), on more and more data for fewer and fewer models."""
+"""How well models are supported, judged on more and more data for fewer and fewer models."""
 
 import math
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import tensors_of
+from torchsfm.robust.scores import Score
 
 M = TypeVar("M")
 
@@ -31,39 +32,23 @@ def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#
     return squared
 
 
-def truncated_loss(
-    squared: Float[Tensor, "g s n"], limit: Float[Tensor, "g"], inside: Bool[Tensor, "g n"] | None = None
-) -> Float[Tensor, "g s"]:
-    """The MSAC score: squared distance over squared threshold, at most 1, summed over the data (Torr & Zisserman 2000).
-
-    Models with a distance that is not a number get an infinite score.
-
-    Args:
-        squared: Squared distances.
-        limit: Squared threshold.
-        inside: Which slots hold data; all of them if not given.
-    """
-    loss = (squared * (1 / limit)[:, None, None]).clamp_(max=1)
-    if inside is not None:
-        loss *= inside[:, None]
-    return loss.sum(-1).nan_to_num_(nan=torch.inf)
-
-
 def losses(
     estimator: Estimator[M],
     models: M,
     data: Sequence[Tensor],
     limit: Float[Tensor, "g"],
-    inside: Bool[Tensor, "g n"] | None,
+    counts: Tensor | None,
+    score: Score,
 ) -> Float[Tensor, "g s"]:
-    """The truncated loss of `s` models of each problem, computed in portions that stay in the cache.
+    """The cost of `s` models of each problem, computed in portions that stay in the cache.
 
     Args:
         estimator: The problem, with a dimension of size 1 for the models.
         models: `(g, s, ...)`.
         data: `(g, 1, n, d)` each.
         limit: Squared threshold.
-        inside: Which slots hold data; all of them if not given.
+        counts: What the data count, `(g, n)`: a boolean or a weight; all alike if not given.
+        score: How models are compared.
     """
     (first, *_) = tensors_of(models)
     g, s = first.shape[:2]
@@ -74,7 +59,8 @@ def losses(
         some = slice(i, i + portion)
         own = tensor_map(lambda t: t[some], estimator)  # noqa: B023
         squared = squared_residual(own, tensor_map(lambda t: t[some], models), *(d[some] for d in data))  # noqa: B023
-        rows.append(truncated_loss(squared, limit[some], None if inside is None else inside[some]))
+        part = None if counts is None else counts[some]
+        rows.append(score.cost(squared, limit[some], part, estimator.codimension))
     return torch.cat(rows) if rows else limit.new_zeros(g, s)
 
 

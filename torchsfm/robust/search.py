@@ -10,11 +10,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
-from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_locally, polish
+from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_locally, optimise_within, scale_of_noise
 from torchsfm.robust.models import cast, join, select, take_slots, zip_map
 from torchsfm.robust.problems import Problems
-from torchsfm.robust.sampling import draw_samples, guided_pools
-from torchsfm.robust.scoring import gather_valid, losses, smallest, squared_residual, stages, truncated_loss
+from torchsfm.robust.sampling import draw_samples, draw_weighted, prosac_pools
+from torchsfm.robust.scores import Msac, Score, counted, limits
+from torchsfm.robust.scoring import gather_valid, losses, smallest, squared_residual, stages
 
 ROUNDS = (16, 32, 64, 128, 256, 512, 1024, 2048)
 """How many samples a round may draw for a problem."""
@@ -22,19 +23,22 @@ SCORED = 8
 """Hypotheses of a round that are scored on all data."""
 OPTIMISED = 3
 """Hypotheses of a round that are optimised locally."""
+_BY_CHANCE = 0.05
+"""Share of wrong data taken to agree with a wrong model, as PROSAC's end assumes."""
 _SAMPLES, _NUMBERS = 1 << 12, 1 << 15
 """Samples to solve at a time, and numbers in one row of all data of several models, on a CPU: what fits its cache."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """When to stop, and in which precision to score."""
+    """When to stop, how to compare models, and in which precision."""
 
     seed: int
     confidence: float
     min_iterations: int
     max_iterations: int
     dtype: torch.dtype
+    score: Score
 
 
 @dataclass(frozen=True)
@@ -43,9 +47,10 @@ class Best:
 
     Attributes:
         model: The model.
-        loss: Its truncated loss over all data; infinite where there is none.
-        support: Its number of inliers.
-        minimal_loss: The least loss of a model straight from a sample.
+        loss: Its cost over all data; infinite where there is none.
+        limit: Its squared threshold.
+        needed: How many samples would do, judging by its inliers.
+        minimal_loss: The least cost of a model straight from a sample.
         solved: Whether any sample had a solution.
         iterations: Number of samples drawn.
         reach: The squared distance at which weights vanish in the loss of which the model is the optimum; 0 if it is none.
@@ -53,7 +58,8 @@ class Best:
 
     model: Any
     loss: Float[Tensor, "p"]
-    support: Int[Tensor, "p"]
+    limit: Float[Tensor, "p"]
+    needed: Float[Tensor, "p"]
     minimal_loss: Float[Tensor, "p"]
     solved: Bool[Tensor, "p"]
     iterations: Int[Tensor, "p"]
@@ -66,15 +72,16 @@ def search(problems: Problems, options: Options) -> Best:
     infinite = torch.full((p,), torch.inf, dtype=options.dtype, device=device)
     none = torch.zeros(p, dtype=torch.long, device=device)
     model = cast(no_model(problems.estimator, problems.data, p), options.dtype)
-    best = Best(model, infinite, none, infinite, none > 0, none, torch.zeros_like(infinite))
+    limit = problems.limit.to(options.dtype)
+    best = Best(model, infinite, limit, infinite.double(), infinite, none > 0, none, torch.zeros_like(infinite))
     coarse = problems.cast(options.dtype)
     active = torch.arange(p, device=device)
     while len(active):
-        size = _round_size(best.iterations[active], samples_needed(best, problems, active, options.confidence), options)
+        size = _round_size(best.iterations[active], best.needed[active], options)
         for number in sorted(set(size.tolist()) - {0}):
             best = _round(problems, coarse, best, active[size == number], number, options)
         active = active[size > 0]
-    return _polished(problems, best)
+    return _polished(problems, coarse, _rivalled(problems, coarse, best, options), options)
 
 
 def _round_size(drawn: Int[Tensor, "g"], needed: Float[Tensor, "g"], options: Options) -> Int[Tensor, "g"]:
@@ -93,11 +100,31 @@ def no_model(estimator: Any, data: Sequence[Tensor], number: int) -> Any:
     return tensor_map(lambda t: t.new_zeros(number, *t.shape[2:]), none.minimal(*samples).model)
 
 
-def samples_needed(best: Best, problems: Problems, index: Int[Tensor, "g"], confidence: float) -> Float[Tensor, "g"]:
+def samples_needed(problems: Problems, near: Bool[Tensor, "g width"], options: Options) -> Float[Tensor, "g"]:
     """How many samples it takes to have drawn, with the given confidence, one of inliers alone."""
-    steps = torch.arange(problems.estimator.sample_size, device=index.device)
-    inlying = (best.support[index, None] - steps).clamp(min=0).double() / (problems.count[index, None] - steps).double()
-    return math.log(1 - confidence) / torch.log1p(-inlying.prod(-1))
+    size, missed = problems.estimator.sample_size, math.log(1 - options.confidence)
+    steps = torch.arange(size, device=near.device)
+    if problems.weight is not None and problems.ranking is None:
+        share = (problems.weight * near).double().sum(-1) / problems.weight.double().sum(-1)
+        share = share**size
+    else:
+        support = near.sum(-1, keepdim=True)
+        share = ((support - steps).clamp(min=0).double() / (problems.count[:, None] - steps).double()).prod(-1)
+    if not options.score.needs_threshold:
+        # The threshold follows from the model: a wrong one would vouch for itself. The median takes half of the data for good.
+        share = share.clamp(max=0.5**size)
+    needed = missed / torch.log1p(-share)
+    if problems.ranking is None or problems.growth is None:
+        return needed
+    # PROSAC's own end (Chum & Matas 2005, 2.2): inliers enough among the n best, and no chance, for the samples drawn of them.
+    number = torch.arange(size, near.shape[-1] + 1, device=near.device)
+    ranked = near.gather(-1, problems.ranking).cumsum(-1)[:, size - 1 :]
+    share = ((ranked[..., None] - steps).clamp(min=0).double() / (number[:, None] - steps).double()).prod(-1)
+    own = missed / torch.log1p(-share)
+    spare = (number - size).double()
+    chance = size + _BY_CHANCE * spare + 3.1 * (_BY_CHANCE * (1 - _BY_CHANCE) * spare).sqrt()
+    good = (ranked > chance) & (problems.growth >= own) & (number <= problems.count[:, None])
+    return torch.minimum(needed, torch.where(good, 2 * own, torch.inf).amin(-1))
 
 
 def _split(index: Int[Tensor, "g"], each: int, budget: int) -> Sequence[Tensor]:
@@ -111,7 +138,7 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
     parts = []
     for part in _split(index, number, _SAMPLES):
         models, valid = _hypotheses(fine.take(part), best.iterations[part], number, options.seed)
-        parts.append((*_cascade(coarse.take(part), cast(models, options.dtype), valid), valid.any(-1)))
+        parts.append((*_cascade(coarse.take(part), cast(models, options.dtype), valid, options.score), valid.any(-1)))
     models = join([part[0] for part in parts])
     loss, solved = (torch.cat([part[i] for part in parts]) for i in (1, 2))
     best = replace(
@@ -122,40 +149,79 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
     improved = (loss[:, 0] < best.minimal_loss[index]).nonzero()[:, 0]
     for part in _split(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), _NUMBERS):
         top = tensor_map(lambda t: t[part, :OPTIMISED], models)  # noqa: B023
-        best = _optimised(coarse.take(index[part]), best, index[part], top, loss[part, 0])
+        best = _optimised(coarse.take(index[part]), best, index[part], top, loss[part, :OPTIMISED], options)
     return best
 
 
-def _optimised(coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, loss: Float[Tensor, "g"]) -> Best:
-    """Update the best models of some problems with what local optimisation makes of the best hypotheses of a round."""
-    wide = coarse.spread()
+def _optimised(coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, loss: Tensor, options: Options) -> Best:
+    """Update the best models of some problems with what local optimisation makes of the best hypotheses of a round.
+
+    Args:
+        coarse: The problems.
+        best: The best models of all problems.
+        index: Which problems these are.
+        top: Hypotheses, the best first.
+        loss: The costs of the hypotheses.
+        options: How to compare.
+    """
+    wide, size, k = coarse.spread(), coarse.estimator.sample_size, coarse.estimator.codimension
+    counts = coarse.inside if coarse.weight is None else coarse.weight
     prefix = [d[:, :, :LOCAL_DATA] for d in wide.data]
-    better = optimise_locally(wide.estimator, top, prefix, coarse.limit, coarse.inside[:, :LOCAL_DATA])
+    limit = limits(options.score, loss, coarse.limit, coarse.count, size, k)
+    better = optimise_locally(wide.estimator, top, prefix, limit, counts[:, :LOCAL_DATA], options.score)
     candidates = join([better, tensor_map(lambda t: t[:, :1], top)], 1)
     squared = squared_residual(wide.estimator, candidates, *wide.data)
-    candidate_loss = truncated_loss(squared, coarse.limit, coarse.inside)
-    support = ((squared < coarse.limit[:, None, None]) & coarse.inside[:, None]).sum(-1)
-    winner = candidate_loss.argmin(-1, keepdim=True)
-    new_loss = candidate_loss.gather(1, winner)[:, 0]
+    candidate_loss = options.score.cost(squared, coarse.limit, counts, k)
+    new_loss, winner = candidate_loss.min(-1, keepdim=True)
+    new_limit = limits(options.score, new_loss, coarse.limit, coarse.count, size, k)[:, 0]
+    squared = squared.gather(1, winner[..., None].expand(-1, -1, squared.shape[-1]))[:, 0]
+    needed = samples_needed(coarse, (squared < new_limit[:, None]) & coarse.inside, options)
     old = _take(best, index)
-    gain = new_loss < old.loss
+    gain = new_loss[:, 0] < old.loss
     new = replace(
         old,
         model=select(gain, tensor_map(lambda t: t[:, 0], take_slots(candidates, winner)), old.model),
-        loss=torch.where(gain, new_loss, old.loss),
-        support=torch.where(gain, support.gather(1, winner)[:, 0], old.support),
-        minimal_loss=loss,
+        loss=torch.where(gain, new_loss[:, 0], old.loss),
+        limit=torch.where(gain, new_limit, old.limit),
+        needed=torch.where(gain, needed, old.needed),
+        minimal_loss=torch.minimum(loss[:, 0], old.minimal_loss),
     )
     return _put(best, index, new)
+
+
+def _rivalled(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
+    """Look for better models in places that samples do not lead to, where the estimator knows such."""
+    if not hasattr(fine.estimator, "rivals"):
+        return best
+    for part in _split(torch.arange(len(fine.count), device=fine.count.device), fine.width, _NUMBERS):
+        some = fine.take(part)
+        model = cast(tensor_map(lambda t: t[part], best.model), torch.float64)  # noqa: B023
+        found = some.estimator.rivals(  # type: ignore[attr-defined]
+            model, *some.data, inside=some.inside, threshold=best.limit[part].double().sqrt(), seed=options.seed
+        )
+        row = (found.valid.any(-1) & best.solved[part]).nonzero()[:, 0]
+        if not len(row):
+            continue
+        chosen, rivals = coarse.take(part[row]), tensor_map(lambda t: t[row].to(options.dtype), found.model)  # noqa: B023
+        counts = chosen.inside if chosen.weight is None else chosen.weight
+        wide = chosen.spread()
+        loss = losses(wide.estimator, rivals, wide.data, chosen.limit, counts, options.score)
+        loss = torch.where(found.valid[row], loss, torch.inf)
+        order = smallest(loss, OPTIMISED)
+        best = _optimised(chosen, best, part[row], take_slots(rivals, order), loss.gather(1, order), options)
+    return best
 
 
 def _hypotheses(fine: Problems, drawn: Int[Tensor, "g"], size: int, seed: int) -> tuple[Any, Bool[Tensor, "g slots"]]:
     """The models through random samples, all solution slots of all samples in a row."""
     m = fine.estimator.sample_size
-    pool = None if fine.ranking is None else guided_pools(fine.count, drawn, size, m)
-    index = draw_samples(seed, fine.count, drawn, size, m, pool).flatten(1)
-    if fine.ranking is not None:
-        index = fine.ranking.gather(1, index)
+    if fine.ranking is not None and fine.growth is not None:
+        pool, newest = prosac_pools(fine.count, fine.growth, drawn, size, m)
+        index = fine.ranking.gather(1, draw_samples(seed, fine.count, drawn, size, m, pool, newest).flatten(1))
+    elif fine.weight is not None:
+        index = draw_weighted(seed, fine.weight, fine.count, drawn, size, m).flatten(1)
+    else:
+        index = draw_samples(seed, fine.count, drawn, size, m).flatten(1)
     sample = []
     for d in fine.data:
         picked = d.mT.gather(2, index[:, None].expand(-1, d.shape[-1], -1))
@@ -166,47 +232,54 @@ def _hypotheses(fine: Problems, drawn: Int[Tensor, "g"], size: int, seed: int) -
     return tensor_map(lambda t: t.flatten(1, 2), solutions.model), valid.flatten(1)
 
 
-def _cascade(coarse: Problems, models: Any, valid: Bool[Tensor, "g slots"]) -> tuple[Any, Float[Tensor, "g kept"]]:
+def _cascade(
+    coarse: Problems, models: Any, valid: Bool[Tensor, "g slots"], score: Score
+) -> tuple[Any, Float[Tensor, "g kept"]]:
     """The best models and their losses over all data, best first, found by way of ever larger parts of the data."""
     wide = coarse.spread()
     for level, (number, keep) in enumerate(stages(coarse.width, valid.shape[-1], SCORED)):
         data = [d[:, :, :number] for d in wide.data]
-        inside = coarse.inside if number == coarse.width else None
+        counts = counted(coarse.inside, coarse.weight, number)
         slots = valid.shape[-1]
         if level == 0 and coarse.estimator.max_solutions > 1:
             column, filled = gather_valid(valid)
-            part = losses(wide.estimator, take_slots(models, column), data, coarse.limit, inside)
+            part = losses(wide.estimator, take_slots(models, column), data, coarse.limit, counts, score)
             loss = part.new_full((len(part), slots + 1), torch.inf)
             loss = loss.scatter_(1, torch.where(filled, column, slots), part)[:, :slots]
         else:
-            loss = losses(wide.estimator, models, data, coarse.limit, inside)
+            loss = losses(wide.estimator, models, data, coarse.limit, counts, score)
         loss = torch.where(valid, loss, torch.inf)
         chosen = smallest(loss, keep)
         models, loss, valid = take_slots(models, chosen), loss.gather(1, chosen), valid.gather(1, chosen)
     return models, loss
 
 
-def _polished(problems: Problems, best: Best) -> Best:
+def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
     """Refine the best models in float64 on all data, and keep what does not lose support."""
-    parts = []
-    for part in _split(torch.arange(len(problems.count), device=problems.count.device), problems.width, _NUMBERS):
-        some, old = problems.take(part), cast(_take(best, part), torch.float64)
+    parts, score, k = [], Msac(), fine.estimator.codimension
+    for part in _split(torch.arange(len(fine.count), device=fine.count.device), fine.width, _NUMBERS):
+        some, rough, old = fine.take(part), coarse.take(part).spread(), _take(best, part)
         wide = some.spread()
+        limit = old.limit.double()
+        prefix = [d[:, :, :LOCAL_DATA] for d in rough.data]
+        inside = some.inside[:, :LOCAL_DATA]
+        weight = None if rough.weight is None else rough.weight[:, :LOCAL_DATA]
         start = tensor_map(lambda t: t[:, None], old.model)
-        model, reach = polish(wide.estimator, start, wide.data, some.limit, some.inside)
+        model, reach = scale_of_noise(rough.estimator, start, prefix, old.limit, inside, weight)
+        reach, start = reach.double() * limit, cast(start, torch.float64)
+        model = optimise_within(wide.estimator, cast(model, torch.float64), wide.data, reach, some.inside, some.weight)
         both = join([model, start], 1)
         squared = squared_residual(wide.estimator, both, *wide.data)
-        loss = truncated_loss(squared, some.limit, some.inside)
-        support = ((squared < some.limit[:, None, None]) & some.inside[:, None]).sum(-1)
+        loss = score.cost(squared, limit, some.inside if some.weight is None else some.weight, k)
         # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
         winner = (loss[:, :1] > 1.02 * loss[:, 1:] + 1).long()
         parts.append(
             replace(
-                old,
+                cast(old, torch.float64),
                 model=tensor_map(lambda t: t[:, 0], take_slots(both, winner)),
                 loss=loss.gather(1, winner)[:, 0],
-                support=support.gather(1, winner)[:, 0],
-                reach=torch.where(winner[:, 0] == 0, reach * some.limit, 0),
+                limit=limit,
+                reach=torch.where(winner[:, 0] == 0, reach, 0),
             )
         )
     return join(parts)
