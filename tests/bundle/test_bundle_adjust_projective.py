@@ -9,8 +9,17 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust_projective
-from torchsfm.geometry import intrinsics, project_points, random_rotation, rotation_from_rotvec, to_homogeneous
-from torchsfm.optim import Cauchy
+from torchsfm.bundle.bundle_adjust_projective import _linearize, _residual
+from torchsfm.geometry import (
+    intrinsics,
+    normalize_sphere,
+    project_points,
+    random_rotation,
+    rotation_from_rotvec,
+    to_homogeneous,
+)
+from torchsfm.optim import Cauchy, UnitSphere
+from torchsfm.optim.terms import Block, Term, Workspace, lift_of, linearize
 
 F64 = torch.float64
 Scene = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -48,6 +57,35 @@ def change_frame(P: Tensor, X: Tensor, condition: float, generator: torch.Genera
     scale_P[::2] *= -1
     scale_X[::3] *= -1
     return scale_P[:, None, None] * P @ torch.linalg.inv(H), scale_X[:, None] * X @ H.mT
+
+
+def test_jacobians(generator: torch.Generator) -> None:
+    """The written-out derivatives are those of the residual along the spheres, on both halves of them."""
+    P, X, x, view, point = make_scene(generator, views=3, points=12)
+    P, X = change_frame(P, X, 10.0, generator)
+    blocks = {
+        "camera": Block(normalize_sphere(P.flatten(1)), UnitSphere(12)),
+        "point": Block(normalize_sphere(X), UnitSphere(4)),
+    }
+    assert ((blocks["point"].x[:, 3] < 0).any(), (blocks["point"].x[:, 3] > 0).any()) == (True, True)
+    values = {name: b.x.mT.contiguous().mT for name, b in blocks.items()}
+    lifts = {name: lift_of(b, values[name]) for name, b in blocks.items()}
+    scale = 1 + torch.rand(len(x), generator=generator, dtype=F64)
+    automatic = Term(_residual, tuple(blocks), (view, point), (x, scale))
+    by_hand = Term(_residual, tuple(blocks), (view, point), (x, scale), linearize=_linearize)
+
+    def jacobians(term: Term, wanted: tuple[bool, bool]) -> tuple[Tensor, list[Tensor | None]]:
+        out = [x.new_empty((2, s, len(x))).permute(2, 0, 1) if w else None for s, w in zip((11, 3), wanted, strict=True)]
+        residual, _ = linearize(term, values, lifts, out, Workspace(x))
+        return residual, out
+
+    r, both = jacobians(automatic, (True, True))
+    for wanted in ((True, True), (True, False), (False, True)):
+        r2, found = jacobians(by_hand, wanted)
+        torch.testing.assert_close(r2, r)
+        for a, b in zip(both, found, strict=True):
+            if b is not None:
+                torch.testing.assert_close(b, a, rtol=1e-8, atol=1e-7)
 
 
 def test_cost_has_its_statistical_size(generator: torch.Generator) -> None:

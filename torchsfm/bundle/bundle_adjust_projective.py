@@ -110,7 +110,7 @@ def bundle_adjust_projective(
     }
     own = image[view]
     moved = x.double() * own[:, 0, 0, None] + own[:, :2, 2]
-    term = Term(_residual, ("camera", "point"), (view, point), (moved, scale[view]), loss, weights)
+    term = Term(_residual, ("camera", "point"), (view, point), (moved, scale[view]), loss, weights, _linearize)
     result = sparse_levenberg_marquardt(
         blocks,
         [term],
@@ -138,8 +138,40 @@ def bundle_adjust_projective(
 def _residual(camera: Tensor, point: Tensor, x: Tensor, scale: Tensor) -> Tensor:
     """Predicted minus measured image points, pixels; finite for all finite cameras and points."""
     p, X = camera.mT.reshape(3, 4, -1), point.mT
-    y = p[:, 0] * X[0] + p[:, 1] * X[1] + p[:, 2] * X[2] + p[:, 3] * X[3]
+    y = torch.addcmul(torch.addcmul(torch.addcmul(p[:, 0] * X[0], p[:, 1], X[1]), p[:, 2], X[2]), p[:, 3], X[3])
     return ((y[:2] * y[2].reciprocal().clamp(-NEAREST, NEAREST) - x.mT) * scale).mT
+
+
+def _linearize(camera: Tensor, point: Tensor, x: Tensor, scale: Tensor, out: list[Tensor | None]) -> Tensor:
+    """Residuals; `out` gets their derivatives by steps on the spheres, in the tangent basis of `UnitSphere`."""
+    p, X = camera.mT.reshape(3, 4, -1), point.mT
+    y = torch.addcmul(torch.addcmul(torch.addcmul(p[:, 0] * X[0], p[:, 1], X[1]), p[:, 2], X[2]), p[:, 3], X[3])
+    inverse = y[2].reciprocal().clamp(-NEAREST, NEAREST)
+    uv = y[:2] * inverse
+    by_camera, by_point = (None if o is None else o.permute(1, 2, 0) for o in out)
+    slope = inverse * scale
+    if by_camera is not None:
+        head, turn = _basis(camera.mT)
+        ray = X * slope
+        for k in (0, 1):
+            torch.mul(head, uv[k] * ray[3] * turn, out=by_camera[k])
+            by_camera[k, 4 * k : 4 * k + 4] += ray
+            by_camera[k, 8:].addcmul_(ray[:3], uv[k], value=-1)
+    if by_point is not None:
+        head, turn = _basis(X)
+        for k in (0, 1):
+            gradient = torch.addcmul(p[k], p[2], uv[k], value=-1) * slope
+            torch.addcmul(gradient[:3], head, gradient[3] * turn, value=-1, out=by_point[k])
+    return ((uv - x.mT) * scale).mT
+
+
+def _basis(unit: Tensor) -> tuple[Tensor, Tensor]:
+    """What takes a gradient (g, g_last) on the sphere of unit vectors (h, last) to tangent coordinates, `g - h g_last turn`.
+
+    This is the Householder basis of `UnitSphere`, for functions that do not change along the vector itself.
+    """
+    last = unit[-1]
+    return unit[:-1], torch.where(last < 0, -1.0, 1.0) / (1 + last.abs())
 
 
 def _is_vector(v: Tensor) -> Tensor:
