@@ -160,6 +160,17 @@ def _camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generat
     return Scene(kind(K), data, torch.cat((R, t[..., None]), -1), _pose_error, _wrong_first, noise)
 
 
+def _focal_camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    Y = _points(batch, n, generator)
+    R = random_rotation(*batch, generator=generator, dtype=torch.float64)
+    t = torch.randn(*batch, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 6.0])
+    X = (Y - t[..., None, :]) @ R
+    K = torch.diag(torch.tensor([FOCAL, FOCAL, 1.0], dtype=torch.float64))
+    relative = lambda A, B: (A - B).norm(dim=(-2, -1)) / B.norm(dim=(-2, -1))  # noqa: E731
+    model = K @ torch.cat((R, t[..., None]), -1)
+    return Scene(kind(), (_image(Y, noise, generator), X), model, relative, _wrong_first, noise)
+
+
 def _point(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
     """A point seen by n cameras around it."""
     X = torch.rand(*batch, 3, generator=generator, dtype=torch.float64) * 2 - 1
@@ -178,5 +189,6 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "homography": _plane,
     "trifocal": _three_views,
     "camera": _camera,
+    "focal_camera": _focal_camera,
     "point": _point,
 }

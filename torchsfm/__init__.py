@@ -198,6 +198,7 @@ from torchsfm.resection import (
     CameraEstimate,
     CameraEstimator,
     CameraRefinement,
+    FocalCameraEstimator,
     PlanarPoses,
     PoseEstimate,
     camera_dlt,
@@ -209,6 +210,7 @@ from torchsfm.resection import (
     camera_pnp,
     camera_up2p,
     estimate_camera,
+    estimate_camera_focal,
     refine_camera,
 )
 from torchsfm.robust import (
@@ -330,6 +332,7 @@ __all__ = [
     "Euclidean",
     "Factorization",
     "Features",
+    "FocalCameraEstimator",
     "FocalEstimate",
     "FocalMotion",
     "Focals",
@@ -442,6 +445,7 @@ __all__ = [
     "essential_from_fundamental",
     "essential_from_pose",
     "estimate_camera",
+    "estimate_camera_focal",
     "estimate_essential",
     "estimate_fundamental",
     "estimate_homography",

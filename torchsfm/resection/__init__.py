@@ -9,9 +9,10 @@ from torchsfm.resection.camera_planar import PlanarPoses, camera_planar
 from torchsfm.resection.camera_pnp import PoseEstimate, camera_pnp
 from torchsfm.resection.camera_up2p import camera_up2p
 from torchsfm.resection.estimate_camera import CameraEstimator, estimate_camera
+from torchsfm.resection.estimate_camera_focal import FocalCameraEstimator, estimate_camera_focal
 from torchsfm.resection.refine_camera import CameraRefinement, refine_camera
 
-ESTIMATORS = (CameraEstimator,)
+ESTIMATORS = (CameraEstimator, FocalCameraEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "CameraEstimate",
     "CameraEstimator",
     "CameraRefinement",
+    "FocalCameraEstimator",
     "PlanarPoses",
     "PoseEstimate",
     "camera_dlt",
@@ -30,5 +32,6 @@ __all__ = [
     "camera_pnp",
     "camera_up2p",
     "estimate_camera",
+    "estimate_camera_focal",
     "refine_camera",
 ]

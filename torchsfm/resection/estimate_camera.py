@@ -186,7 +186,7 @@ def estimate_camera(
     usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
     if mask is not None:
         usable = usable & mask
-    centre, size = _middle(X.detach(), usable)
+    centre, size = middle_and_size(X.detach(), usable)
     focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt().detach()
     focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
     # Pixels from the principal point, in focal lengths.
@@ -223,11 +223,11 @@ def estimate_camera(
     )
 
 
-def _middle(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+def middle_and_size(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
     """Medians of the usable points and of their distances from it: points far away must not cost the others precision."""
     some = usable.any(-1)[..., None]
     if X.shape[-2] == 0:
-        centre = X.new_zeros(*usable.shape[:-1], 3)
+        centre = X.new_zeros(*usable.shape[:-1], X.shape[-1])
         return centre, torch.ones_like(centre[..., 0])
     centre = torch.where(usable[..., None], X, torch.nan).nanmedian(dim=-2).values
     centre = torch.where(some, centre, 0)

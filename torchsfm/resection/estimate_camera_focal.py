@@ -1,0 +1,197 @@
+"""Pose and focal length of a camera from correspondences with known points, of which many are wrong."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
+from torchsfm.optim import rotation_exponential
+from torchsfm.resection.camera_p4pf import camera_p4pf
+from torchsfm.resection.estimate_camera import middle_and_size
+from torchsfm.robust import Degeneracy, RobustResult, damped_solve, ransac
+
+
+@dataclass(frozen=True)
+class FocalCameraEstimator:
+    """The camera `diag(f, f, 1) [R | t]` in images whose origin is the principal point.
+
+    Distances are reprojection errors in the unit of the image points.
+    """
+
+    model_name: ClassVar[str] = "focal_camera"
+    data_names: ClassVar[tuple[str, ...]] = ("x", "X")
+    sample_size: ClassVar[int] = 4
+    max_solutions: ClassVar[int] = 1
+    codimension: ClassVar[int] = 2
+    dimension: ClassVar[int] = 7
+
+    def minimal(
+        self, x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]
+    ) -> Solutions[Float[Tensor, "*batch 1 3 4"]]:
+        """The camera of four points."""
+        return camera_p4pf(x, X)
+
+    def squared_residual(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Squared reprojection error; infinite behind the camera."""
+        y0, y1, y2 = (model[..., :3] @ X.mT + model[..., 3:]).unbind(-2)
+        inverse = 1 / y2
+        u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
+        return (u * u + v * v).masked_fill(~(y2 > 0), torch.inf)
+
+    def residual(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Reprojection error; infinite behind the camera."""
+        return self.squared_residual(model, x, X).sqrt()
+
+    def degenerate(self, x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether two image points coincide."""
+        pairs = [(i, j) for i in range(4) for j in range(i)]
+        same = torch.stack([(x[..., i, :] == x[..., j, :]).all(-1) for i, j in pairs])
+        return same.any(0).expand(torch.broadcast_shapes(same.shape[1:], X.shape[:-2]))  # type: ignore[no-untyped-call]
+
+    def refine(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        weights: Float[Tensor, "*#batch n"],
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """A Gauss-Newton step on the reprojection error over pose and logarithm of the focal length."""
+        f, pose = _split(model)
+        Y = pose[..., :3] @ X.mT + pose[..., 3:]
+        y0, y1, y2 = Y.unbind(-2)
+        good = (weights > 0) & (y2 > 0)
+        inverse = torch.where(good, 1 / torch.where(good, y2, 1), 0)
+        a, b = y0 * inverse, y1 * inverse
+        root = torch.where(good, weights, 0).sqrt()
+        zero = torch.zeros_like(a)
+        # Derivatives over (w, v, log f).
+        da = torch.stack((-a * b, 1 + a * a, -b, inverse, zero, -a * inverse, a), -2)
+        db = torch.stack((-1 - b * b, a * b, a, zero, inverse, -b * inverse, b), -2)
+        scale = (f[..., None] * root)[..., None, :]
+        J = torch.cat((da * scale, db * scale), -1)
+        ru, rv = f[..., None] * a - x[..., 0], f[..., None] * b - x[..., 1]
+        r = torch.cat((ru * root, rv * root), -1)
+        moments = (torch.cat((J, r[..., None, :]), -2) @ J.mT).double()
+        step = -damped_solve(moments[..., :7, :], moments[..., 7, :, None])[..., 0]
+        turned = rotation_from_rotvec(step[..., :3]) @ pose.double()
+        R, t = turned[..., :3], turned[..., 3:] + step[..., 3:6, None]
+        # What a start in lower precision lacks to a rotation.
+        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
+        zoomed = f.double() * step[..., 6].clamp(-1, 1).exp()
+        return _join(zoomed, torch.cat((R, t), -1)).to(x.dtype)
+
+    def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
+        """[R | t] <- exp(w) [R | t] + [0 | v], f <- exp(g) f for steps (w, v, g)."""
+        f, pose = _split(model)
+        moved = rotation_exponential(step[..., :3]) @ pose
+        moved = torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:6, None]), -1)
+        return _join(f * step[..., 6].exp(), moved)
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """COLLINEAR: all inliers but so few as chance explains are on a line, as far as can be seen; PLANAR: in a plane."""
+        line, plane = line_and_plane_distances(X, inliers)
+        focal = torch.linalg.vector_norm(model[..., 0, :3], dim=-1).clamp_min(1e-12)
+        depth = (X @ model[..., 2, :3, None])[..., 0] + model[..., 2, 3:]
+        visible = 2 * threshold[..., None] * depth.abs() / focal[..., None] + 1e-9 * X.abs().amax(-1)
+        off_line, off_plane = ((inliers & (distance > visible)).sum(-1) > 2 + chance for distance in (line, plane))
+        code = torch.where(off_plane, int(Degeneracy.NONE), int(Degeneracy.PLANAR))
+        return torch.where(off_line, code, int(Degeneracy.COLLINEAR)).to(torch.int8)
+
+
+def _split(P: Tensor) -> tuple[Tensor, Tensor]:
+    """The focal length and `[R | t]`."""
+    f = torch.linalg.vector_norm(P[..., :2, :3], dim=(-2, -1)) * 0.5**0.5
+    f = torch.where(f > 0, f, 1.0)
+    return f, torch.cat((P[..., :2, :] / f[..., None, None], P[..., 2:, :]), -2)
+
+
+def _join(f: Tensor, pose: Tensor) -> Tensor:
+    return torch.cat((f[..., None, None] * pose[..., :2, :], pose[..., 2:, :]), -2)
+
+
+def estimate_camera_focal(
+    x: Float[Tensor, "*#batch n 2"],
+    X: Float[Tensor, "*#batch n 3"],
+    c: Float[Tensor, "*#batch 2"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    scores: Float[Tensor, "*#batch n"] | None = None,
+    generator: torch.Generator | None = None,
+    confidence: float = 0.9999,
+    max_iterations: int = 10_000,
+    covariance: bool = False,
+) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
+    """The camera of each image, its focal length included, from correspondences of which many may be wrong.
+
+    LO-RANSAC over four-point samples (`camera_p4pf`), then a robust minimum of the reprojection error over pose and focal
+    length. Pixels are square and undistorted. Computed in float64, hypotheses scored in float32.
+
+    Args:
+        x: Image points in pixels, without distortion.
+        X: The points in the world.
+        c: Principal points in pixels (the middle of the image, if nothing better is known).
+        threshold: Largest reprojection error of an inlier in pixels.
+        mask: Which correspondences exist. Rows that are not finite are left out too.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        generator: Source of randomness.
+        confidence: Wanted probability of having drawn a sample without outliers.
+        max_iterations: Most samples to draw.
+        covariance: Compute the covariance of pose and focal length.
+
+    Returns:
+        Cameras `P = K [R | t]` with `K = ((f, 0, c_x), (0, f, c_y), (0, 0, 1))`, which `krt_from_camera` takes apart; inliers
+        (in front of the camera), score, iterations, status, degeneracy (COLLINEAR; PLANAR: all inliers in a plane, which determines
+        the focal length the better the more it is tilted, and not at all where it faces the camera), covariance (7 x 7, of
+        (w, v) in the camera's frame as in `Pose.retract` and log f). The cameras carry their derivatives with respect to the
+        inliers and c (see `ransac`).
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    batch = check_tensors(
+        x=(x, "n 2"), X=(X, "n 3"), c=(c, "2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n")
+    )
+    dtype = x.dtype
+    x, X, c = x.double(), X.double(), c.double()
+    usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
+    usable = usable if mask is None else usable & mask
+    centre, size = middle_and_size(X.detach(), usable)
+    offset = x - c[..., None, :]
+    _, radius = middle_and_size(torch.cat((offset, -offset), -2).detach(), torch.cat((usable, usable), -1))
+    Y = (X - centre[..., None, :]) / size[..., None, None]
+    result = ransac(
+        FocalCameraEstimator(), offset / radius[..., None, None], Y, threshold=threshold / radius, mask=mask,
+        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
+    )  # fmt: skip
+    f, pose = _split(result.model)
+    R = pose[..., :3]
+    t = pose[..., 3] * size[..., None] - (R @ centre[..., None])[..., 0]
+    P = _join(f * radius, torch.cat((R, t[..., None]), -1))
+    P = torch.cat((P[..., :2, :] + c[..., :, None] * P[..., 2:, :], P[..., 2:, :].expand(*batch, 1, 4)), -2)
+    spread = result.covariance
+    if spread is not None:
+        unit = torch.ones(*size.shape, 7, dtype=size.dtype, device=size.device)
+        unit[..., 3:6] = size[..., None]
+        spread = (spread * unit[..., :, None] * unit[..., None, :]).to(dtype)
+    return replace(result, model=P.to(dtype), score=result.score.to(dtype), covariance=spread)
