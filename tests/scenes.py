@@ -1,7 +1,7 @@
 """Random scenes for every estimator: measurements of a known model, in the estimator's own form of data and model."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -171,6 +171,11 @@ def _focal_camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.G
     return Scene(kind(), (_image(Y, noise, generator), X), model, relative, _wrong_first, noise)
 
 
+def _projective_camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    scene = _focal_camera(kind, batch, n, generator, noise)
+    return replace(scene, model=scene.model / scene.model.norm(dim=(-2, -1), keepdim=True))
+
+
 def _point(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
     """A point seen by n cameras around it."""
     X = torch.rand(*batch, 3, generator=generator, dtype=torch.float64) * 2 - 1
@@ -190,5 +195,6 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "trifocal": _three_views,
     "camera": _camera,
     "focal_camera": _focal_camera,
+    "projective_camera": _projective_camera,
     "point": _point,
 }

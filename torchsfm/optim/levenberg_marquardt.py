@@ -300,7 +300,7 @@ def _flatten(tree: Any, batch: torch.Size) -> Any:
         rest = v.shape[len(batch) :]
         if len(batch) == 1:
             return v.expand(batch + rest)
-        return v.expand(batch + rest).reshape(-1, *rest) if batch else v[None]
+        return v.expand(batch + rest).reshape(batch.numel(), *rest) if batch else v[None]
 
     return tensor_map(one, tree)
 

@@ -10,9 +10,11 @@ from torchsfm.resection.camera_pnp import PoseEstimate, camera_pnp
 from torchsfm.resection.camera_up2p import camera_up2p
 from torchsfm.resection.estimate_camera import CameraEstimator, estimate_camera
 from torchsfm.resection.estimate_camera_focal import FocalCameraEstimator, estimate_camera_focal
+from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
 from torchsfm.resection.refine_camera import CameraRefinement, refine_camera
+from torchsfm.resection.resect_cameras import ResectedCameras, resect_cameras
 
-ESTIMATORS = (CameraEstimator, FocalCameraEstimator)
+ESTIMATORS = (CameraEstimator, FocalCameraEstimator, ProjectiveCameraEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
 
 __all__ = [
@@ -23,6 +25,8 @@ __all__ = [
     "FocalCameraEstimator",
     "PlanarPoses",
     "PoseEstimate",
+    "ProjectiveCameraEstimator",
+    "ResectedCameras",
     "camera_dlt",
     "camera_gp3p",
     "camera_p3p",
@@ -33,5 +37,7 @@ __all__ = [
     "camera_up2p",
     "estimate_camera",
     "estimate_camera_focal",
+    "estimate_camera_projective",
     "refine_camera",
+    "resect_cameras",
 ]

@@ -159,10 +159,10 @@ def estimate_camera_focal(
 
     Returns:
         Cameras `P = K [R | t]` with `K = ((f, 0, c_x), (0, f, c_y), (0, 0, 1))`, which `krt_from_camera` takes apart; inliers
-        (in front of the camera), score, iterations, status, degeneracy (COLLINEAR; PLANAR: all inliers in a plane, which determines
-        the focal length the better the more it is tilted, and not at all where it faces the camera), covariance (7 x 7, of
-        (w, v) in the camera's frame as in `Pose.retract` and log f). The cameras carry their derivatives with respect to the
-        inliers and c (see `ransac`).
+        (in front of the camera), score, iterations, status, degeneracy (COLLINEAR; PLANAR: all inliers in a plane, which
+        determines the focal length the better the more it is tilted, and not at all where it faces the camera), covariance
+        (7 x 7, of (w, v) in the camera's frame as in `Pose.retract` and log f). The cameras carry their derivatives with
+        respect to the inliers and c (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.

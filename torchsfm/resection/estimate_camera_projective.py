@@ -1,0 +1,212 @@
+"""An uncalibrated camera from correspondences with known points, of which many are wrong."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+from torchsfm.geometry import line_and_plane_distances
+from torchsfm.linalg import nullspace_rows
+from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
+from torchsfm.resection._focal import incidence_rows
+from torchsfm.resection.estimate_camera import middle_and_size
+from torchsfm.robust import Degeneracy, RobustResult, damped_solve, ransac
+
+_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class ProjectiveCameraEstimator:
+    """Any 3x4 camera P, with |P| = 1 and points in front where the third coordinate of P X is positive.
+
+    A sample is six points, of which the last gives one equation. Distances are reprojection errors in the unit of the image
+    points.
+    """
+
+    model_name: ClassVar[str] = "projective_camera"
+    data_names: ClassVar[tuple[str, ...]] = ("x", "X")
+    sample_size: ClassVar[int] = 6
+    max_solutions: ClassVar[int] = 1
+    codimension: ClassVar[int] = 2
+    dimension: ClassVar[int] = 11
+
+    def minimal(
+        self, x: Float[Tensor, "*#batch 6 2"], X: Float[Tensor, "*#batch 6 3"]
+    ) -> Solutions[Float[Tensor, "*batch 1 3 4"]]:
+        """The camera of five and a half points."""
+        batch = check_tensors(x=(x, "6 2"), X=(X, "6 3"))
+        with torch.no_grad():
+            rows = [a.detach().double().expand(*batch, 6, k).reshape(-1, 6, k).permute(1, 2, 0) for a, k in ((x, 2), (X, 3))]
+            starts = range(0, max(rows[0].shape[-1], 1), _CHUNK)
+            parts = [_minimal(*(r[..., i : i + _CHUNK] for r in rows)) for i in starts]
+            P, valid = (torch.cat(part) for part in zip(*parts, strict=True))
+            P, valid = P.reshape(*batch, 1, 3, 4).to(x.dtype), valid.reshape(*batch, 1)
+        if wants_derivative(x, X):
+            P = attach_implicit(equations, P, x[..., None, :, :], X[..., None, :, :], dims=2, valid=valid)
+        return Solutions(P, valid)
+
+    def squared_residual(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Squared reprojection error; infinite behind the camera."""
+        y0, y1, y2 = (model[..., :3] @ X.mT + model[..., 3:]).unbind(-2)
+        inverse = 1 / y2
+        u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
+        return (u * u + v * v).masked_fill(~(y2 > 0), torch.inf)
+
+    def residual(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Reprojection error; infinite behind the camera."""
+        return self.squared_residual(model, x, X).sqrt()
+
+    def degenerate(self, x: Float[Tensor, "*#batch 6 2"], X: Float[Tensor, "*#batch 6 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether two image points coincide."""
+        pairs = [(i, j) for i in range(6) for j in range(i)]
+        same = torch.stack([(x[..., i, :] == x[..., j, :]).all(-1) for i, j in pairs])
+        return same.any(0).expand(torch.broadcast_shapes(same.shape[1:], X.shape[:-2]))  # type: ignore[no-untyped-call]
+
+    def refine(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        weights: Float[Tensor, "*#batch n"],
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """A Gauss-Newton step on the reprojection error over the entries of P, across P itself."""
+        y0, y1, y2 = (model[..., :3] @ X.mT + model[..., 3:]).unbind(-2)
+        good = (weights > 0) & (y2 > 0)
+        inverse = torch.where(good, 1 / torch.where(good, y2, 1), 0)
+        a, b = y0 * inverse, y1 * inverse
+        root = torch.where(good, weights, 0).sqrt()
+        h = torch.cat((X.mT, torch.ones_like(X.mT[..., :1, :])), -2) * (inverse * root)[..., None, :]
+        zero = torch.zeros_like(h)
+        ju = torch.cat((h, zero, -a[..., None, :] * h), -2)
+        jv = torch.cat((zero, h, -b[..., None, :] * h), -2)
+        r = torch.cat(((a - x[..., 0]) * root, (b - x[..., 1]) * root), -1)
+        J = torch.cat((ju, jv), -1)
+        moments = (torch.cat((J, r[..., None, :]), -2) @ J.mT).double()
+        A, g = moments[..., :12, :], moments[..., 12, :, None]
+        p = model.double().flatten(-2).expand(*A.shape[:-1])
+        # The scale is free: hold it, in units of the rest.
+        trace = A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+        new = p - damped_solve(A + trace * p[..., :, None] * p[..., None, :], g)[..., 0]
+        size = torch.linalg.vector_norm(new, dim=-1, keepdim=True)
+        new = new / torch.where(size > 0, size, 1.0)
+        return new.reshape(*new.shape[:-1], 3, 4).to(x.dtype)
+
+    def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 11"]) -> Float[Tensor, "*batch 3 4"]:
+        """P moved along the unit sphere."""
+        moved = UnitSphere(12).retract(model.flatten(-2), step)
+        return moved.reshape(*moved.shape[:-1], 3, 4)
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """COLLINEAR or PLANAR: all inliers but so few as chance explains are on a line or a plane, as far as can be seen."""
+        line, plane = line_and_plane_distances(X, inliers)
+        # How far a point must move to be seen to move, at least.
+        size = torch.linalg.matrix_norm(model[..., :2, :3], dim=(-2, -1)).clamp_min(1e-12)
+        depth = (X @ model[..., 2, :3, None])[..., 0] + model[..., 2, 3:]
+        visible = 2 * threshold[..., None] * depth.abs() / size[..., None] + 1e-9 * X.abs().amax(-1)
+        off_line, off_plane = ((inliers & (distance > visible)).sum(-1) > 4 + chance for distance in (line, plane))
+        code = torch.where(off_plane, int(Degeneracy.NONE), int(Degeneracy.PLANAR))
+        return torch.where(off_line, code, int(Degeneracy.COLLINEAR)).to(torch.int8)
+
+
+def equations(
+    model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch 6 2"], X: Float[Tensor, "*#batch 6 3"]
+) -> Float[Tensor, "*batch 12"]:
+    """Eleven equations of five and a half points, and |P|^2 = 1."""
+    Y = X @ model[..., :3].mT + model[..., None, :, 3]
+    first, second = Y[..., 0] - x[..., 0] * Y[..., 2], Y[..., 1] - x[..., 1] * Y[..., 2]
+    # Of the last point the equation that `_minimal` takes: across the image point, in the direction of the first axis.
+    a, b = x[..., 5, :].unbind(-1)
+    length = (a * a + b * b + 1).sqrt()
+    k = 1 / (length + 1)
+    u, v, w = 1 - a * a * k / length, -a * b * k / length, -a / length
+    last = u * Y[..., 5, 0] + v * Y[..., 5, 1] + w * Y[..., 5, 2]
+    size = model.square().sum((-2, -1)) - 1
+    parts = torch.broadcast_tensors(*first[..., :5].unbind(-1), *second[..., :5].unbind(-1), last, size)  # type: ignore[no-untyped-call]
+    return torch.stack(parts, -1)
+
+
+def _minimal(x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
+    """P (batch, 12) and validity (batch) of x and X (point, coordinate, batch)."""
+    good = torch.isfinite(x).all(0).all(0) & torch.isfinite(X).all(0).all(0)
+    x, X = torch.where(good, x, 1.0), torch.where(good, X, 1.0)
+    rows = incidence_rows(x, torch.cat((X, torch.ones_like(X[:, :1])), 1))
+    basis, pivot = nullspace_rows(rows[:11])
+    p = basis[0]
+    depth = p[8] * X[:, 0] + p[9] * X[:, 1] + p[10] * X[:, 2] + p[11]
+    front = (depth > 0).all(0)
+    valid = good & (front | (depth < 0).all(0)) & (pivot > 1e-11) & torch.isfinite(p).all(0)
+    p = torch.where(front, p, -p)
+    nothing = torch.eye(3, 4, dtype=x.dtype, device=x.device).flatten()[:, None] / 3**0.5
+    return torch.where(valid, p, nothing).T, valid
+
+
+def estimate_camera_projective(
+    x: Float[Tensor, "*#batch n 2"],
+    X: Float[Tensor, "*#batch n 3"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    scores: Float[Tensor, "*#batch n"] | None = None,
+    generator: torch.Generator | None = None,
+    confidence: float = 0.9999,
+    max_iterations: int = 10_000,
+) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
+    """The uncalibrated 3x4 camera of each image, from correspondences of which many may be wrong.
+
+    LO-RANSAC over six-point samples, then a robust minimum of the reprojection error over all eleven parameters. Computed in
+    float64, hypotheses scored in float32.
+
+    Args:
+        x: Image points in pixels.
+        X: The points in the world.
+        threshold: Largest reprojection error of an inlier in pixels.
+        mask: Which correspondences exist. Rows that are not finite are left out too.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        generator: Source of randomness.
+        confidence: Wanted probability of having drawn a sample without outliers.
+        max_iterations: Most samples to draw.
+
+    Returns:
+        Cameras with `|P[2, :3]| = 1` and inliers at positive third coordinates; inliers, score, iterations, status, degeneracy
+        (COLLINEAR, PLANAR: neither determines the camera). The cameras carry their derivatives with respect to the inliers.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    check_tensors(x=(x, "n 2"), X=(X, "n 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    dtype = x.dtype
+    x, X = x.double(), X.double()
+    usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
+    usable = usable if mask is None else usable & mask
+    centre, size = middle_and_size(X.detach(), usable)
+    middle, radius = middle_and_size(x.detach(), usable)
+    result = ransac(
+        ProjectiveCameraEstimator(), (x - middle[..., None, :]) / radius[..., None, None],
+        (X - centre[..., None, :]) / size[..., None, None], threshold=threshold / radius, mask=mask,
+        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        max_iterations=max_iterations, scoring_dtype=torch.float32,
+    )  # fmt: skip
+    P = result.model
+    P = torch.cat((P[..., :3], P[..., 3:] * size[..., None, None] - P[..., :3] @ centre[..., None]), -1)
+    P = torch.cat((P[..., :2, :] * radius[..., None, None] + middle[..., None] * P[..., 2:, :], P[..., 2:, :]), -2)
+    third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
+    P = P / torch.where(third > 0, third, 1.0)
+    return replace(result, model=P.to(dtype), score=result.score.to(dtype))

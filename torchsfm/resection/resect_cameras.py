@@ -1,0 +1,144 @@
+"""All cameras of a list at once, from the points that each of them sees."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from torchsfm._types import Status, check_tensors
+from torchsfm.geometry import Camera, Pose
+from torchsfm.resection.camera_dlt import camera_dlt
+from torchsfm.resection.camera_pnp import camera_pnp
+from torchsfm.resection.estimate_camera import estimate_camera, middle_and_size
+from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
+from torchsfm.resection.refine_camera import refine_camera
+
+_STEPS = 8
+
+
+@dataclass(frozen=True)
+class ResectedCameras:
+    """Cameras, what they agree with and what became of each."""
+
+    model: Float[Tensor, "*batch v 3 4"]
+    """`[R | t]` where K was given, otherwise P with `|P[2, :3]| = 1`; finite always."""
+    inliers: Bool[Tensor, "*batch v n"]
+    """The observations that count: nearer than the threshold, or all that are wanted where there is none."""
+    error: Float[Tensor, "*batch v"]
+    """Root-mean-square reprojection error of the inliers in pixels."""
+    status: Int8[Tensor, "*batch v"]
+    """OK; TOO_FEW points for the camera; NOT_FINITE; DEGENERATE: the points do not determine it (in a line, for an uncalibrated
+    camera in a plane); BEHIND; NOT_CONVERGED; NO_CONSENSUS."""
+
+
+def resect_cameras(
+    x: Float[Tensor, "*#batch v n 2"],
+    X: Float[Tensor, "*#batch n 3"],
+    K: Float[Tensor, "*#batch v 3 3"] | None = None,
+    *,
+    threshold: float | Float[Tensor, "*#batch v"] | None = None,
+    visible: Bool[Tensor, "*#batch v n"] | None = None,
+    generator: torch.Generator | None = None,
+    max_iterations: int = 10_000,
+) -> ResectedCameras:
+    """Every camera of a list of images of the same points, calibrated or not, in one batched call.
+
+    With a threshold each camera is found among wrong correspondences (`estimate_camera`, `estimate_camera_projective`); without
+    one all observations count, and the camera is the minimum of squared reprojection errors, from `camera_pnp` or `camera_dlt`.
+    Each image has its own points, sampling and stop.
+
+    Args:
+        x: Image points in pixels, without distortion.
+        X: The points in the world.
+        K: Intrinsics of each image, upper triangular with last row (0, 0, 1); None for uncalibrated cameras.
+        threshold: Largest reprojection error of an inlier in pixels; None to trust all observations.
+        visible: Which image sees which point; all by default.
+        generator: Source of randomness.
+        max_iterations: Most samples to draw for an image.
+
+    Returns:
+        The cameras, inliers, errors and a status for each.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    batch = check_tensors(x=(x, "v n 2"), X=(X, "n 3"), K=(K, "v 3 3"), threshold=(limit, "v"), visible=(visible, "v n: bool"))
+    v, n = x.shape[-3:-1]
+    shape = (*batch, v)
+    x, X = x.expand(*shape, n, 2), X[..., None, :, :].expand(*shape, n, 3)
+    seen = torch.ones(*shape, n, dtype=torch.bool, device=x.device) if visible is None else visible.expand(*shape, n)
+    K = None if K is None else K.expand(*shape, 3, 3)
+    if threshold is not None:
+        options = {"mask": seen, "generator": generator, "max_iterations": max_iterations}
+        if K is not None:
+            found = estimate_camera(x, X, K, threshold=threshold, **options)  # type: ignore[arg-type]
+        else:
+            found = estimate_camera_projective(x, X, threshold=threshold, **options)  # type: ignore[arg-type]
+        model, inliers, status = found.model, found.inliers, found.status.to(torch.int8)
+    elif K is not None:
+        model, status = _calibrated(x, X, K, seen)
+        inliers = seen
+    else:
+        model, status = _uncalibrated(x, X, seen)
+        inliers = seen
+    return ResectedCameras(model, inliers, _error(model if K is None else K @ model, x, X, inliers), status)
+
+
+def _calibrated(x: Tensor, X: Tensor, K: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """The pose of each camera from all its points."""
+    h = torch.cat((x, torch.ones_like(x[..., :1])), -1)
+    d = h @ torch.linalg.inv_ex(K)[0].mT
+    with torch.no_grad():
+        start = camera_pnp(d.detach(), X.detach(), weights=seen.to(x.dtype))
+    refined = refine_camera(x, X, Pose.from_matrix(start.model), Camera(K), weights=seen)
+    # What the start knows of the data stands: too few points, not determined.
+    status = torch.where(start.status == Status.OK, refined.status, start.status)
+    return refined.model, status.to(torch.int8)
+
+
+def _uncalibrated(x: Tensor, X: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """P of each camera from all its points."""
+    dtype, n = x.dtype, x.shape[-2]
+    if n < 6:
+        nothing = torch.eye(3, 4, dtype=dtype, device=x.device).expand(*seen.shape[:-1], 3, 4)
+        return nothing, torch.full(seen.shape[:-1], int(Status.TOO_FEW), dtype=torch.int8, device=x.device)
+    w = seen.to(dtype)
+    start = camera_dlt(x, X, weights=w)
+    finite = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
+    use = seen & finite
+    centre, size = middle_and_size(X.detach().double(), use)
+    middle, radius = middle_and_size(x.detach().double(), use)
+    y = torch.where(use[..., None], (x - middle[..., None, :]) / radius[..., None, None], 0.0)
+    Y = torch.where(use[..., None], (X - centre[..., None, :]) / size[..., None, None], 0.0)
+    P = start.model.double()
+    P = torch.cat((P[..., :2, :] - middle[..., None] * P[..., 2:, :], P[..., 2:, :] * radius[..., None, None]), -2)
+    P = torch.cat((P[..., :3] * size[..., None, None], P[..., 3:] + P[..., :3] @ centre[..., None]), -1)
+    P = P / torch.linalg.vector_norm(P, dim=(-2, -1), keepdim=True)
+    estimator = ProjectiveCameraEstimator()
+
+    def cost(P: Tensor) -> Tensor:
+        return torch.where(use, estimator.squared_residual(P, y, Y), 0.0).sum(-1)
+
+    value = cost(P)
+    for _ in range(_STEPS):
+        new = estimator.refine(P, y, Y, weights=use.to(y.dtype))
+        after = cost(new)
+        better = after <= value * (1 + 1e-12)
+        P, value = torch.where(better[..., None, None], new, P), torch.where(better, after, value)
+    P = torch.cat((P[..., :3] / size[..., None, None], P[..., 3:]), -1)
+    P = torch.cat((P[..., :3], P[..., 3:] - P[..., :3] @ centre[..., None]), -1)
+    P = torch.cat((P[..., :2, :] * radius[..., None, None] + middle[..., None] * P[..., 2:, :], P[..., 2:, :]), -2)
+    third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
+    P = P / torch.where(third > 0, third, 1.0)
+    good = ((start.status == Status.OK) & torch.isfinite(P).all(-1).all(-1))[..., None, None]
+    return torch.where(good, P.to(dtype), start.model), start.status
+
+
+def _error(P: Tensor, x: Tensor, X: Tensor, inliers: Tensor) -> Tensor:
+    h = X @ P[..., :3].mT + P[..., None, :, 3]
+    square = (h[..., :2] / h[..., 2:] - x).square().sum(-1)
+    use = inliers & torch.isfinite(square)
+    mean = torch.where(use, square, 0.0).sum(-1) / use.sum(-1).clamp_min(1)
+    return torch.where(mean > 0, torch.where(mean > 0, mean, 1.0).sqrt(), 0.0)
