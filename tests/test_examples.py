@@ -56,3 +56,11 @@ def test_train_match_weights(tmp_path: Path) -> None:
 def test_no_example_is_forgotten() -> None:
     tested = set(re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text()))
     assert tested == {path.name for path in EXAMPLES.glob("*.py")}
+
+
+def test_nothing_known(tmp_path: Path) -> None:
+    text = run("nothing_known.py", tmp_path)
+    around, sideways = text.split("Twelve views, moving sideways:")
+    assert number(r"focal length ([\d.]+) \+-", around) == pytest.approx(1000.0, rel=0.02)
+    assert number(r"points: ([\d.]+)% of the scene", around) < 1
+    assert "autocalibration: OK" not in sideways
