@@ -94,21 +94,44 @@ def attach_optimum(
     """
 
     def gradient(z: Tensor, *arguments: Tensor) -> Tensor:
-        slope: Tensor = torch.func.grad(lambda v: objective(v, *arguments).sum())(z)
-        return slope.reshape(*z.shape[: z.ndim - dims], -1)
+        slope = _gradient(lambda v: objective(v, *arguments).sum(), z)
+        return slope.reshape(z.shape[: z.ndim - dims] + (-1,))
 
     return attach_implicit(gradient, y, *inputs, dims=dims, valid=valid)
 
 
+def _transformed() -> bool:
+    """Whether `torch.func` is at work. Only then are its own functions used: their first call imports dynamo, for a second."""
+    return bool(torch._C._functorch.peek_interpreter_stack() is not None)
+
+
+def _gradient(function: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
+    """The gradient of a scalar function, itself differentiable in whatever else the function depends on."""
+    if _transformed():
+        return torch.func.grad(function)(y)  # type: ignore[no-any-return]
+    with torch.enable_grad():
+        z = y if y.requires_grad else y.detach().requires_grad_()
+        return torch.autograd.grad(function(z), z, create_graph=True)[0]
+
+
 def _jacobian(function: Callable[[Tensor], Tensor], y: Tensor, dims: int) -> Tensor:
     """The Jacobian `(*batch, m, k)` of a function that treats the elements of the batch one by one."""
-    value, pull = torch.func.vjp(function, y)[:2]
+    if _transformed():
+        value, pull = torch.func.vjp(function, y)[:2]
+    else:
+        with torch.enable_grad():
+            z = y.detach().requires_grad_()
+            value = function(z)
+
+        def pull(seed: Tensor) -> tuple[Tensor, ...]:
+            return torch.autograd.grad(value, z, seed, retain_graph=True, materialize_grads=True)
+
     rows = []
     for i in range(value.shape[-1]):
         seed = torch.zeros_like(value)
         seed[..., i] = 1
         rows.append(pull(seed)[0].flatten(y.ndim - dims))
-    return torch.stack(rows, -2)
+    return torch.stack(rows, -2).detach()
 
 
 def _pseudo_inverse(jacobian: Tensor) -> tuple[Tensor, Tensor]:
@@ -134,4 +157,4 @@ def _pseudo_inverse(jacobian: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _align(mask: Tensor, x: Tensor, batch_dims: int) -> Tensor:
-    return mask.reshape(*mask.shape, *([1] * (x.ndim - batch_dims)))
+    return mask.reshape(mask.shape + (1,) * (x.ndim - batch_dims))

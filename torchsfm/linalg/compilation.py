@@ -1,0 +1,106 @@
+"""The one switch for `torch.compile`, and the decorator of what it compiles.
+
+A kernel is a function of tensors with the batch in the last dimension, without data-dependent shapes, called where nothing is
+differentiated. Batches are cut into pieces that stay in the cache: small ones for eager mode, larger ones when compiled. There is
+one compiled object for each dtype and device, with a dynamic batch. Dynamo is imported when the switch is on, and only then.
+"""
+
+from collections.abc import Callable
+from functools import update_wrapper
+from types import FunctionType
+from typing import Any, overload
+
+import torch
+from torch import Tensor
+
+Rows = tuple[Tensor, ...]
+
+COMPILED_CHUNK = 16384
+_on = False
+
+
+def compile_kernels(on: bool = True) -> None:
+    """Compile the hot kernels of solvers with `torch.compile`, from now on and everywhere, or no longer.
+
+    The first call of a solver then takes seconds (up to a minute where PyTorch's disk cache is empty) for each dtype; later ones
+    are several times faster for batches of thousands and slower for single problems. Needs a C++ compiler. Results may differ
+    from eager mode by rounding. Whatever keeps a kernel from being compiled whole and once is an error, not a fall back to
+    eager mode. No effect on what runs inside a function that is itself being compiled.
+
+    Args:
+        on: Whether to compile.
+    """
+    global _on
+    _on = on
+
+
+class Kernel:
+    """A function of rows that is cut into pieces and compiled on demand."""
+
+    def __init__(self, function: Callable[..., Rows], chunk: int) -> None:
+        self.function = function
+        self.chunk = chunk
+        self._compiled: dict[Any, Callable[..., Rows]] = {}
+        update_wrapper(self, function)
+
+    def __call__(self, *rows: Tensor, **options: Any) -> Rows:
+        """The function's value, the pieces joined along the last dimension; options are constants to the compiler."""
+        run, size, batch = self.function, self.chunk, rows[0].shape[-1]
+        if _on and batch > 0 and not torch.compiler.is_compiling():
+            run, size = self._run_compiled, COMPILED_CHUNK
+        if batch <= size:
+            return run(*rows, **options)
+        pieces = [run(*(row[..., i : i + size] for row in rows), **options) for i in range(0, batch, size)]
+        return tuple(torch.cat(parts, -1) for parts in zip(*pieces, strict=True))
+
+    def _run_compiled(self, *rows: Tensor, **options: Any) -> Rows:
+        first = rows[0]
+        # What dynamo would compile anew for.
+        state = (torch.get_num_threads(), torch.is_inference_mode_enabled())
+        key = (first.dtype, first.device, *state, *options.items())
+        compiled = self._compiled.get(key)
+        # A batch of one would be compiled as such.
+        single = first.shape[-1] == 1
+        rows = tuple((row.expand(*row.shape[:-1], 2) if single else row).contiguous() for row in rows)
+        if compiled is None:
+            compiled = self._compiled[key] = _compile(self.function, options)
+            for row in rows:
+                torch._dynamo.mark_dynamic(row, row.ndim - 1, min=2, max=COMPILED_CHUNK)
+        with torch.no_grad():
+            outputs = compiled(*rows)
+        return tuple(row[..., :1] for row in outputs) if single else outputs
+
+
+@overload
+def kernel(function: Callable[..., Rows]) -> Kernel: ...
+@overload
+def kernel(*, chunk: int) -> Callable[[Callable[..., Rows]], Kernel]: ...
+def kernel(function: Callable[..., Rows] | None = None, *, chunk: int = 4096) -> Any:
+    """Make a function of tensors `(..., batch)` to a tuple of tensors `(..., batch)` a kernel.
+
+    Args:
+        function: The function, a plain one whose elements of the batch do not depend on each other.
+        chunk: How many problems to take at a time in eager mode.
+    """
+    return Kernel(function, chunk) if function is not None else lambda f: Kernel(f, chunk)
+
+
+def _compile(function: Callable[..., Rows], options: dict[str, Any]) -> Callable[..., Rows]:
+    import torch._dynamo  # noqa: F401
+    from torch._inductor.compile_fx import compile_fx
+
+    assert isinstance(function, FunctionType)
+    # Dynamo keeps what it compiles with the code object: each compiled object gets its own.
+    copy = FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
+    copy.__kwdefaults__ = options
+    times = 0
+
+    def once(graph: Any, inputs: list[Any]) -> Any:
+        nonlocal times
+        times += 1
+        if times > 1:
+            raise RuntimeError(f"{function.__qualname__} would be compiled more than once")
+        # One loop over the batch: the default limit cuts long formulas into many, with their intermediate values in memory.
+        return compile_fx(graph, inputs, config_patches={"max_fusion_size": 100_000})
+
+    return torch.compile(copy, fullgraph=True, backend=once)  # type: ignore[no-any-return]
