@@ -16,6 +16,7 @@ from torch import Tensor
 Rows = tuple[Tensor, ...]
 
 COMPILED_CHUNK = 16384
+_WIDTH = 16
 _on = False
 
 
@@ -59,16 +60,23 @@ class Kernel:
         state = (torch.get_num_threads(), torch.is_inference_mode_enabled())
         key = (first.dtype, first.device, *state, *options.items())
         compiled = self._compiled.get(key)
-        # A batch of one would be compiled as such.
-        single = first.shape[-1] == 1
-        rows = tuple((row.expand(*row.shape[:-1], 2) if single else row).contiguous() for row in rows)
+        # A multiple of the width of a vector needs no loop for the rest, which would be as much code again.
+        batch = first.shape[-1]
+        lines = max(2, -(-batch // _WIDTH))
+        rows = tuple(_padded(row, lines * _WIDTH).unflatten(-1, (lines, _WIDTH)) for row in rows)
         if compiled is None:
             compiled = self._compiled[key] = _compile(self.function, options)
             for row in rows:
-                torch._dynamo.mark_dynamic(row, row.ndim - 1, min=2, max=COMPILED_CHUNK)
+                torch._dynamo.mark_dynamic(row, row.ndim - 2, min=2, max=COMPILED_CHUNK // _WIDTH)
         with torch.no_grad():
             outputs = compiled(*rows)
-        return tuple(row[..., :1] for row in outputs) if single else outputs
+        return tuple(row[..., :batch] for row in outputs)
+
+
+def _padded(row: Tensor, size: int) -> Tensor:
+    """Contiguous, and of this many columns: the last stands in the place of those that are missing."""
+    missing = size - row.shape[-1]
+    return torch.cat((row, row[..., -1:].expand(*row.shape[:-1], missing)), -1) if missing else row.contiguous()
 
 
 @overload
@@ -86,7 +94,7 @@ def kernel(function: Callable[..., Rows] | None = None, *, chunk: int = 4096) ->
 
 
 def _compile(function: Callable[..., Rows], options: dict[str, Any]) -> Callable[..., Rows]:
-    import torch._dynamo  # noqa: F401
+    import torch._dynamo
     from torch._inductor.compile_fx import compile_fx
 
     assert isinstance(function, FunctionType)
@@ -103,4 +111,7 @@ def _compile(function: Callable[..., Rows], options: dict[str, Any]) -> Callable
         # One loop over the batch: the default limit cuts long formulas into many, with their intermediate values in memory.
         return compile_fx(graph, inputs, config_patches={"max_fusion_size": 100_000})
 
-    return torch.compile(copy, fullgraph=True, backend=once)  # type: ignore[no-any-return]
+    def whole(*lines: Tensor) -> Rows:
+        return copy(*(line.flatten(-2) for line in lines))
+
+    return torch.compile(whole, fullgraph=True, backend=once)

@@ -10,11 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.rows import add_rows, combine_rows
+from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.vectors import fma, fms
 from torchsfm.optim import attach_implicit, wants_derivative
-
-_CHUNK = 4096
-"""Problems at a time: their numbers fit the cache."""
 
 
 def equations(
@@ -46,52 +44,59 @@ def homography_4pt(
     """
     batch = check_tensors(x1=(x1, "4 2"), x2=(x2, "4 2"))
     with torch.no_grad():
-        rows1, rows2 = (x.detach().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0) for x in (x1, x2))
-        starts = range(0, max(rows1.shape[-1], 1), _CHUNK)
-        chunks = [_solve(rows1[..., i : i + _CHUNK], rows2[..., i : i + _CHUNK]) for i in starts]
-        rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
-        H = rows.mT.reshape(*batch, 1, 3, 3)
+        rows1, rows2 = (x.detach().double().expand(*batch, 4, 2).reshape(-1, 8).t() for x in (x1, x2))
+        rows, good = _solve(rows1, rows2)
+        H = rows.t().reshape(*batch, 1, 3, 3).to(x1.dtype)
         valid = good.reshape(*batch, 1)
     if wants_derivative(x1, x2):
         H = attach_implicit(equations, H, x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
     return Solutions(H, valid)
 
 
-def _solve(x1: Float[Tensor, "4 2 batch"], x2: Float[Tensor, "4 2 batch"]) -> tuple[Tensor, Tensor]:
+@kernel(chunk=8192)
+def _solve(x1: Float[Tensor, "8 batch"], x2: Float[Tensor, "8 batch"]) -> tuple[Tensor, Tensor]:
     """H as (9, batch) and valid as (batch)."""
-    # Both images together, the fourth point at the origin and the largest coordinate 1. NaN and inf show in the size.
-    x = torch.stack((x1, x2), 2)
-    y = x[:3] - x[3]
-    size = y.abs().amax((0, 1))
-    fine = ((size > 0) & (size < torch.inf)).all(0)
-    u, v = (y * (1 / size)).unbind(1)
+    (u0, u1, u2), (v0, v1, v2), (cu, cv), d1 = _around_the_fourth(x1)
+    (a0, a1, a2), (b0, b1, b2), (ca, cb), d2 = _around_the_fourth(x2)
     # The weights of three points in the fourth are 2x2 cross products.
-    (u0, u1, u2), (v0, v1, v2) = u.unbind(0), v.unbind(0)
-    weights = torch.stack((u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0))
-    areas = torch.cat((weights, add_rows(weights)[None])).abs().amin((0, 1))
-    # First image: u, v, weights k; second: a, b, weights m.
-    (k0, m0), (k1, m1), (k2, m2) = (row.unbind(0) for row in weights.unbind(0))
-    (u0, a0), (u1, a1), (u2, a2) = u0.unbind(0), u1.unbind(0), u2.unbind(0)
-    (v0, b0), (v1, b1), (v2, b2) = v0.unbind(0), v1.unbind(0), v2.unbind(0)
-    (cu, ca), (cv, cb) = x[3, 0].unbind(0), x[3, 1].unbind(0)
-    d1, d2 = size.unbind(0)
-    w0, w1, w2 = m0 * k1 * k2, m1 * k2 * k0, m2 * k0 * k1
+    k0, k1, k2 = fms(u2, v1, u1 * v2), fms(u0, v2, u2 * v0), fms(u1, v0, u0 * v1)
+    m0, m1, m2 = fms(a2, b1, a1 * b2), fms(a0, b2, a2 * b0), fms(a1, b0, a0 * b1)
+    areas = k0.abs()
+    for area in (k1, k2, k0 + k1 + k2, m0, m1, m2, m0 + m1 + m2):
+        areas = torch.minimum(areas, area.abs())
+    w0, w1, w2 = m0 * (k1 * k2), m1 * (k2 * k0), m2 * (k0 * k1)
 
     def column(p: Tensor, q: Tensor, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The points of the second image with these weights, in its own coordinates."""
         low = p + q + r
-        top, middle = combine_rows((a0, a1, a2), (p, q, r)), combine_rows((b0, b1, b2), (p, q, r))
-        return torch.addcmul(top * d2, ca, low), torch.addcmul(middle * d2, cb, low), low
+        top, middle = fma(a2, r, fma(a1, q, a0 * p)), fma(b2, r, fma(b1, q, b0 * p))
+        return fma(ca, low, top * d2), fma(cb, low, middle * d2), low
 
     # Columns of adj [p1 p2 p3]'; then (a, b, c) -> (a, b, c d - a cu - b cv) for the first image's own coordinates.
     first = column((v1 - v2) * w0, (v2 - v0) * w1, (v0 - v1) * w2)
     second = column((u2 - u1) * w0, (u0 - u2) * w1, (u1 - u0) * w2)
     third = column(k0 * w0, k1 * w1, k2 * w2)
-    last = [c * d1 - a * cu - b * cv for a, b, c in zip(first, second, third, strict=True)]
-    H = torch.stack([entry for row in zip(first, second, last, strict=True) for entry in row])
-    # The squares of small numbers must not vanish.
-    H = H / H.abs().amax(0)
-    square = combine_rows(H, H)
-    valid = fine & (areas > 64 * torch.finfo(H.dtype).eps) & torch.isfinite(square)
-    identity = torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1) / 3**0.5
-    return torch.where(valid, H * square.rsqrt(), identity), valid
+    last = [fms(b, cv, fms(a, cu, c * d1)) for a, b, c in zip(first, second, third, strict=True)]
+    rows = [entry for row in zip(first, second, last, strict=True) for entry in row]
+    square = rows[0] * rows[0]
+    for row in rows[1:]:
+        square = fma(row, row, square)
+    # False for NaN; an empty slot holds the identity.
+    valid = (areas > 64 * torch.finfo(x1.dtype).eps) & (square > 0) & (square < torch.inf)
+    scale = torch.where(valid, square.rsqrt(), 0.0)
+    empty = torch.where(valid, 0.0, 3**-0.5)
+    rows = [(row * scale).nan_to_num(0.0, 0.0, 0.0) for row in rows]
+    for i in (0, 4, 8):
+        rows[i] = rows[i] + empty
+    return torch.stack(rows), valid
+
+
+def _around_the_fourth(x: Tensor) -> tuple[list[Tensor], list[Tensor], tuple[Tensor, Tensor], Tensor]:
+    """First three points with the fourth at the origin and the largest coordinate 1; what they were moved and scaled by."""
+    *points, cu, cv = x.unbind(0)
+    us, vs = [u - cu for u in points[0::2]], [v - cv for v in points[1::2]]
+    size = us[0].abs()
+    for coordinate in (*us[1:], *vs):
+        size = torch.maximum(size, coordinate.abs())
+    scale = 1 / size
+    return [u * scale for u in us], [v * scale for v in vs], (cu, cv), size

@@ -140,5 +140,3 @@ def _pose(u: list[Vector], X: list[Vector], depths: Rows, valid: Tensor | None) 
         t = each(lambda x, y, j=j: fms(y, m[j], x), t, columns[j])
     stacked = [v if isinstance(v, Tensor) else torch.stack(v) for v in (*columns, t)]
     return torch.stack([v if v.ndim > 2 else v[:, None] for v in stacked], 1)
-
-
