@@ -24,26 +24,38 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
         An orthonormal basis as k = n - m rows, and the smallest pivot: the distance of a row from the span of those before it,
         which is 0 where the rows are dependent (the basis is then still orthonormal, or not finite).
     """
-    m, n, batch = a.shape
-    a = a.clone()
-    reflections = []
+    basis, smallest = nullspace_columns(a.transpose(0, 1).contiguous())
+    return basis.transpose(0, 1), smallest
+
+
+def nullspace_columns(a: Float[Tensor, "n m batch"]) -> tuple[Float[Tensor, "n k batch"], Float[Tensor, " batch"]]:
+    """`nullspace_rows` with the matrices and the basis transposed, which is faster; what is in `a` is lost."""
+    n, m, batch = a.shape
+    reflections: list[tuple[list[Tensor], Tensor, Tensor]] = []
     smallest = None
     for i in range(m):
-        v = a[i, i:].clone()
-        length = combine_rows(v, v).sqrt()
+        v = a[i:, i]
+        rows = list(v.unbind(0))
+        length = combine_rows(rows, rows).sqrt_()
         smallest = length if smallest is None else torch.minimum(smallest, length)
-        signed = torch.copysign(length, v[0])
-        v[0] += signed
-        beta = 1 / (signed * v[0])
-        reflections.append((v, beta))
+        signed = torch.copysign(length, rows[0])
+        rows[0] += signed
+        # By -1 / (signed v0) instead of 2 / (v'v), which is the same.
+        beta = (signed * rows[0]).reciprocal_().neg_()
+        reflections.append((rows, v, beta))
         if i + 1 < m:
-            rest = a[i + 1 :, i:]
-            rest.addcmul_((combine_rows(rest.unbind(1), v) * beta)[:, None], v, value=-1)
-    basis = torch.eye(n - m, n, dtype=a.dtype, device=a.device).roll(m, 1)[..., None].repeat(1, 1, batch)
-    for i in range(m - 1, -1, -1):
-        v, beta = reflections[i]
-        product = combine_rows(basis[:, i + 1 :].unbind(1), v[1:])
-        basis[:, i:].addcmul_((product * beta)[:, None], v, value=-1)
+            rest = a[i:, i + 1 :]
+            rest.addcmul_(v[:, None], combine_rows(rest.unbind(0), rows).mul_(beta))
+    # The last reflection of the last rows of the identity; the other entries are still zero.
+    rows, v, beta = reflections.pop()
+    basis = a.new_zeros(n, n - m, batch)
+    torch.mul(v[:, None], v[1:] * beta, out=basis[m - 1 :])
+    for i in range(n - m):
+        basis[m + i, i] += 1
+    for i in range(m - 2, -1, -1):
+        rows, v, beta = reflections[i]
+        product = combine_rows(basis[i + 1 :].unbind(0), rows[1:]).mul_(beta)
+        basis[i:].addcmul_(v[:, None], product)
     assert smallest is not None
     return basis, smallest
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.nullspace import nullspace_rows
+from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.real_roots import real_root_list
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -35,18 +35,8 @@ _CONVERGED = 1e-7
 _CUBICS = [(0, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 1), (0, 0, 2), (0, 0, 3), (1, 1, 2), (1, 1, 3), (0, 1, 2), (0, 1, 3)]
 _CUBICS += [(0, 2, 2), (0, 2, 3), (0, 3, 3), (1, 2, 2), (1, 2, 3), (1, 3, 3), (2, 2, 2), (2, 2, 3), (2, 3, 3), (3, 3, 3)]
 _SQUARES = [(0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
-_I, _J = [i for i, _ in _SQUARES], [j for _, j in _SQUARES]
-# The ways to write a monomial as a square times a variable; monomials with most ways first, so that each round is a prefix.
-_WAYS = {m: [(q, v) for q, v in product(_SQUARES, range(4)) if tuple(sorted((*q, v))) == m] for m in _CUBICS}
-_ORDER = sorted(_CUBICS, key=lambda m: -len(_WAYS[m]))
-_ROUNDS = [
-    (
-        [_SQUARES.index(_WAYS[m][r][0]) for m in _ORDER if len(_WAYS[m]) > r],
-        [_WAYS[m][r][1] for m in _ORDER if len(_WAYS[m]) > r],
-    )
-    for r in range(3)
-]
-_TO_NISTER = [_ORDER.index(m) for m in _CUBICS]
+# The ways to write a monomial as a square, by its number, times a variable.
+_WAYS = [[(_SQUARES.index(q), v) for q, v in product(_SQUARES, range(4)) if tuple(sorted((*q, v))) == m] for m in _CUBICS]
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
 
 
@@ -82,7 +72,8 @@ def essential_5pt(
     """
     batch = check_tensors(d1=(d1, "5 3"), d2=(d2, "5 3"))
     with torch.no_grad():
-        rows1, rows2 = (d.detach().double().expand(*batch, 5, 3).reshape(-1, 5, 3).permute(1, 2, 0) for d in (d1, d2))
+        # (coordinate, ray, problem)
+        rows1, rows2 = (d.detach().double().expand(*batch, 5, 3).reshape(-1, 5, 3).permute(2, 1, 0) for d in (d1, d2))
         E, valid = _solve(rows1, rows2)
         E, valid = E.to(d1.dtype).reshape(*batch, 10, 3, 3), valid.reshape(*batch, 10)
     if wants_derivative(d1, d2):
@@ -105,7 +96,7 @@ class _Candidates(NamedTuple):
     basis: Tensor
 
 
-def _solve(d1: Float[Tensor, "5 3 batch"], d2: Float[Tensor, "5 3 batch"]) -> tuple[Tensor, Tensor]:
+def _solve(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"]) -> tuple[Tensor, Tensor]:
     """E as (batch, 10, 9) and valid as (batch, 10)."""
     batch = d1.shape[-1]
     starts = range(0, max(batch, 1), _CHUNK)
@@ -150,47 +141,70 @@ def _candidates(d1: Tensor, d2: Tensor) -> _Candidates:
 
 
 def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
+    d = d.contiguous()
     largest = d.abs().amax((0, 1))
     fine = torch.isfinite(largest) & (largest > 0)
     d = torch.where(fine, d / torch.where(fine, largest, 1), 1)
-    square = combine_rows(d.unbind(1), d.unbind(1))
-    return d / torch.where(square > 0, square, 1).sqrt()[:, None], fine & (square > 0).all(0)
+    square = combine_rows(d, d)
+    return d * torch.where(square > 0, square, 1).rsqrt_(), fine & (square > 0).all(0)
 
 
 def _basis(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
     """An orthonormal basis (4, 9, batch) of the matrices with d2' E d1 = 0, in which the last two follow the skew part."""
-    P = d2[:, :, None] * d1[:, None]
+    P = d2[:, None] * d1[None]
     half = 0.5**0.5
-    T = P.transpose(1, 2)
-    S, D = (P + T) * half, (P - T) * half
+    (p00, p01, p02), (p10, p11, p12), (p20, p21, p22) = (row.unbind(0) for row in P.unbind(0))
     # Orthonormal coordinates: what is eliminated first, then trace, and the skew part by z, x, y.
-    first = (P[:, 2, 2], S[:, 0, 2], S[:, 1, 2], (P[:, 0, 0] - P[:, 1, 1]) * half, S[:, 0, 1])
-    last = ((P[:, 0, 0] + P[:, 1, 1]) * half, D[:, 1, 0], D[:, 2, 1], D[:, 0, 2])
-    N, pivot = nullspace_rows(torch.stack((*first, *last), 1))
-    e33, s13, s23, minus, s12, plus, a3, a1, a2 = N.unbind(1)
+    first = (p22, (p02 + p20) * half, (p12 + p21) * half, (p00 - p11) * half, (p01 + p10) * half)
+    last = ((p00 + p11) * half, (p10 - p01) * half, (p21 - p12) * half, (p02 - p20) * half)
+    N, pivot = nullspace_columns(torch.stack((*first, *last)))
+    e33, s13, s23, minus, s12, plus, a3, a1, a2 = N.unbind(0)
     entries = (plus + minus, s12 - a3, s13 + a2, s12 + a3, plus - minus, s23 - a1, s13 - a2, s23 + a1)
-    return torch.stack((*(e * half for e in entries), e33), 1), pivot
+    basis = torch.stack((*entries, e33), 1)
+    basis[:, :8] *= half
+    return basis, pivot
 
 
 def _constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"]:
     """Coefficients of the monomials in (E E' - tr(E E') / 2) E = 0 and det E = 0."""
-    a, b = E[_I], E[_J]
-    S = combine_rows(a.permute(2, 0, 1, 3)[:, :, :, None], b.permute(2, 0, 1, 3)[:, :, None])
-    S[4:] = S[4:] + S[4:].transpose(1, 2)
-    half = 0.5 * (S[:, 0, 0] + S[:, 1, 1] + S[:, 2, 2])
-    for i in range(3):
-        S[:, i, i] -= half
-    minors = a[:, 1, _NEXT] * b[:, 2, _AFTER] - a[:, 1, _AFTER] * b[:, 2, _NEXT]
-    minors[4:] += b[4:, 1, _NEXT] * a[4:, 2, _AFTER] - b[4:, 1, _AFTER] * a[4:, 2, _NEXT]
-    out = torch.zeros(20, 10, E.shape[-1], dtype=E.dtype, device=E.device)
-    for squares, variables in _ROUNDS:
-        s, e, m = S[squares], E[variables], minors[squares]
-        rows = out[: len(squares)]
-        trace = rows[:, :9].view(len(squares), 3, 3, E.shape[-1])
-        for j in range(3):
-            trace.addcmul_(s[:, :, j, None], e[:, j, None])
-            rows[:, 9].addcmul_(m[:, j], e[:, 0, j])
-    return out[_TO_NISTER]
+    batch = E.shape[-1]
+    # Coefficients of the squares: the symmetric E E' by columns, and the cofactors of the first column of E.
+    S = E.new_empty(10, 3, 3, batch)
+    columns = [matrix[:, :, None].unbind(1) for matrix in E.unbind(0)]
+    lines = [matrix.unbind(0) for matrix in E.transpose(1, 2).unbind(0)]
+    for (i, j), square in zip(_SQUARES, S.unbind(0), strict=True):
+        torch.mul(columns[i][0], lines[j][0], out=square)
+        for k in (1, 2):
+            square.addcmul_(columns[i][k], lines[j][k])
+        if i != j:
+            square += square.transpose(0, 1).clone()
+    diagonal = S.view(10, 9, batch)[:, ::4]
+    diagonal -= (S[:, 0, 0] + S[:, 1, 1]).add_(S[:, 2, 2]).mul_(0.5)[:, None]
+    C = E.new_empty(3, 10, batch)
+    first, second = E[:, None, :, 1], E[None, :, :, 2]
+    for k, cofactors in enumerate(C.unbind(0)):
+        minors = first[:, :, _NEXT[k]] * second[:, :, _AFTER[k]]
+        minors.addcmul_(first[:, :, _AFTER[k]], second[:, :, _NEXT[k]], value=-1)
+        cofactors[:4] = minors.diagonal().mT
+        for number, (i, j) in enumerate(_SQUARES[4:], 4):
+            torch.add(minors[i, j], minors[j, i], out=cofactors[number])
+    out = E.new_empty(20, 10, batch)
+    traces = [square.unbind(1) for square in S[:, :, :, None].unbind(0)]
+    entries = [matrix.unbind(0) for matrix in E.unbind(0)]
+    determinants = [combine_rows(C, matrix[:, 0]).unbind(0) for matrix in E.unbind(0)]
+    for row, ways in zip(out.unbind(0), _WAYS, strict=True):
+        trace, determinant = row[:9].view(3, 3, batch), row[9]
+        for number, (square, variable) in enumerate(ways):
+            for k in range(3):
+                if number + k:
+                    trace.addcmul_(traces[square][k], entries[variable][k])
+                else:
+                    torch.mul(traces[square][k], entries[variable][k], out=trace)
+            if number:
+                determinant += determinants[variable][square]
+            else:
+                determinant.copy_(determinants[variable][square])
+    return out
 
 
 def _eliminate(A: Float[Tensor, "20 10 batch"]) -> Float[Tensor, "10 6 batch"]:
