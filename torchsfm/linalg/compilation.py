@@ -1,8 +1,8 @@
 """The one switch for `torch.compile`, and the decorator of what it compiles.
 
 A kernel is a function of tensors with the batch in the last dimension, without data-dependent shapes, called where nothing is
-differentiated. Batches are cut into pieces that stay in the cache: small ones for eager mode, larger ones when compiled. There is
-one compiled object for each dtype and device, with a dynamic batch. Dynamo is imported when the switch is on, and only then.
+differentiated. Batches are cut into pieces that stay in the cache: small ones for eager mode, larger ones when compiled. There
+is one compiled object for each dtype and device, with a dynamic batch. Dynamo is imported once the switch is on, not before.
 """
 
 from collections.abc import Callable
@@ -23,10 +23,10 @@ _on = False
 def compile_kernels(on: bool = True) -> None:
     """Compile the hot kernels of solvers with `torch.compile`, from now on and everywhere, or no longer.
 
-    The first call of a solver then takes seconds (up to a minute where PyTorch's disk cache is empty) for each dtype; later ones
-    are several times faster for batches of thousands and slower for single problems. Needs a C++ compiler. Results may differ
-    from eager mode by rounding. Whatever keeps a kernel from being compiled whole and once is an error, not a fall back to
-    eager mode. No effect on what runs inside a function that is itself being compiled.
+    The first call of a solver then takes seconds, up to minutes where PyTorch's disk cache is empty, for each dtype; later ones
+    are several times faster for batches of thousands, and slower for single problems. Needs a C++ compiler. Results may differ
+    from those of eager mode by rounding. Whatever keeps a kernel from being compiled whole and once is an error, not a fall
+    back to eager mode. No effect on what runs inside a function that is itself being compiled.
 
     Args:
         on: Whether to compile.
@@ -63,7 +63,7 @@ class Kernel:
         # A multiple of the width of a vector needs no loop for the rest, which would be as much code again.
         batch = first.shape[-1]
         lines = max(2, -(-batch // _WIDTH))
-        rows = tuple(_padded(row, lines * _WIDTH).unflatten(-1, (lines, _WIDTH)) for row in rows)
+        rows = tuple(_padded(row, lines * _WIDTH).view(*row.shape[:-1], lines, _WIDTH) for row in rows)
         if compiled is None:
             compiled = self._compiled[key] = _compile(self.function, options)
             for row in rows:
@@ -112,6 +112,7 @@ def _compile(function: Callable[..., Rows], options: dict[str, Any]) -> Callable
         return compile_fx(graph, inputs, config_patches={"max_fusion_size": 100_000})
 
     def whole(*lines: Tensor) -> Rows:
-        return copy(*(line.flatten(-2) for line in lines))
+        outputs: Rows = copy(*(line.flatten(-2) for line in lines))
+        return outputs
 
     return torch.compile(whole, fullgraph=True, backend=once)

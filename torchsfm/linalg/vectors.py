@@ -22,6 +22,7 @@ def vectors(block: Tensor) -> list[Vector]:
 
 
 def vector(*rows: Tensor) -> Vector:
+    """A vector of three rows."""
     return rows if torch.compiler.is_compiling() else torch.stack(rows)
 
 
@@ -39,6 +40,7 @@ def together(vectors: list[Vector]) -> list[Vector]:
 
 
 def detached(v: Vector) -> Vector:
+    """Without its graph."""
     return each(lambda x: x.detach(), v)
 
 
@@ -53,10 +55,12 @@ def fms(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def minus(a: Vector, b: Vector) -> Vector:
+    """`a - b`."""
     return each(lambda x, y: x - y, a, b)
 
 
 def scaled(a: Vector, k: Tensor) -> Vector:
+    """`k a`."""
     return each(lambda x: x * k, a)
 
 
@@ -66,16 +70,19 @@ def combined(k: Tensor, a: Vector, m: Tensor, b: Vector) -> Vector:
 
 
 def chosen(mask: Tensor, a: Vector, b: Vector) -> Vector:
+    """`a` where the mask says so, else `b`."""
     return each(lambda x, y: torch.where(mask, x, y), a, b)
 
 
 def dot(a: Vector, b: Vector) -> Tensor:
+    """`a'b`."""
     if isinstance(a, Tensor) and isinstance(b, Tensor):
         return (a * b).sum(0)
     return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2]))
 
 
 def cross(a: Vector, b: Vector) -> Vector:
+    """`a x b`."""
     a0, a1, a2 = a
     b0, b1, b2 = b
     return vector(fms(a2, b1, a1 * b2), fms(a0, b2, a2 * b0), fms(a1, b0, a0 * b1))

@@ -95,7 +95,7 @@ def attach_optimum(
 
     def gradient(z: Tensor, *arguments: Tensor) -> Tensor:
         slope = _gradient(lambda v: objective(v, *arguments).sum(), z)
-        return slope.reshape(z.shape[: z.ndim - dims] + (-1,))
+        return slope.reshape(*z.shape[: z.ndim - dims], -1)
 
     return attach_implicit(gradient, y, *inputs, dims=dims, valid=valid)
 
