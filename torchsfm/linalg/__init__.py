@@ -1,5 +1,6 @@
 """Numbers without geometry: null spaces, roots of polynomials, small systems, nearest matrices."""
 
+from torchsfm.linalg.compilation import compile_kernels
 from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3, solve
 from torchsfm.linalg.nullspace import null_vector, nullspace_rows, orthonormal_nullspace
 from torchsfm.linalg.polynomial import companion_roots, evaluate, solve_cubic, solve_quadratic
@@ -10,6 +11,7 @@ from torchsfm.linalg.real_roots import real_roots
 __all__ = [
     "adjugate_3x3",
     "companion_roots",
+    "compile_kernels",
     "cross",
     "determinant_3x3",
     "evaluate",

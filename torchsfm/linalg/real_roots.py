@@ -1,6 +1,6 @@
 """All real roots of batched polynomials of any degree, by elementwise arithmetic alone.
 
-The projective line is cut into 128 cells of equal angle, x = tan(phi), in four sectors: the polynomial and its reversal, for
+The projective line is cut into 80 cells of equal angle, x = tan(phi), in four sectors: the polynomial and its reversal, for
 arguments between 0 and 1 and between -1 and 0. On the circle the polynomial is the form h(phi) = cos(phi)^n p(tan phi). Values
 and derivatives at the nodes tell, by the Bernstein coefficients of the cubic through them, which cells may hold several roots;
 those are cut once more, in sixteen. There a sign change is one root, and a dip towards zero one pair of roots or none. The
@@ -8,6 +8,7 @@ cubic gives a start, Newton's method between bounds the root.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 from torchsfm.linalg.polynomial import attach_roots
 from torchsfm.linalg.rows import take_columns
 
-_CELLS = 32
+_CELLS = 20
 """Cells from 0 to 45 degrees."""
 _PARTS = 16
 """Parts of a cell that is looked at more closely."""
@@ -35,7 +36,8 @@ class RootList(NamedTuple):
 
     def slot(self) -> Int[Tensor, " roots"]:
         """The number of each root among those of its polynomial."""
-        return torch.arange(len(self.item), device=self.item.device) - torch.searchsorted(self.item, self.item)
+        count = torch.bincount(self.item)
+        return torch.arange(len(self.item), device=self.item.device) - (count.cumsum(0) - count).index_select(0, self.item)
 
 
 class _Cells(NamedTuple):
@@ -53,8 +55,8 @@ class _Cells(NamedTuple):
 def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]:
     """The real roots of polynomials of degree m - 1 >= 2, each in a slot of its own.
 
-    Found are all roots, except where three or more lie within about 0.1 degrees of each other as angles atan(x), or four or
-    more within about 1.5: scale the argument so that the roots of interest are around 1. Two real roots that rounding cannot
+    Found are all roots, except where three or more lie within about 0.15 degrees of each other as angles atan(x), or four or
+    more within about 2.5: scale the argument so that the roots of interest are around 1. Two real roots that rounding cannot
     tell from a complex pair may be missing.
 
     Args:
@@ -163,9 +165,10 @@ def _horner(c: Tensor, x: Tensor) -> Tensor:
     return value
 
 
-def _horner_slope(c: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Values and derivatives; c has one dimension more than x, in front."""
-    last, *rest = c.flip(0).unbind(0)
+def _horner_slope(c: Tensor | Sequence[Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+    """Values and derivatives; c are rows, lowest power first."""
+    *rest, last = c if isinstance(c, Sequence) else c.unbind(0)
+    rest.reverse()
     value, slope = torch.addcmul(rest[0], last, x), last + torch.zeros_like(x)
     for row in rest[1:]:
         torch.addcmul(value, slope, x, out=slope)
@@ -210,8 +213,9 @@ def _refine(
     tangent = angle * (1 + angle * angle / 3)
     y = (bottom + tangent) / (1 - bottom * tangent)
     k = k * up
-    k[1::2] *= torch.where(minus, -torch.ones_like(up), 1)
-    p, d = _horner_slope(k, y)
+    k[1::2] *= torch.where(minus, -1.0, 1.0).to(k.dtype)
+    rows = k.unbind(0)
+    p, d = _horner_slope(rows, y)
     # For a pair, h + h' a + (h'' / 2) a^2 = 0 in the angle a from the dip.
     square = 1 + y * y
     q = square * d - n * y * p
@@ -226,7 +230,7 @@ def _refine(
         # Rounding may carry a converged root over its bound.
         inside = (y >= bottom - 1e-10) & (y <= top + 1e-10)
         y = torch.where(inside, y, 0.5 * (bottom + top))
-        p, d = _horner_slope(k, y)
+        p, d = _horner_slope(rows, y)
         before = (p > 0) ^ right
         bottom, top = torch.where(before, y, bottom), torch.where(before, top, y)
         y = y - p / d

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg.rows import add_rows, combine_rows
-from torchsfm.motion._five_points import cross, normalised
+from torchsfm.motion._five_points import cross, longest, normalised
 
 
 def combine(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> Float[Tensor, "9 roots"]:
@@ -21,9 +21,8 @@ def polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     e = combine(u, basis)
     cofactors = torch.stack((cross(e[3:6], e[6:]), cross(e[6:], e[:3]), cross(e[:3], e[3:6])))
     squares = cofactors * cofactors
-    i, j = add_rows(squares.unbind(1)).max(0).indices, add_rows(squares).max(0).indices
-    v3 = normalised(cofactors.gather(0, i.expand(1, 3, -1))[0])
-    u3 = normalised(cofactors.gather(1, j.expand(3, 1, -1))[:, 0])
+    v3 = normalised(longest(add_rows(squares.unbind(1)).unbind(0), cofactors.unbind(0)))
+    u3 = normalised(longest(add_rows(squares).unbind(0), cofactors.unbind(1)))
     # A frame around u3 without branches (Duff et al. 2017).
     sign = torch.copysign(torch.ones_like(u3[2]), u3[2])
     a = -1 / (sign + u3[2])
@@ -39,9 +38,9 @@ def polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     columns = basis.view(4, 3, 3, -1).permute(2, 1, 0, 3)
     Bv1, Bv2, Bv3 = (combine_rows(columns, v) for v in (v1, v2, v3))
     p = combine_rows(Bv3, u3)
-    q = combine_rows(Bv1, u1) - combine_rows(Bv2, u2)
-    r = combine_rows(Bv2, u1) + combine_rows(Bv1, u2)
-    error = torch.stack([combine_rows(f, u).abs() for f in (p, q, r)]).amax(0)
+    q = combine_rows(Bv1, u1).sub_(combine_rows(Bv2, u2))
+    r = combine_rows((*Bv2, *Bv1), (*u1, *u2))
+    error = torch.maximum(torch.maximum(*(combine_rows(f, u).abs_() for f in (p, q))), combine_rows(r, u).abs_())
     p0, p1, p2, p3 = p
     q0, q1, q2, q3 = q
     r0, r1, r2, r3 = r

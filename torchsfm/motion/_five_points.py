@@ -128,10 +128,17 @@ def back_substitute(x: Tensor, y: Tensor, w: Tensor, s: Tensor, c: Tensor) -> Te
     powers = (cc * c, cc * s, ss * c, ss * s)
     X, Y, W = (combine_rows(p[:4], powers) for p in (x, y, w))
     W = (W * c).addcmul_(w[4], ss * ss)
-    n = torch.stack([cross((X[i], Y[i], W[i]), (X[j], Y[j], W[j])) for i, j in ((1, 2), (2, 0), (0, 1))])
-    best = add_rows((n * n).unbind(1)).max(0).indices
-    n0, n1, n2 = n.gather(0, best.expand(1, 3, -1))[0]
+    rows = list(zip(X, Y, W, strict=True))
+    n = [cross(rows[i], rows[j]) for i, j in ((1, 2), (2, 0), (0, 1))]
+    n0, n1, n2 = longest([combine_rows(v, v) for v in n], n)
     return normalised(torch.stack((n0, n1, s * n2, c * n2)))
+
+
+def longest(squares: Sequence[Tensor], vectors: Sequence[Tensor]) -> Tensor:
+    """Of three vectors the one with the largest square."""
+    first, second, third = squares
+    longer = torch.where(second > first, vectors[1], vectors[0])
+    return torch.where(third > torch.maximum(first, second), vectors[2], longer)
 
 
 def normalised(u: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torchsfm.motion._essential_manifold import combine, polish
 from torchsfm.motion._five_points import back_substitute, nullspace_basis, polynomial, turned
 from torchsfm.optim import attach_implicit, wants_derivative
 
-_CHUNK = 2048
+_CHUNK = 4096
 """Problems at a time: their matrices fit the cache."""
 _INDEPENDENT = 1e-13
 _NEAR = 1e-8
@@ -30,7 +30,7 @@ _CONVERGED = 1e-7
 """Distance from the manifold before the last step, of what is a solution."""
 _POOR = 1e-4
 """Distance of a start from the manifold that casts doubt on the polynomial."""
-_SAME = 1e-5, 1e-8
+_SAME = 1e-5, 2e-7
 """Distance below which two unit matrices are one solution, from two polynomials and from the same one."""
 
 
@@ -106,16 +106,19 @@ def _solve(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"]) -> tu
     u, last = found.u, found.error.index_select(0, found.rest)
     for _ in range(_MORE):
         u, last = polish(u, found.basis)
-    E = found.E.index_copy(1, found.rest, combine(u, found.basis))
-    error = found.error.index_copy(0, found.rest, last)
-    keep = ((error < _CONVERGED) & torch.isfinite(E).all(0)).nonzero()[:, 0]
-    item, slot = found.item.index_select(0, keep), found.slot.index_select(0, keep)
-    # An empty slot holds diag(1, 1, 0).
-    out = d1.new_zeros(batch, 20 if len(again) else 10, 9)
-    out[..., ::4] = torch.tensor([1.0, 1.0, 0.0], dtype=d1.dtype, device=d1.device)
-    out[item, slot] = take_columns(E, keep).mT * 2**0.5
-    valid = torch.zeros(out.shape[:2], dtype=torch.bool, device=d1.device)
-    valid[item, slot] = True
+    found.E.index_copy_(1, found.rest, combine(u, found.basis))
+    found.error.index_copy_(0, found.rest, last)
+    # A unit matrix is finite in all entries or in none.
+    good = (found.error < _CONVERGED) & torch.isfinite(found.E[0])
+    # An empty slot holds diag(1, 1, 0); what is no solution goes to one slot behind all others.
+    slots = 20 if len(again) else 10
+    out = d1.new_zeros(batch * slots + 1, 9)
+    out[:, ::4] = torch.tensor([1.0, 1.0, 0.0], dtype=d1.dtype, device=d1.device)
+    place = torch.where(good, found.item * slots + found.slot, batch * slots)
+    out.index_copy_(0, place, found.E.mT * 2**0.5)
+    valid = torch.zeros(batch * slots + 1, dtype=torch.bool, device=d1.device)
+    valid[place] = True
+    out, valid = out[:-1].view(batch, slots, 9), valid[:-1].view(batch, slots)
     if len(again):
         out[again, :10], valid[again, :10] = _once(out[again], valid[again])
     return out[:, :10], valid[:, :10]
@@ -161,21 +164,22 @@ def _chunk(d1: Tensor, d2: Tensor, other_coordinates: bool) -> _Candidates:
     x, y, w, p = polynomial(basis)
     # Without five independent equations there is no polynomial and no root.
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
-    roots = real_root_list(torch.where(fine, p, torch.nan), steps=2)
+    roots = real_root_list(torch.where(fine, p, torch.nan), steps=1)
+    # Never more than the degree.
+    slot = roots.slot().clamp_max(9)
     # From here on each root has a column of its own.
     item = roots.item
     x, y, w, basis = (take_columns(rows, item) for rows in (x, y, w, basis))
     u, error = polish(back_substitute(x, y, w, roots.s, roots.t), basis)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
-    # Never more than the degree.
-    slot = roots.slot().clamp_max(9)
     return _Candidates(item, slot, combine(u, basis), error, rest, take_columns(u, rest), take_columns(basis, rest))
 
 
 def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays of length 1, and where all are finite and have a direction; what they are elsewhere concerns no other problem."""
     d = d.contiguous()
     largest = d.abs().amax((0, 1))
-    fine = torch.isfinite(largest) & (largest > 0)
-    d = torch.where(fine, d / torch.where(fine, largest, 1), 1)
+    # Squares neither overflow nor vanish.
+    d = d * (1 / largest)
     square = combine_rows(d, d)
-    return d * torch.where(square > 0, square, 1).rsqrt_(), fine & (square > 0).all(0)
+    return d.mul_(square.rsqrt()), (largest < torch.inf) & (square > 0).all(0)
