@@ -111,6 +111,7 @@ from torchsfm.images import (
     track_points,
     track_sequence,
 )
+from torchsfm.linalg import compile_kernels
 from torchsfm.motion import (
     AffineFactorization,
     Factorization,
@@ -435,6 +436,7 @@ __all__ = [
     "cameras_from_quadrifocal",
     "cameras_from_trifocal",
     "canonical_cameras",
+    "compile_kernels",
     "correct_matches",
     "courtyard_scene",
     "cross_matrix",
