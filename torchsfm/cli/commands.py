@@ -25,6 +25,13 @@ app = typer.Typer(
 )
 
 
+class Method(StrEnum):
+    """Ways to reconstruct of `--method`."""
+
+    incremental = "incremental"
+    projective = "projective"
+
+
 class CameraModel(StrEnum):
     """Lens distortion models of `--camera`."""
 
@@ -82,6 +89,10 @@ def reconstruct(
             help="Estimate the principal point too, or hold it at the middle of the image.",
         ),
     ] = True,
+    method: Annotated[
+        Method,
+        typer.Option(help="From two images on, or all together without calibration and then autocalibration."),
+    ] = Method.incremental,
     max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
     seed: Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where an earlier run into the same folder stopped.")] = False,
@@ -94,7 +105,7 @@ def reconstruct(
         source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
         result = job.run(
             source, threads, sequence=sequence, camera=camera.value if camera else None, K=K, shared_camera=shared_camera,
-            free_principal_point=free_principal_point, max_features=max_features, seed=seed, resume=resume,
+            free_principal_point=free_principal_point, method=method.value, max_features=max_features, seed=seed, resume=resume,
         )  # fmt: skip
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])

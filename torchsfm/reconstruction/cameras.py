@@ -16,7 +16,7 @@ DEFAULT_FOCAL = 1.2
 """Focal length over the longer side of the image (a view of 45 degrees) when nothing tells it."""
 
 
-FOCAL_SIGMA = {"given": 0.01, "exif": 0.05, "fundamental matrices": 0.2, "default": 0.5}
+FOCAL_SIGMA = {"given": 0.01, "exif": 0.05, "autocalibration": 0.05, "fundamental matrices": 0.2, "default": 0.5}
 """How far a focal length may be off, as a fraction, by where it comes from."""
 
 

@@ -91,7 +91,7 @@ def grow_model(
         model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
         if len(model.X) < MIN_POINTS:
             continue
-        grown = _grow(model, mapping.registered, options, progress)
+        grown = extend_model(model, mapping.registered, options, progress)
         if best is None or int(grown[0].registered.sum()) > int(best[0].registered.sum()):
             best = grown
         if int(grown[0].registered.sum()) > 0.5 * available:
@@ -99,9 +99,20 @@ def grow_model(
     return best
 
 
-def _grow(
+def extend_model(
     model: Mapping, elsewhere: Bool[Tensor, "v"], options: MappingOptions, progress: Callable[[int, int], None]
 ) -> tuple[Mapping, dict[int, str]]:
+    """Register all images that fit, and refine the whole.
+
+    Args:
+        model: A mapping of at least two registered images, with points.
+        elsewhere: Images that belong to other models and are left alone.
+        options: How the model is grown.
+        progress: Called with the number of registered images and of all.
+
+    Returns:
+        The mapping, and for each image that was tried and did not fit the reason.
+    """
     v = len(model.registered)
     focal_known = options.focal_sigma < UNKNOWN_FOCAL
     focal_known[model.camera_index[model.registered]] = True

@@ -11,14 +11,16 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
-from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, grow_model
+from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
 from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.projective import projective_start
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
 from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
 
+METHODS = ("incremental", "projective")
 MIN_IMAGES = 2
 """Smallest number of images of a model."""
 FEW_IMAGES = 60
@@ -39,6 +41,7 @@ def build_models(
     shared_camera: bool | None,
     K: Float[Tensor, "3 3"] | None,
     free_principal_point: bool,
+    method: str,
     generator: torch.Generator,
     stages: Stages,
     progress: Progress,
@@ -56,12 +59,17 @@ def build_models(
         shared_camera: See `reconstruct`.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
+        method: "incremental" or "projective".
         generator: Source of randomness.
         stages: Timing and saving.
         progress: Called as images are registered.
     """
     if camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
+    if method not in METHODS:
+        raise ReconstructionError(f"no method '{method}'; there are {', '.join(METHODS)}")
+    if method == "projective" and K is not None:
+        raise ReconstructionError("the projective method finds the camera itself; known intrinsics are for the incremental one")
     few = len(graph.names) <= FEW_IMAGES
     with stages.timed("map"), one_thread() if few else nullcontext():
         camera_index = group_cameras(graph.image_size, labels, shared_camera)
@@ -76,11 +84,29 @@ def build_models(
         empty = Mapping.start(graph, track, cameras, camera_index)
         models: list[Reconstruction] = []
         reasons: dict[int, str] = {}
+        autocalibration: list[str] = []
         taken = empty.registered
         while int((~taken).sum()) >= MIN_IMAGES:
-            mapped = grow_model(replace(empty, registered=taken), options, lambda n, v: progress("map", n, v))
-            if mapped is None:
-                break
+            report = lambda n, v: progress("map", n, v)  # noqa: E731
+            if method == "projective":
+                start = projective_start(empty, ~taken, threshold=options.reprojection, min_angle=options.min_angle)
+                if start is None:
+                    break
+                autocalibration.append(start.summary)
+                if start.mapping is None:
+                    # What was refused is not tried again in smaller parts.
+                    taken = taken.clone()
+                    taken[start.views] = True
+                    reasons |= dict.fromkeys(start.views.tolist(), "autocalibration was refused")
+                    continue
+                source = tuple("autocalibration" for _ in start.focal_sigma)
+                metric = replace(options, expected=start.expected(), focal_sigma=start.focal_sigma)
+                mapped = extend_model(start.mapping, taken, metric, report)
+            else:
+                grown = grow_model(replace(empty, registered=taken), options, report)
+                if grown is None:
+                    break
+                mapped = grown
             model, failed = mapped
             if not models:
                 reasons |= failed
@@ -90,11 +116,11 @@ def build_models(
                 _save_model(models[-1], stages.folder, len(models) - 1)
         models.sort(key=lambda model: (-model.num_registered, -model.num_points))
     progress("map", len(graph.names), len(graph.names))
-    unknown_focal = (focal_uncertainty(source) >= UNKNOWN_FOCAL)[camera_index]
+    unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[camera_index]
     verdict = graph.verdicts(cameras.K[camera_index], unknown_focal)
     pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
     images = _image_reports(graph, models, reasons, failures, order)
-    return SfmResult(tuple(models), Report(images, pairs, dict(stages.seconds), source))
+    return SfmResult(tuple(models), Report(images, pairs, dict(stages.seconds), source, tuple(autocalibration)))
 
 
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
@@ -144,6 +170,7 @@ def reconstruct_tracks(
     K: Float[Tensor, "3 3"] | None = None,
     focal: float | None = None,
     free_principal_point: bool = True,
+    method: str = "incremental",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SfmResult:
@@ -161,6 +188,7 @@ def reconstruct_tracks(
         K: Known intrinsics of all images.
         focal: First guess of the focal length in pixels, which is then adjusted.
         free_principal_point: Estimate the principal point too.
+        method: "incremental" or "projective", see `reconstruct`.
         seed: The same seed gives the same model.
         progress: Called as images are registered.
 
@@ -201,6 +229,7 @@ def reconstruct_tracks(
         shared_camera=shared_camera,
         K=K,
         free_principal_point=free_principal_point,
+        method=method,
         generator=generator,
         stages=Stages(None, False, ""),
         progress=progress or (lambda stage, done, total: None),

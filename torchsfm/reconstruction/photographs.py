@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import ImageError, list_images, match_features, retrieve_pairs
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all, unpack
-from torchsfm.reconstruction.models import build_models
+from torchsfm.reconstruction.models import METHODS, build_models
 from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
 from torchsfm.reconstruction.sequence import add_corners, sequence_pairs, track_corners
 from torchsfm.reconstruction.stages import Arrays, Stages, fingerprint, one_thread
@@ -29,6 +29,7 @@ def reconstruct(
     shared_camera: bool | None = None,
     K: Float[Tensor, "3 3"] | None = None,
     free_principal_point: bool = True,
+    method: str = "incremental",
     max_features: int = 8192,
     neighbours: int = 20,
     seed: int = 0,
@@ -53,6 +54,9 @@ def reconstruct(
         K: Known intrinsics of all images, in pixels; they are not adjusted.
         free_principal_point: Estimate the principal point too, of models of four images or more, expected within 1 % of the
             image's size from its centre, instead of holding it there.
+        method: "incremental" starts from two images and a first focal length; "projective" reconstructs all images together
+            without calibration, by factorisation of the longest tracks, and finds the camera by autocalibration. It refuses
+            rather than guesses where the images do not determine the focal length (`report.autocalibration` says why).
         max_features: Features per image.
         neighbours: Images each one is matched with when there are many.
         seed: The same seed gives the same model.
@@ -70,6 +74,8 @@ def reconstruct(
     """
     if camera is not None and camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
+    if method not in METHODS:
+        raise ReconstructionError(f"no method '{method}'; there are {', '.join(METHODS)}")
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
     report = progress or (lambda stage, done, total: None)
@@ -92,6 +98,7 @@ def reconstruct(
         shared_camera=shared_camera,
         K=K,
         free_principal_point=free_principal_point,
+        method=method,
         generator=generator,
         stages=stages,
         progress=report,

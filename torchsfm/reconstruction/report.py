@@ -51,13 +51,16 @@ class Report:
         images: One entry per input file, in the order of the input.
         pairs: The comparison of all pairs, with indices into the images that could be read.
         seconds: Wall-clock time of each stage.
-        focal_source: Where each camera's first focal length came from: "given", "exif", "fundamental matrices" or "default".
+        focal_source: Where each camera's first focal length came from: "given", "exif", "autocalibration", "fundamental
+            matrices" or "default".
+        autocalibration: For each set of images that was autocalibrated what was assumed, found and determined, or why not.
     """
 
     images: tuple[ImageReport, ...]
     pairs: PairReport
     seconds: dict[str, float]
     focal_source: tuple[str, ...] = ()
+    autocalibration: tuple[str, ...] = ()
 
     def summary(self) -> str:
         """A few lines for people."""
@@ -68,6 +71,7 @@ class Report:
             lines.append(f"{len(self.pairs.pairs)} pairs compared: {kinds}, {self.pairs.count(Verdict.UNRELATED)} unrelated")
         if self.focal_source:
             lines.append("focal length first from: " + ", ".join(sorted(set(self.focal_source))))
+        lines += [f"autocalibration: {text}" for text in self.autocalibration]
         lines += [f"not registered: {image.name} ({image.reason})" for image in self.images if image.model is None]
         lines.append("seconds: " + ", ".join(f"{stage} {time:.1f}" for stage, time in self.seconds.items()))
         return "\n".join(lines)
@@ -102,6 +106,8 @@ class SfmResult:
             return f"none of the {len(pairs.pairs)} pairs of images have enough in common"
         if pairs.count(Verdict.ROTATION) == related:
             return "the camera only turned about its centre, which gives no depth"
+        if self.report.autocalibration:
+            return "autocalibration: " + self.report.autocalibration[0]
         return f"no model could be started from the {related} pairs of images that have something in common"
 
 

@@ -59,6 +59,7 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         "pairs": pairs,
         "seconds": {stage: round(value, 3) for stage, value in report.seconds.items()},
         "focal_source": list(report.focal_source),
+        "autocalibration": list(report.autocalibration),
         **more,
     }
 
@@ -67,6 +68,8 @@ def report_markdown(record: Record) -> str:
     """The record as a markdown page: models, cameras, images, pairs, and where the time went."""
     lines = ["# Reconstruction", ""]
     lines += _models_text(record)
+    if texts := record.get("autocalibration"):
+        lines += ["## Autocalibration", "", *(f"- {text}" for text in texts), ""]
     if truth := record.get("truth"):
         lines += ["## Against the truth", "", *_table(["", ""], [[key, value] for key, value in truth.items()]), ""]
     lines += ["## Images", ""]
