@@ -14,6 +14,8 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.optim import levenberg_marquardt
 
+_OPEN = 0.65
+"""Norm of the noise in all equations, relative to the least singular value along the tensors, above which that may be noise."""
 TensorOf = Callable[[Tensor], tuple[Tensor, Tensor]]
 """From cameras (*batch, u, 3, 4) after the first the tensor, flat, and its derivative (*batch, entries, 12 u)."""
 
@@ -145,16 +147,37 @@ def inverse_similarity(S: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     return torch.cat((torch.cat((eye / s, -c / s), -1), S[..., 2:, :]), -2)
 
 
-def second_singular_ratio(A: Float[Tensor, "*batch m k"]) -> tuple[Tensor, Tensor]:
-    """The second smallest of k singular values relative to the largest, and the smallest relative to the second."""
+def tensor_uncertainty(
+    tensor_of: TensorOf, A: Float[Tensor, "*batch m k"], fit: CameraFit, number: Int[Tensor, "*batch"]
+) -> tuple[Tensor, Tensor]:
+    """How well the equations determine a fitted tensor: without derivative.
+
+    Args:
+        tensor_of: As for `fit_cameras`.
+        A: The linear equations.
+        fit: The fitted cameras.
+        number: How many of the equations are not empty.
+
+    Returns:
+        The standard deviation of the tensor of norm 1 in its least determined direction, by the residuals, at most 1; and
+        whether the equations determine it at all: where they do not, they have low rank along the tensors, or in a direction
+        that they leave open nothing but the noise has given them rank, as little as the noise has left of residuals.
+    """
     with torch.no_grad():
-        R = torch.linalg.qr(A.detach(), mode="r")[1]
-        values = torch.linalg.svdvals(R)
-        k = A.shape[-1]
-        second = values[..., k - 2]
-        last = values[..., k - 1] if values.shape[-1] == k else torch.zeros_like(second)
-        largest = values[..., 0]
-        return second / torch.where(largest > 0, largest, 1), last / torch.where(second > 0, second, 1)
+        A = A.detach()
+        _, J = tensor_of(fit.P.detach())
+        t = fit.tensor.detach()
+        J = J @ free_directions(fit.P)
+        J = J - t[..., None] * (t[..., None, :] @ J)
+        J = torch.where(torch.isfinite(J).flatten(-2).all(-1)[..., None, None], J, 0)
+        Q = torch.linalg.qr(J)[0]
+        values = torch.linalg.svdvals(torch.linalg.qr(A @ Q, mode="r")[1])
+        least, largest = values[..., -1], values[..., 0]
+        noise = (2 * fit.cost / (number - J.shape[-1]).clamp(min=1)).sqrt()
+        ratio = noise / torch.where(least > 0, least, 1)
+        spread = noise * number.clamp(min=1).to(noise.dtype).sqrt()
+        determined = (least > 1e-10 * largest) & (spread < _OPEN * least)
+        return torch.where(least > 0, ratio, 1).clamp(max=1), determined
 
 
 def combined_status(finite: Tensor, enough: Tensor, determined: Tensor, converged: Tensor) -> Tensor:

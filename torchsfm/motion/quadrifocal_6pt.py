@@ -14,15 +14,11 @@ from torchsfm.motion.multilinear_fit import (
     fit_cameras,
     inverse_similarity,
     normalized_views,
-    second_singular_ratio,
+    tensor_uncertainty,
 )
 from torchsfm.tensors import cameras_from_quadrifocal, canonical_cameras, quadrifocal_from_cameras, transform_quadrifocal
 from torchsfm.tensors.quadrifocal import quadrifocal_jacobian
-
-_INDEPENDENT = 1e-9
-"""Second smallest singular value of the equations, relative to the largest, that is taken for zero."""
-_AMBIGUOUS = 0.6
-"""Smallest singular value relative to the second smallest that leaves the choice between the two to chance."""
+from torchsfm.tensors.trifocal import unit_tensor
 
 
 @dataclass(frozen=True)
@@ -33,22 +29,22 @@ class QuadrifocalFit:
         Q: The tensor with norm 1, in the coordinates of the input; it is that of the cameras.
         P: The cameras in the frame of `canonical_cameras`.
         error: Root mean square of the algebraic residuals, without unit.
-        ambiguity: Singular value of the linear solution relative to the next, from 0 to 1: near 1 another tensor fits the
-            linear equations about as well.
+        uncertainty: Standard deviation of the tensor of norm 1 in its least determined direction, in normalised coordinates,
+            estimated from the residuals; at most 1.
         status: OK; TOO_FEW points with weight; DEGENERATE: they leave more than one tensor (points in a plane, centres that
-            coincide), exactly or, ambiguity above 0.6, within their noise; NOT_CONVERGED; NOT_FINITE: numbers with weight that
+            coincide), exactly or within their noise; NOT_CONVERGED; NOT_FINITE: numbers with weight that
             are not.
     """
 
     Q: Float[Tensor, "*batch 3 3 3 3"]
     P: Float[Tensor, "*batch 4 3 4"]
     error: Float[Tensor, "*batch"]
-    ambiguity: Float[Tensor, "*batch"]
+    uncertainty: Float[Tensor, "*batch"]
     status: Int[Tensor, "*batch"]
 
 
 def quadrifocal_6pt(
-    x: Float[Tensor, "*#batch 4 n 2"], *, weights: Float[Tensor, "*#batch n"] | None = None, max_iterations: int = 30
+    x: Float[Tensor, "*#batch 4 n 2"], *, weights: Float[Tensor, "*#batch n"] | None = None, max_iterations: int = 50
 ) -> QuadrifocalFit:
     """The quadrifocal tensor of least algebraic error among those that four cameras can have.
 
@@ -62,7 +58,7 @@ def quadrifocal_6pt(
         max_iterations: Most steps of the minimisation.
 
     Returns:
-        Tensor, cameras, error, ambiguity and status; all finite always. Differentiable in points and weights through the
+        Tensor, cameras, error, uncertainty and status; all finite always. Differentiable in points and weights through the
         minimum.
 
     Raises:
@@ -73,19 +69,18 @@ def quadrifocal_6pt(
     views = normalized_views(x.expand(*batch, 4, n, 2), x.new_zeros(*batch, 4, 0, 3), weights, None)
     A = _equations(views)
     q, _ = null_vector(A.detach())
-    second, ambiguity = second_singular_ratio(A)
     start = cameras_from_quadrifocal(q.reshape(*batch, 3, 3, 3, 3))
     fit = fit_cameras(_tensor_of, A, start.P[..., 1:, :, :], max_iterations)
     inverse = inverse_similarity(views.S)
     Q = transform_quadrifocal(fit.tensor.reshape(*batch, 3, 3, 3, 3), *inverse.unbind(-3))
-    Q = Q / (Q * Q).sum((-4, -3, -2, -1), keepdim=True).sqrt()
+    Q = unit_tensor(Q, 4)[0]
     eye = torch.eye(3, 4, dtype=Q.dtype, device=Q.device).expand(*batch, 1, 3, 4)
     P = canonical_cameras(inverse @ torch.cat((eye, fit.P), -3))
-    enough = (views.root > 0).sum(-1) >= 6
-    determined = (second > _INDEPENDENT) & (ambiguity < _AMBIGUOUS) & (start.status == Status.OK)
-    status = combined_status(views.finite, enough, determined, fit.status == Status.OK)
+    number = 16 * (views.root > 0).sum(-1)
+    uncertainty, determined = tensor_uncertainty(_tensor_of, A, fit, number)
+    status = combined_status(views.finite, number >= 96, determined & (start.status == Status.OK), fit.status == Status.OK)
     error = (2 * fit.cost / A.shape[-2]).sqrt()
-    return QuadrifocalFit(Q.to(x.dtype), P.to(x.dtype), error.to(x.dtype), ambiguity.to(x.dtype), status)
+    return QuadrifocalFit(Q.to(x.dtype), P.to(x.dtype), error.to(x.dtype), uncertainty.to(x.dtype), status)
 
 
 def _equations(views: NormalizedViews) -> Tensor:

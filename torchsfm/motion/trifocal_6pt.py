@@ -20,7 +20,7 @@ from torchsfm.linalg.rows import combine_rows
 from torchsfm.optim import attach_implicit, wants_derivative
 from torchsfm.tensors import trifocal_from_cameras, trifocal_ppp
 
-_CHUNK = 1024
+_CHUNK = 2048
 """Problems at a time: their matrices fit the cache."""
 _INDEPENDENT = 1e-12
 """Smallest pivot of the normalised equations that is not taken for zero."""

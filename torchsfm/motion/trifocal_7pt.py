@@ -14,14 +14,10 @@ from torchsfm.motion.multilinear_fit import (
     fit_cameras,
     inverse_similarity,
     normalized_views,
-    second_singular_ratio,
+    tensor_uncertainty,
 )
 from torchsfm.tensors import cameras_from_trifocal, canonical_cameras, transform_trifocal
-
-_INDEPENDENT = 1e-9
-"""Second smallest singular value of the equations, relative to the largest, that is taken for zero."""
-_AMBIGUOUS = 0.6
-"""Smallest singular value relative to the second smallest that leaves the choice between the two to chance."""
+from torchsfm.tensors.trifocal import unit_tensor
 
 
 @dataclass(frozen=True)
@@ -32,17 +28,17 @@ class TrifocalFit:
         T: The tensor with norm 1, in the coordinates of the input; it meets all internal constraints.
         P: The cameras in the frame of `canonical_cameras`, whose tensor it is.
         error: Root mean square of the algebraic residuals, without unit.
-        ambiguity: Singular value of the linear solution relative to the next, from 0 to 1: near 1 another tensor fits the
-            linear equations about as well.
+        uncertainty: Standard deviation of the tensor of norm 1 in its least determined direction, in normalised coordinates,
+            estimated from the residuals; at most 1.
         status: OK; TOO_FEW points and lines with weight; DEGENERATE: they leave more than one tensor (points in a plane,
-            centres that coincide, lines that meet), exactly or, ambiguity above 0.6, within their noise; NOT_CONVERGED;
+            centres that coincide, lines that meet), exactly or within their noise; NOT_CONVERGED;
             NOT_FINITE: numbers with weight that are not.
     """
 
     T: Float[Tensor, "*batch 3 3 3"]
     P: Float[Tensor, "*batch 3 3 4"]
     error: Float[Tensor, "*batch"]
-    ambiguity: Float[Tensor, "*batch"]
+    uncertainty: Float[Tensor, "*batch"]
     status: Int[Tensor, "*batch"]
 
 
@@ -50,9 +46,10 @@ def trifocal_7pt(
     x: Float[Tensor, "*#batch 3 n 2"],
     l: Float[Tensor, "*#batch 3 m 3"] | None = None,  # noqa: E741
     *,
+    ends: Float[Tensor, "*#batch m 2 2"] | None = None,
     weights: Float[Tensor, "*#batch n"] | None = None,
     line_weights: Float[Tensor, "*#batch m"] | None = None,
-    max_iterations: int = 30,
+    max_iterations: int = 50,
 ) -> TrifocalFit:
     """The trifocal tensor of least algebraic error among those that three cameras can have.
 
@@ -63,60 +60,75 @@ def trifocal_7pt(
     Args:
         x: Points in the three images; n may be 0.
         l: Lines in the three images, homogeneous, of any scale. 4 n + 2 m must be at least 26.
+        ends: Two points on each line in the first image, where the line's equations are set: the end points of the measured
+            segment, for far from it a line is not known well. A unit left and right of the point next to the centre of the
+            image, if not given.
         weights: Weight of each point's squared errors, >= 0; 0 means absent, and what stands there is not looked at.
         line_weights: The same for lines.
         max_iterations: Most steps of the minimisation.
 
     Returns:
-        Tensor, cameras, error, ambiguity and status; all finite always. Differentiable in points, lines and weights through the
-        minimum.
+        Tensor, cameras, error, uncertainty and status; all finite always. Differentiable in points, lines and weights through
+        the minimum.
 
     Raises:
         ValueError: Wrong shape, dtype or device, or too few points and lines.
     """
     points = x[..., :0, :].expand(*x.shape[:-2], 0, 2) if l is None else l[..., :0]
     batch = check_tensors(
-        x=(x, "3 n 2"), l=(l, "3 m 3"), weights=(weights, "n"), line_weights=(line_weights if l is not None else None, "m")
+        x=(x, "3 n 2"), l=(l, "3 m 3"), ends=(ends, "m 2 2"), weights=(weights, "n"), line_weights=(line_weights, "m")
     )
+    if l is None and (ends is not None or line_weights is not None):
+        raise ValueError("l: wanted the lines to which ends or line_weights belong, got None")
     lines = points.new_zeros(*x.shape[:-3], 3, 0, 3) if l is None else l
     n, m = x.shape[-2], lines.shape[-2]
     if 4 * n + 2 * m < 26:
         raise ValueError(f"x, l: wanted 4 n + 2 m >= 26 for n points and m lines, got n = {n} and m = {m}")
-    views = normalized_views(
-        x.expand(*batch, 3, n, 2), lines.expand(*batch, 3, m, 3), weights, None if l is None else line_weights
-    )
-    A = _equations(views)
+    views = normalized_views(x.expand(*batch, 3, n, 2), lines.expand(*batch, 3, m, 3), weights, line_weights)
+    on_first = _points_on_lines(views, None if ends is None else ends.expand(*batch, m, 2, 2))
+    finite = views.finite & torch.isfinite(on_first).flatten(-3).all(-1)
+    A = _equations(views, torch.where(finite[..., None, None, None], on_first, 0))
     t, _ = null_vector(A.detach())
-    second, ambiguity = second_singular_ratio(A)
     start = cameras_from_trifocal(t.reshape(*batch, 3, 3, 3))
     fit = fit_cameras(_tensor_of, A, start.P[..., 1:, :, :], max_iterations)
     inverse = inverse_similarity(views.S)
     T = transform_trifocal(fit.tensor.reshape(*batch, 3, 3, 3), *inverse.unbind(-3))
-    T = T / (T * T).sum((-3, -2, -1), keepdim=True).sqrt()
+    T = unit_tensor(T, 3)[0]
     eye = torch.eye(3, 4, dtype=T.dtype, device=T.device).expand(*batch, 1, 3, 4)
     P = canonical_cameras(inverse @ torch.cat((eye, fit.P), -3))
-    enough = 4 * (views.root > 0).sum(-1) + 2 * (views.line_root > 0).sum(-1) >= 26
-    determined = (second > _INDEPENDENT) & (ambiguity < _AMBIGUOUS) & (start.status == Status.OK)
-    status = combined_status(views.finite, enough, determined, fit.status == Status.OK)
+    number = 4 * (views.root > 0).sum(-1) + 2 * (views.line_root > 0).sum(-1)
+    uncertainty, determined = tensor_uncertainty(_tensor_of, A, fit, number)
+    status = combined_status(finite, number >= 26, determined & (start.status == Status.OK), fit.status == Status.OK)
     error = (2 * fit.cost / A.shape[-2]).sqrt()
-    return TrifocalFit(T.to(x.dtype), P.to(x.dtype), error.to(x.dtype), ambiguity.to(x.dtype), status)
+    return TrifocalFit(T.to(x.dtype), P.to(x.dtype), error.to(x.dtype), uncertainty.to(x.dtype), status)
 
 
-def _equations(views: NormalizedViews) -> Tensor:
-    """The linear equations in T_i^jk, flat: four a point, four a line (of which two are independent)."""
+def _points_on_lines(views: NormalizedViews, ends: Tensor | None) -> Tensor:
+    """Two points (*batch, m, 2, 2) on each line of the first image, in normalised coordinates; 0 for absent lines."""
+    normal, offset = views.l[..., 0, :, None, :2], views.l[..., 0, :, None, 2:]
+    present = (views.line_root > 0)[..., None, None]
+    if ends is None:
+        along = torch.stack((-normal[..., 1], normal[..., 0]), -1)
+        both = -offset * normal + along * torch.tensor([[1.0], [-1.0]], dtype=along.dtype, device=along.device)
+    else:
+        S = views.S[..., 0, None, None, :2, :]
+        ends = torch.where(present, ends.double(), 0)
+        both = (S[..., :2] @ ends[..., None])[..., 0] + S[..., 2]
+        both = both - ((both * normal).sum(-1, keepdim=True) + offset) * normal
+    return torch.where(present, both, 0)
+
+
+def _equations(views: NormalizedViews, on_first: Tensor) -> Tensor:
+    """The linear equations in T_i^jk, flat: four a point and two a line."""
     one, zero = torch.ones_like(views.x[..., 0]), torch.zeros_like(views.x[..., 0])
-    # The vertical and the horizontal line through each point, and two points on each line, a unit from its foot.
+    # The vertical and the horizontal line through each point.
     vertical = torch.stack((one, zero, -views.x[..., 0]), -1)
     horizontal = torch.stack((zero, one, -views.x[..., 1]), -1)
     axes = torch.stack((vertical, horizontal), -2)
     h1 = torch.stack((views.x[..., 0, :, 0], views.x[..., 0, :, 1], one[..., 0, :]), -1) * views.root[..., None]
     by_points = torch.einsum("...ni,...naj,...nbk->...nabijk", h1, axes[..., 1, :, :, :], axes[..., 2, :, :, :])
-    normal, offset = views.l[..., 0, :, :2], views.l[..., 0, :, 2:]
-    along = torch.stack((-normal[..., 1], normal[..., 0]), -1)
-    foot = -offset * normal
-    root = views.line_root[..., None]
-    ends = [torch.cat((end, torch.ones_like(offset)), -1) * root for end in (foot + along, foot - along)]
-    by_lines = torch.einsum("...nei,...nj,...nk->...neijk", torch.stack(ends, -2), *views.l[..., 1:, :, :].unbind(-3))
+    ends = torch.nn.functional.pad(on_first, (0, 1), value=1.0) * views.line_root[..., None, None]
+    by_lines = torch.einsum("...nei,...nj,...nk->...neijk", ends, *views.l[..., 1:, :, :].unbind(-3))
     return torch.cat((by_points.flatten(-6, -4).flatten(-3), by_lines.flatten(-5, -4).flatten(-3)), -2)
 
 
