@@ -1,4 +1,3 @@
-import gzip
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import BundleResult, bundle_adjust
+from torchsfm.bundle import BundleResult, bundle_adjust, bundle_adjust_model
 from torchsfm.bundle.projection import Projection, camera_from_rows, camera_rows
+from torchsfm.formats import read_bal
 from torchsfm.geometry import (
     DISTORTION_MODELS,
     Camera,
@@ -334,21 +334,6 @@ def test_wrong_arguments(generator: torch.Generator, unchecked: None) -> None:
         bundle_adjust(poses, cameras, X, x, view, point, fixed_points=torch.ones(3, dtype=torch.bool))
 
 
-def read_bal(path: Path) -> tuple[Pose, Camera, Tensor, Tensor, Tensor, Tensor]:
-    """Bundle Adjustment in the Large: cameras look down -z, so turn them half a turn about x and mirror image y."""
-    text = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
-    numbers = np.array(text.split(), dtype=np.float64)
-    v, n, m = numbers[:3].astype(int)
-    observations = torch.tensor(numbers[3 : 3 + 4 * m].reshape(m, 4))
-    camera = torch.tensor(numbers[3 + 4 * m : 3 + 4 * m + 9 * v].reshape(v, 9))
-    X = torch.tensor(numbers[3 + 4 * m + 9 * v :].reshape(n, 3))
-    flip = torch.tensor([1.0, -1.0, -1.0], dtype=F64)
-    poses = Pose(flip[:, None] * rotation_from_rotvec(camera[:, :3]), flip * camera[:, 3:6])
-    K = intrinsics(camera[:, 6], torch.zeros(v, 2, dtype=F64))
-    view, point = observations[:, :2].long().unbind(1)
-    return poses, Camera(K, Radial(camera[:, 7], camera[:, 8])), X, observations[:, 2:] * flip[:2], view.clone(), point.clone()
-
-
 @pytest.mark.parametrize(
     ("name", "start", "end"),
     [
@@ -358,7 +343,7 @@ def read_bal(path: Path) -> tuple[Pose, Camera, Tensor, Tensor, Tensor, Tensor]:
     ],
 )
 def test_bal(data: Path, name: str, start: float, end: float) -> None:
-    result = bundle_adjust(*read_bal(data / "bal" / name), free=("focal", "k1", "k2"), max_iterations=100)
+    result = bundle_adjust_model(read_bal(data / "bal" / name), free=("focal", "k1", "k2"), max_iterations=100).result
     np.testing.assert_allclose(result.initial_cost, start, rtol=1e-5)
     assert result.cost <= end
     angles = rotation_angle(result.poses.R @ result.poses.R.mT)

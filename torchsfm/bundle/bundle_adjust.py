@@ -14,6 +14,7 @@ from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.rig import Rig
 from torchsfm.geometry import Camera, Pose
 from torchsfm.optim import Loss, sparse_levenberg_marquardt
+from torchsfm.optim.schur import Solver
 from torchsfm.optim.sparse_derivative import Hessian
 
 
@@ -63,6 +64,7 @@ def bundle_adjust(
     gauge: Gauge = "free",
     max_iterations: int = 50,
     tolerance: float = 1e-6,
+    linear_solver: Solver = "auto",
     hessian: Hessian = "exact",
     progress: Callable[[int, float], None] | None = None,
 ) -> BundleResult:
@@ -102,6 +104,7 @@ def bundle_adjust(
             from it keeps its distance. Only where nothing else holds the world.
         max_iterations: Most steps tried.
         tolerance: End when a step lowers the cost by less than this fraction.
+        linear_solver: "dense", "pcg" (for thousands of cameras), or "auto"; see `sparse_levenberg_marquardt`.
         hessian: Used for derivatives only: "exact", or "gauss-newton", cheaper and some percent off where residuals are large.
         progress: Called with the number of steps and the cost after each.
 
@@ -129,6 +132,7 @@ def bundle_adjust(
         eliminate=cheapest_elimination(blocks),
         max_iterations=max_iterations,
         function_tolerance=tolerance,
+        linear_solver=linear_solver,
         hessian=hessian,
         progress=progress,
     )

@@ -12,6 +12,7 @@ from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.rig import Rig
 from torchsfm.geometry import Camera, Pose
 from torchsfm.optim import Loss
+from torchsfm.optim.schur import Solver
 from torchsfm.optim.sparse_derivative import Hessian
 
 
@@ -68,6 +69,7 @@ class BundleOptions(TypedDict, total=False):
     gauge: Gauge
     max_iterations: int
     tolerance: float
+    linear_solver: Solver
     hessian: Hessian
     progress: Callable[[int, float], None] | None
 
