@@ -29,6 +29,8 @@ class Status(IntEnum):
     """The answer lies behind a camera."""
     NO_CONSENSUS = 6
     """No hypothesis was supported by more data than any sample supports."""
+    INTERRUPTED = 7
+    """Stopped from outside; the value returned is the best seen."""
 
 
 @dataclass(frozen=True)

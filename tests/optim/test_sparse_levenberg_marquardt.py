@@ -239,16 +239,43 @@ def test_float32_comes_back_as_float32(scene: Scene) -> None:
     np.testing.assert_allclose(result.cost, solve(scene.blocks(), [scene.term()]).cost, rtol=1e-4)
 
 
-def test_interrupt_comes_through(scene: Scene) -> None:
+@pytest.mark.parametrize("way", ["raise", "return"])
+def test_interrupt_returns_the_best_so_far(scene: Scene, way: str) -> None:
     before = scene.point.clone()
+    costs = []
 
-    def stop(iteration: int, cost: float) -> None:
-        if iteration == 2:
+    def stop(iteration: int, cost: float) -> bool | None:
+        costs.append(cost)
+        if iteration == 2 and way == "raise":
             raise KeyboardInterrupt
+        return iteration < 2
 
-    with pytest.raises(KeyboardInterrupt):
-        solve(scene.blocks(), [scene.term()], progress=stop)
+    result = solve(scene.blocks(), [scene.term()], progress=stop)
+    assert result.status == Status.INTERRUPTED
+    assert result.iterations == len(costs) == 2
+    assert result.cost == costs[-1] < result.initial_cost
+    same = sparse_levenberg_marquardt(
+        scene.blocks(), [scene.term()], eliminate="point", function_tolerance=0.0, max_iterations=2
+    )
+    assert torch.equal(same.x["point"], result.x["point"])
     assert torch.equal(scene.point, before)
+
+
+def test_interrupt_inside_a_step(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    plain = schur.Elimination.linearize
+
+    def linearize(self: schur.Elimination, x: dict[str, Tensor]) -> object:
+        calls.append(x)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return plain(self, x)
+
+    monkeypatch.setattr(schur.Elimination, "linearize", linearize)
+    result = solve(scene.blocks(), [scene.term()])
+    assert result.status == Status.INTERRUPTED
+    assert torch.equal(result.x["point"], calls[2]["point"].contiguous())
+    assert result.cost < result.initial_cost
 
 
 def test_wrong_arguments(scene: Scene) -> None:

@@ -24,8 +24,8 @@ class BundleResult:
 
     `residuals` are distances in the image, pixels, inf where `used` is False: weight 0, or not finite at the start (a NaN
     coordinate, a camera or point that is not finite). `cost` and `initial_cost` are `sum w rho(residual^2) / 2` (and priors).
-    `status`: `OK` where a tolerance was met, `NOT_CONVERGED` where the iteration limit came first, `TOO_FEW` where nothing
-    was free and observed, `NOT_FINITE` where no observation could be used.
+    `status`: `OK` where a tolerance was met, `NOT_CONVERGED` where the iteration limit came first, `INTERRUPTED` where it was
+    stopped, `TOO_FEW` where nothing was free and observed, `NOT_FINITE` where no observation could be used.
     """
 
     poses: Pose
@@ -66,7 +66,7 @@ def bundle_adjust(
     tolerance: float = 1e-6,
     linear_solver: Solver = "auto",
     hessian: Hessian = "exact",
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[int, float], bool | None] | None = None,
 ) -> BundleResult:
     """Minimise the reprojection error over poses, cameras and points together (Triggs et al. 2000; HZ 18.1).
 
@@ -106,7 +106,7 @@ def bundle_adjust(
         tolerance: End when a step lowers the cost by less than this fraction.
         linear_solver: "dense", "pcg" (for thousands of cameras), or "auto"; see `sparse_levenberg_marquardt`.
         hessian: Used for derivatives only: "exact", or "gauss-newton", cheaper and some percent off where residuals are large.
-        progress: Called with the number of steps and the cost after each.
+        progress: Called with the number of steps and the cost after each; False, or an interrupt, ends it with the best so far.
 
     Returns:
         The adjusted poses, cameras and points, in the dtype given, with costs and residuals. Where observations, weights, or

@@ -71,7 +71,7 @@ class BundleOptions(TypedDict, total=False):
     tolerance: float
     linear_solver: Solver
     hessian: Hessian
-    progress: Callable[[int, float], None] | None
+    progress: Callable[[int, float], bool | None] | None
 
 
 @dataclass(frozen=True)

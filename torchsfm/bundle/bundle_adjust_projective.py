@@ -48,7 +48,7 @@ def bundle_adjust_projective(
     max_iterations: int = 50,
     tolerance: float = 1e-6,
     hessian: Hessian = "exact",
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[int, float], bool | None] | None = None,
 ) -> ProjectiveBundleResult:
     """Minimise the reprojection error over projective cameras and points (HZ 18.1; Triggs et al. 2000).
 
@@ -73,7 +73,7 @@ def bundle_adjust_projective(
         max_iterations: Most steps tried.
         tolerance: End when a step lowers the cost by less than this fraction.
         hessian: Used for derivatives only, as in `bundle_adjust`.
-        progress: Called with the number of steps and the cost after each.
+        progress: Called with the number of steps and the cost after each; False, or an interrupt, ends it with the best so far.
 
     Returns:
         Cameras and points in the frame and dtype given; those fixed or not observed bit for bit. Where observations, weights or

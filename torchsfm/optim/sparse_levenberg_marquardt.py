@@ -23,8 +23,8 @@ class SparseResult:
 
     `x` holds every block, `residuals` every term's residuals (m, d) there, `used` (m) which of them count: a residual that is
     not finite at the start is left out. `status` is `Status.OK` where a tolerance was met or no step lowers the cost any more,
-    `NOT_CONVERGED` where the iteration limit came first, `TOO_FEW` where nothing is free or observed, `NOT_FINITE` where no
-    residual is finite.
+    `NOT_CONVERGED` where the iteration limit came first, `INTERRUPTED` where it was stopped from outside, `TOO_FEW` where
+    nothing is free or observed, `NOT_FINITE` where no residual is finite.
     """
 
     x: dict[str, Tensor]
@@ -48,7 +48,7 @@ def sparse_levenberg_marquardt(
     initial_damping: float = 1e-4,
     linear_solver: Solver = "auto",
     hessian: Hessian = "exact",
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[int, float], bool | None] | None = None,
 ) -> SparseResult:
     """Minimise a sum of terms over variable blocks.
 
@@ -69,7 +69,9 @@ def sparse_levenberg_marquardt(
             more of them, in memory that grows with the residuals alone); "auto" takes what the size suggests.
         hessian: Used for derivatives of the minimum only: "exact", or "gauss-newton", which leaves out second derivatives of
             the residuals and is some percent off where residuals are large.
-        progress: Called with the number of iterations and the cost after each.
+        progress: Called with the number of iterations and the cost after each. Returning False ends the minimisation; so does
+            an interrupt (Ctrl-C), there or anywhere else in the iterations. Either way the best so far is returned, with
+            the status INTERRUPTED: who has more to do after it looks there.
 
     Returns:
         The minimum. Where data, weights or fixed variables require a gradient, `x` and `residuals` carry their derivatives by
@@ -81,7 +83,7 @@ def sparse_levenberg_marquardt(
     _check(blocks, terms, eliminate)
     if linear_solver not in get_args(Solver):
         raise ValueError(f"linear_solver: wanted one of {get_args(Solver)}, got {linear_solver!r}")
-    options = (max_iterations, function_tolerance, gradient_tolerance, step_tolerance, initial_damping, progress)
+    options = _Options(max_iterations, function_tolerance, gradient_tolerance, step_tolerance, initial_damping, progress)
     with torch.no_grad():
         double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
         x = {name: b.x for name, b in double.items()}
@@ -91,75 +93,88 @@ def sparse_levenberg_marquardt(
         layout = lay_out(double, counted, eliminate)
         # A residual of fixed variables is a constant of the cost.
         constant = sum((float(term_cost(t, term_residual(t, x))) for t in layout.still), 0.0)
+        state = _Descent(x, 0.0, 0.0)
         if layout.pieces:
-            found = _descend(Elimination(double, layout, linear_solver), x, constant, *options)
+            engine = Elimination(double, layout, linear_solver)
+            state.cost = state.initial = float(engine.cost(x))
+            status = _run(engine, state, constant, options)
         else:
             none = any(u.numel() for u in used) and not any(bool(u.any()) for u in used)
-            found = _End(x, constant, constant, 0, Status.NOT_FINITE if none else Status.TOO_FEW)
-    x = found.x
+            status = Status.NOT_FINITE if none else Status.TOO_FEW
+    x = state.x
     if wants_derivative(*followed(dict(blocks), terms)):
         x = attach_sparse_optimum(dict(blocks), terms, x, used, eliminate, hessian)
         plain = [replace(term, data=tuple(_double(d) for d in term.data)) for term in terms]
     residuals = tuple(term_residual(t, x) for t in plain)
     out = {name: x[name].to(b.x.dtype).contiguous() for name, b in blocks.items()}
-    return SparseResult(out, found.cost, found.initial, residuals, used, found.iterations, found.status)
+    cost, initial = state.cost + constant, state.initial + constant
+    return SparseResult(out, cost, initial, residuals, used, state.iterations, status)
 
 
-@dataclass(frozen=True)
-class _End:
+@dataclass
+class _Descent:
+    """Where the minimisation stands, at any moment the best so far."""
+
     x: dict[str, Tensor]
     cost: float
     initial: float
-    iterations: int
-    status: Status
+    iterations: int = 0
 
 
-def _descend(
-    engine: Elimination,
-    x: dict[str, Tensor],
-    constant: float,
-    max_iterations: int,
-    function_tolerance: float,
-    gradient_tolerance: float,
-    step_tolerance: float,
-    damping: float,
-    progress: Callable[[int, float], None] | None,
-) -> _End:
+@dataclass(frozen=True)
+class _Options:
+    max_iterations: int
+    function_tolerance: float
+    gradient_tolerance: float
+    step_tolerance: float
+    initial_damping: float
+    progress: Callable[[int, float], bool | None] | None
+
+
+def _run(engine: Elimination, state: _Descent, constant: float, options: _Options) -> Status:
+    """Descend; an interrupt ends it where it is."""
+    try:
+        return _descend(engine, state, constant, options)
+    except KeyboardInterrupt:
+        return Status.INTERRUPTED
+
+
+def _descend(engine: Elimination, state: _Descent, constant: float, options: _Options) -> Status:
     """Damped steps until a tolerance is met; a rejected step keeps the linearisation."""
-    cost = initial = float(engine.cost(x))
-    system = engine.linearize(x)
-    growth = 2.0
-    for iteration in range(1, max_iterations + 1):
+    system = engine.linearize(state.x)
+    damping, growth = options.initial_damping, 2.0
+    for iteration in range(1, options.max_iterations + 1):
         slope = float(system.gradient())
-        if slope <= gradient_tolerance or not math.isfinite(slope):
-            status = Status.OK if math.isfinite(slope) else Status.NOT_FINITE
-            return _End(x, cost + constant, initial + constant, iteration - 1, status)
+        if slope <= options.gradient_tolerance or not math.isfinite(slope):
+            return Status.OK if math.isfinite(slope) else Status.NOT_FINITE
+        cost = state.cost
         step, promised, solvable = system.step(damping)
         solved, promise = bool(solvable), float(promised)
-        trial = move(engine.blocks, engine.layout, x, step)
+        trial = move(engine.blocks, engine.layout, state.x, step)
         trial_cost = float(engine.cost(trial)) if solved else math.inf
         ratio = (cost - trial_cost) / max(promise, 1e-300)
         # Below the rounding error of the cost a step is taken on its promise: it brings x, not the cost, to its end.
         rounding = solved and promise <= 1e-12 * cost and trial_cost - cost <= 1e-14 * cost
         accepted = rounding or (trial_cost < cost and ratio > 1e-3)
         # A promise far below the tolerance ends it, kept or not: rounding decides whether such a step lowers the cost.
-        done = solved and promise <= 1e-2 * function_tolerance * cost
-        done = done or (solved and _length(step) <= step_tolerance * (_length(x) + step_tolerance))
+        done = solved and promise <= 1e-2 * options.function_tolerance * cost
+        done = done or (solved and _length(step) <= options.step_tolerance * (_length(state.x) + options.step_tolerance))
         if accepted:
-            done = done or (not rounding and cost - trial_cost <= function_tolerance * cost)
-            x, cost = trial, trial_cost
+            done = done or (not rounding and cost - trial_cost <= options.function_tolerance * cost)
+            state.x, state.cost = trial, trial_cost
             damping = max(damping * max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3), 1e-16)
             growth = 2.0
         else:
             damping, growth = damping * growth, 2 * growth
-        if progress is not None:
-            progress(iteration, cost + constant)
+        state.iterations = iteration
+        if options.progress is not None and options.progress(iteration, state.cost + constant) is False:
+            return Status.OK if done else Status.INTERRUPTED
         # At the largest damping no step whatever lowers the cost.
         if done or damping > 1e16:
-            return _End(x, cost + constant, initial + constant, iteration, Status.OK)
-        if accepted:
-            system = engine.linearize(x)
-    return _End(x, cost + constant, initial + constant, max_iterations, Status.NOT_CONVERGED)
+            return Status.OK
+        if accepted and iteration < options.max_iterations:
+            system = engine.linearize(state.x)
+    return Status.NOT_CONVERGED
 
 
 def _double(x: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
 from torchsfm.geometry import Camera
 from torchsfm.optim import Cauchy
@@ -72,6 +73,9 @@ def adjust(
         max_iterations=max_iterations,
         tolerance=tolerance,
     )
+    if result.status == Status.INTERRUPTED:
+        # There is more to do than this: let the interrupt through.
+        raise KeyboardInterrupt
     return replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X)
 
 
