@@ -8,12 +8,12 @@ from torch import Tensor
 def line_and_plane_distances(
     X: Float[Tensor, "*batch n d"], present: Bool[Tensor, "*batch n"], steps: int = 4
 ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
-    """The distances of points from the line and from the hyperplane that most of them are near to.
+    """The distances of points from the line and from the plane that most of them are near to.
 
     Principal axes of reweighted moments (weights 1 / (distance + rms distance)), so that a few points aside do not matter.
 
     Args:
-        X: Points of any dimension from 2 on.
+        X: Points in two or more dimensions.
         present: Which points count.
         steps: How often to weigh anew.
 
@@ -22,7 +22,7 @@ def line_and_plane_distances(
     """
     X = torch.where(present[..., None], X, 0).double()
     found = []
-    for axes in (1, X.shape[-1] - 1):
+    for axes in (1, 2) if X.shape[-1] > 2 else (1,):
         weights = present.to(X.dtype)
         distance = torch.zeros_like(weights)
         for _ in range(steps):
@@ -37,4 +37,4 @@ def line_and_plane_distances(
             spread = (torch.where(present, distance, 0).sum(-1, keepdim=True) / number).clamp(min=1e-300)
             weights = torch.where(present, spread / (distance + 1e-2 * spread), 0)
         found.append(distance)
-    return found[0], found[1]
+    return found[0], found[-1]

@@ -123,11 +123,7 @@ def matrices(entries: Float[Tensor, "*batch nn"], n: int) -> Float[Tensor, "*bat
     return entries.reshape(*entries.shape[:-1], n, n)
 
 
-def cofactor_rows(F: Float[Tensor, "*batch 3 3"]) -> list[list[Tensor]]:
-    """The cofactors of a matrix: the gradient of its determinant."""
-    (a, b, c), (d, e, f), (g, h, i) = ([F[..., i, j] for j in range(3)] for i in range(3))
-    return [
-        [e * i - f * h, f * g - d * i, d * h - e * g],
-        [c * h - b * i, a * i - c * g, b * g - a * h],
-        [b * f - c * e, c * d - a * f, a * e - b * d],
-    ]
+def cofactors(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The matrix of cofactors: the gradient of the determinant. Its rows are cross products of rows."""
+    C: Tensor = torch.linalg.cross(F.roll(-1, -2), F.roll(-2, -2))
+    return C

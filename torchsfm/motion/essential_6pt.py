@@ -16,7 +16,7 @@ from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.geometry.rotations import cross_matrix
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.rows import add_rows, combine_rows
-from torchsfm.motion.epipolar_fit import cofactor_rows
+from torchsfm.motion.epipolar_fit import cofactors
 from torchsfm.optim import attach_implicit, wants_derivative
 from torchsfm.robust import damped_solve
 
@@ -216,7 +216,7 @@ def _cost(R: Tensor, t: Tensor, d1: Tensor, d2: Tensor) -> Tensor:
 def _pose(E: Float[Tensor, "batch 3 3"]) -> tuple[Tensor, Tensor]:
     """One of the four poses of a matrix near an essential one (Horn 1990), a rotation to second order."""
     E = E * (2**0.5 / E.flatten(-2).norm(dim=-1)[:, None, None])
-    C = torch.stack([torch.stack(row, -1) for row in cofactor_rows(E)], -2)
+    C = cofactors(E)
     best = (C * C).sum(-2).argmax(-1)
     t = C.gather(-1, best[:, None, None].expand(-1, 3, 1))[..., 0]
     t = t / t.norm(dim=-1, keepdim=True).clamp_min(1e-280)

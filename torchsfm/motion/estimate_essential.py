@@ -11,7 +11,7 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.geometry import cross_matrix, rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import (
     bilinear,
-    cofactor_rows,
+    cofactors,
     cross_rows,
     forms,
     normal_equations,
@@ -55,7 +55,7 @@ class RelativePoseEstimator:
         solutions = essential_5pt(d1, d2)
         E = solutions.model
         h1, h2 = sphere_rows(d1[..., None, :, :]), sphere_rows(d2[..., None, :, :])
-        C = torch.stack([torch.stack(row, -1) for row in cofactor_rows(E)], -2)
+        C = cofactors(E)
         best = (C * C).sum(-2).argmax(-1)
         t = C.gather(-1, best[..., None, None].expand(*best.shape, 3, 1))[..., 0]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()

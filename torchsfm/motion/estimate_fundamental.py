@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.motion.epipolar_fit import (
     bilinear,
-    cofactor_rows,
+    cofactors,
     cross_rows,
     forms,
     matrices,
@@ -87,11 +87,11 @@ class FundamentalEstimator:
         """
         A, b = normal_equations(model[..., :3], plane_rows(x1), plane_rows(x2), weights, sphere=False)
         F, e = model[..., :3].double(), model[..., 3].double()
-        f, cofactors = F.flatten(-2), torch.stack([c for row in cofactor_rows(F) for c in row], -1)
+        f, normal = F.flatten(-2), cofactors(F).flatten(-2)
         A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * f[..., :, None] * f[..., None, :]
-        free, bound = damped_solve(A, torch.stack((b, cofactors), -1)).unbind(-1)
-        gap = (cofactors * f).sum(-1) / 3 - (cofactors * free).sum(-1)
-        share = (cofactors * bound).sum(-1)
+        free, bound = damped_solve(A, torch.stack((b, normal), -1)).unbind(-1)
+        gap = (normal * f).sum(-1) / 3 - (normal * free).sum(-1)
+        share = (normal * bound).sum(-1)
         f = f - free - (gap / torch.where(share > 0, share, torch.inf))[..., None] * bound
         F = matrices(f * (f * f).sum(-1, keepdim=True).rsqrt(), 3)
         return _with_epipole(F, e).to(x1.dtype)
@@ -137,7 +137,7 @@ class FundamentalEstimator:
 
 def _left_epipole(F: Tensor) -> Tensor:
     """The left null vector, of norm 1: the largest column of the matrix of cofactors."""
-    C = torch.stack([torch.stack(row, -1) for row in cofactor_rows(F)], -2)
+    C = cofactors(F)
     square = (C * C).sum(-2)
     best = square.argmax(-1, keepdim=True)
     e = C.gather(-1, best[..., None, :].expand(*C.shape[:-1], 1))[..., 0]
@@ -151,7 +151,7 @@ def _with_epipole(F: Tensor, e: Tensor) -> Tensor:
 
 
 def _cofactors(f: Tensor) -> Tensor:
-    return torch.stack([c for row in cofactor_rows(matrices(f, 3)) for c in row], -1)
+    return cofactors(matrices(f, 3)).flatten(-2)
 
 
 def _determinant_step(f: Tensor) -> Tensor:

@@ -119,17 +119,18 @@ def plane_rivals(
         threshold: Largest distance of an inlier.
         seed: Seed for the pairs.
     """
-    F, e, h1, h2 = model[..., :3], model[..., 3], plane_rows(x1), plane_rows(x2)
     limit = threshold * threshold
-    near = (estimator.squared_residual(model, x1, x2) < limit[:, None]) & inside
-    H, on = dominant_plane(cross_rows(e, F), e, h1, h2, near, 4 * limit, sphere=False)
+    # First a look at a part, spread over all.
+    some = min(x1.shape[1], 2 * _OFF_PLANE)
+    _, on, near = _on_plane(estimator, model, x1[:, :some], x2[:, :some], inside[:, :some], limit)
     suspect = (2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)
     out = model[:, None].expand(-1, _RIVALS, -1, -1).clone()
     valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
     row = suspect.nonzero()[:, 0]
     if not len(row):
         return Solutions(out, valid)
-    y1, y2, there, bound, H, on = x1[row], x2[row], inside[row], limit[row], H[row], on[row]
+    y1, y2, there, bound = x1[row], x2[row], inside[row], limit[row]
+    H, on, _ = _on_plane(estimator, model[row], y1, y2, there, bound)
     for _ in range(3):
         H = plane_estimator.refine(H, y1, y2, weights=on.to(H.dtype))
         on = there & (plane_estimator.squared_residual(H, y1, y2) < 4 * bound[:, None])
@@ -159,6 +160,16 @@ def plane_rivals(
     out[row] = both.gather(1, least.indices[..., None, None].expand(-1, -1, 3, 4))
     valid[row] = (least.values < counts.sum(-1, keepdim=True)) & (count >= 2)[:, None]
     return Solutions(out, valid)
+
+
+def _on_plane(
+    estimator: Any, model: Tensor, x1: Tensor, x2: Tensor, inside: Tensor, limit: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The homography of the dominant plane, the inliers on it, and all inliers."""
+    F, e = model[..., :3], model[..., 3]
+    near = (estimator.squared_residual(model, x1, x2) < limit[:, None]) & inside
+    H, on = dominant_plane(cross_rows(e, F), e, plane_rows(x1), plane_rows(x2), near, 4 * limit, sphere=False)
+    return H, on, near
 
 
 def fundamentals_of_parallax(

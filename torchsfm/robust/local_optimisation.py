@@ -18,10 +18,10 @@ LOCAL_STEPS = (9.0, 4.0, 1.5, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 _LEAST = 1e-6
 """Smallest variance of the noise in units of the squared threshold."""
-SCALE_STEPS, FIXED_STEPS = 4, 4
+SCALE_STEPS, FIXED_STEPS = 3, 4
 """Rounds of the final refinement that estimate the scale of the noise, and rounds that hold it."""
-LOCAL_DATA = 512
-"""Local optimisation looks at this many data at most."""
+LOCAL_DATA, SCALE_DATA = 256, 512
+"""Local optimisation, and the estimation of the scale, look at so many data at most."""
 
 
 def optimise_locally(

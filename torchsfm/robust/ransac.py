@@ -5,6 +5,7 @@ Sample, score, optimise locally, stop: LO-RANSAC (Chum, Matas & Kittler 2003). T
 data and the seed alone: the sizes of all arrays that touch a problem follow from its own number of data.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
@@ -15,7 +16,7 @@ from torch import Tensor
 from torchsfm._types import Status, check_tensors, tensor_map
 from torchsfm.robust.degeneracy import Degeneracy
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.models import cast, zip_map
+from torchsfm.robust.models import cast, join
 from torchsfm.robust.optimum import attach_derivative, has_manifold, step_covariance
 from torchsfm.robust.problems import Problems, pack
 from torchsfm.robust.scores import LeastMedian, Msac, Score
@@ -23,6 +24,9 @@ from torchsfm.robust.scoring import around_model, beyond_chance, squared_residua
 from torchsfm.robust.search import Best, Options, no_model, search
 
 M = TypeVar("M")
+
+_GLANCE = 256
+"""How many data to look at first for a degeneracy."""
 
 
 @dataclass(frozen=True)
@@ -141,13 +145,13 @@ def ransac(
         enough = (usable.sum(-1) >= estimator.sample_size) & torch.isfinite(square) & (bound > 0)
         status = torch.full((p,), int(Status.NOT_FINITE), dtype=torch.int8, device=device)
         status[exists.sum(-1) < estimator.sample_size] = int(Status.TOO_FEW)
-        model = no_model(fields, flat, p)
         inliers = torch.zeros(p, n, dtype=torch.bool, device=device)
         support = torch.zeros(p, dtype=torch.float64, device=device)
         iterations = torch.zeros(p, dtype=torch.long, device=device)
         degeneracy = torch.full((p,), int(Degeneracy.TOO_FEW), dtype=torch.int8, device=device)
         selected, reach = torch.zeros_like(inliers), torch.ones_like(support)
         options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype, score)
+        found: list[tuple[Tensor, M]] = []
         given = None if counts is None else counts.detach()
         for problems in pack(fields, flat, usable, enough, square, trust, given):
             best = search(problems, options)
@@ -165,7 +169,7 @@ def ransac(
             )
             fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
             status[member] = torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8)
-            model = zip_map(lambda old, new: old.index_copy(0, member, new), model, best.model)  # noqa: B023
+            found.append((member, best.model))
             inliers[member] = problems.scatter(near, n)
             support[member] = soft
             iterations[member] = best.iterations
@@ -174,6 +178,7 @@ def ransac(
             within = (squared < best.reach[:, None]) & problems.inside & optimal[:, None]
             selected[member] = problems.scatter(within, n)
             reach[member] = torch.where(optimal, best.reach, 1)
+    model = _together(found, fields, flat, p)
     counts = torch.ones_like(usable, dtype=torch.float64) if counts is None else counts
     spread = step_covariance(fields, model, flat, counts.detach(), selected, reach) if covariance else None
     model = attach_derivative(own, model, graph, counts, selected, reach)
@@ -189,15 +194,29 @@ def ransac(
     )
 
 
+def _together(found: Sequence[tuple[Tensor, M]], estimator: Estimator[M], data: Sequence[Tensor], p: int) -> M:
+    """The models of all problems, zeros where there is none."""
+    if not found:
+        return no_model(estimator, data, p)
+    member = torch.cat([index for index, _ in found])
+    return tensor_map(lambda t: t.new_zeros(p, *t.shape[1:]).index_copy(0, member, t), join([model for _, model in found]))
+
+
 def _degeneracy(problems: Problems, best: Best, near: Bool[Tensor, "p n"], chance: Float[Tensor, "p"]) -> Int[Tensor, "p"]:
     """What the inliers lack, or all data where no sample determined a model."""
     estimator, solved = problems.estimator, best.solved
     code = torch.where(solved, int(Degeneracy.NONE), int(Degeneracy.UNDETERMINED)).to(torch.int8)
     if hasattr(estimator, "degeneracy"):
-        looked_at = torch.where(solved[:, None], near, problems.inside)
-        found = estimator.degeneracy(
-            best.model, *problems.data, inliers=looked_at, threshold=problems.limit.sqrt(), chance=chance
-        )
+        looked_at, found = torch.where(solved[:, None], near, problems.inside), code
+        index = torch.arange(len(near), device=near.device)
+        # What a part of the data, spread over all, already shows to be determined need not be looked at in full.
+        for part in (slice(0, _GLANCE), slice(None)) if problems.width > 2 * _GLANCE else (slice(None),):
+            some = problems.take(index)
+            model = tensor_map(lambda t: t[index], best.model)  # noqa: B023
+            data = [d[:, part] for d in some.data]
+            own = {"inliers": looked_at[index, part], "threshold": some.limit.sqrt(), "chance": chance[index]}
+            found = found.index_copy(0, index, some.estimator.degeneracy(model, *data, **own))  # type: ignore[attr-defined]
+            index = index[found[index] != Degeneracy.NONE]
         code = torch.where(solved | (found != Degeneracy.NONE), found, code)
     few = (solved & (near.sum(-1) <= estimator.sample_size)) | (problems.count <= estimator.sample_size)
     return torch.where(few, int(Degeneracy.TOO_FEW), code).to(torch.int8)

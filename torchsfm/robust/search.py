@@ -3,25 +3,28 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
-from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_locally, optimise_within, scale_of_noise
+from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.local_optimisation import LOCAL_DATA, SCALE_DATA, optimise_locally, optimise_within, scale_of_noise
 from torchsfm.robust.models import cast, join, select, take_slots, zip_map
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import draw_samples, draw_weighted, prosac_pools
 from torchsfm.robust.scores import Msac, Score, counted, limits
 from torchsfm.robust.scoring import gather_valid, losses, smallest, squared_residual, stages
 
+M = TypeVar("M")
+
 ROUNDS = (16, 32, 64, 128, 256, 512, 1024, 2048)
 """How many samples a round may draw for a problem."""
 SCORED = 8
 """Hypotheses of a round that are scored on all data."""
-OPTIMISED = 3
+OPTIMISED = 2
 """Hypotheses of a round that are optimised locally."""
 _BY_CHANCE = 0.05
 """Share of wrong data taken to agree with a wrong model, as PROSAC's end assumes."""
@@ -46,7 +49,7 @@ class Best:
     """The best model found for each problem.
 
     Attributes:
-        model: The model.
+        model: The model; zeros where no sample had a solution, None before the first round.
         loss: Its cost over all data; infinite where there is none.
         limit: Its squared threshold.
         needed: How many samples would do, judging by its inliers.
@@ -71,9 +74,8 @@ def search(problems: Problems, options: Options) -> Best:
     p, device = len(problems.count), problems.count.device
     infinite = torch.full((p,), torch.inf, dtype=options.dtype, device=device)
     none = torch.zeros(p, dtype=torch.long, device=device)
-    model = cast(no_model(problems.estimator, problems.data, p), options.dtype)
     limit = problems.limit.to(options.dtype)
-    best = Best(model, infinite, limit, infinite.double(), infinite, none > 0, none, torch.zeros_like(infinite))
+    best = Best(None, infinite, limit, infinite.double(), infinite, none > 0, none, torch.zeros_like(infinite))
     coarse = problems.cast(options.dtype)
     active = torch.arange(p, device=device)
     while len(active):
@@ -93,7 +95,7 @@ def _round_size(drawn: Int[Tensor, "g"], needed: Float[Tensor, "g"], options: Op
     return torch.where(rest > 0, size, 0)
 
 
-def no_model(estimator: Any, data: Sequence[Tensor], number: int) -> Any:
+def no_model(estimator: Estimator[M], data: Sequence[Tensor], number: int) -> M:
     """Zeros in the form of a model for each of a number of problems."""
     none = tensor_map(lambda t: t[:0], estimator)
     samples = [d.new_zeros(0, estimator.sample_size, d.shape[-1]) for d in data]
@@ -141,6 +143,8 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
         parts.append((*_cascade(coarse.take(part), cast(models, options.dtype), valid, options.score), valid.any(-1)))
     models = join([part[0] for part in parts])
     loss, solved = (torch.cat([part[i] for part in parts]) for i in (1, 2))
+    if best.model is None:
+        best = replace(best, model=tensor_map(lambda t: t.new_zeros(len(best.loss), *t.shape[2:]), models))
     best = replace(
         best,
         solved=best.solved.index_put((index,), best.solved[index] | solved),
@@ -261,9 +265,9 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         some, rough, old = fine.take(part), coarse.take(part).spread(), _take(best, part)
         wide = some.spread()
         limit = old.limit.double()
-        prefix = [d[:, :, :LOCAL_DATA] for d in rough.data]
-        inside = some.inside[:, :LOCAL_DATA]
-        weight = None if rough.weight is None else rough.weight[:, :LOCAL_DATA]
+        prefix = [d[:, :, :SCALE_DATA] for d in rough.data]
+        inside = some.inside[:, :SCALE_DATA]
+        weight = None if rough.weight is None else rough.weight[:, :SCALE_DATA]
         start = tensor_map(lambda t: t[:, None], old.model)
         model, reach = scale_of_noise(rough.estimator, start, prefix, old.limit, inside, weight)
         reach, start = reach.double() * limit, cast(start, torch.float64)
