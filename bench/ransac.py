@@ -1,21 +1,27 @@
-"""Robust estimation against PoseLib and OpenCV: time and error on simulated pairs.
+"""Robust estimation against other programs: time and error on simulated pairs, and error on real ones.
 
-`python -m bench.ransac` prints a table; `pytest bench/ransac.py` times one case of each model. Times are of one thread, as CPU
-time, so that they mean something on a busy machine. The peers are asked for the same confidence; PoseLib runs with
-`dyn_num_trials_mult=1` and `min_iterations=100`, else it would draw three times the samples.
+`python -m bench.ransac` prints the grid: every model, number of points and share of inliers, for one pair and for batches, on
+the same pairs for everybody. `--models H --points 1000 --inliers 0.5 --pairs 16 --single 4` is a short run; `--real FOLDER`
+runs over real pairs instead. `pytest bench/ransac.py` times one case of each model.
+
+With one thread times are CPU time, so that they mean something on a busy machine; with more they are the clock's. The peers are
+asked for the same confidence; PL1 is PoseLib with `dyn_num_trials_mult=1` and `min_iterations=100`, MAGSAC is OpenCV's.
 """
 
 import argparse
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from bench.ransac_peers import CONFIDENCE, MOST, PEERS, answer
+from bench.ransac_real import report
 from torchsfm.geometry import random_rotation, rotation_angle, rotation_from_rotvec
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography
 from torchsfm.resection import estimate_camera
@@ -24,10 +30,8 @@ from torchsfm.tensors import essential_from_fundamental, pose_from_essential
 FOCAL, SIZE = 800.0, 1000.0
 CENTRE = SIZE / 2
 K = torch.tensor([[FOCAL, 0, CENTRE], [0, FOCAL, CENTRE], [0, 0, 1]], dtype=torch.float64)
-CONFIDENCE = 0.9999
 POINTS, NOISE = 1000, 1.0
 THRESHOLD = {"F": 2.0, "E": 2.0, "H": 2.5, "P": 2.5}
-MOST = 100_000
 
 
 @dataclass(frozen=True)
@@ -94,59 +98,13 @@ def ours(model: str, scene: Scene, seed: int = 0) -> Tensor:
     return estimate_essential(rays(scene.x1), rays(scene.x2), threshold=threshold / FOCAL, **options).model
 
 
-def poselib(model: str, scene: Scene) -> Tensor:
-    """PoseLib, pair by pair."""
-    import poselib as pl
-
-    threshold = THRESHOLD[model]
-    options = {
-        "max_epipolar_error": threshold, "max_reproj_error": threshold, "success_prob": CONFIDENCE, "max_iterations": MOST,
-        "min_iterations": 100, "dyn_num_trials_mult": 1.0,
-    }  # fmt: skip
-    camera = {"model": "PINHOLE", "width": int(SIZE), "height": int(SIZE), "params": [FOCAL, FOCAL, CENTRE, CENTRE]}
-    results = []
-    for a, b in zip(scene.x1.numpy(), scene.x2.numpy(), strict=True):
-        if model == "F":
-            found = pl.estimate_fundamental(a, b, options, {})[0]
-        elif model == "H":
-            found = pl.estimate_homography(a, b, options, {})[0]
-        elif model == "P":
-            found = pl.estimate_absolute_pose(b, a, camera, options, {})[0].Rt
-        else:
-            pose = pl.estimate_relative_pose(a, b, camera, camera, options, {})[0]
-            found = np.cross(np.eye(3), pose.t / np.linalg.norm(pose.t)).T @ pose.R
-        results.append(torch.from_numpy(np.asarray(found)))
-    return torch.stack(results)
-
-
-def opencv(model: str, scene: Scene) -> Tensor:
-    """OpenCV's USAC_MAGSAC, pair by pair; for P its RANSAC over AP3P."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    threshold, matrix, results = THRESHOLD[model], K.numpy(), []
-    for a, b in zip(scene.x1.numpy(), scene.x2.numpy(), strict=True):
-        if model == "F":
-            found = cv2.findFundamentalMat(a, b, cv2.USAC_MAGSAC, threshold, CONFIDENCE, MOST)[0]
-        elif model == "H":
-            found = cv2.findHomography(a, b, cv2.USAC_MAGSAC, threshold, maxIters=MOST, confidence=CONFIDENCE)[0]
-        elif model == "P":
-            _, r, t, _ = cv2.solvePnPRansac(
-                a,
-                b,
-                matrix,
-                None,
-                iterationsCount=MOST,
-                reprojectionError=threshold,
-                confidence=CONFIDENCE,
-                flags=cv2.SOLVEPNP_AP3P,
-            )
-            found = np.concatenate((cv2.Rodrigues(r)[0], t), 1)
-        else:
-            found = cv2.findEssentialMat(a, b, matrix, cv2.USAC_MAGSAC, CONFIDENCE, threshold, MOST)[0]
-        shape = (3, 4) if model == "P" else (3, 3)
-        results.append(torch.zeros(shape, dtype=torch.float64) if found is None else torch.from_numpy(found[:3]))
-    return torch.stack(results)
+def peer(name: str, model: str, scene: Scene) -> Tensor:
+    """Another program, pair by pair."""
+    found = [
+        torch.from_numpy(answer(name, model, a, b, K.numpy(), THRESHOLD[model]))
+        for a, b in zip(scene.x1.numpy(), scene.x2.numpy(), strict=True)
+    ]
+    return torch.stack(found)
 
 
 def errors(model: str, scene: Scene, found: Tensor) -> Tensor:
@@ -168,48 +126,77 @@ def errors(model: str, scene: Scene, found: Tensor) -> Tensor:
 
 
 def measure(run: Callable[[], Tensor]) -> tuple[float, Tensor]:
-    """CPU seconds of one call, and what it returned."""
-    start = time.process_time()
+    """Seconds of one call, and what it returned."""
+    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+    start = clock()
     found = run()
-    return time.process_time() - start, found
+    return clock() - start, found
+
+
+def part(scene: Scene, index: slice) -> Scene:
+    """Some of the pairs."""
+    return Scene(*(None if f is None else f[index] for f in vars(scene).values()))
+
+
+def grid(arguments: argparse.Namespace) -> None:
+    """Print the table of the simulated pairs."""
+    print(
+        f"{'model':5} {'points':>6} {'inliers':>7} {'candidate':14} {'ms/pair':>8} {'median':>8} {'p95':>8}   (degrees; H: px)"
+    )
+    most = max(arguments.pairs)
+    for model in arguments.models:
+        for points in arguments.points:
+            for ratio in arguments.inliers:
+                scene = scenes(model, most, ratio, arguments.seed, points)
+                rows: list[tuple[str, float, Tensor]] = []
+                for name in filter(None, arguments.peers.split(",")):
+                    if name == "kornia" and model not in "FH":
+                        continue
+                    few = part(scene, slice(arguments.peer_pairs))
+                    seconds, found = measure(lambda: peer(name, model, few))  # noqa: B023
+                    rows.append((name, seconds / len(found), errors(model, few, found)))
+                ours(model, part(scene, slice(2)))
+                if arguments.single:
+                    seconds, parts = 0.0, []
+                    for i in range(arguments.single):
+                        one = part(scene, slice(i, i + 1))
+                        spent, found = measure(lambda: ours(model, one))  # noqa: B023
+                        seconds, parts = seconds + spent, [*parts, errors(model, one, found)]
+                    rows.append(("ours, single", seconds / arguments.single, torch.cat(parts)))
+                for pairs in arguments.pairs:
+                    some = part(scene, slice(pairs))
+                    seconds, found = measure(lambda: ours(model, some))  # noqa: B023
+                    rows.append((f"ours, batch {pairs}", seconds / pairs, errors(model, some, found)))
+                for name, spent, error in rows:
+                    p95, median = error.quantile(0.95).item(), error.median().item()
+                    print(
+                        f"{model:5} {points:6} {ratio:7.2f} {name:14} {spent * 1e3:8.2f} {median:8.4f} {p95:8.4f}", flush=True
+                    )
 
 
 def main() -> None:
-    """Print the table."""
+    """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--models", default="FHPE")
     parser.add_argument("--inliers", type=float, nargs="+", default=[0.3, 0.5, 0.8])
-    parser.add_argument("--pairs", type=int, default=64)
+    parser.add_argument("--points", type=int, nargs="+", default=[200, 1000, 5000])
+    parser.add_argument("--pairs", type=int, nargs="+", default=[64, 256], help="sizes of the batches")
     parser.add_argument("--single", type=int, default=8, help="how many pairs to run one by one")
-    parser.add_argument("--points", type=int, default=POINTS)
+    parser.add_argument("--peer-pairs", type=int, default=64, help="how many pairs the peers get")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--peers", default="PoseLib,OpenCV")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--peers", default=",".join(PEERS), help=f"any of {', '.join(PEERS)}")
+    parser.add_argument("--real", type=Path, help="folder of the real data sets")
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    peers = {"PoseLib": poselib, "OpenCV": opencv}
-    print(f"{'model':5} {'inliers':>7} {'candidate':14} {'ms/pair':>8} {'median':>8} {'p95':>8}   (degrees; H: px)")
-    for model in arguments.models:
-        for ratio in arguments.inliers:
-            scene = scenes(model, arguments.pairs, ratio, arguments.seed, arguments.points)
-            rows: list[tuple[str, float, Tensor]] = []
-            for name in filter(None, arguments.peers.split(",")):
-                seconds, found = measure(lambda: peers[name](model, scene))  # noqa: B023
-                rows.append((name, seconds / arguments.pairs, errors(model, scene, found)))
-            ours(model, Scene(*(None if f is None else f[:2] for f in vars(scene).values())))
-            if arguments.single:
-                seconds, parts = 0.0, []
-                for i in range(arguments.single):
-                    one = Scene(*(None if f is None else f[i : i + 1] for f in vars(scene).values()))
-                    spent, found = measure(lambda: ours(model, one))  # noqa: B023
-                    seconds, parts = seconds + spent, [*parts, errors(model, one, found)]
-                rows.append(("ours, single", seconds / arguments.single, torch.cat(parts)))
-            seconds, found = measure(lambda: ours(model, scene))  # noqa: B023
-            rows.append((f"ours, batch {arguments.pairs}", seconds / arguments.pairs, errors(model, scene, found)))
-            for name, spent, error in rows:
-                p95 = error.quantile(0.95).item()
-                print(
-                    f"{model:5} {ratio:7.2f} {name:14} {spent * 1e3:8.2f} {error.median().item():8.4f} {p95:8.4f}", flush=True
-                )
+    torch.set_num_threads(arguments.threads)
+    with contextlib.suppress(ImportError):
+        import cv2
+
+        cv2.setNumThreads(arguments.threads)
+    if arguments.real:
+        report(arguments.real, [name for name in filter(None, arguments.peers.split(",")) if name != "kornia"])
+    else:
+        grid(arguments)
 
 
 @pytest.mark.parametrize("model", ["F", "H", "P", "E"])
