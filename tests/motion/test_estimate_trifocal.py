@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.motion import TrifocalEstimator, estimate_trifocal, quadrifocal_6pt, trifocal_7pt
+from torchsfm.robust import Degeneracy
 from torchsfm.tensors import (
     quadrifocal_from_cameras,
     transfer_points_quadrifocal,
@@ -73,6 +74,30 @@ def test_refined_estimate_is_better_than_the_algebraic_one(generator: torch.Gene
     robust = transfer_error(estimate_trifocal(x, threshold=4.0, generator=generator).model, held).median(-1).values
     algebraic = transfer_error(trifocal_7pt(x).P, held).median(-1).values
     assert robust.mean() < 1.05 * algebraic.mean()
+
+
+def test_derivatives_covariance_and_degeneracy(generator: torch.Generator) -> None:
+    x, _, _ = scene(1, 40, 0.1, generator, noise=0.3)
+    seed = lambda: torch.Generator().manual_seed(1)  # noqa: E731
+    found = estimate_trifocal(x.requires_grad_(), threshold=2.0, generator=seed(), covariance=True)
+    assert found.degeneracy == Degeneracy.NONE
+    assert found.covariance is not None
+    assert found.covariance.shape == (1, 36, 36)
+    # The gradient against the estimate from moved points.
+    weight = torch.randn(1, 3, 3, 4, generator=generator, dtype=F64) / found.model.detach().abs().clamp(min=1e-3)
+    (grad,) = torch.autograd.grad((found.model * weight).sum(), x)
+    d = torch.randn(x.shape, generator=generator, dtype=F64) * found.inliers[:, None, :, None]
+    h = 1e-3
+    models = [estimate_trifocal(x.detach() + s * h * d, threshold=2.0, generator=seed()).model for s in (1, -1)]
+    slope = ((models[0] - models[1]) * weight).sum() / (2 * h)
+    torch.testing.assert_close((grad * d).sum(), slope, rtol=0.02, atol=1e-6)
+    P = cameras(4, v=3, generator=generator)
+    X = points(4, n=60, generator=generator)
+    X[..., 2] = 0.4 * X[..., 0]
+    flat = images(P, X) + 0.3 * torch.randn(4, 3, 60, 2, generator=generator, dtype=F64)
+    planar = estimate_trifocal(flat, threshold=2.0, generator=seed(), max_iterations=200)
+    assert (planar.degeneracy[planar.status == Status.OK] == Degeneracy.PLANAR).all()
+    assert (planar.status == Status.OK).any()
 
 
 def test_bad_problems_and_scale_of_the_threshold(generator: torch.Generator) -> None:

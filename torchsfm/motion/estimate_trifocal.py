@@ -4,15 +4,17 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.motion.multilinear_fit import frame_directions, inverse_similarity
+from torchsfm.motion.epipolar_fit import plane_rows
+from torchsfm.motion.multilinear_fit import frame_directions, free_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
+from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
-from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
 from torchsfm.tensors import canonical_cameras
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -31,6 +33,7 @@ class TrifocalEstimator:
     sample_size: ClassVar[int] = 6
     max_solutions: ClassVar[int] = 3
     codimension: ClassVar[int] = 3
+    dimension: ClassVar[int] = 18
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#batch 6 2"], x3: Float[Tensor, "*#batch 6 2"]
@@ -92,6 +95,34 @@ class TrifocalEstimator:
         moved = canonical_frame(P - step.reshape(*step.shape[:-1], 2, 3, 4), signed=False)
         return moved[..., 1:, :, :].to(x1.dtype)
 
+    def retract(
+        self, model: Float[Tensor, "*#batch 2 3 4"], step: Float[Tensor, "*#batch 18"]
+    ) -> Float[Tensor, "*batch 2 3 4"]:
+        """The cameras moved along a basis of the directions that change more than the frame and scales."""
+        delta = (free_directions(model) @ step[..., None])[..., 0]
+        moved: Tensor = model + delta.reshape(*delta.shape[:-1], 2, 3, 4)
+        return moved
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 2 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        x3: Float[Tensor, "*#batch n 2"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """PLANAR: homographies from the first image relate all inliers but so few as chance explains to both others."""
+        limit = 4 * threshold * threshold
+        planar = torch.ones_like(threshold, dtype=torch.bool)
+        for k, x in enumerate((x2, x3)):
+            A, e = model[..., k, :, :3], model[..., k, :, 3]
+            _, on = dominant_plane(A, e, plane_rows(x1), plane_rows(x), inliers, limit, sphere=False)
+            planar = planar & on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
+        return torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE)).to(torch.int8)
+
 
 def _rows(x: Tensor) -> list[Tensor]:
     return [x[..., 0], x[..., 1]]
@@ -100,43 +131,68 @@ def _rows(x: Tensor) -> list[Tensor]:
 def estimate_trifocal(
     x: Float[Tensor, "*#batch 3 n 2"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
+    covariance: bool = False,
 ) -> RobustResult[Float[Tensor, "*batch 3 3 4"]]:
     """Three projective cameras for each triplet of images, from correspondences of which many may be wrong.
 
     LO-RANSAC over six-point samples, then a robust minimum of the reprojection error over the cameras and all points. Computed
     in float64, hypotheses scored in float32. `trifocal_from_cameras` makes the tensor of them. Points of one plane, or centres
-    that coincide, leave the cameras undetermined.
+    that coincide, leave the cameras open.
 
     Args:
         x: Points in the three images.
         threshold: Largest distance of an inlier, in the unit of the points: the root of the sum of squared distances in the
-            three images to those of one point in space.
+            three images to those of one point in space. None where it is not known: more than half of the correspondences must
+            then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
+        covariance: Compute the covariance of the entries of the cameras, camera by camera and row by row.
 
     Returns:
-        Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, score, iterations, status.
+        Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, score, iterations, status, degeneracy
+        (PLANAR: homographies relate all inliers but so few as chance explains; the cameras are then some of many), covariance
+        (36 x 36, of rank 18). The cameras carry their derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x=(x, "3 n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
+    check_tensors(x=(x, "3 n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"), weights=(weights, "n"))
     y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), mask)
+    estimator = TrifocalEstimator()
     result = ransac(
-        TrifocalEstimator(), *y, threshold=scale * threshold, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32,
+        estimator, *y, threshold=None if threshold is None else scale * threshold, mask=mask,
+        scores=None if scores is None else scores.double(), weights=None if weights is None else weights.double(),
+        score=score, generator=generator, confidence=confidence, max_iterations=max_iterations,
+        scoring_dtype=torch.float32, covariance=covariance,
     )  # fmt: skip
-    first = torch.eye(3, 4, dtype=torch.float64, device=x.device).expand(*result.model.shape[:-3], 1, 3, 4)
-    P = inverse_similarity(torch.stack(S, -3)) @ torch.cat((first, result.model), -3)
-    return replace(result, model=canonical_cameras(P).to(x.dtype), score=result.score.to(x.dtype))
+    back = inverse_similarity(torch.stack(S, -3))
+
+    def in_pixels(model: Tensor) -> Tensor:
+        first = torch.eye(3, 4, dtype=model.dtype, device=model.device).expand(*model.shape[:-3], 1, 3, 4)
+        return canonical_cameras(back @ torch.cat((first, model), -3))
+
+    spread = None
+    if result.covariance is not None:
+        found = result.model.detach()
+        spread = push_forward(lambda step: in_pixels(estimator.retract(found, step)).flatten(-3), result.covariance)
+    return replace(
+        result,
+        model=in_pixels(result.model).to(x.dtype),
+        score=result.score.to(x.dtype),
+        threshold=(result.threshold / scale).to(x.dtype),
+        covariance=None if spread is None else spread.to(x.dtype),
+    )
