@@ -15,7 +15,8 @@ import numpy as np
 import torch
 
 from torchsfm.bundle import bundle_adjust_model
-from torchsfm.bundle.projection import Projection, camera_from_rows, camera_rows
+from torchsfm.bundle.intrinsics import camera_from_rows, camera_rows
+from torchsfm.bundle.projection import Projection
 from torchsfm.geometry import BundleProblem, Pose
 from torchsfm.optim import Cauchy, Huber, RigidMotion
 

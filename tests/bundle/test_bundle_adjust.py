@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import BundleResult, bundle_adjust, bundle_adjust_model
-from torchsfm.bundle.projection import Projection, camera_from_rows, camera_rows
+from torchsfm.bundle import BundleResult, bundle_adjust, bundle_adjust_model, bundle_covariance
+from torchsfm.bundle.intrinsics import camera_from_rows, camera_rows
+from torchsfm.bundle.projection import Projection
 from torchsfm.formats import read_bal
 from torchsfm.geometry import (
     DISTORTION_MODELS,
@@ -187,6 +188,38 @@ def test_shared_and_separate_intrinsics(generator: torch.Generator) -> None:
     assert torch.equal(held.cameras.K[0], guess.K[0])
     assert held.cameras.K[1, 0, 0] != guess.K[1, 0, 0]
     assert torch.equal(held.cameras.distortion.k1, guess.distortion.k1)
+
+
+def test_intrinsics_free_in_some_cameras(generator: torch.Generator) -> None:
+    """Any subset of numbers in any subset of cameras; the rest keep every bit."""
+    poses, cameras, X, x, view, point, group = make_scene(generator, groups=2)
+    start, X0 = perturb(poses, X, generator, 0.003)
+    first = torch.tensor([True, False])
+    args, options = (start, cameras, X0, x, view, point), {"camera_index": group, "tolerance": 1e-12}
+    one = bundle_adjust(*args, free=("focal",), fixed_cameras=first, **options)
+    two = bundle_adjust(*args, free=("focal",), fixed_intrinsics={"focal": first}, **options)
+    np.testing.assert_allclose(two.cost, one.cost, rtol=1e-10)
+    torch.testing.assert_close(two.X, one.X, rtol=0, atol=1e-8)
+    assert torch.equal(two.cameras.K[0], cameras.K[0])
+    free = ("focal", "principal_point", "k1", "k2")
+    fixed = {"focal": first, "principal_point": torch.tensor([True, True]), "k2": ~first}
+    mixed = bundle_adjust(*args, free=free, fixed_intrinsics=fixed, **options)
+    before, after = camera_rows(cameras), camera_rows(mixed.cameras)
+    held = torch.tensor([[1, 1, 1, 1, 1, 0, 0], [0, 1, 1, 1, 1, 0, 1]], dtype=torch.bool)
+    assert torch.equal(torch.isclose(after, before, rtol=1e-15, atol=0), held)
+    assert torch.equal(mixed.cameras.K[0], cameras.K[0])
+    everything = bundle_adjust(*args, free=free, **options)
+    nothing = bundle_adjust(*args, free=(), **options)
+    assert everything.cost < mixed.cost < nothing.cost
+    found = (mixed.poses, mixed.cameras, mixed.X, x, view, point)
+    known = bundle_covariance(*found, camera_index=group, free=free, fixed_intrinsics=fixed)
+    assert known.nullity == 7
+    columns = torch.tensor([[1, 1, 1, 0, 0], [0, 1, 1, 0, 1]], dtype=torch.bool)
+    assert torch.equal(known.cameras.diagonal(dim1=1, dim2=2) == 0, columns)
+    with pytest.raises(ValueError, match="fixed_intrinsics"):
+        bundle_adjust(*args, free=free, fixed_intrinsics={"focal": torch.ones(3, dtype=torch.bool)}, camera_index=group)
+    with pytest.raises(ValueError, match="zoom"):
+        bundle_adjust(*args, free=free, fixed_intrinsics={"zoom": first}, camera_index=group)
 
 
 def test_masks_are_kept_bit_for_bit(generator: torch.Generator) -> None:

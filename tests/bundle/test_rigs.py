@@ -6,7 +6,8 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, Rig, bundle_adjust, bundle_covariance
-from torchsfm.bundle.projection import Projection, camera_rows
+from torchsfm.bundle.intrinsics import camera_rows
+from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rig import RigProjection
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_angle, rotation_from_rotvec
 from torchsfm.optim import RigidMotion, Subset

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.bundle.intrinsics import Switched, camera_from_rows, camera_rows, free_columns, free_switches
 from torchsfm.bundle.priors import Prior
-from torchsfm.bundle.projection import Projection, camera_from_rows, camera_rows, free_columns
+from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rig import Rig, RigProjection
 from torchsfm.geometry import Camera, Pose
 from torchsfm.optim import Block, Loss, RigidMotion, Subset, Term
@@ -30,6 +31,7 @@ class Bundle:
     fixed_poses: Tensor | None
     fixed_points: Tensor | None
     fixed_cameras: Tensor | None
+    fixed_intrinsics: Mapping[str, Tensor] | None
     fixed_sensors: Tensor | None
     weights: Tensor | None
     loss: Loss | None
@@ -93,13 +95,18 @@ class Bundle:
         model = type(self.cameras.distortion)
         columns = free_columns(self.free, model)
         rows = camera_rows(self.cameras)
+        manifold: Subset | Switched = Subset(rows.shape[1], columns)
+        if self.fixed_intrinsics:
+            manifold = Switched(rows.shape[1], columns)
+            switches = free_switches(columns, self.fixed_intrinsics, model, self.cameras.K)
+            rows = torch.cat((rows, switches.to(rows.dtype)), 1)
         blocks = {
             "pose": Block(_pose_rows(self.poses), RigidMotion(), self.fixed_poses),
-            "camera": Block(rows, Subset(rows.shape[1], columns), self.fixed_cameras),
+            "camera": Block(rows, manifold, self.fixed_cameras),
             "point": Block(self.X, None, self.fixed_points),
         }
         skew = 4 in columns or self.cameras.K.requires_grad or bool((rows[:, 4] != 0).any())
-        projection = Projection(model, columns, skew)
+        projection = Projection(model, columns, skew, bool(self.fixed_intrinsics))
         camera = camera_index[self.view]
         data, options = (self.x,), (self.loss, self.weights)
         if self.rig is None:
@@ -132,23 +139,6 @@ def check_index(**indices: tuple[Tensor, int]) -> None:
             raise ValueError(f"{name}: wanted numbers from 0 to {limit - 1}, got {int(index.min())} to {int(index.max())}")
 
 
-def intrinsics_prior(sigma: Mapping[str, float], mean: Camera) -> Term:
-    """Gaussian priors on intrinsics by the names users know; "focal" is relative."""
-    rows, model = camera_rows(mean), type(mean.distortion)
-    columns, scales = [], []
-    for name, value in sigma.items():
-        for column in free_columns((name,), model):
-            columns.append(column)
-            scales.append(rows[:, column].abs() * value if name == "focal" else torch.full_like(rows[:, column], value))
-    picked = torch.tensor(columns, device=rows.device)
-    return Term(
-        lambda camera, mean, scale: (camera[:, picked] - mean) / scale,
-        ("camera",),
-        (torch.arange(rows.shape[0], device=rows.device),),
-        (rows[:, picked], torch.stack(scales, -1)),
-    )
-
-
 def moved_poses(poses: Pose, start: Tensor, end: Tensor) -> Pose:
     """Poses that did not move keep every bit."""
     moved = (start != end).any(-1)
@@ -158,8 +148,8 @@ def moved_poses(poses: Pose, start: Tensor, end: Tensor) -> Pose:
 
 
 def moved_cameras(cameras: Camera, start: Tensor, end: Tensor) -> Camera:
-    """Cameras that did not change keep every bit of K."""
-    changed = (start != end).any(-1)
+    """Cameras whose K did not change keep every bit of it."""
+    changed = (start[:, :5] != end[:, :5]).any(-1)
     new = camera_from_rows(end, type(cameras.distortion))
     return Camera(torch.where(changed[:, None, None], new.K, cameras.K), new.distortion)
 

@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle.blocks import Bundle, cheapest_elimination, intrinsics_prior, moved_cameras, moved_poses
+from torchsfm.bundle.blocks import Bundle, cheapest_elimination, moved_cameras, moved_poses
 from torchsfm.bundle.gauge import Gauge, restore_gauge
+from torchsfm.bundle.intrinsics import intrinsics_prior
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.rig import Rig
 from torchsfm.geometry import Camera, Pose
@@ -54,6 +55,7 @@ def bundle_adjust(
     fixed_poses: Bool[Tensor, "f"] | None = None,
     fixed_points: Bool[Tensor, "n"] | None = None,
     fixed_cameras: Bool[Tensor, "g"] | None = None,
+    fixed_intrinsics: Mapping[str, Bool[Tensor, "g"]] | None = None,
     rig: Rig | None = None,
     fixed_sensors: Bool[Tensor, "k"] | None = None,
     weights: Float[Tensor, "m"] | None = None,
@@ -90,6 +92,7 @@ def bundle_adjust(
         fixed_poses: Poses that do not move.
         fixed_points: Points that do not move.
         fixed_cameras: Cameras that do not change.
+        fixed_intrinsics: By names as in `free`, cameras in which these do not change, where they are free in others.
         rig: Which views were taken together: `cam_from_world = cam_from_rig rig_from_world`. `view` and `camera_index` go by
             views all the same.
         fixed_sensors: Sensors whose place on the rig does not change: all of a calibrated rig, or one of each rig, whose frame
@@ -117,8 +120,8 @@ def bundle_adjust(
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
     bundle = Bundle(
-        poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras, fixed_sensors,
-        weights, loss, priors,
+        poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras,
+        fixed_intrinsics, fixed_sensors, weights, loss, priors,
     )  # fmt: skip
     held = priors or any(mask is not None and bool(mask.any()) for mask in (fixed_poses, fixed_points))
     if gauge not in ("free", "first") or (gauge == "first" and held):

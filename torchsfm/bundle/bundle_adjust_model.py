@@ -59,6 +59,7 @@ class BundleOptions(TypedDict, total=False):
     fixed_poses: Tensor | None
     fixed_points: Tensor | None
     fixed_cameras: Tensor | None
+    fixed_intrinsics: Mapping[str, Tensor] | None
     rig: Rig | None
     fixed_sensors: Tensor | None
     weights: Tensor | None

@@ -1,6 +1,6 @@
 """The covariance of a bundle: how well poses, cameras and points are known."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -49,6 +49,7 @@ def bundle_covariance(
     fixed_poses: Bool[Tensor, "f"] | None = None,
     fixed_points: Bool[Tensor, "n"] | None = None,
     fixed_cameras: Bool[Tensor, "g"] | None = None,
+    fixed_intrinsics: Mapping[str, Bool[Tensor, "g"]] | None = None,
     rig: Rig | None = None,
     fixed_sensors: Bool[Tensor, "k"] | None = None,
     weights: Float[Tensor, "m"] | None = None,
@@ -72,6 +73,7 @@ def bundle_covariance(
         fixed_poses: Views that did not move.
         fixed_points: Points that did not move.
         fixed_cameras: Cameras that did not change.
+        fixed_intrinsics: By names as in `free`, cameras in which these did not change.
         rig: The adjusted rig.
         fixed_sensors: Sensors whose place on the rig did not change.
         weights: Weights of the observations, inverse variances up to `sigma`.
@@ -87,8 +89,8 @@ def bundle_covariance(
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
     bundle = Bundle(
-        poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras, fixed_sensors,
-        weights, loss, priors,
+        poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras,
+        fixed_intrinsics, fixed_sensors, weights, loss, priors,
     )  # fmt: skip
     with torch.no_grad():
         blocks, terms = bundle.problem()
@@ -96,4 +98,10 @@ def bundle_covariance(
     scale = sigma if sigma is not None else (unit.square_sum / max(unit.redundancy, 1)) ** 0.5
     pose, camera, points = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
     sensor = None if rig is None else unit.blocks["sensor"] * scale**2
-    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity, unit, sensor)
+    held = 0
+    if fixed_intrinsics:
+        # Those held in one camera but not in others stand in the system as directions that nothing determines.
+        switch = blocks["camera"].x[:, -camera.shape[-1] :] > 0
+        camera = torch.where(switch[:, :, None] & switch[:, None], camera, 0.0)
+        held = int((~switch & (unit.columns["camera"] >= 0)).sum())
+    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity - held, unit, sensor)

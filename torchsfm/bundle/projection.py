@@ -1,6 +1,6 @@
 """The reprojection residual of one observation and its derivatives, as a term for the sparse optimiser.
 
-A camera is one row of numbers here, `(fx, fy / fx, cx, cy, skew, distortion...)`, so that "focal" is one number.
+Cameras are rows of numbers; see `intrinsics`.
 """
 
 from collections.abc import Sequence
@@ -10,38 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.geometry import BrownConrady, Camera, DistortionModel, NoDistortion, Radial, SimpleRadial
+from torchsfm.geometry import BrownConrady, DistortionModel, NoDistortion, Radial, SimpleRadial
 from torchsfm.geometry.decentring import brown_jacobian
-
-COORDINATES: dict[str, tuple[int, ...]] = {"focal": (0,), "aspect": (1,), "principal_point": (2, 3), "skew": (4,)}
-"""Columns of a camera row by the names users know."""
-
-
-def camera_rows(camera: Camera) -> Float[Tensor, "g k"]:
-    """Cameras as rows of numbers."""
-    K = camera.K
-    fx = K[:, 0, 0]
-    head = torch.stack((fx, K[:, 1, 1] / fx, K[:, 0, 2], K[:, 1, 2], K[:, 0, 1]), -1)
-    names = camera.distortion.parameter_names
-    return torch.cat((head, *(getattr(camera.distortion, name)[:, None] for name in names)), -1)
-
-
-def camera_from_rows(rows: Float[Tensor, "g k"], model: type[DistortionModel]) -> Camera:
-    """Cameras from rows of numbers."""
-    fx, aspect, cx, cy, skew = rows[:, :5].unbind(-1)
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    K = torch.stack((fx, skew, cx, zero, fx * aspect, cy, zero, zero, one), -1).reshape(-1, 3, 3)
-    return Camera(K, model.from_parameters(rows[:, 5:]))  # type: ignore[arg-type]
-
-
-def free_columns(names: Sequence[str], model: type[DistortionModel]) -> tuple[int, ...]:
-    """The columns of a camera row that names stand for, in order."""
-    columns = dict(COORDINATES)
-    columns.update({name: (5 + i,) for i, name in enumerate(model.parameter_names)})
-    for name in names:
-        if name not in columns:
-            raise ValueError(f"free: wanted names among {sorted(columns)}, got {name!r}")
-    return tuple(sorted({c for name in names for c in columns[name]}))
 
 
 @dataclass(frozen=True)
@@ -53,6 +23,8 @@ class Projection:
     """Columns of the camera row that are optimised."""
     skew: bool = True
     """Whether any camera has skew; False saves time."""
+    switched: bool = False
+    """Whether switches follow the camera's numbers; see `Switched`."""
 
     def residual(self, pose: Tensor, camera: Tensor, point: Tensor, x: Tensor) -> Tensor:
         """Predicted minus measured image points, pixels; finite for all finite points, also behind the camera."""
@@ -60,7 +32,7 @@ class Projection:
 
     def residual_of(self, moved: Tensor, camera: Tensor, x: Tensor) -> Tensor:
         """The residual of points in camera coordinates, (3, m)."""
-        k = camera.mT[5:]
+        k = self._lens(camera)
         if issubclass(self.model, RADIAL):
             uv, _, s = _flatten(moved)
             if len(k):
@@ -86,13 +58,13 @@ class Projection:
 
     def linearize_at(self, moved: Tensor, camera: Tensor, x: Tensor, by_camera: Tensor, by_intrinsics: Tensor | None) -> Tensor:
         """Residuals of points in camera coordinates (3, m), and their derivatives by those and by free camera numbers."""
-        rows = camera.mT
+        rows, k = camera.mT, self._lens(camera)
         if issubclass(self.model, RADIAL):
-            uv, by_parameter = _differentiate_radial(moved, rows[5:], by_camera)
+            uv, by_parameter = _differentiate_radial(moved, k, by_camera)
         elif issubclass(self.model, BrownConrady):
-            uv, by_parameter = _differentiate_brown(moved, rows[5:], by_camera)
+            uv, by_parameter = _differentiate_brown(moved, k, by_camera)
         else:
-            uv, by_parameter = _differentiate(self.model, moved, rows[5:], by_camera)
+            uv, by_parameter = _differentiate(self.model, moved, k, by_camera)
         focal = _focal(rows)
         residual = self._pixels(uv, rows, x.mT, focal)
         shear = rows[4] * by_camera[1] if self.skew else None
@@ -101,7 +73,12 @@ class Projection:
             by_camera[0] += shear
         if by_intrinsics is not None:
             self._by_intrinsics(uv, rows, focal, by_parameter, by_intrinsics)
+            if self.switched:
+                by_intrinsics *= rows[5 + self.model.num_parameters :]
         return residual.mT
+
+    def _lens(self, camera: Tensor) -> Tensor:
+        return camera.mT[5 : 5 + self.model.num_parameters]
 
     def _pixels(self, uv: Tensor, rows: Tensor, x: Tensor, focal: Tensor) -> Tensor:
         pixels = torch.addcmul(rows[2:4] - x, focal, uv)
