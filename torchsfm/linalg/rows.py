@@ -5,7 +5,6 @@
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 
@@ -30,5 +29,5 @@ def combine_rows(rows: Tensor | Sequence[Tensor], weights: Tensor | Sequence[Ten
     weights = weights if isinstance(weights, Sequence) else weights.unbind(0)
     total = rows[0] * weights[0]
     for row, weight in zip(rows[1:], weights[1:], strict=True):
-        torch.addcmul(total, row, weight, out=total)
+        total.addcmul_(row, weight)
     return total

@@ -1,8 +1,10 @@
 """Seven points in two uncalibrated images: F with x2' F x1 = 0 and det F = 0 (Hartley & Zisserman 2004, 11.1.2).
 
-The seven linear equations leave a G0 + b G1, and the determinant is a cubic form in (a, b). All arithmetic has the batch in the
+The seven linear equations leave s G + t H, and the determinant is a cubic form in (s, t). All arithmetic has the batch in the
 last dimension.
 """
+
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -10,13 +12,13 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import determinant_3x3
-from torchsfm.linalg.nullspace import nullspace_rows
+from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.polynomial import cubic_rows
 from torchsfm.linalg.rows import combine_rows
+from torchsfm.linalg.vectors import fma, fms
 from torchsfm.optim import attach_implicit, wants_derivative
 
-_CHUNK = 2048
-"""Problems at a time: their matrices fit the cache."""
 _INDEPENDENT = 1e-12
 """Smallest pivot of the normalised equations, and largest coefficient of the cubic, that are not taken for zero."""
 
@@ -50,10 +52,9 @@ def fundamental_7pt(
     """
     batch = check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
     with torch.no_grad():
-        rows1, rows2 = (x.detach().double().expand(*batch, 7, 2).reshape(-1, 7, 2).permute(1, 2, 0) for x in (x1, x2))
-        starts = range(0, max(rows1.shape[-1], 1), _CHUNK)
-        chunks = [_solve(rows1[..., i : i + _CHUNK], rows2[..., i : i + _CHUNK]) for i in starts]
-        rows, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
+        # (coordinate, point, problem)
+        rows1, rows2 = (x.detach().double().expand(*batch, 7, 2).reshape(-1, 7, 2).permute(2, 1, 0) for x in (x1, x2))
+        rows, good = _solve(rows1, rows2)
         F = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 3).to(x1.dtype)
         valid = good.mT.reshape(*batch, 3)
     if wants_derivative(x1, x2):
@@ -61,50 +62,55 @@ def fundamental_7pt(
     return Solutions(F, valid)
 
 
-def _solve(x1: Float[Tensor, "7 2 batch"], x2: Float[Tensor, "7 2 batch"]) -> tuple[Tensor, Tensor]:
+@kernel(chunk=8192)
+def _solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tuple[Tensor, Tensor]:
     """F as (9, 3, batch) and valid as (3, batch)."""
-    h1, c1, s1, fine1 = _normalised(x1)
-    h2, c2, s2, fine2 = _normalised(x2)
-    basis, pivot = nullspace_rows((h2[:, :, None] * h1[:, None]).flatten(1, 2))
-    G = basis.view(2, 3, 3, -1)
-    r0, r1, r2 = G.unbind(1)
-    cofactors = torch.stack((_cross(r1, r2), _cross(r2, r0), _cross(r0, r1)), 1)
-    # det(a G0 + b G1): the coefficients of b^3, a b^2, a^2 b, a^3.
-    d0, d3 = combine_rows(cofactors[1, 0], G[1, 0]), combine_rows(cofactors[0, 0], G[0, 0])
-    d1, d2 = combine_rows(cofactors[1].flatten(0, 1), basis[0]), combine_rows(cofactors[0].flatten(0, 1), basis[1])
-    some = torch.stack((d0, d1, d2, d3)).abs().amax(0)
+    (u, v), c1, size1 = _around_the_first(x1)
+    (a, b), c2, size2 = _around_the_first(x2)
+    # The first point says that F33 = 0: six equations in eight entries are left.
+    N, pivot = nullspace_columns(torch.stack((a * u, a * v, a, b * u, b * v, b, u, v)))
+    n = [pair.unbind(0) for pair in N.unbind(0)]
+    g, h = [pair[0] for pair in n], [pair[1] for pair in n]
+    # det(s G + t H): the coefficients of t^3, s t^2, s^2 t, s^3.
+    C, D = _cofactors(g), _cofactors(h)
+    d0, d3 = combine_rows(D[6:], h[6:]), combine_rows(C[6:], g[6:])
+    d1, d2 = combine_rows(D, g), combine_rows(C, h)
+    some = torch.maximum(torch.maximum(d0.abs(), d1.abs()), torch.maximum(d2.abs(), d3.abs()))
     # The larger of the outer coefficients leads.
     turn = d0.abs() > d3.abs()
     roots, real = cubic_rows(
         torch.where(turn, d3, d0), torch.where(turn, d2, d1), torch.where(turn, d1, d2), torch.where(turn, d0, d3)
     )
-    one = torch.ones_like(roots)
-    F = torch.where(turn, one, roots) * basis[0, :, None] + torch.where(turn, roots, one) * basis[1, :, None]
-    # Back to the coordinates that came: T2' F T1 with the similarities T = [s I, -s c].
-    F = F.view(3, 3, 3, -1)
-    last = F[:, 2] - s1 * (c1[0] * F[:, 0] + c1[1] * F[:, 1])
-    F = torch.stack((s1 * F[:, 0], s1 * F[:, 1], last), 1)
-    last = F[2] - s2 * (c2[0] * F[0] + c2[1] * F[1])
-    F = torch.cat((s2 * F[0], s2 * F[1], last))
-    F = F * combine_rows(F, F).rsqrt()
-    valid = real & (fine1 & fine2 & (torch.minimum(pivot, some) > _INDEPENDENT)) & torch.isfinite(F).all(0)
-    # An empty slot holds diag(1, 1, 0).
-    empty = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=F.dtype, device=F.device)[:, None, None] / 2**0.5
-    return torch.where(valid, F, empty), valid
+    s, t = torch.where(turn, 1.0, roots), torch.where(turn, roots, 1.0)
+    f0, f1, f2, f3, f4, f5, f6, f7 = (fma(t, y, s * x) for x, y in zip(g, h, strict=True))
+    # Back to the coordinates that came: T2' F T1 with T = [I, -c] / size, up to scale.
+    f2 = fms(c1[1], f1, fms(c1[0], f0, f2 * size1))
+    f5 = fms(c1[1], f4, fms(c1[0], f3, f5 * size1))
+    f6, f7 = f6 * size2, f7 * size2
+    f8 = -fma(c1[0], f6, c1[1] * f7)
+    f6, f7, f8 = (fms(c2[1], y, fms(c2[0], x, z)) for x, y, z in ((f0, f3, f6), (f1, f4, f7), (f2, f5, f8)))
+    rows = [f0, f1, f2, f3, f4, f5, f6, f7, f8]
+    square = combine_rows(rows, rows)
+    # False for NaN; an empty slot holds diag(1, 1, 0).
+    valid = real & (torch.minimum(pivot, some) > _INDEPENDENT) & (square > 0) & (square < torch.inf)
+    scale = torch.where(valid, square.rsqrt(), 0.0)
+    empty = torch.where(valid, 0.0, 0.5**0.5)
+    rows = [(row * scale).nan_to_num(0.0, 0.0, 0.0) for row in rows]
+    rows[0], rows[4] = rows[0] + empty, rows[4] + empty
+    return torch.stack(rows), valid
 
 
-def _normalised(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Homogeneous points (7, 3, batch) with |u|, |v| <= 1; centre, scale, and which elements are finite and not a point."""
-    low, high = x.amin(0), x.amax(0)
-    centre, size = 0.5 * (low + high), 0.5 * (high - low).amax(0)
-    fine = torch.isfinite(size) & (size > 0)
-    scale = 1 / torch.where(fine, size, 1)
-    h = torch.ones(7, 3, x.shape[-1], dtype=x.dtype, device=x.device)
-    h[:, :2] = torch.where(fine, (x - centre) * scale, 0)
-    return h, centre, scale, fine
+def _around_the_first(x: Tensor) -> tuple[Tensor, Sequence[Tensor], Tensor]:
+    """The other points (2, 6, batch) with the first at the origin and the largest coordinate 1; where it was and the scale."""
+    x = x.contiguous()
+    centre = x[:, 0]
+    moved = x[:, 1:] - centre[:, None]
+    size = moved.abs().amax((0, 1))
+    return moved * (1 / size), centre.unbind(0), size
 
 
-def _cross(a: Float[Tensor, "k 3 batch"], b: Float[Tensor, "k 3 batch"]) -> Float[Tensor, "k 3 batch"]:
-    a0, a1, a2 = a.unbind(1)
-    b0, b1, b2 = b.unbind(1)
-    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0), 1)
+def _cofactors(f: Sequence[Tensor]) -> list[Tensor]:
+    """Of a matrix whose last entry is 0, without the last one."""
+    f0, f1, f2, f3, f4, f5, f6, f7 = f
+    first, second = (-(f5 * f7), f5 * f6, fms(f4, f6, f3 * f7)), (f2 * f7, -(f2 * f6), fms(f0, f7, f1 * f6))
+    return [*first, *second, fms(f2, f4, f1 * f5), fms(f0, f5, f2 * f3)]
