@@ -45,8 +45,8 @@ class Triangle:
         self.n2 = tuple(dot(c, c) for c in chords)
         self.volume = dot(u[0], cross(u[1], u[2]))
 
-    def candidates(self) -> list[tuple[Rows, Tensor]]:
-        """Slots for the depths, four in all, and which of them are real and positive."""
+    def candidates(self) -> tuple[Rows, Tensor]:
+        """The depths in four slots, rows (slot, problem), and which of them are real and positive."""
         p, q = self._pencil()
         n = each(lambda m: 0.5 * m, vector(*self.n2))
         s = each(lambda k: k * (2 - k), n)
@@ -75,11 +75,14 @@ class Triangle:
         other = each(lambda x, y: fms(root, y, x) * size, p, q)
         total = self.a[0] + self.a[1] + self.a[2]
         slots = [slot for line in together(list(self._lines(w, n))) for slot in self._meet(line, other, n, total)]
-        if torch.compiler.is_compiling():
-            return slots
-        parts = zip(*((*depths, real) for depths, real in slots), strict=True)
-        l0, l1, l2, real = (torch.cat(part) for part in parts)
-        return [((l0, l1, l2), real)]
+        if len(slots) == 4:
+            # Slots in the order that stacked lines have.
+            parts = zip(*((*depths, real) for depths, real in (slots[0], slots[2], slots[1], slots[3])), strict=True)
+            l0, l1, l2, real = (torch.stack(part) for part in parts)
+        else:
+            parts = zip(*((*depths, real) for depths, real in slots), strict=True)
+            l0, l1, l2, real = (torch.cat(part) for part in parts)
+        return (l0, l1, l2), real
 
     def _pencil(self) -> tuple[Vector, Vector]:
         """Orthonormal weights of the three forms that cancel the right-hand sides."""
@@ -144,19 +147,17 @@ class Triangle:
         f0, f1, f2 = fma(e0, e0, m[0] * x0 * x1), fma(e1, e1, m[1] * x0 * x2), fma(e2, e2, m[2] * x1 * x2)
         return f0 + f1 + f2 if w is None else fma(w[0], f0, fma(w[1], f1, w[2] * f2))
 
-    def newton(self, depths: Rows, valid: Tensor | None = None) -> tuple[Rows, Tensor]:
-        """One Newton step on the three quadrics and how well they were met before it.
+    def newton(self, depths: Rows, valid: Tensor | None = None) -> Rows:
+        """One Newton step on the three quadrics.
 
-        That is the largest error of a quadric relative to its side of the triangle. Slots that are not `valid`, if given,
-        stay as they are and have no derivative; otherwise what divides by zero comes out as it does.
+        Slots that are not `valid`, if given, stay as they are and have no derivative; otherwise what divides by zero comes
+        out as it does.
         """
         l0, l1, l2 = depths
         m0, m1, m2 = self.n2
         e0, e1, e2 = l0 - l1, l0 - l2, l1 - l2
         m00, m01, m10, m12, m21, m22 = m0 * l0, m0 * l1, m1 * l0, m1 * l2, m2 * l1, m2 * l2
-        r0 = fma(m00, l1, fma(e0, e0, -self.a[0]))
-        r1 = fma(m10, l2, fma(e1, e1, -self.a[1]))
-        r2 = fma(m21, l2, fma(e2, e2, -self.a[2]))
+        r0, r1, r2 = self._residuals(depths, (e0, e1, e2), (m00, m10, m21))
         a0, a1 = torch.add(m01, e0, alpha=2), torch.sub(m00, e0, alpha=2)
         b0, b2 = torch.add(m12, e1, alpha=2), torch.sub(m10, e1, alpha=2)
         c1, c2 = torch.add(m22, e2, alpha=2), torch.sub(m21, e2, alpha=2)
@@ -169,12 +170,22 @@ class Triangle:
         inverse = 1 / det if valid is None else torch.where(valid, 1 / det, 0.0)
         s0, s1 = fma(r0, p, a1 * m), fms(a0, m, r0 * q)
         s2 = fms(fms(a0, r1, r0 * b0), c1, a1 * b0 * r2)
-        new = fms(s0, inverse, l0), fms(s1, inverse, l1), fms(s2, inverse, l2)
-        return new, self._worst(r0, r1, r2)
+        return fms(s0, inverse, l0), fms(s1, inverse, l1), fms(s2, inverse, l2)
+
+    def _residuals(self, depths: Rows, differences: Rows, products: Rows) -> Rows:
+        _, l1, l2 = depths
+        squares = [fma(e, e, -a) for e, a in zip(differences, self.a, strict=True)]
+        return tuple(fma(m, x, square) for m, x, square in zip(products, (l1, l2, l2), squares, strict=True))
 
     def _worst(self, r0: Tensor, r1: Tensor, r2: Tensor) -> Tensor:
         a0, a1, a2 = self.a
         return torch.maximum(torch.maximum((r0 / a0).abs(), (r1 / a1).abs()), (r2 / a2).abs())
+
+    def error(self, depths: Rows) -> Tensor:
+        """The largest error of a quadric relative to its side of the triangle."""
+        l0, l1, l2 = depths
+        m0, m1, m2 = self.n2
+        return self._worst(*self._residuals(depths, (l0 - l1, l0 - l2, l1 - l2), (m0 * l0, m1 * l0, m2 * l1)))
 
     def polish(self, depths: Rows, valid: Tensor) -> tuple[Rows, Tensor]:
         """Newton steps, unless they lead astray as at a double root; and which slots meet the quadrics in the end.
@@ -182,10 +193,9 @@ class Triangle:
         Where two of the points are close to each other the start has a small error in the quadrics and a large one in the
         depths. The first step then trades one for the other, so that what counts is the error after three.
         """
-        rows, before = self.newton(depths)
-        rows, _ = self.newton(rows)
-        rows, _ = self.newton(rows)
-        _, after = self.newton(rows)
+        before = self.error(depths)
+        rows = self.newton(self.newton(self.newton(depths)))
+        after = self.error(rows)
         # False for NaN too.
         better = after <= before
         l0, l1, l2 = (torch.where(better, new, old) for new, old in zip(rows, depths, strict=True))
@@ -199,8 +209,7 @@ class Triangle:
 
     def follow(self, depths: Rows, valid: Tensor) -> Rows:
         """The same depths with their derivatives: those of two Newton steps from the solution, exact to second order."""
-        rows, _ = self.newton(depths, valid)
-        rows, _ = self.newton(rows, valid)
+        rows = self.newton(self.newton(depths, valid), valid)
         return tuple(depth + (row - row.detach()) for depth, row in zip(depths, rows, strict=True))
 
 

@@ -77,14 +77,13 @@ def _solve(rays: Tensor, points: Tensor, eps: float, differentiable: bool) -> tu
     X = vectors(torch.where(sound, points, safe))
     with torch.no_grad():
         triangle = Triangle([detached(v) for v in u], [detached(v) for v in X])
-        solved = [triangle.polish(depths, valid & sound) for depths, valid in triangle.candidates()]
+        depths, valid = triangle.candidates()
+        depths, valid = triangle.polish(depths, valid & sound)
     if differentiable:
-        triangle = Triangle(u, X)
-        solved = [(triangle.follow(depths, valid), valid) for depths, valid in solved]
-    poses = [_pose(u, X, depths, valid if differentiable else None) for depths, valid in solved]
+        depths = Triangle(u, X).follow(depths, valid)
+    pose = _pose(u, X, depths, valid if differentiable else None)
     # (row, column, slot, problem) to (slot, row, column, problem)
-    model = torch.cat(poses, 2).permute(2, 0, 1, 3).reshape(48, sound.shape[0])
-    return model, torch.cat([valid if valid.ndim > 1 else valid[None] for _, valid in solved])
+    return pose.permute(2, 0, 1, 3).reshape(48, sound.shape[0]), valid
 
 
 def equations(
