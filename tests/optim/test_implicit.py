@@ -115,3 +115,28 @@ def test_optimum(generator: torch.Generator) -> None:
         return attach_optimum(lambda y, b: (y - b**3).square().sum(-1) + y.square().sum(-1).square(), y, b)
 
     assert torch.autograd.gradcheck(centre, (b,))
+
+
+def test_numbers_without_dimensions() -> None:
+    a = torch.tensor(2.0, dtype=F64, requires_grad=True)
+    root = attach_implicit(lambda y, a: (y * y - a)[..., None], a.detach().sqrt(), a, dims=0)
+    assert root.shape == ()
+    assert torch.allclose(torch.autograd.grad(root, a)[0], 0.5 / a.detach().sqrt())
+    valid = torch.tensor(False)
+    nothing = attach_implicit(lambda y, a: (y * y - a)[..., None], a.detach().sqrt(), a, dims=0, valid=valid)
+    assert torch.autograd.grad(nothing, a)[0] == 0
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's own, where its forward derivatives are first used
+def test_optimum_in_forward_mode_and_inside_function_transforms() -> None:
+    def optimum(x: Tensor) -> Tensor:
+        # The y that makes |y - x^2|^2 + |y - 1|^2 least.
+        objective = lambda y, x: ((y - x * x) ** 2 + (y - 1) ** 2).sum(-1)  # noqa: E731
+        return attach_optimum(objective, (x.detach() ** 2 + 1) / 2, x)
+
+    x = torch.tensor([[0.5, -2.0], [3.0, 1.0]], dtype=F64)
+    tangent = torch.tensor([[1.0, 2.0], [-1.0, 0.5]], dtype=F64)
+    with torch.autograd.forward_ad.dual_level():
+        moved = torch.autograd.forward_ad.unpack_dual(optimum(torch.autograd.forward_ad.make_dual(x, tangent)))
+        assert torch.allclose(moved.tangent, x * tangent)
+    assert torch.allclose(torch.func.grad(lambda x: optimum(x).sum())(x), x)

@@ -1,0 +1,87 @@
+"""The switch for compiled kernels: the same answers, every batch size, errors instead of a silent fall back."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm import compile_kernels, homography_4pt
+from torchsfm.linalg.compilation import kernel
+
+
+@pytest.fixture
+def compiled():
+    compile_kernels()
+    yield
+    compile_kernels(False)
+
+
+@kernel(chunk=4)
+def doubled(x: Tensor, y: Tensor, *, factor: float = 2.0) -> tuple[Tensor, Tensor]:
+    """Rows (2, batch) and (batch)."""
+    return factor * x, x[0] + y
+
+
+def test_pieces_are_joined(generator: torch.Generator) -> None:
+    for batch in (0, 1, 3, 4, 5, 11):
+        x, y = torch.randn(2, batch, generator=generator), torch.randn(batch, generator=generator)
+        a, b = doubled(x, y, factor=3.0)
+        assert torch.equal(a, 3 * x)
+        assert torch.equal(b, x[0] + y)
+
+
+def test_eager_mode_imports_no_compiler() -> None:
+    program = (
+        "import sys, torch, torchsfm\n"
+        "x = torch.rand(3, 4, 2, dtype=torch.float64, requires_grad=True)\n"
+        "torchsfm.homography_4pt(x, torch.rand(3, 4, 2, dtype=torch.float64)).model.sum().backward()\n"
+        "d = torch.rand(2, 5, 3, dtype=torch.float64, requires_grad=True)\n"
+        "torchsfm.essential_5pt(d, torch.rand(2, 5, 3, dtype=torch.float64)).model.sum().backward()\n"
+        "assert 'torch._dynamo' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_compiled_kernels_give_the_same(compiled: None, generator: torch.Generator) -> None:
+    for dtype in (torch.float64, torch.float32):
+        for batch in (1, 2, 17, 33, 20000):
+            x, y = torch.randn(2, batch, generator=generator, dtype=dtype), torch.randn(batch, generator=generator, dtype=dtype)
+            a, b = doubled(x, y)
+            assert torch.equal(a, 2 * x)
+            assert torch.equal(b, x[0] + y)
+            assert b.dtype == dtype
+    x1, x2 = torch.rand(2, 500, 4, 2, generator=generator, dtype=torch.float64)
+    x1[7, 2] = torch.nan
+    x1[8, 2] = x1[8, 1]
+    fast = homography_4pt(x1, x2)
+    compile_kernels(False)
+    plain = homography_4pt(x1, x2)
+    assert torch.equal(fast.valid, plain.valid)
+    assert not fast.valid[7:9].any()
+    torch.testing.assert_close(fast.model, plain.model, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_what_cannot_be_compiled_whole_is_an_error(compiled: None) -> None:
+    @kernel
+    def broken(x: Tensor) -> tuple[Tensor, ...]:
+        return (x * len(x[0].nonzero().tolist()),)
+
+    with pytest.raises(Exception, match=r"(?i)graph|dynamo|data.dependent|unsupported"):
+        broken(torch.ones(1, 40))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_compiling_twice_is_an_error(compiled: None) -> None:
+    x = torch.ones(2, 40)
+    doubled(x, x[0])
+    # Not the shape it was compiled for.
+    with pytest.raises(Exception, match="more than once"):
+        doubled(torch.ones(3, 40), x[0])
