@@ -26,7 +26,7 @@ def short_row(case: Case, options: argparse.Namespace) -> str:
     """One solver's line of the README."""
     double, single = (recall.recall(case, "random", options.samples, d).share for d in (torch.float64, torch.float32))
     hard = min((recall.recall(case, family, options.samples, torch.float64).share, family) for family in case.families)
-    times = speed.speeds(case, options.batch, options.repeats)
+    times = speed.speeds(case, options.batch, options.repeats, not options.no_compile)
     peers = ", ".join(f"{name} {1e6 * times[name]:.2f}" for name in case.peers if name in times)
     cells = [f"`{case.name}`", str(case.size), str(case.slots), f"{double:.4f} / {single:.4f}", f"{hard[0]:.4f} ({hard[1]})"]
     cells += [f"{1e6 * times['eager']:.2f}", f"{1e6 * times['compiled']:.2f}" if "compiled" in times else "", peers]
@@ -59,6 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--gradient-samples", type=int, default=100_000)
     parser.add_argument("--batch", type=int, default=16384, help="samples for timing")
     parser.add_argument("--repeats", type=int, default=5, help="rounds of timing")
+    parser.add_argument("--no-compile", action="store_true", help="leave out torch.compile, which takes minutes the first time")
     parser.add_argument("--readme", action="store_true", help="write the short table into README.md and print nothing else")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
@@ -73,7 +74,7 @@ def main(arguments: list[str] | None = None) -> None:
             if part == "recall":
                 recall.report(case, options.samples, options.peer_samples)
             elif part == "speed":
-                speed.report(case, options.batch, options.repeats)
+                speed.report(case, options.batch, options.repeats, not options.no_compile)
             elif part == "counts":
                 counts.report(case, options.samples)
             elif part == "gradients":

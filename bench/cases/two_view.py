@@ -269,6 +269,7 @@ CASES: tuple[Case, ...] = (
         },
         wanted=0.999,
         published=0.20e6,
+        compiled=True,
     ),
     Case(
         "fundamental_7pt",
@@ -284,6 +285,7 @@ CASES: tuple[Case, ...] = (
             "kornia": Peer("kornia", kornia_7pt, batched=True),
         },
         published=0.68e6,
+        compiled=True,
     ),
     Case(
         "homography_4pt",
@@ -299,6 +301,7 @@ CASES: tuple[Case, ...] = (
             "kornia": Peer("kornia", kornia_homography, batched=True),
         },
         published=23.2e6,
+        compiled=True,
     ),
     Case(
         "fundamental_8pt",

@@ -16,6 +16,7 @@ FAMILIES = (
     "forward",
     "sideways",
     "small baseline",
+    "tiny baseline",
     "far points",
     "roll 90",
     "convergent 90",
@@ -47,6 +48,8 @@ def two_views(family: str, count: int, n: int, generator: torch.Generator) -> tu
         R, t = torch.eye(3, dtype=F64).expand(count, 3, 3), torch.tensor([1.0, 0, 0], dtype=F64).expand(count, 3)
     elif family == "small baseline":
         R, t = turn(0.1), 0.1 * t
+    elif family == "tiny baseline":
+        R, t = turn(0.1), 0.06 * t
     elif family == "far points":
         X = X * 100 ** uniform(count, n, 1)
     elif family == "roll 90":

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.motion._five_points import cross, longest, normalised
 
@@ -12,6 +13,7 @@ def combine(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> F
     return combine_rows(basis, u)
 
 
+@kernel(chunk=1 << 20)
 def polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     """One Newton step on the essential manifold within the null space, and how far the start was from the manifold.
 
