@@ -49,39 +49,42 @@ def image_scaling(image_size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batc
     return torch.stack(rows, -1).reshape(*scale.shape, 3, 3)
 
 
-def prepare_cameras(
-    P: Float[Tensor, "b v 3 4"],
-    X: Float[Tensor, "b n 4"],
-    x: Float[Tensor, "b v n 2"] | None,
-    visible: Bool[Tensor, "b v n"],
-    image_size: Float[Tensor, "b v 2"],
-    noise: Float[Tensor, "b"] | None,
-) -> PreparedCameras:
-    """Scale, orient and move cameras and points to the frame of the best view; weigh them by their covariance.
+@dataclass(frozen=True)
+class CanonicalCameras:
+    """As `PreparedCameras`, without weights."""
+
+    P: Float[Tensor, "b v 3 4"]
+    X: Float[Tensor, "b n 4"]
+    frame: Float[Tensor, "b 4 4"]
+    image: Float[Tensor, "b v 3 3"]
+    order: Int[Tensor, "b v"]
+    visible: Bool[Tensor, "b v n"]
+    present: Bool[Tensor, "b v"]
+    consistent: Float[Tensor, "b"]
+    finite: Bool[Tensor, "b"]
+
+
+def canonical_cameras(
+    P: Float[Tensor, "b v 3 4"], X: Float[Tensor, "b n 4"], visible: Bool[Tensor, "b v n"], image_size: Float[Tensor, "b v 2"]
+) -> CanonicalCameras:
+    """Scale, orient and move cameras and points to the frame of the view with most points.
 
     Args:
         P: Cameras in pixels.
         X: Homogeneous points.
-        x: Observations in pixels, of which only the noise is estimated.
         visible: Which points each view sees.
         image_size: Width and height.
-        noise: Standard deviation of the observations per coordinate, in pixels; from x if None, else 1.
     """
     b, v = visible.shape[:2]
     point_good = torch.isfinite(X).all(-1) & (X != 0).any(-1)
     view_good = torch.isfinite(P).flatten(-2).all(-1) & (P != 0).flatten(-2).any(-1)
     visible = visible & point_good[:, None] & view_good[..., None]
-    if x is not None:
-        visible = visible & torch.isfinite(x).all(-1)
     # A view needs as many points as a camera has unknowns.
     present = visible.sum(-1) >= 6
     visible = visible & present[..., None]
     finite = present.any(-1)
     X = torch.where(point_good[..., None], X, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=X.dtype, device=X.device))
     P = torch.where(view_good[..., None, None], P, torch.eye(3, 4, dtype=P.dtype, device=P.device))
-    sigma = _noise(P, X, x, visible) if noise is None else noise
-    sigma = torch.where(torch.isfinite(sigma), sigma, 1.0).clamp_min(NOISE_FLOOR)
-
     usable_size = torch.isfinite(image_size).all(-1) & (image_size > 0).all(-1)
     image_size = torch.where(usable_size[..., None], image_size, 1.0)
     finite = finite & (usable_size | ~present).all(-1)
@@ -108,15 +111,44 @@ def prepare_cameras(
     # Problems that cannot be solved go through the motions with harmless numbers.
     Q = torch.where((finite[:, None] & present)[..., None, None], Q, eye)
     Y = torch.where(finite[:, None, None], Y, torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=X.dtype, device=X.device))
-    precision = (1 / (sigma[:, None] * T[..., 0, 0])).square()
-    weights = visible.to(P.dtype) * torch.where(present, precision, 0.0)[..., None]
+    return CanonicalCameras(Q, Y, frame, T, order, visible, present, oriented.consistent, finite)
+
+
+def prepare_cameras(
+    P: Float[Tensor, "b v 3 4"],
+    X: Float[Tensor, "b n 4"],
+    x: Float[Tensor, "b v n 2"] | None,
+    visible: Bool[Tensor, "b v n"],
+    image_size: Float[Tensor, "b v 2"],
+    noise: Float[Tensor, "b"] | None,
+) -> PreparedCameras:
+    """Bring cameras and points to the canonical frame, and weigh them by their covariance.
+
+    Args:
+        P: Cameras in pixels.
+        X: Homogeneous points.
+        x: Observations in pixels, of which only the noise is estimated.
+        visible: Which points each view sees.
+        image_size: Width and height.
+        noise: Standard deviation of the observations per coordinate, in pixels; from x if None, else 1.
+    """
+    if x is not None:
+        visible = visible & torch.isfinite(x).all(-1)
+    c = canonical_cameras(P, X, visible, image_size)
+    b, v = visible.shape[:2]
+    kept = torch.zeros_like(c.visible)
+    kept[torch.arange(b, device=P.device)[:, None], c.order] = c.visible
+    sigma = _noise(torch.nan_to_num(P), torch.nan_to_num(X), x, kept) if noise is None else noise
+    sigma = torch.where(torch.isfinite(sigma), sigma, 1.0).clamp_min(NOISE_FLOOR)
+    precision = (1 / (sigma[:, None] * c.image[..., 0, 0])).square()
+    weights = c.visible.to(P.dtype) * torch.where(c.present, precision, 0.0)[..., None]
     if v <= MAX_COUPLED:
-        S = camera_information(Q, Y, weights)
-        covariance: Tensor = covariance_in_frame(Q, S, torch.zeros(b, dtype=torch.long, device=P.device))
+        S = camera_information(c.P, c.X, weights)
+        covariance: Tensor = covariance_in_frame(c.P, S, torch.zeros(b, dtype=torch.long, device=P.device))
     else:
-        covariance = _separate(Q, camera_information(Q, Y, weights, coupled=False))
+        covariance = _separate(c.P, camera_information(c.P, c.X, weights, coupled=False))
     covariance = torch.where(torch.isfinite(covariance), covariance, 0.0)
-    return PreparedCameras(Q, Y, frame, T, order, visible, present, covariance, sigma, oriented.consistent, finite)
+    return PreparedCameras(c.P, c.X, c.frame, c.image, c.order, c.visible, c.present, covariance, sigma, c.consistent, c.finite)
 
 
 def _frame(P: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:

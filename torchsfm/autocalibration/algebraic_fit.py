@@ -1,0 +1,131 @@
+"""Small least-squares problems in intrinsics from many starts, judged by their own residuals."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int8
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.autocalibration.intrinsics_model import Assumption, intrinsics_from_parameters
+from torchsfm.autocalibration.projective_input import image_scaling
+from torchsfm.optim import levenberg_marquardt
+
+MAX_DEVIATION = 0.15
+"""Standard deviation of the logarithm of the focal length, from the residuals, beyond which it is not determined."""
+_PRIOR = 1e-5
+"""Weight of what is expected of the intrinsics: enough to hold what the data do not determine, too little to pull what they
+do."""
+
+
+@dataclass(frozen=True)
+class IntrinsicsEstimate:
+    """Intrinsics that all views share, from algebraic constraints."""
+
+    K: Float[Tensor, "*batch 3 3"]
+    deviation: Float[Tensor, "*batch"]
+    """Standard deviation of the logarithm of the focal length, as the residuals tell it; 1 where nothing is known."""
+    cost: Float[Tensor, "*batch"]
+    """Sum of squares of the constraints, without unit."""
+    status: Int8[Tensor, "*batch"]
+    """OK; DEGENERATE: the constraints do not determine the focal length; TOO_FEW of them; NOT_FINITE. Where it is not OK, K is
+    the best found and not to be relied on."""
+
+
+def check_shared(assume: Assumption) -> None:
+    """Refuse assumptions under which views differ.
+
+    Raises:
+        ValueError: They do.
+    """
+    if assume.varying:
+        raise ValueError(f"assume: wanted intrinsics that are the same in all views, got varying {assume.varying}")
+
+
+def scaled(H: Float[Tensor, "*batch m 3 3"], T: Float[Tensor, "*batch 3 3"], inverse_left: bool = True) -> Tensor:
+    """Homographies between images in the coordinates that T leads to."""
+    inverse = torch.linalg.inv_ex(T).inverse[..., None, :, :]
+    moved: Tensor = T[..., None, :, :] @ H @ inverse if inverse_left else inverse.mT @ H @ inverse
+    return moved
+
+
+def fit_intrinsics(
+    constraints: Callable[..., Tensor],
+    starts: Float[Tensor, "b k u"],
+    assume: Assumption,
+    data: tuple[Any, ...],
+    count: Float[Tensor, "b"],
+    image_size: Float[Tensor, "b 2"],
+) -> tuple[IntrinsicsEstimate, Float[Tensor, "b u"]]:
+    """Minimise `constraints(K, further, *data) -> (..., n)` over intrinsics and further unknowns, from every start.
+
+    Args:
+        constraints: Takes K in scaled coordinates and the unknowns beyond the intrinsics.
+        starts: Intrinsic unknowns as `assume.columns` has them, followed by the further ones.
+        assume: What is free.
+        data: Tensors with the batch in front.
+        count: Number of constraints that count, of each problem.
+        image_size: Width and height.
+
+    Returns:
+        The best of each problem, and all its unknowns.
+    """
+    b, k, u = starts.shape
+    spread = assume.spread(1, starts)[0]
+    q = spread.shape[-1]
+    precision = assume.precision(1, starts) * _PRIOR
+
+    def residual(x: Tensor, *tensors: Tensor) -> Tensor:
+        K = intrinsics_from_parameters(x[..., :q] @ spread.mT)
+        return torch.cat((constraints(K, x[..., q:], *tensors), x[..., :q] * precision), -1)[..., None]
+
+    many = tuple(t[:, None].expand(b, k, *t.shape[1:]) for t in data)
+    result = levenberg_marquardt(residual, starts, *many, max_iterations=60, function_tolerance=1e-13, step_tolerance=1e-11)
+    cost = torch.nan_to_num(result.cost, torch.inf)
+    best = cost.argmin(-1)
+    rows = torch.arange(b, device=starts.device)
+    x = torch.nan_to_num(result.x[rows, best])
+
+    # The deviation of the focal length from the curvature, in the unit that the residuals themselves give.
+    def only(delta: Tensor) -> Tensor:
+        return residual(x + delta, *data)[..., 0]
+
+    columns = []
+    for i in range(u):
+        step = torch.zeros_like(x)
+        step[:, i] = 1e-6 * (1 + x[:, i].abs())
+        columns.append((only(step) - only(-step)) / (2 * step[:, i : i + 1]))
+    J = torch.nan_to_num(torch.stack(columns, -1))[:, : -q if q else None]
+    J = torch.nan_to_num(J)
+    total = 2 * cost[rows, best]
+    redundancy = (count - u).clamp_min(1)
+    finite = torch.isfinite(total)
+    total = torch.where(finite, total, 0.0)
+    scale = J.norm(dim=1).clamp_min(1e-12)
+    A = (J / scale[:, None]).mT @ (J / scale[:, None])
+    eye = torch.eye(u, dtype=x.dtype, device=x.device)
+    inverse = torch.linalg.inv_ex(A + 1e-13 * eye).inverse / (scale[:, :, None] * scale[:, None])
+    # Rounding is the least of errors.
+    noise = total / redundancy + 1e-20
+    first = next(i for i, (p, _) in enumerate(assume.columns(1)) if p == 0)
+    deviation = torch.nan_to_num((inverse[:, first, first].clamp_min(0) * noise).sqrt(), 1.0).clamp_max(1.0)
+    T = image_scaling(image_size)
+    K = torch.linalg.inv_ex(T).inverse @ intrinsics_from_parameters((x[:, :q] @ spread.mT).clamp(-20, 20))
+    K = K / K[:, 2:, 2:]
+    status = torch.full((b,), int(Status.OK), dtype=torch.int8, device=x.device)
+    outside = (x[:, first].abs() > 3.7) | (deviation > MAX_DEVIATION)
+    for condition, code in ((outside, Status.DEGENERATE), (~finite, Status.NOT_FINITE), (count < u, Status.TOO_FEW)):
+        status = torch.where(condition, int(code), status)
+    return IntrinsicsEstimate(K, torch.where(finite, deviation, 1.0), total, status.to(torch.int8)), x
+
+
+def focal_starts(assume: Assumption, b: int, further: Tensor, focals: tuple[float, ...] = (0.4, 0.8, 1.5, 3.0, 6.0)) -> Tensor:
+    """Every one of some focal lengths (over the image size) with every one of the further unknowns `(f, u)`: (b, k, q + u)."""
+    q = len(assume.columns(1))
+    logs = further.new_tensor(focals).log()
+    intrinsic = further.new_zeros(len(focals), q)
+    intrinsic[:, 0] = logs
+    both = torch.cat((intrinsic.repeat_interleave(len(further), 0), further.repeat(len(focals), 1)), -1)
+    return both.expand(b, *both.shape)

@@ -1,0 +1,166 @@
+"""The absolute dual quadric by linear least squares.
+
+`w*_i = K_i K_i' ~ P_i Q P_i'`: every known zero or ratio in w* is one linear equation in the ten entries of Q (Triggs,
+"Autocalibration and the absolute quadric", CVPR 1997; Pollefeys, Koch & Van Gool, IJCV 1999). The unknown scale of each
+equation, w*_33, is put right by solving again. Q has rank 3 and is positive semidefinite; the nearest such quadric is taken.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from torchsfm._types import Status, check_tensors
+from torchsfm.autocalibration.projective_input import image_scaling
+from torchsfm.linalg import null_vector
+
+_PAIRS = tuple((i, j) for i in range(4) for j in range(i, 4))
+SIGMA = {"aspect": 0.1, "skew": 0.01, "principal_point": 0.05, "focal": 3.0}
+"""How far the entries of w* / w*_33 that should be zero may be off, in images of size 1."""
+
+
+@dataclass(frozen=True)
+class DualQuadric:
+    """An absolute dual quadric and the intrinsics that it gives each view."""
+
+    model: Float[Tensor, "*batch 4 4"]
+    """Symmetric, rank 3, positive semidefinite, |Q| = 1."""
+    K: Float[Tensor, "*batch v 3 3"]
+    valid: Bool[Tensor, "*batch v"]
+    """Views whose conic is that of a real camera; others have K = I."""
+    plane: Float[Tensor, "*batch 4"]
+    """The plane at infinity, Q plane = 0."""
+    gap: Float[Tensor, "*batch"]
+    """Ratio of the least to the second least singular value of the equations: near 1 where they leave Q open."""
+    negative: Float[Tensor, "*batch"]
+    """The third over the largest eigenvalue before positivity was enforced; negative where it had to be."""
+    status: Int8[Tensor, "*batch"]
+    """OK; DEGENERATE: Q is left open, or is not that of real cameras; TOO_FEW equations; NOT_FINITE."""
+
+
+def dual_quadric_linear(
+    P: Float[Tensor, "*#batch v 3 4"],
+    *,
+    image_size: tuple[float, float],
+    weights: Float[Tensor, "*#batch v"] | None = None,
+    zero_skew: bool = True,
+    unit_aspect: bool = True,
+    expected_focal: float | None = 1.2,
+    iterations: int = 4,
+) -> DualQuadric:
+    """The absolute dual quadric of projective cameras whose principal points are in the middle of the images.
+
+    Focal lengths may vary. Known to be fooled by artificial solutions where the motion is nearly critical (Gherardi & Fusiello
+    2010); `autocalibrate_points` does not depend on it.
+
+    Args:
+        P: Cameras in pixels, of any scale and sign.
+        image_size: Width and height in pixels.
+        weights: Of the views; 0 leaves one out.
+        zero_skew: Use that pixels are rectangular.
+        unit_aspect: Use that they are square.
+        expected_focal: Focal length, over the longer side of the image, that is softly expected (within a factor of about 2, as
+            Pollefeys et al., IJCV 2004, do); None expects none.
+        iterations: Number of solutions, each with the scales of the one before.
+
+    Returns:
+        The quadric, intrinsics per view and status.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not fit.
+    """
+    batch = check_tensors(P=(P, "v>=2 3 4"), weights=(weights, "v"))
+    v = P.shape[-3]
+    full = P.detach().double().expand(*batch, v, 3, 4)
+    w = full.new_ones(*batch, v) if weights is None else weights.detach().double().expand(*batch, v)
+    good = torch.isfinite(full).flatten(-2).all(-1) & torch.isfinite(w) & (w > 0)
+    w = torch.where(good, w, 0.0)
+    T = image_scaling(full.new_tensor(image_size))
+    focal = 1.0 if expected_focal is None else expected_focal
+    T = torch.diag(full.new_tensor([1 / focal, 1 / focal, 1.0])) @ T
+    eye = torch.eye(3, 4, dtype=full.dtype, device=full.device)
+    S = T @ torch.where(good[..., None, None], full, eye)
+    # A frame in which the cameras' rows are about orthonormal on average makes the equations well conditioned.
+    S = S / S.flatten(-2).norm(dim=-1)[..., None, None].clamp_min(1e-300)
+    gram = (S.mT @ S * w[..., None, None]).sum(-3)
+    gram = gram / gram.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp_min(1e-300)
+    L, info = torch.linalg.cholesky_ex(gram + 1e-10 * torch.eye(4, dtype=full.dtype, device=full.device))
+    eye4 = torch.eye(4, dtype=full.dtype, device=full.device)
+    L = torch.where((info == 0)[..., None, None], L, eye4)
+    frame = torch.linalg.inv_ex(L.mT).inverse
+    S = S @ frame[..., None, :, :]
+    S = S / S.flatten(-2).norm(dim=-1)[..., None, None].clamp_min(1e-300)
+
+    def row(i: int, j: int) -> Tensor:
+        a, b = S[..., i, :], S[..., j, :]
+        terms = [a[..., k] * b[..., m] + (a[..., m] * b[..., k] if k != m else 0) for k, m in _PAIRS]
+        return torch.stack(terms, -1)
+
+    corner = row(2, 2)
+    rows = [(row(0, 2), SIGMA["principal_point"] / focal), (row(1, 2), SIGMA["principal_point"] / focal)]
+    rows += [(row(0, 1), SIGMA["skew"])] if zero_skew else []
+    rows += [(row(0, 0) - row(1, 1), SIGMA["aspect"])] if unit_aspect else []
+    known = len(rows)
+    if expected_focal is not None:
+        rows += [(row(0, 0) - corner, SIGMA["focal"]), (row(1, 1) - corner, SIGMA["focal"])]
+    A = torch.stack([r / sigma for r, sigma in rows], -2)
+    scale = torch.ones_like(w)
+    q = A.new_zeros(*batch, 10)
+    for _ in range(max(iterations, 1)):
+        whole = (A * (w.sqrt() / scale)[..., None, None]).flatten(-3, -2)
+        q, _ = null_vector(torch.nn.functional.pad(whole, (0, 0, 0, 10)))
+        size = (corner * q[..., None, :]).sum(-1).abs()
+        scale = size.clamp_min(1e-3 * size.amax(-1, keepdim=True)).clamp_min(1e-300)
+    values = torch.linalg.svdvals(torch.nn.functional.pad(torch.nan_to_num(whole), (0, 0, 0, 10)))
+    gap = values[..., -1] / values[..., -2].clamp_min(1e-300)
+    i, j = torch.tensor(_PAIRS, device=P.device).unbind(-1)
+    Q = q.new_zeros(*batch, 4, 4)
+    Q[..., i, j] = q
+    Q[..., j, i] = q
+    spectrum, axes = torch.linalg.eigh(Q)
+    flip = (spectrum[..., 0] + spectrum[..., -1] < 0)[..., None]
+    spectrum = torch.where(flip, -spectrum.flip(-1), spectrum)
+    axes = torch.where(flip[..., None], axes.flip(-1), axes)
+    third = spectrum[..., 1] / spectrum[..., 3].clamp_min(1e-300)
+    kept = spectrum.clamp_min(0)
+    kept = torch.cat((torch.zeros_like(kept[..., :1]), kept[..., 1:]), -1)
+    Q = (axes * kept[..., None, :]) @ axes.mT
+    plane = torch.linalg.solve_ex(frame.mT, axes[..., :1]).result[..., 0]
+    Q = frame @ Q @ frame.mT
+    conic = T @ full.nan_to_num(0.0, 0.0, 0.0) @ Q[..., None, :, :] @ (T @ full.nan_to_num(0.0, 0.0, 0.0)).mT
+    K, valid = _upper_cholesky(conic)
+    valid = valid & good
+    K = torch.linalg.inv_ex(T).inverse @ torch.where(valid[..., None, None], K, T @ eye[:, :3])
+    K = torch.where(valid[..., None, None], K / K[..., 2:, 2:], eye[:, :3])
+    status = torch.full(batch, int(Status.OK), dtype=torch.int8, device=P.device)
+    count = good.sum(-1)
+    for condition, code in (
+        ((third < 1e-9) | (gap > 0.5) | ~(valid | ~good).all(-1), Status.DEGENERATE),
+        (count * known < 9, Status.TOO_FEW),
+        (count == 0, Status.NOT_FINITE),
+    ):
+        status = torch.where(condition, int(code), status)
+    dtype = P.dtype
+    unit = Q / Q.flatten(-2).norm(dim=-1)[..., None, None].clamp_min(1e-300)
+    plane = plane / plane.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+    numbers = (unit.to(dtype), K.to(dtype), valid, plane.to(dtype), gap.to(dtype), third.to(dtype))
+    return DualQuadric(*numbers, status.to(torch.int8))
+
+
+def _upper_cholesky(C: Tensor) -> tuple[Tensor, Tensor]:
+    """The upper triangular K with `K K' ~ C`, K_33 = 1, and where there is one."""
+    c33 = C[..., 2, 2]
+    good = c33.abs() > 0
+    D = C / torch.where(good, c33, 1.0)[..., None, None]
+    cx, cy = D[..., 0, 2], D[..., 1, 2]
+    yy = D[..., 1, 1] - cy * cy
+    good = good & (yy > 0)
+    fy = torch.where(good, yy, 1.0).sqrt()
+    skew = (D[..., 0, 1] - cx * cy) / fy
+    xx = D[..., 0, 0] - cx * cx - skew * skew
+    good = good & (xx > 0) & torch.isfinite(D).flatten(-2).all(-1)
+    fx = torch.where(good, xx, 1.0).sqrt()
+    zero = torch.zeros_like(fx)
+    K = torch.stack((fx, skew, cx, zero, fy, cy, zero, zero, zero + 1), -1).reshape(C.shape)
+    return torch.where(good[..., None, None], K, torch.eye(3, dtype=C.dtype, device=C.device)), good
