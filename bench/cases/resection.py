@@ -9,8 +9,23 @@ from torch import Tensor
 
 from bench.cases import scenes
 from bench.cases.case import Case, Peer, Sample, pose_error
-from torchsfm import camera_p3p
+from torchsfm import (
+    Solutions,
+    Status,
+    camera_dlt,
+    camera_gp3p,
+    camera_p3p,
+    camera_p4pf,
+    camera_p35pf,
+    camera_planar,
+    camera_pnp,
+    camera_up2p,
+)
+from torchsfm.resection.camera_gp3p import equations as gp3p_equations
 from torchsfm.resection.camera_p3p import equations as p3p_equations
+from torchsfm.resection.camera_p4pf import equations as p4pf_equations
+from torchsfm.resection.camera_p35pf import equations as p35pf_equations
+from torchsfm.resection.camera_up2p import equations as up2p_equations
 
 
 def rays_and_points(n: int) -> Callable[[str, int, torch.Generator, torch.dtype], tuple[Sample, Tensor]]:
@@ -21,6 +36,122 @@ def rays_and_points(n: int) -> Callable[[str, int, torch.Generator, torch.dtype]
         return (torch.nn.functional.normalize(Y, dim=-1).to(dtype), X.to(dtype)), P
 
     return scene
+
+
+def focal_points(n: int) -> Callable[[str, int, torch.Generator, torch.dtype], tuple[Sample, Tensor]]:
+    """Samples of n points in an image of a focal length between 500 and 2000, and `diag(f, f, 1) [R | t]`."""
+
+    def scene(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+        Y, X, P = scenes.camera(family, batch, n, generator)
+        f = 500 * 4 ** scenes.uniform(generator, batch, 1, 1)
+        x = f * Y[..., :2] / Y[..., 2:]
+        return (x.to(dtype), X.to(dtype)), torch.cat((f, f, torch.ones_like(f)), 1) * P
+
+    return scene
+
+
+def rig_rays(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+    """Samples of three rays from centres about 1 from each other, and the pose of the rig."""
+    Y, X, P = scenes.camera(family, batch, 3, generator)
+    p = scenes.normal(generator, batch, 3, 3) * (0.01 if family == "small baseline" else 1)
+    d = torch.nn.functional.normalize(Y - p, dim=-1)
+    return (p.to(dtype), d.to(dtype), X.to(dtype)), P
+
+
+def upright_rays(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+    """Samples of two rays and their points, with the vertical in the camera and in the world; and the pose."""
+    Y, X, P = scenes.camera(family, batch, 3, generator)
+    Y, X = Y[:, :2], X[:, :2]
+    G = scenes.directions(generator, batch)
+    g = (P[..., :3] @ G[..., None])[..., 0]
+    d = torch.nn.functional.normalize(Y, dim=-1)
+    return (d.to(dtype), X.to(dtype), g.to(dtype), G.to(dtype)), P
+
+
+def plane_rays(n: int) -> Callable[[str, int, torch.Generator, torch.dtype], tuple[Sample, Tensor]]:
+    """Samples of n rays and points of a plane, and the pose."""
+
+    def scene(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+        Y, _, P = scenes.camera(family, batch, n, generator)
+        normal = torch.tensor([0.3, -0.2, 1.0], dtype=scenes.F64)
+        middle = Y.mean(1, keepdim=True)
+        Y = Y * ((middle @ normal) / (Y @ normal))[..., None]
+        X = (Y - P[:, None, :, 3]) @ P[..., :3]
+        return (torch.nn.functional.normalize(Y, dim=-1).to(dtype), X.to(dtype)), P
+
+    return scene
+
+
+def camera_error(models: Tensor, truth: Tensor) -> Tensor:
+    """The distance of cameras relative to the true one, whose third row has length 1."""
+    truth = truth[:, None]
+    return (models - truth).norm(dim=(-2, -1)) / truth.norm(dim=(-2, -1))
+
+
+def solved(door: Callable[..., Any]) -> Callable[..., Solutions[Tensor]]:
+    """A door that returns one model and a status, as a solver with one slot."""
+
+    def solve(*sample: Tensor) -> Solutions[Tensor]:
+        found = door(*sample)
+        return Solutions(found.model.unsqueeze(-3), (found.status == Status.OK).unsqueeze(-1))
+
+    return solve
+
+
+def both_planar(d: Tensor, X: Tensor) -> Solutions[Tensor]:
+    """Both poses of a plane."""
+    found = camera_planar(d, X)
+    return Solutions(found.model, found.valid)
+
+
+def poselib_gp3p() -> Callable[..., Any]:
+    import poselib
+
+    return lambda p, d, X: [pose.Rt for pose in poselib.gp3p(p, d, X)]
+
+
+def poselib_p4pf() -> Callable[..., Any]:
+    import poselib
+
+    def solve(x: Any, X: Any) -> Any:
+        return [np.diag([f, f, 1]) @ pose.Rt for pose, f in zip(*poselib.p4pf(x, X, True), strict=True)]
+
+    return solve
+
+
+def poselib_up2p() -> Callable[..., Any]:
+    import poselib
+
+    def frame(v: Any) -> Any:
+        """A rotation that takes v to PoseLib's vertical, the second axis."""
+        v = v / np.linalg.norm(v)
+        a = np.cross(v, np.eye(3)[np.abs(v).argmin()])
+        a /= np.linalg.norm(a)
+        return np.stack((a, v, np.cross(a, v)))
+
+    def solve(d: Any, X: Any, g: Any, G: Any) -> Any:
+        A, B = frame(g), frame(G)
+        poses = poselib.up2p(np.ascontiguousarray(d @ A.T), np.ascontiguousarray(X @ B.T))
+        return [A.T @ np.hstack((pose.R @ B, pose.t[:, None])) for pose in poses]
+
+    return solve
+
+
+def opencv_pnp(method: str) -> Callable[[], Callable[..., Any]]:
+    """OpenCV's door with one of its methods."""
+
+    def make() -> Callable[..., Any]:
+        import cv2
+
+        flag, eye = getattr(cv2, method), np.eye(3)
+
+        def solve(d: Any, X: Any) -> Any:
+            _, turns, shifts, _ = cv2.solvePnPGeneric(X, np.ascontiguousarray(d[:, :2] / d[:, 2:]), eye, None, flags=flag)
+            return [np.hstack((cv2.Rodrigues(w)[0], t)) for w, t in zip(turns, shifts, strict=True)]
+
+        return solve
+
+    return make
 
 
 def poselib_p3p() -> Callable[..., Any]:
@@ -55,5 +186,84 @@ CASES: tuple[Case, ...] = (
         peers={"PoseLib": Peer("poselib", poselib_p3p), "OpenCV": Peer("cv2", opencv_p3p)},
         published=4.5e6,
         compiled=True,
+    ),
+    Case(
+        "camera_up2p",
+        size=2,
+        slots=2,
+        solve=camera_up2p,
+        scene=upright_rays,
+        error=pose_error,
+        equations=up2p_equations,
+        families=("narrow view", "90 degree rotation", "far points", "centre near the plane"),
+        degenerate=("repeated points", "all at infinity", "pure rotation", "zero baseline"),
+        peers={"PoseLib": Peer("poselib", poselib_up2p)},
+    ),
+    Case(
+        "camera_p35pf",
+        size=4,
+        slots=10,
+        solve=camera_p35pf,
+        scene=focal_points(4),
+        error=camera_error,
+        equations=p35pf_equations,
+        families=("near planar", "narrow view", "90 degree rotation", "centre near the plane"),
+        degenerate=("repeated points", "collinear", "coplanar", "all at infinity", "pure rotation", "zero baseline"),
+    ),
+    Case(
+        "camera_p4pf",
+        size=4,
+        slots=1,
+        solve=camera_p4pf,
+        scene=focal_points(4),
+        error=camera_error,
+        equations=p4pf_equations,
+        families=("near planar", "narrow view", "90 degree rotation", "centre near the plane"),
+        degenerate=("repeated points", "collinear", "coplanar", "all at infinity", "pure rotation", "zero baseline"),
+        peers={"PoseLib": Peer("poselib", poselib_p4pf)},
+    ),
+    Case(
+        "camera_gp3p",
+        size=3,
+        slots=8,
+        solve=camera_gp3p,
+        scene=rig_rays,
+        error=pose_error,
+        equations=gp3p_equations,
+        families=("narrow view", "90 degree rotation", "far points", "sliver triangle", "small baseline"),
+        degenerate=("repeated points", "collinear", "all at infinity", "pure rotation", "zero baseline"),
+        peers={"PoseLib": Peer("poselib", poselib_gp3p)},
+    ),
+    Case(
+        "camera_dlt",
+        size=6,
+        slots=1,
+        solve=solved(camera_dlt),
+        scene=focal_points(6),
+        error=camera_error,
+        families=("near planar", "narrow view", "90 degree rotation"),
+        degenerate=("repeated points", "collinear", "coplanar", "all at infinity"),
+    ),
+    Case(
+        "camera_pnp",
+        size=6,
+        slots=1,
+        solve=solved(camera_pnp),
+        scene=rays_and_points(6),
+        error=pose_error,
+        families=("near planar", "coplanar", "narrow view", "90 degree rotation", "centre near the plane"),
+        degenerate=("repeated points", "collinear", "all at infinity", "pure rotation", "zero baseline"),
+        peers={"OpenCV": Peer("cv2", opencv_pnp("SOLVEPNP_SQPNP"))},
+    ),
+    Case(
+        "camera_planar",
+        size=4,
+        slots=2,
+        solve=both_planar,
+        scene=plane_rays(4),
+        error=pose_error,
+        families=("narrow view", "90 degree rotation"),
+        degenerate=("repeated points", "collinear", "all at infinity", "pure rotation", "zero baseline"),
+        peers={"OpenCV": Peer("cv2", opencv_pnp("SOLVEPNP_IPPE"))},
     ),
 )

@@ -18,7 +18,9 @@ from torchsfm.optim import attach_implicit, wants_derivative
 _CHUNK = 4096
 """Problems at a time: what is in use stays in the cache."""
 _PAIRS = ((0, 1), (0, 2), (1, 2))
-# A fixed rotation of (l1, l2, l3, 1).
+_DIFFERENCES = ((0.5**0.5, 1 / 6**0.5), (-(0.5**0.5), 1 / 6**0.5), (0.0, -2 / 6**0.5))
+"""Orthonormal coordinates of three numbers whose sum is 0."""
+# A fixed rotation of the coordinates.
 _TURN = torch.linalg.qr(torch.tensor([[5.0, 1, -2, 3], [-1, 4, 3, 2], [2, -3, 5, 1], [3, 2, 1, -4]], dtype=torch.float64)).Q
 
 
@@ -88,26 +90,32 @@ def _solve(eps: float, p: Tensor, d: Tensor, X: Tensor) -> tuple[Tensor, Tensor]
     flat = combine_rows(normal, normal).sqrt() <= 8 * eps * longest.sqrt() * torch.maximum(longest.sqrt(), far)
     crossed = torch.stack([combine_rows(c, c) for c in (_cross(d[i], d[j]) for i, j in _PAIRS)]).amax(0)
     good = finite & ~flat & (crossed > 1e-24)
-    # Depths are counted from where two rays are as far from each other as their points, in units of the triangle: that keeps
-    # the solutions apart.
-    origin, p = p, p + d * torch.where(good, _common_depth(p, d, sides), 0.0)
+    # What keeps the solutions apart: depths are counted from where two rays are as far from each other as their points, their
+    # differences in units of the triangle, their mean in units of that depth.
+    depth = torch.where(good, _common_depth(p, d, sides), 0.0)
+    origin, p = p, p + d * depth
     apart = torch.stack([combine_rows(e, e) for e in (p[i] - p[j] for i, j in _PAIRS)]).amax(0)
     unit = torch.where(good, torch.maximum(longest, apart).sqrt(), torch.nan)
     shift = (p - origin) / unit
     p, X = p / unit, X / unit
     turn = _TURN.to(p)
+    mean = (depth / unit).clamp_min(1.0) / 3**0.5
+    # The depths and 1 as linear forms of the four coordinates.
+    depths = [turn[:, 0, None] * mean + (turn[:, 1] * a + turn[:, 2] * b)[:, None] for a, b in _DIFFERENCES]
     quadrics = []
     for (i, j), side in zip(_PAIRS, sides, strict=True):
         apart = p[i] - p[j]
-        forms = turn[:, i, None, None] * d[i] - turn[:, j, None, None] * d[j] + turn[:, 3, None, None] * apart
+        forms = depths[i][:, None] * d[i] - depths[j][:, None] * d[j] + turn[:, 3, None, None] * apart
         q = sum(product_of_forms(forms[:, c], forms[:, c]) for c in range(3))
         one = turn[:, 3, None].expand(4, batch)
         quadrics.append(q - (side / (unit * unit)) * product_of_forms(one, one))
     found = intersect_quadrics(*quadrics)
-    l = torch.stack([combine_rows(found.point, [turn[k, i] for k in range(4)]) for i in range(4)])  # noqa: E741
     item = found.item
+    q = [combine_rows(found.point, [turn[k, i] for k in range(4)]) for i in range(4)]
+    q[0] = q[0] * mean[item]
+    l = torch.stack([q[0] + a * q[1] + b * q[2] for a, b in _DIFFERENCES]) / q[3]  # noqa: E741
     p, d, X, unit, shift = (take_columns(v, item) if v.ndim > 1 else v[item] for v in (p, d, X, unit, shift))
-    l, met = _refine(l[:3] / l[3], p, d, X)  # noqa: E741
+    l, met = _refine(l, p, d, X)  # noqa: E741
     right = met & (l + combine_rows(shift.unbind(1), d.unbind(1)) > 0).all(0)
     Y = p + d * l[:, None]
     pose = _motion(X, Y)
