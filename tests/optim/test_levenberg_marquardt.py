@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 
 import numpy as np
 import pytest
@@ -202,3 +203,15 @@ def test_wrong_shapes(unchecked: None) -> None:
         levenberg_marquardt(lambda x, t: x - t, torch.ones(4, 3), torch.ones(4, 3))
     with pytest.raises(ValueError, match="size"):
         levenberg_marquardt(lambda x: x[0][..., None], (torch.ones(4, 3),))
+
+
+def test_pieces_change_nothing(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, t, y = decay_data(generator, 23)
+    start = torch.ones(23, 3, dtype=F64)
+    whole = levenberg_marquardt(decay, start, t, y)
+    monkeypatch.setattr(importlib.import_module("torchsfm.optim.levenberg_marquardt"), "PIECE", 5 * 90)
+    cut = levenberg_marquardt(decay, start, t, y)
+    for name in ("x", "cost", "initial_cost"):
+        torch.testing.assert_close(getattr(cut, name), getattr(whole, name), rtol=1e-9, atol=1e-12)
+    assert torch.equal(cut.status, whole.status)
+    assert cut.iterations.shape == (23,)

@@ -4,7 +4,18 @@ from torchsfm.optim.covariance import SparseCovariance, sparse_covariance
 from torchsfm.optim.implicit import attach_implicit, attach_optimum, wants_derivative
 from torchsfm.optim.levenberg_marquardt import LeastSquaresResult, levenberg_marquardt
 from torchsfm.optim.loss import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey, loss_slope
-from torchsfm.optim.manifold import Euclidean, Manifold, RigidMotion, Rotation, Subset, UnitSphere, rotation_exponential
+from torchsfm.optim.manifold import (
+    Euclidean,
+    Manifold,
+    Positive,
+    Product,
+    RigidMotion,
+    Rotation,
+    Subset,
+    UnitSphere,
+    rotation_exponential,
+)
+from torchsfm.optim.manifold_line import Line3D
 from torchsfm.optim.sparse_levenberg_marquardt import SparseResult, sparse_levenberg_marquardt
 from torchsfm.optim.terms import Block, Term
 
@@ -15,8 +26,11 @@ __all__ = [
     "GemanMcClure",
     "Huber",
     "LeastSquaresResult",
+    "Line3D",
     "Loss",
     "Manifold",
+    "Positive",
+    "Product",
     "RigidMotion",
     "Rotation",
     "SoftL1",

@@ -1,8 +1,7 @@
 """Levenberg-Marquardt for thousands of small dense least-squares problems at once.
 
 Minimises `sum_i w_i rho(|r_i(x)|^2) / 2` over `x` for every element of a batch. Each problem has its own damping, its own
-accepted and rejected steps and its own end; a finished problem leaves the batch. The damping follows the trust-region rule of
-Nielsen (1999; Madsen, Nielsen & Tingleff 2004, 3.2), scaled by the diagonal of the normal equations (Marquardt 1963).
+accepted and rejected steps and its own end (`damped_steps`).
 """
 
 from collections.abc import Callable
@@ -14,11 +13,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, tensor_map
+from torchsfm.optim.damped_steps import Found, Options, minimise
+from torchsfm.optim.dense_problem import DenseProblem, Linearize
 from torchsfm.optim.implicit import attach_optimum, wants_derivative
-from torchsfm.optim.loss import Loss, loss_slope
+from torchsfm.optim.loss import Loss
+from torchsfm.optim.trees import cut, flatten, join, leaves
 
 M = TypeVar("M")
-Linearize = Callable[..., tuple[Tensor, Tensor]]
+PIECE = 600_000
+"""Numbers in the Jacobians of the problems minimised together: more do not stay in the cache."""
 
 
 @dataclass(frozen=True)
@@ -85,192 +88,42 @@ def levenberg_marquardt(
         if not isinstance(x0, Tensor):
             raise ValueError("size: wanted the number of tangent directions, since x0 is not one tensor")
         size = x0.shape[-1]
-    leaves = _leaves((data, weights))
+    followed = leaves((data, weights))
+    options = Options(max_iterations, function_tolerance, step_tolerance, initial_damping)
     with torch.no_grad():
-        batch = _batch_shape(residual, x0, data)
-        flat_x = _flatten(tensor_map(torch.Tensor.detach, x0), batch)
-        flat_data = _flatten(tensor_map(torch.Tensor.detach, data), batch)
-        flat_weights = None if weights is None else _flatten(weights.detach(), batch)
-        problem = _Problem(residual, move, size, loss, linearize)
-        result = _minimise(
-            problem, flat_x, flat_data, flat_weights, max_iterations, function_tolerance, step_tolerance, initial_damping
-        )
+        shape = _residual_shape(residual, x0, data)
+        batch = shape[:-2]
+        flat_x = flatten(tensor_map(torch.Tensor.detach, x0), batch)
+        flat_data = flatten(tensor_map(torch.Tensor.detach, data), batch)
+        flat_weights = None if weights is None else flatten(weights.detach(), batch)
+        problem = DenseProblem(residual, move, size, loss, linearize)
+        step = max(1, PIECE // max(1, shape[-2] * shape[-1] * size))
+        result = _minimise_in_pieces(problem, flat_x, flat_data, flat_weights, options, batch.numel(), step)
     x = result.x
-    if wants_derivative(*leaves):
+    if wants_derivative(*followed):
         good = (result.status == Status.OK) | (result.status == Status.NOT_CONVERGED)
-        x = _attach(problem, x, _flatten(data, batch), None if weights is None else _flatten(weights, batch), good)
+        x = _attach(problem, x, flatten(data, batch), None if weights is None else flatten(weights, batch), good)
     return LeastSquaresResult(
         tensor_map(lambda v: v.reshape(batch + v.shape[1:]), x),
-        *(v.reshape(batch) for v in (result.cost, result.initial_cost, result.iterations, result.status)),
+        *(v.reshape(batch) for v in result[1:]),
     )
 
 
-@dataclass(frozen=True)
-class _Problem:
-    residual: Callable[..., Tensor]
-    retract: Callable[[Any, Tensor], Any]
-    size: int
-    loss: Loss | None
-    linearize: Linearize | None
-
-    def cost(self, x: Any, data: Any, weights: Tensor | None) -> Tensor:
-        square = self.residual(x, *data).square().sum(-1).double()
-        rho = square if self.loss is None else self.loss(square)
-        if weights is not None:
-            # Left out means left out: a NaN there must not come through.
-            rho = torch.where(weights > 0, rho * weights, 0.0)
-        return rho.sum(-1) / 2
-
-    def normal_equations(self, x: Any, data: Any, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost, gradient and Gauss-Newton matrix, in float64."""
-        r, jacobian = self.linearize(x, *data) if self.linearize is not None else self._differentiate(x, data)
-        r, jacobian = r.double(), jacobian.double()
-        square = r.square().sum(-1)
-        scale = torch.ones_like(square) if self.loss is None else loss_slope(self.loss, square)
-        rho = square if self.loss is None else self.loss(square)
-        if weights is not None:
-            counts = weights > 0
-            rho = torch.where(counts, rho * weights, 0.0)
-            scale = torch.where(counts, scale * weights, 0.0)
-            r = torch.where(counts[..., None], r, 0.0)
-            jacobian = torch.where(counts[..., None, None], jacobian, 0.0)
-        flat = jacobian.flatten(1, 2)
-        weighted = (scale[..., None, None] * jacobian).flatten(1, 2)
-        gradient = (weighted * r.flatten(1)[..., None]).sum(1)
-        return rho.sum(-1) / 2, gradient, weighted.mT @ flat
-
-    def _differentiate(self, x: Any, data: Any) -> tuple[Tensor, Tensor]:
-        """Residual and Jacobian, column by column.
-
-        The pullback is linear in what it pulls back, so its own pullbacks are the columns of the Jacobian. Forward mode would
-        do the same, but loading it takes PyTorch seconds.
-        """
-        first = _leaves(x)[0]
-        with torch.enable_grad():
-            delta = first.new_zeros((first.shape[0], self.size)).requires_grad_()
-            value = self.residual(self.retract(x, delta), *data)
-            seed = torch.zeros_like(value).requires_grad_()
-            (pulled,) = torch.autograd.grad(value, delta, seed, create_graph=True, materialize_grads=True)
-            ones = torch.ones_like(pulled[:, 0])
-            columns = [
-                torch.autograd.grad(pulled[:, i], seed, ones, retain_graph=True, materialize_grads=True)[0]
-                for i in range(self.size)
-            ]
-        return value.detach(), torch.stack(columns, -1)
+def _minimise_in_pieces(
+    problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, options: Options, count: int, step: int
+) -> Found:
+    """Minimise `step` problems at a time."""
+    found = []
+    for start in range(0, max(count, 1), step):
+        some, its_data, its_weights = cut((x, data, weights), start, start + step)
+        found.append(minimise(problem, some, its_data, its_weights, options))
+    return Found(*(join(list(parts)) for parts in zip(*found, strict=True)))
 
 
-@dataclass
-class _State:
-    """The problems still under way, with their places in the batch."""
-
-    index: Tensor
-    x: Any
-    data: Any
-    weights: Tensor | None
-    cost: Tensor
-    gradient: Tensor
-    hessian: Tensor
-    damping: Tensor
-    growth: Tensor
-
-    def keep(self, active: Tensor) -> "_State":
-        where = active.nonzero()[:, 0]
-        return tensor_map(lambda v: v.index_select(0, where), self)
-
-
-def _minimise(
-    problem: _Problem,
-    x: Any,
-    data: Any,
-    weights: Tensor | None,
-    max_iterations: int,
-    function_tolerance: float,
-    step_tolerance: float,
-    initial_damping: float,
-) -> LeastSquaresResult[Any]:
-    cost, gradient, hessian = problem.normal_equations(x, data, weights)
-    count = cost.shape[0]
-    iterations = torch.zeros(count, dtype=torch.int32, device=cost.device)
-    status = torch.full((count,), int(Status.NOT_CONVERGED), dtype=torch.int8, device=cost.device)
-    status[~(cost.isfinite() & gradient.isfinite().all(-1) & hessian.isfinite().all(-1).all(-1))] = int(Status.NOT_FINITE)
-    status[_too_few(problem, x, data, weights)] = int(Status.TOO_FEW)
-    best, best_cost, initial = x, cost, cost
-    ones = torch.ones_like(cost)
-    index = torch.arange(count, device=cost.device)
-    state = _State(index, x, data, weights, cost, gradient, hessian, initial_damping * ones, 2 * ones)
-    active = status == Status.NOT_CONVERGED
-    if not active.all():
-        state, active = state.keep(active), active[active]
-    for _ in range(max_iterations):
-        if state.index.numel() == 0:
-            break
-        step, promise, solved = _solve(state)
-        trial = problem.retract(state.x, step.to(_leaves(state.x)[0].dtype))
-        cost, gradient, hessian = problem.normal_equations(trial, state.data, state.weights)
-        ratio = (state.cost - cost) / promise.clamp_min(torch.finfo(cost.dtype).tiny)
-        usable = solved & cost.isfinite() & gradient.isfinite().all(-1) & hessian.isfinite().all(-1).all(-1)
-        # Below the rounding error of the cost a step is taken on the promise: the last one brings x, not the cost, to its end.
-        noise = 1e-14 * state.cost
-        rounding = (promise <= 100 * noise) & (cost - state.cost <= noise)
-        accepted = usable & (((cost <= state.cost) & (ratio > 1e-4)) | rounding)
-        small = solved & (promise <= function_tolerance * state.cost)
-        small |= accepted & ~rounding & (state.cost - cost <= function_tolerance * state.cost)
-        small |= solved & (_norm(step) <= step_tolerance * (_norm(state.x) + step_tolerance))
-        shrink = (1 - (2 * ratio.clamp(0, 1) - 1) ** 3).clamp_min(1 / 3)
-        damping = torch.where(accepted, state.damping * shrink, state.damping * state.growth).clamp_min(1e-16)
-        growth = torch.where(accepted, 2 * torch.ones_like(damping), 2 * state.growth)
-        iterations[state.index] += active.int()
-        accepted = accepted & active
-        state = _State(
-            state.index,
-            _select(accepted, trial, state.x),
-            state.data,
-            state.weights,
-            torch.where(accepted, cost, state.cost),
-            torch.where(accepted[:, None], gradient, state.gradient),
-            torch.where(accepted[:, None, None], hessian, state.hessian),
-            damping,
-            growth,
-        )
-        done = active & (small | (damping > 1e16))
-        status[state.index[done]] = int(Status.OK)
-        active = active & ~done
-        if 2 * active.sum() <= active.numel():
-            best, best_cost = _put(best, state.index, state.x), best_cost.index_copy(0, state.index, state.cost)
-            state, active = state.keep(active), active[active]
-    best, best_cost = _put(best, state.index, state.x), best_cost.index_copy(0, state.index, state.cost)
-    return LeastSquaresResult(best, best_cost.nan_to_num(nan=torch.inf), initial.nan_to_num(nan=torch.inf), iterations, status)
-
-
-def _solve(state: _State) -> tuple[Tensor, Tensor, Tensor]:
-    """The damped step, the decrease the linear model promises, and where the system could be solved."""
-    diagonal = state.hessian.diagonal(dim1=-2, dim2=-1)
-    # A direction that nothing depends on gets the damping of the others, and so does not move.
-    floor = 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(diagonal.dtype).tiny
-    damped = state.damping[:, None] * diagonal.clamp_min(floor)
-    factor, info = torch.linalg.cholesky_ex(state.hessian + torch.diag_embed(damped))
-    solved = info == 0
-    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
-    factor = torch.where(solved[:, None, None], factor, eye)
-    step = -torch.cholesky_solve(state.gradient[..., None], factor)[..., 0]
-    solved = solved & step.isfinite().all(-1)
-    step = torch.where(solved[:, None], step, torch.zeros_like(step))
-    promise = (step * (damped * step - state.gradient)).sum(-1) / 2
-    return step, promise, solved
-
-
-def _too_few(problem: _Problem, x: Any, data: Any, weights: Tensor | None) -> Tensor:
-    count, components = problem.residual(x, *data).shape[-2:]
-    first = _leaves(x)[0]
-    if weights is None:
-        return torch.full(first.shape[:1], count * components < problem.size, device=first.device)
-    return (weights > 0).sum(-1) * components < problem.size
-
-
-def _attach(problem: _Problem, x: Any, data: Any, weights: Tensor | None, good: Tensor) -> Any:
+def _attach(problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, good: Tensor) -> Any:
     """The minimum with its derivatives with respect to all tensors in data and weights."""
-    followed = _leaves((data, weights))
-    first = _leaves(x)[0]
+    followed = leaves((data, weights))
+    first = leaves(x)[0]
     zero = first.new_zeros((first.shape[0], problem.size))
 
     def objective(delta: Tensor, *tensors: Tensor) -> Tensor:
@@ -279,55 +132,19 @@ def _attach(problem: _Problem, x: Any, data: Any, weights: Tensor | None, good: 
         return problem.cost(problem.retract(x, delta), new_data, new_weights)
 
     delta = attach_optimum(objective, zero, *followed, valid=good)
-    moved = iter(_leaves(problem.retract(x, delta)))
+    moved = iter(leaves(problem.retract(x, delta)))
     # The value stays what it was, bit for bit.
     return tensor_map(lambda v: v + (m := next(moved)) - m.detach(), x)
 
 
-def _batch_shape(residual: Callable[..., Tensor], x0: Any, data: Any) -> torch.Size:
-    first = _leaves(x0)[0].shape
+def _residual_shape(residual: Callable[..., Tensor], x0: Any, data: Any) -> torch.Size:
+    """The shape (*batch, n, d) of the residuals."""
+    first = leaves(x0)[0].shape
     shape = residual(x0, *data).shape
     batch = shape[:-2]
     if len(shape) < 2 or first[: len(batch)] != batch or (isinstance(x0, Tensor) and len(first) != len(batch) + 1):
         raise ValueError(f"residual: wanted (*batch, n, d), the batch in front of x0 {tuple(first)}, got {tuple(shape)}")
-    return batch
-
-
-def _flatten(tree: Any, batch: torch.Size) -> Any:
-    """One batch dimension in front of every tensor."""
-
-    def one(v: Tensor) -> Tensor:
-        rest = v.shape[len(batch) :]
-        if len(batch) == 1:
-            return v.expand(batch + rest)
-        return v.expand(batch + rest).reshape(batch.numel(), *rest) if batch else v[None]
-
-    return tensor_map(one, tree)
-
-
-def _leaves(tree: Any) -> list[Tensor]:
-    found: list[Tensor] = []
-
-    def collect(v: Tensor) -> Tensor:
-        found.append(v)
-        return v
-
-    tensor_map(collect, tree)
-    return found
-
-
-def _select(mask: Tensor, a: Any, b: Any) -> Any:
-    other = iter(_leaves(b))
-    return tensor_map(lambda v: torch.where(mask.reshape(-1, *([1] * (v.ndim - 1))), v, next(other)), a)
-
-
-def _put(tree: Any, index: Tensor, values: Any) -> Any:
-    new = iter(_leaves(values))
-    return tensor_map(lambda v: v.index_copy(0, index, next(new)), tree)
-
-
-def _norm(tree: Any) -> Tensor:
-    return torch.stack([v.double().flatten(1).square().sum(-1) for v in _leaves(tree)]).sum(0).sqrt()
+    return shape
 
 
 def _add(x: Any, delta: Tensor) -> Any:

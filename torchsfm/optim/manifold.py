@@ -135,6 +135,50 @@ class UnitSphere:
         return moved
 
 
+@dataclass(frozen=True)
+class Positive:
+    """Positive numbers (focal lengths, scales, depths), moved by their logarithm: `x exp(delta)`. Signs are kept."""
+
+    size: int = 1
+
+    @property
+    def ambient(self) -> int:
+        """Numbers stored."""
+        return self.size
+
+    @property
+    def tangent(self) -> int:
+        """Degrees of freedom."""
+        return self.size
+
+    def retract(self, x: Float[Tensor, "*#b n"], delta: Float[Tensor, "*#b n"]) -> Float[Tensor, "*b n"]:
+        """The numbers scaled."""
+        return x * delta.exp()
+
+
+@dataclass(frozen=True)
+class Product:
+    """Several parameters side by side in one block, each on its own manifold."""
+
+    parts: tuple[Manifold, ...]
+
+    @property
+    def ambient(self) -> int:
+        """Numbers stored."""
+        return sum(part.ambient for part in self.parts)
+
+    @property
+    def tangent(self) -> int:
+        """Degrees of freedom."""
+        return sum(part.tangent for part in self.parts)
+
+    def retract(self, x: Float[Tensor, "*#b n"], delta: Float[Tensor, "*#b d"]) -> Float[Tensor, "*b n"]:
+        """Each part moved by its share of the step."""
+        values = torch.split(x, [part.ambient for part in self.parts], -1)
+        steps = torch.split(delta, [part.tangent for part in self.parts], -1)
+        return torch.cat([part.retract(v, d) for part, v, d in zip(self.parts, values, steps, strict=True)], -1)
+
+
 def rotation_exponential(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """The rotation `exp([w]x)`, smooth at zero (Rodrigues)."""
     square = (w * w).sum(-1)[..., None, None]
