@@ -9,6 +9,7 @@ import torch
 from typer.testing import CliRunner
 
 from torchsfm.cli import app
+from torchsfm.cli.job import Job
 from torchsfm.formats import read_bal, read_colmap, read_ply, write_bal, write_colmap
 from torchsfm.geometry import BrownConrady, BundleProblem, Camera
 from torchsfm.reconstruction import Reconstruction
@@ -136,6 +137,23 @@ def test_options_reach_the_adjustment(bal: Path) -> None:
     assert table(held)["after"][0] > table(squares)["after"][0]
     _, short, _ = torchsfm("bundle", bal, "--max-iterations", 1)
     assert "stopped at the largest number of iterations after 1 iterations" in short
+
+
+def test_interrupt_keeps_the_best_so_far(bal: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = Job.progress
+
+    def progress(self: Job, stage: str, done: int, total: int) -> None:
+        plain(self, stage, done, total)
+        if (stage, done) == ("bundle", 2):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Job, "progress", progress)
+    status, text, _ = torchsfm("bundle", bal, "--out", tmp_path / "out.txt")
+    assert status == 130
+    assert "interrupted after 2 iterations" in text
+    cost = float(read_bal(tmp_path / "out.txt").residuals().square().sum() / 2)
+    assert cost == pytest.approx(table(text)["after"][0], rel=1e-4)
+    assert cost < 0.5 * table(text)["before"][0]
 
 
 def test_what_is_not_there(tmp_path: Path) -> None:

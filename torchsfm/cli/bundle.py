@@ -11,7 +11,7 @@ import typer
 
 from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, bundle_adjust_model
-from torchsfm.cli.job import NOTHING, Job, UserError, told
+from torchsfm.cli.job import INTERRUPTED, NOTHING, Job, UserError, told
 from torchsfm.formats import read_bal, read_colmap, read_libmv, write_bal, write_colmap, write_ply
 from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey
@@ -43,6 +43,7 @@ LOSSES: dict[LossName, Callable[[float], Loss]] = {
 ENDINGS = {
     Status.OK: "converged",
     Status.NOT_CONVERGED: "stopped at the largest number of iterations",
+    Status.INTERRUPTED: "interrupted",
 }
 
 
@@ -75,7 +76,10 @@ def bundle(
     tolerance: Annotated[float, typer.Option(min=0, help="Least relative decrease of the cost to go on for.")] = 1e-6,
     threads: Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")] = None,
 ) -> None:
-    """Adjust cameras and points of a given problem, and compare before and after."""
+    """Adjust cameras and points of a given problem, and compare before and after.
+
+    An interrupt (Ctrl-C) ends it with the best so far, which is written as the end would be.
+    """
     with told(Job(out or file)) as job:
         job.set_threads(threads)
         job.progress("read", 0, 1)
@@ -106,6 +110,8 @@ def bundle(
         if out is not None:
             write_model(adjusted.model, out)
             typer.echo(f"written: {out}")
+        if result.status == Status.INTERRUPTED:
+            raise typer.Exit(INTERRUPTED)
 
 
 def read_model(path: Path) -> Model:
