@@ -201,6 +201,14 @@ def soft_ransac(
     )  # fmt: skip
 
 
+def uniform_numbers(seed: int, rows: int, columns: int, device: torch.device) -> Float[Tensor, "rows columns"]:
+    """Random numbers between 0 and 1 that are a hash of the seed, the row and the column."""
+    counter = torch.arange(rows, device=device)[:, None] * (1 << 32) + torch.arange(columns, device=device)
+    key = hash_integers(torch.tensor(seed, device=device))
+    random = (hash_integers(hash_integers(counter + 1) ^ key) >> 11) & ((1 << 53) - 1)
+    return (random.double() + 0.5) * 2.0**-53
+
+
 def _draw(
     logits: Float[Tensor, "p n"], usable: Bool[Tensor, "p n"], hypotheses: int, size: int, seed: int
 ) -> tuple[Int[Tensor, "p h m"], Float[Tensor, "p h"]]:
@@ -211,10 +219,7 @@ def _draw(
     """
     p, n = logits.shape
     device = logits.device
-    counter = torch.arange(hypotheses, device=device)[:, None] * (1 << 32) + torch.arange(n, device=device)
-    key = hash_integers(torch.tensor(seed, device=device))
-    random = (hash_integers(hash_integers(counter + 1) ^ key) >> 11) & ((1 << 53) - 1)
-    uniform = (random.double() + 0.5) * 2.0**-53
+    uniform = uniform_numbers(seed, hypotheses, n, device)
     noise = -torch.log(-torch.log(uniform))
     with torch.no_grad():
         keys = torch.where(usable, logits.double(), -torch.inf)[:, None] + noise

@@ -1,0 +1,320 @@
+"""Several models in one set of data: the data are grouped by what they have in common, which is the models they prefer.
+
+Hypotheses are drawn from near neighbours, and from anywhere, and the best supported are optimised locally. A datum prefers the
+hypotheses near it, by exp(-r / threshold). Two groups are as alike as their preferences (Tanimoto's distance), a group prefers
+what all its members do, and groups merge until none prefers what another does (T-linkage: Magri & Fusiello 2014). All groups that
+are nearest to each other merge at a time, so that few rounds do. Each group that is larger than chance has a model refined on
+it; groups that an earlier model explains join it, and so do single data well inside a model.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.local_optimisation import optimise_locally
+from torchsfm.robust.models import cast, join
+from torchsfm.robust.scoring import squared_residual
+from torchsfm.robust.soft_selection import uniform_numbers
+
+M = TypeVar("M")
+
+_NEIGHBOURS = (10, 20, 40)
+"""From how many neighbours of a datum a quarter of the samples each is drawn; the last quarter is drawn from all."""
+_REACH = 4.0
+"""Squared distance, in units of the squared threshold, to which data prefer a hypothesis at all."""
+_EXPLAINED = 0.6
+"""Share of a group within the threshold of an earlier model that joins it."""
+_INSIDE = 0.25
+"""Squared distance within which single data join a model."""
+_REFINEMENTS = 6
+_NUMBERS = 1 << 18
+"""Distances to compute at a time."""
+
+
+@dataclass(frozen=True)
+class Structures(Generic[M]):
+    """Models that together explain the data of each problem.
+
+    Attributes:
+        model: As many slots as were asked for, the model of most data first; empty slots hold copies of some model, or zero.
+        valid: Which slots hold models.
+        label: The slot that each datum belongs to, -1 for none.
+        found: How many structures there were; more than slots means that the smallest are left out.
+        status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample had a
+            solution; `NO_CONSENSUS`: no group is large enough.
+    """
+
+    model: M
+    valid: Bool[Tensor, "*batch s"]
+    label: Int[Tensor, "*batch n"]
+    found: Int[Tensor, "*batch"]
+    status: Int[Tensor, "*batch"]
+
+
+def find_structures(
+    estimator: Estimator[M],
+    *data: Float[Tensor, "*#batch n _"],
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    slots: int = 8,
+    smallest: int | None = None,
+    hypotheses: int = 2000,
+    kept: int = 600,
+    generator: torch.Generator | None = None,
+) -> Structures[M]:
+    """Find several models of one kind in each problem's data, and which data belong to which.
+
+    Rows with NaN or infinite numbers are left out. Problems are worked on one after the other, each with its own number of data;
+    the result for a problem is the same whatever else is in the batch. Time and memory grow with the square of the number of
+    data.
+
+    Args:
+        estimator: The problem: what to solve, measure and refine.
+        *data: The data, `(*batch, n, d)` each, equally many; batch dimensions broadcast. Neighbours are near in all of them.
+        threshold: Largest distance of data from their model, in the unit of the estimator's residual; one number or one per
+            problem. Two to four times the scale of the noise: structures are found by being dense, not by being exact.
+        mask: Which data exist; all of them if not given.
+        slots: Most structures to return.
+        smallest: Least number of data of a structure; four more than a sample has if not given.
+        hypotheses: Samples to draw for a problem.
+        kept: Hypotheses to optimise and to group by.
+        generator: Source of randomness; PyTorch's global one if not given.
+
+    Returns:
+        Models, labels and status of each problem. No derivatives.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    if not data:
+        raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
+    m = estimator.sample_size
+    smallest = m + 4 if smallest is None else smallest
+    for name, value, least in (("slots", slots, 1), ("smallest", smallest, m), ("hypotheses", hypotheses, 1), ("kept", kept, 1)):
+        if value < least:
+            raise ValueError(f"{name}: wanted at least {least}, got {value}")
+    known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
+    limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(threshold)
+    batch = check_tensors(**known, threshold=(limit, ""), mask=(mask, "n: bool"))
+    dtype, device, n, p = data[0].dtype, data[0].device, data[0].shape[-2], batch.numel()
+    seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
+    with torch.no_grad():
+        flat = [d.detach().double().expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
+        own = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
+        own = cast(own, torch.float64)
+        bound = limit.double().expand(batch).reshape(p)
+        exists = torch.ones(p, n, dtype=torch.bool, device=device)
+        exists = exists if mask is None else mask.expand(*batch, n).reshape(p, n)
+        usable = exists
+        for d in flat:
+            usable = usable & torch.isfinite(d).all(-1)
+        enough = (usable.sum(-1) >= m) & torch.isfinite(bound) & (bound > 0)
+        status = torch.full((p,), int(Status.NOT_FINITE), dtype=torch.int8, device=device)
+        status[exists.sum(-1) < m] = int(Status.TOO_FEW)
+        label = torch.full((p, n), -1, dtype=torch.long, device=device)
+        found = torch.zeros(p, dtype=torch.long, device=device)
+        model = _empty(own, flat, p, slots)
+        for i in enough.nonzero()[:, 0].tolist():
+            inside = usable[i]
+            problem = _Problem(
+                tensor_map(lambda t: t[i : i + 1], own), [d[i][inside][None] for d in flat], bound[i : i + 1] ** 2  # noqa: B023
+            )
+            groups, models, solved = problem.solve(seed, hypotheses, kept, smallest)
+            number = 0 if models is None else int(groups.max()) + 1
+            label[i, inside] = torch.where(groups < slots, groups, -1)
+            found[i] = number
+            status[i] = int(Status.OK if number else Status.NO_CONSENSUS if solved else Status.DEGENERATE)
+            if models is not None:
+                at = torch.arange(slots, device=device).clamp(max=number - 1)
+                _place(model, i, tensor_map(lambda t: t[at], models))  # noqa: B023
+        valid = torch.arange(slots, device=device) < found[:, None]
+        return Structures(
+            tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
+            valid.reshape(*batch, slots), label.reshape(*batch, n), found.reshape(batch), status.reshape(batch),
+        )  # fmt: skip
+
+
+def _empty(estimator: Estimator[M], data: list[Tensor], p: int, slots: int) -> M:
+    """Zero models of the right shape."""
+    one = torch.zeros(1, 1, dtype=torch.long, device=data[0].device).expand(1, estimator.sample_size)
+    sample = [torch.zeros_like(d[:1, :1]).expand(1, one.shape[1], d.shape[-1]) for d in data]
+    if p == 0:
+        sample = [d.new_zeros(1, one.shape[1], d.shape[-1]) for d in data]
+    fields = tensor_map(lambda t: t[:1] if p else t.new_ones(1, *t.shape[1:]), estimator)
+    shape = fields.minimal(*sample).model
+    return tensor_map(lambda t: t.new_zeros(p, slots, *t.shape[2:]), shape)
+
+
+def _place(models: Any, i: int, own: Any) -> None:
+    pieces: list[Tensor] = []
+    tensor_map(lambda t: (pieces.append(t), t)[1], own)  # type: ignore[func-returns-value]
+    tensor_map(lambda t: t[i].copy_(pieces.pop(0)), models)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """One problem, with a batch dimension of size 1: estimator, data (1, n, d), squared threshold (1)."""
+
+    estimator: Any
+    data: list[Tensor]
+    limit: Tensor
+
+    @property
+    def count(self) -> int:
+        return self.data[0].shape[1]
+
+    def solve(self, seed: int, hypotheses: int, kept: int, smallest: int) -> tuple[Tensor, Any, bool]:
+        """The group of each datum, largest first, -1 for none; the models of the groups, if any; whether samples had solutions."""
+        nothing = torch.full((self.count,), -1, dtype=torch.long, device=self.limit.device)
+        models = self.hypotheses(seed, hypotheses)
+        if self._number(models) == 0:
+            return nothing, None, False
+        models = self.best(models, kept)
+        ratio = self.ratios(models)
+        preference = torch.where(ratio < _REACH, torch.exp(-ratio.clamp(max=_REACH).sqrt()), 0)
+        group = link(preference.mT)
+        members = (group == group[:, None]).sum(-1)
+        # The first member stands for its group; large groups first.
+        heads = ((group == torch.arange(self.count, device=group.device)) & (members >= smallest)).nonzero()[:, 0]
+        heads = heads[members[heads].argsort(descending=True, stable=True)]
+        if len(heads) == 0:
+            return nothing, None, True
+        inside = group == heads[:, None]
+        models = self.refined(models, ratio, inside)
+        return self.joined(models, inside)
+
+    @staticmethod
+    def _number(models: Any) -> int:
+        sizes: list[int] = []
+        tensor_map(lambda t: (sizes.append(len(t)), t)[1], models)  # type: ignore[func-returns-value]
+        return sizes[0]
+
+    def hypotheses(self, seed: int, number: int) -> Any:
+        """Models through samples of neighbours and of all data."""
+        n, m, device = self.count, self.estimator.sample_size, self.limit.device
+        parts = []
+        for d in self.data:
+            spread = d[0].std(0, correction=0).norm()
+            parts.append(d[0] / torch.where(spread > 0, spread, 1))
+        place = torch.cat(parts, -1)
+        most = min(max(_NEIGHBOURS), n - 1)
+        near = []
+        for i in range(0, n, 512):
+            # The datum itself is its own nearest neighbour, or as near as any.
+            gap = torch.cdist(place[i : i + 512], place, compute_mode="donot_use_mm_for_euclid_dist")
+            row = torch.arange(len(gap), device=device)
+            gap[row, row + i] = torch.inf
+            near.append(gap.topk(most, largest=False).indices)
+        nearest = torch.cat(near)
+        samples = []
+        share = -(-number // (len(_NEIGHBOURS) + 1))
+        for level, k in enumerate((*_NEIGHBOURS, n - 1)):
+            random = uniform_numbers(seed + level, share, min(k, n - 1) + 1, device)
+            first = (random[:, 0] * n).long()
+            if k >= n - 1:
+                # Anything but the first.
+                others = random[:, 1:].topk(m - 1, dim=-1).indices
+                others = others + (others >= first[:, None])
+            else:
+                order = random[:, 1 : max(k, m - 1) + 1].topk(m - 1, dim=-1).indices
+                others = nearest[first[:, None], order]
+            samples.append(torch.cat((first[:, None], others), -1))
+        index = torch.cat(samples)
+        wide = tensor_map(lambda t: t[:, None], self.estimator)
+        sample = [d[:, index] for d in self.data]
+        solutions = wide.minimal(*sample)
+        valid = solutions.valid & ~wide.degenerate(*sample)[..., None]
+        return tensor_map(lambda t: t[valid], solutions.model)
+
+    def ratios(self, models: Any) -> Float[Tensor, "h n"]:
+        """Squared distances in units of the squared threshold."""
+        wide = tensor_map(lambda t: t[:, None], self.estimator)
+        total, step = self._number(models), max(1, _NUMBERS // self.count)
+        rows = []
+        for i in range(0, total, step):
+            some = tensor_map(lambda t: t[None, i : i + step], models)  # noqa: B023
+            rows.append(squared_residual(wide, some, *(d[:, None] for d in self.data))[0] / self.limit)
+        return torch.cat(rows).nan_to_num(nan=torch.inf)
+
+    def best(self, models: Any, kept: int) -> Any:
+        """The best supported, locally optimised."""
+        score = (1 - self.ratios(models).clamp(max=1)).sum(-1)
+        chosen = score.argsort(descending=True, stable=True)[:kept]
+        wide = tensor_map(lambda t: t[:, None], self.estimator)
+        everywhere = torch.ones(1, self.count, dtype=torch.bool, device=score.device)
+        step, done = max(1, _NUMBERS // self.count), []
+        for i in range(0, len(chosen), step):
+            some = tensor_map(lambda t: t[chosen[i : i + step]][None], models)  # noqa: B023
+            done.append(optimise_locally(wide, some, [d[:, None] for d in self.data], self.limit, everywhere))
+        return tensor_map(lambda t: t[0], join(done, 1))
+
+    def refined(self, models: Any, ratio: Tensor, inside: Bool[Tensor, "g n"]) -> Any:
+        """A model of each group: the best hypothesis for it, refined on its members."""
+        loss = ratio.clamp(max=1) @ inside.to(ratio.dtype).mT
+        group = tensor_map(lambda t: t[loss.argmin(0)], models)
+        wide = tensor_map(lambda t: t[:, None], self.estimator)
+        for _ in range(_REFINEMENTS):
+            weights = (inside * (1 - self.ratios(group) / _REACH).clamp(min=0))[None]
+            moved = wide.refine(tensor_map(lambda t: t[None], group), *(d[:, None] for d in self.data), weights=weights)
+            group = tensor_map(lambda t: t[0], moved)
+        return group
+
+    def joined(self, models: Any, inside: Bool[Tensor, "g n"]) -> tuple[Tensor, Any, bool]:
+        """Groups that an earlier model explains with it, and the data well inside a model."""
+        ratio = self.ratios(models)
+        home: list[int] = []
+        heads: list[int] = []
+        for k in range(len(inside)):
+            explained = [(ratio[h][inside[k]] < 1).double().mean() > _EXPLAINED for h in heads]
+            if not any(explained):
+                heads.append(k)
+            home.append(explained.index(True) if any(explained) else len(heads) - 1)
+        group = torch.full((self.count,), -1, dtype=torch.long, device=ratio.device)
+        for k, h in enumerate(home):
+            group[inside[k]] = h
+        models = tensor_map(lambda t: t[heads], models)
+        least, nearest = ratio[heads].min(0)
+        group = torch.where((group < 0) & (least < _INSIDE), nearest, group)
+        # Refined once more on all that belong, and the largest first.
+        inside = group == torch.arange(len(heads), device=group.device)[:, None]
+        models = self.refined(models, self.ratios(models), inside)
+        order = inside.sum(-1).argsort(descending=True, stable=True)
+        rank = torch.empty_like(order)
+        rank[order] = torch.arange(len(order), device=order.device)
+        return torch.where(group < 0, -1, rank[group.clamp(min=0)]), tensor_map(lambda t: t[order], models), True
+
+
+def link(preference: Float[Tensor, "n h"]) -> Int[Tensor, "n"]:
+    """Group data by their preferences for hypotheses: the first member of the group of each datum.
+
+    Groups that are each other's nearest merge, round by round, until no two have a preference in common.
+    """
+    preference = preference.clone()
+    n = len(preference)
+    head = torch.arange(n, device=preference.device)
+    alive = head.clone()
+    while len(alive) > 1:
+        product = preference @ preference.mT
+        size = product.diagonal()
+        alike = product / (size[:, None] + size - product).clamp(min=1e-30)
+        alike.fill_diagonal_(-1)
+        most, nearest = alike.max(-1)
+        here = torch.arange(len(alive), device=head.device)
+        pair = (nearest[nearest] == here) & (here < nearest) & (most > 1e-9)
+        first = pair.nonzero()[:, 0]
+        if len(first) == 0:
+            break
+        second = nearest[first]
+        preference[first] = torch.minimum(preference[first], preference[second])
+        map_to = torch.arange(n, device=head.device)
+        map_to[alive[second]] = alive[first]
+        head = map_to[head]
+        rest = torch.ones_like(here, dtype=torch.bool)
+        rest[second] = False
+        preference, alive = preference[rest], alive[rest]
+    return head
