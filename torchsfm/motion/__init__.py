@@ -5,6 +5,7 @@ from torchsfm.motion.essential_6pt import essential_6pt
 from torchsfm.motion.estimate_essential import RelativePoseEstimator, estimate_essential
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_fundamental
 from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
+from torchsfm.motion.estimate_structures import estimate_fundamentals, estimate_homographies
 from torchsfm.motion.estimate_trifocal import TrifocalEstimator, estimate_trifocal
 from torchsfm.motion.factorization_affine import AffineFactorization, factorize_affine
 from torchsfm.motion.factorization_points import Factorization, factorize_points
@@ -41,6 +42,8 @@ __all__ = [
     "essential_6pt",
     "estimate_essential",
     "estimate_fundamental",
+    "estimate_fundamentals",
+    "estimate_homographies",
     "estimate_homography",
     "estimate_trifocal",
     "factorize_affine",

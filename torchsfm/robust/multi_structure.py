@@ -2,8 +2,8 @@
 
 Hypotheses are drawn from near neighbours, and from anywhere, and the best supported are optimised locally. A datum prefers the
 hypotheses near it, by exp(-r / threshold). Two groups are as alike as their preferences (Tanimoto's distance), a group prefers
-what all its members do, and groups merge until none prefers what another does (T-linkage: Magri & Fusiello 2014). All groups that
-are nearest to each other merge at a time, so that few rounds do. Each group that is larger than chance has a model refined on
+what all its members do, and groups merge until none prefers what another does (T-linkage: Magri & Fusiello 2014). All groups
+that are nearest to each other merge at a time, so that few rounds do. Each group that is large enough has a model refined on
 it; groups that an earlier model explains join it, and so do single data well inside a model.
 """
 
@@ -16,8 +16,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors, tensor_map
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.local_optimisation import optimise_locally
-from torchsfm.robust.models import cast, join
+from torchsfm.robust.models import cast, join, tensors_of
 from torchsfm.robust.scoring import squared_residual
 from torchsfm.robust.soft_selection import uniform_numbers
 
@@ -31,6 +30,8 @@ _EXPLAINED = 0.6
 """Share of a group within the threshold of an earlier model that joins it."""
 _INSIDE = 0.25
 """Squared distance within which single data join a model."""
+_SHRINKING = (9.0, 4.0, 1.5, 1.0)
+"""Squared distances within which data count in the steps of local optimisation."""
 _REFINEMENTS = 6
 _NUMBERS = 1 << 18
 """Distances to compute at a time."""
@@ -69,9 +70,9 @@ def find_structures(
 ) -> Structures[M]:
     """Find several models of one kind in each problem's data, and which data belong to which.
 
-    Rows with NaN or infinite numbers are left out. Problems are worked on one after the other, each with its own number of data;
-    the result for a problem is the same whatever else is in the batch. Time and memory grow with the square of the number of
-    data.
+    Rows with NaN or infinite numbers are left out. Problems are worked on one after the other, each with its own number of
+    data; the result for a problem is the same whatever else is in the batch. Time and memory grow with the square of the number
+    of data.
 
     Args:
         estimator: The problem: what to solve, measure and refine.
@@ -95,7 +96,12 @@ def find_structures(
         raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
     m = estimator.sample_size
     smallest = m + 4 if smallest is None else smallest
-    for name, value, least in (("slots", slots, 1), ("smallest", smallest, m), ("hypotheses", hypotheses, 1), ("kept", kept, 1)):
+    for name, value, least in (
+        ("slots", slots, 1),
+        ("smallest", smallest, m),
+        ("hypotheses", hypotheses, 1),
+        ("kept", kept, 1),
+    ):
         if value < least:
             raise ValueError(f"{name}: wanted at least {least}, got {value}")
     known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
@@ -121,9 +127,8 @@ def find_structures(
         model = _empty(own, flat, p, slots)
         for i in enough.nonzero()[:, 0].tolist():
             inside = usable[i]
-            problem = _Problem(
-                tensor_map(lambda t: t[i : i + 1], own), [d[i][inside][None] for d in flat], bound[i : i + 1] ** 2  # noqa: B023
-            )
+            fields = tensor_map(lambda t: t[i : i + 1], own)  # noqa: B023
+            problem = _Problem(fields, [d[i][inside][None] for d in flat], bound[i : i + 1] ** 2)
             groups, models, solved = problem.solve(seed, hypotheses, kept, smallest)
             number = 0 if models is None else int(groups.max()) + 1
             label[i, inside] = torch.where(groups < slots, groups, -1)
@@ -131,7 +136,8 @@ def find_structures(
             status[i] = int(Status.OK if number else Status.NO_CONSENSUS if solved else Status.DEGENERATE)
             if models is not None:
                 at = torch.arange(slots, device=device).clamp(max=number - 1)
-                _place(model, i, tensor_map(lambda t: t[at], models))  # noqa: B023
+                for all_, own_ in zip(tensors_of(model), tensors_of(models), strict=True):
+                    all_[i] = own_[at]
         valid = torch.arange(slots, device=device) < found[:, None]
         return Structures(
             tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
@@ -141,19 +147,10 @@ def find_structures(
 
 def _empty(estimator: Estimator[M], data: list[Tensor], p: int, slots: int) -> M:
     """Zero models of the right shape."""
-    one = torch.zeros(1, 1, dtype=torch.long, device=data[0].device).expand(1, estimator.sample_size)
-    sample = [torch.zeros_like(d[:1, :1]).expand(1, one.shape[1], d.shape[-1]) for d in data]
-    if p == 0:
-        sample = [d.new_zeros(1, one.shape[1], d.shape[-1]) for d in data]
+    sample = [d.new_zeros(1, estimator.sample_size, d.shape[-1]) for d in data]
     fields = tensor_map(lambda t: t[:1] if p else t.new_ones(1, *t.shape[1:]), estimator)
     shape = fields.minimal(*sample).model
     return tensor_map(lambda t: t.new_zeros(p, slots, *t.shape[2:]), shape)
-
-
-def _place(models: Any, i: int, own: Any) -> None:
-    pieces: list[Tensor] = []
-    tensor_map(lambda t: (pieces.append(t), t)[1], own)  # type: ignore[func-returns-value]
-    tensor_map(lambda t: t[i].copy_(pieces.pop(0)), models)
 
 
 @dataclass(frozen=True)
@@ -169,10 +166,10 @@ class _Problem:
         return self.data[0].shape[1]
 
     def solve(self, seed: int, hypotheses: int, kept: int, smallest: int) -> tuple[Tensor, Any, bool]:
-        """The group of each datum, largest first, -1 for none; the models of the groups, if any; whether samples had solutions."""
+        """The group of each datum, largest first, -1 for none; the groups' models, if any; whether samples had solutions."""
         nothing = torch.full((self.count,), -1, dtype=torch.long, device=self.limit.device)
         models = self.hypotheses(seed, hypotheses)
-        if self._number(models) == 0:
+        if len(tensors_of(models)[0]) == 0:
             return nothing, None, False
         models = self.best(models, kept)
         ratio = self.ratios(models)
@@ -187,12 +184,6 @@ class _Problem:
         inside = group == heads[:, None]
         models = self.refined(models, ratio, inside)
         return self.joined(models, inside)
-
-    @staticmethod
-    def _number(models: Any) -> int:
-        sizes: list[int] = []
-        tensor_map(lambda t: (sizes.append(len(t)), t)[1], models)  # type: ignore[func-returns-value]
-        return sizes[0]
 
     def hypotheses(self, seed: int, number: int) -> Any:
         """Models through samples of neighbours and of all data."""
@@ -234,7 +225,7 @@ class _Problem:
     def ratios(self, models: Any) -> Float[Tensor, "h n"]:
         """Squared distances in units of the squared threshold."""
         wide = tensor_map(lambda t: t[:, None], self.estimator)
-        total, step = self._number(models), max(1, _NUMBERS // self.count)
+        total, step = len(tensors_of(models)[0]), max(1, _NUMBERS // self.count)
         rows = []
         for i in range(0, total, step):
             some = tensor_map(lambda t: t[None, i : i + step], models)  # noqa: B023
@@ -245,23 +236,27 @@ class _Problem:
         """The best supported, locally optimised."""
         score = (1 - self.ratios(models).clamp(max=1)).sum(-1)
         chosen = score.argsort(descending=True, stable=True)[:kept]
-        wide = tensor_map(lambda t: t[:, None], self.estimator)
-        everywhere = torch.ones(1, self.count, dtype=torch.bool, device=score.device)
         step, done = max(1, _NUMBERS // self.count), []
         for i in range(0, len(chosen), step):
-            some = tensor_map(lambda t: t[chosen[i : i + step]][None], models)  # noqa: B023
-            done.append(optimise_locally(wide, some, [d[:, None] for d in self.data], self.limit, everywhere))
-        return tensor_map(lambda t: t[0], join(done, 1))
+            some = tensor_map(lambda t: t[chosen[i : i + step]], models)  # noqa: B023
+            for factor in _SHRINKING:
+                some = self.step(some, (self.ratios(some) < factor).double())
+            done.append(some)
+        return join(done)
+
+    def step(self, models: Any, weights: Float[Tensor, "h n"]) -> Any:
+        """A step of weighted refinement of each model."""
+        wide = tensor_map(lambda t: t[:, None], self.estimator)
+        some = tensor_map(lambda t: t[None], models)
+        moved = wide.refine(some, *(d[:, None] for d in self.data), weights=weights[None])
+        return tensor_map(lambda t: t[0], moved)
 
     def refined(self, models: Any, ratio: Tensor, inside: Bool[Tensor, "g n"]) -> Any:
         """A model of each group: the best hypothesis for it, refined on its members."""
         loss = ratio.clamp(max=1) @ inside.to(ratio.dtype).mT
         group = tensor_map(lambda t: t[loss.argmin(0)], models)
-        wide = tensor_map(lambda t: t[:, None], self.estimator)
         for _ in range(_REFINEMENTS):
-            weights = (inside * (1 - self.ratios(group) / _REACH).clamp(min=0))[None]
-            moved = wide.refine(tensor_map(lambda t: t[None], group), *(d[:, None] for d in self.data), weights=weights)
-            group = tensor_map(lambda t: t[0], moved)
+            group = self.step(group, inside * (1 - self.ratios(group) / _REACH).clamp(min=0))
         return group
 
     def joined(self, models: Any, inside: Bool[Tensor, "g n"]) -> tuple[Tensor, Any, bool]:
@@ -270,7 +265,7 @@ class _Problem:
         home: list[int] = []
         heads: list[int] = []
         for k in range(len(inside)):
-            explained = [(ratio[h][inside[k]] < 1).double().mean() > _EXPLAINED for h in heads]
+            explained = [bool((ratio[h][inside[k]] < 1).double().mean() > _EXPLAINED) for h in heads]
             if not any(explained):
                 heads.append(k)
             home.append(explained.index(True) if any(explained) else len(heads) - 1)

@@ -1,0 +1,99 @@
+"""Several motions, or several planes, in one pair of images."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import check_tensors
+from torchsfm.motion.estimate_fundamental import FundamentalEstimator
+from torchsfm.motion.estimate_homography import HomographyEstimator
+from torchsfm.motion.normalization import common_scale
+from torchsfm.robust import Structures, find_structures
+
+
+def estimate_fundamentals(
+    x1: Float[Tensor, "*#batch n 2"],
+    x2: Float[Tensor, "*#batch n 2"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    slots: int = 8,
+    smallest: int | None = None,
+    generator: torch.Generator | None = None,
+) -> Structures[Float[Tensor, "*batch s 3 3"]]:
+    """The fundamental matrices of bodies that moved differently between two images, and which matches belong to which.
+
+    By preference clustering (`find_structures`) over seven-point hypotheses with the oriented epipolar constraint.
+
+    Args:
+        x1: Points in the first image.
+        x2: The corresponding points in the second image, in the same unit.
+        threshold: Largest Sampson distance of a body's points, in the unit of the points; about four times that for one motion.
+        mask: Which correspondences exist. Rows that are not finite are left out too.
+        slots: Most motions to return.
+        smallest: Fewest points of a motion; 11 if not given.
+        generator: Source of randomness.
+
+    Returns:
+        F with x2' F x1 = 0 and |F| = 1 (Frobenius) in each valid slot, zero in the others; labels, number found, status.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"))
+    y = common_scale(x1.double(), x2.double(), mask)
+    found = find_structures(
+        FundamentalEstimator(), y.x1, y.x2, threshold=y.scale * threshold, mask=mask, slots=slots, smallest=smallest,
+        generator=generator,
+    )  # fmt: skip
+    F = y.T2.mT[..., None, :, :] @ found.model[..., :3] @ y.T1[..., None, :, :]
+    return _unit(found, F, x1.dtype)
+
+
+def estimate_homographies(
+    x1: Float[Tensor, "*#batch n 2"],
+    x2: Float[Tensor, "*#batch n 2"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    slots: int = 8,
+    smallest: int | None = None,
+    generator: torch.Generator | None = None,
+) -> Structures[Float[Tensor, "*batch s 3 3"]]:
+    """The homographies of several planes seen in two images, and which matches belong to which.
+
+    By preference clustering (`find_structures`) over four-point hypotheses.
+
+    Args:
+        x1: Points in the first image.
+        x2: The corresponding points in the second image, in the same unit.
+        threshold: Largest Sampson distance of a plane's points, in the unit of the points.
+        mask: Which correspondences exist. Rows that are not finite are left out too.
+        slots: Most planes to return.
+        smallest: Fewest points of a plane; 8 if not given.
+        generator: Source of randomness.
+
+    Returns:
+        H with x2 ~ H x1 and |H| = 1 (Frobenius) in each valid slot, zero in the others; labels, number found, status.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"))
+    y = common_scale(x1.double(), x2.double(), mask)
+    found = find_structures(
+        HomographyEstimator(), y.x1, y.x2, threshold=y.scale * threshold, mask=mask, slots=slots, smallest=smallest,
+        generator=generator,
+    )  # fmt: skip
+    H = torch.linalg.inv_ex(y.T2)[0][..., None, :, :] @ found.model @ y.T1[..., None, :, :]
+    return _unit(found, H, x1.dtype)
+
+
+def _unit(found: Structures[Tensor], model: Tensor, dtype: torch.dtype) -> Structures[Tensor]:
+    size = model.flatten(-2).norm(dim=-1)[..., None, None]
+    good = found.valid[..., None, None] & (size > 0)
+    return replace(found, model=torch.where(good, model / torch.where(good, size, 1), 0).to(dtype))
