@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.linalg import null_vector
 from torchsfm.optim import levenberg_marquardt
 
 _OPEN = 0.65
@@ -145,6 +146,29 @@ def inverse_similarity(S: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     s, c = S[..., :1, :1], S[..., :2, 2:]
     eye = torch.eye(2, dtype=S.dtype, device=S.device)
     return torch.cat((torch.cat((eye / s, -c / s), -1), S[..., 2:, :]), -2)
+
+
+def least_vector(A: Float[Tensor, "*batch m k"]) -> Float[Tensor, "*batch k"]:
+    """The unit vector v with the least |A v|, without derivative: also where A'A has lost it among the next ones."""
+    with torch.no_grad():
+        A = A.detach()
+        v, _ = null_vector(A)
+        if A.shape[-2] < A.shape[-1]:
+            return v
+        # Inverse iteration with the triangular factor of A itself.
+        R = torch.linalg.qr(A, mode="r")[1]
+        pivots = R.diagonal(dim1=-2, dim2=-1)
+        floor = torch.finfo(A.dtype).eps * pivots.abs().amax(-1, keepdim=True)
+        small = pivots.abs() <= floor
+        R = R + torch.diag_embed(torch.where(small, torch.where(floor > 0, floor, 1) - pivots, 0))
+        w = v[..., None]
+        for _ in range(4):
+            w = torch.linalg.solve_triangular(R.mT, w, upper=False)
+            w = torch.linalg.solve_triangular(R, w / w.norm(dim=-2, keepdim=True), upper=True)
+            w = w / w.norm(dim=-2, keepdim=True)
+        w = w[..., 0]
+        better = torch.isfinite(w).all(-1) & ((A @ w[..., None]).norm(dim=(-2, -1)) <= (A @ v[..., None]).norm(dim=(-2, -1)))
+        return torch.where(better[..., None], w, v)
 
 
 def tensor_uncertainty(

@@ -7,12 +7,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
-from torchsfm.linalg import null_vector
 from torchsfm.motion.multilinear_fit import (
     NormalizedViews,
     combined_status,
     fit_cameras,
     inverse_similarity,
+    least_vector,
     normalized_views,
     tensor_uncertainty,
 )
@@ -68,7 +68,7 @@ def quadrifocal_6pt(
     n = x.shape[-2]
     views = normalized_views(x.expand(*batch, 4, n, 2), x.new_zeros(*batch, 4, 0, 3), weights, None)
     A = _equations(views)
-    q, _ = null_vector(A.detach())
+    q = least_vector(A)
     start = cameras_from_quadrifocal(q.reshape(*batch, 3, 3, 3, 3))
     fit = fit_cameras(_tensor_of, A, start.P[..., 1:, :, :], max_iterations)
     inverse = inverse_similarity(views.S)

@@ -7,12 +7,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
-from torchsfm.linalg import null_vector
 from torchsfm.motion.multilinear_fit import (
     NormalizedViews,
     combined_status,
     fit_cameras,
     inverse_similarity,
+    least_vector,
     normalized_views,
     tensor_uncertainty,
 )
@@ -74,13 +74,12 @@ def trifocal_7pt(
     Raises:
         ValueError: Wrong shape, dtype or device, or too few points and lines.
     """
-    points = x[..., :0, :].expand(*x.shape[:-2], 0, 2) if l is None else l[..., :0]
     batch = check_tensors(
         x=(x, "3 n 2"), l=(l, "3 m 3"), ends=(ends, "m 2 2"), weights=(weights, "n"), line_weights=(line_weights, "m")
     )
     if l is None and (ends is not None or line_weights is not None):
         raise ValueError("l: wanted the lines to which ends or line_weights belong, got None")
-    lines = points.new_zeros(*x.shape[:-3], 3, 0, 3) if l is None else l
+    lines = x.new_zeros(*x.shape[:-3], 3, 0, 3) if l is None else l
     n, m = x.shape[-2], lines.shape[-2]
     if 4 * n + 2 * m < 26:
         raise ValueError(f"x, l: wanted 4 n + 2 m >= 26 for n points and m lines, got n = {n} and m = {m}")
@@ -88,7 +87,7 @@ def trifocal_7pt(
     on_first = _points_on_lines(views, None if ends is None else ends.expand(*batch, m, 2, 2))
     finite = views.finite & torch.isfinite(on_first).flatten(-3).all(-1)
     A = _equations(views, torch.where(finite[..., None, None, None], on_first, 0))
-    t, _ = null_vector(A.detach())
+    t = least_vector(A)
     start = cameras_from_trifocal(t.reshape(*batch, 3, 3, 3))
     fit = fit_cameras(_tensor_of, A, start.P[..., 1:, :, :], max_iterations)
     inverse = inverse_similarity(views.S)
