@@ -24,7 +24,7 @@ CUBIC = list(combinations_with_replacement(range(4), 3))
 """Monomials of a cubic: xxx, xxy, xxz, xxw, xyy, xyz, xyw, xzz, xzw, xww, yyy, yyz, yyw, yzz, yzw, yww, zzz, zzw, zww, www."""
 _CHUNK = 512
 """Problems at a time where the work is at all points of the circle at once: what is in use stays in the cache."""
-_MORE = 10
+_MORE = 6
 _LONGEST = 0.5
 _ATTEMPTS = 2
 """Further systems of coordinates for problems of which not every root is a common point."""
@@ -287,13 +287,18 @@ def _determinant(m: list[Row]) -> Tensor:
 def _polished(v: Tensor, *forms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Newton's method on the unit sphere, longer for those that need it; where it came to an end, and where it began near."""
     gradients = [_Gradient(form) for form in forms]
-    v, size = _newton(v, gradients)
-    rest = (size > _CONVERGED).nonzero()[:, 0]
+    v, first = _newton(v, gradients)
+    size = first
+    rest = (first > _CONVERGED).nonzero()[:, 0]
     u, few = take_columns(v, rest), [g.take(rest) for g in gradients]
-    last = size.index_select(0, rest)
     for _ in range(_MORE):
+        if len(rest) == 0:
+            break
         u, last = _newton(u, few)
-    return v.index_copy(1, rest, u), size.index_copy(0, rest, last) <= _CONVERGED, size <= _NEAR
+        v, size = v.index_copy(1, rest, u), size.index_copy(0, rest, last)
+        going = (last > _CONVERGED).nonzero()[:, 0]
+        rest, u, few = rest.index_select(0, going), take_columns(u, going), [g.take(going) for g in few]
+    return v, size <= _CONVERGED, first <= _NEAR
 
 
 class _Gradient:

@@ -111,9 +111,9 @@ def _solve(eps: float, p: Tensor, d: Tensor, X: Tensor) -> tuple[Tensor, Tensor]
         quadrics.append(q - (side / (unit * unit)) * product_of_forms(one, one))
     found = intersect_quadrics(*quadrics)
     item = found.item
-    q = [combine_rows(found.point, [turn[k, i] for k in range(4)]) for i in range(4)]
-    q[0] = q[0] * mean[item]
-    l = torch.stack([q[0] + a * q[1] + b * q[2] for a, b in _DIFFERENCES]) / q[3]  # noqa: E741
+    u = [combine_rows(found.point, [turn[k, i] for k in range(4)]) for i in range(4)]
+    u[0] = u[0] * mean[item]
+    l = torch.stack([u[0] + a * u[1] + b * u[2] for a, b in _DIFFERENCES]) / u[3]  # noqa: E741
     p, d, X, unit, shift = (take_columns(v, item) if v.ndim > 1 else v[item] for v in (p, d, X, unit, shift))
     l, met = _refine(l, p, d, X)  # noqa: E741
     right = met & (l + combine_rows(shift.unbind(1), d.unbind(1)) > 0).all(0)

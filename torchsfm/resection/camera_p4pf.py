@@ -23,7 +23,9 @@ from torchsfm.resection.camera_p35pf import structure, sum_of_products
 
 _CHUNK = 4096
 _INDEPENDENT = 1e-12
-_STEPS = 4
+_STEPS = 8
+_EXACT = 1e-22
+"""Squared error of exact data, in units of the image's radius."""
 _FAR = 0.3
 """Largest error of what is taken for a camera, in units of the image's radius."""
 
@@ -134,24 +136,37 @@ def _images(R: Tensor, t: Tensor, f: Tensor, X: Tensor) -> tuple[Tensor, Tensor,
 
 
 def _refine(R: Tensor, t: Tensor, f: Tensor, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gauss-Newton steps on (w, v, log f), the pose moving from the left, kept where they do not increase the error."""
-    before = _residuals(R, t, f, x, X)
-    for _ in range(_STEPS):
-        y, depth, Y = _images(R, t, f, X)
-        inverse = 1 / depth
-        a, b = Y[:, 0] * inverse, Y[:, 1] * inverse
-        zero = torch.zeros_like(a)
-        ju = torch.stack((-a * b, 1 + a * a, -b, inverse, zero, -a * inverse, a), 1)
-        jv = torch.stack((-1 - b * b, a * b, a, zero, inverse, -b * inverse, b), 1)
-        J = torch.cat((ju, jv)) * f
-        r = torch.cat((y[:, 0] - x[:, 0], y[:, 1] - x[:, 1]))
-        step = -least_squares_rows(J, r)
-        turn = rotation_from_rotvec(step[:3].T).permute(1, 2, 0)
-        new_R = torch.stack([combine_rows(R, turn[i][:, None]) for i in range(3)])
-        new_t = torch.stack([combine_rows(t, turn[i]) for i in range(3)]) + step[3:6]
-        new_f = f * step[6].clamp(-1, 1).exp()
-        after = _residuals(new_R, new_t, new_f, x, X)
-        better = after <= before * (1 + 1e-12) + 1e-28
-        R, t, f = torch.where(better, new_R, R), torch.where(better, new_t, t), torch.where(better, new_f, f)
-        before = torch.where(better, after, before)
+    """Gauss-Newton steps kept where they do not increase the error; more than one only for those that are not exact."""
+    R, t, f, error, _ = _step(R, t, f, x, X, _residuals(R, t, f, x, X))
+    rest = (error > _EXACT).nonzero()[:, 0]
+    for _ in range(_STEPS - 1):
+        if len(rest) == 0:
+            break
+        y, Y = take_columns(x, rest), take_columns(X, rest)
+        r, u, g, e, gain = _step(R[..., rest], t[:, rest], f[rest], y, Y, error[rest])
+        R, t, f = R.index_copy(2, rest, r), t.index_copy(1, rest, u), f.index_copy(0, rest, g)
+        error = error.index_copy(0, rest, e)
+        rest = rest[gain > 1e-14 * e]
     return R, t, f
+
+
+def _step(
+    R: Tensor, t: Tensor, f: Tensor, x: Tensor, X: Tensor, before: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """One step on (w, v, log f), the pose moving from the left; the camera, its error and how much was gained."""
+    y, depth, Y = _images(R, t, f, X)
+    inverse = 1 / depth
+    a, b = Y[:, 0] * inverse, Y[:, 1] * inverse
+    zero = torch.zeros_like(a)
+    ju = torch.stack((-a * b, 1 + a * a, -b, inverse, zero, -a * inverse, a), 1)
+    jv = torch.stack((-1 - b * b, a * b, a, zero, inverse, -b * inverse, b), 1)
+    step = -least_squares_rows(torch.cat((ju, jv)) * f, torch.cat((y[:, 0] - x[:, 0], y[:, 1] - x[:, 1])))
+    turn = rotation_from_rotvec(step[:3].T).permute(1, 2, 0)
+    new_R = torch.stack([combine_rows(R, turn[i][:, None]) for i in range(3)])
+    new_t = torch.stack([combine_rows(t, turn[i]) for i in range(3)]) + step[3:6]
+    new_f = f * step[6].clamp(-1, 1).exp()
+    after = _residuals(new_R, new_t, new_f, x, X)
+    better = after <= before * (1 + 1e-12) + 1e-28
+    R, t, f = torch.where(better, new_R, R), torch.where(better, new_t, t), torch.where(better, new_f, f)
+    after = torch.where(better, after, before)
+    return R, t, f, after, before - after
