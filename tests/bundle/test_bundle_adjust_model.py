@@ -12,10 +12,10 @@ from torchsfm._types import Status
 from torchsfm.bundle import Rig, bundle_adjust, bundle_adjust_model
 from torchsfm.bundle.blocks import cheapest_elimination
 from torchsfm.formats import read_libmv
-from torchsfm.geometry import BundleProblem, Camera, Pose
+from torchsfm.geometry import BundleProblem, Camera, Pose, intrinsics, project_points
 from torchsfm.optim import Block, RigidMotion, Subset
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.simulation import random_bundle_problem
+from torchsfm.simulation import orbit_poses, random_bundle_problem, random_points
 
 F64 = torch.float64
 
@@ -117,6 +117,32 @@ def test_poses_are_eliminated_where_they_are_many() -> None:
     assert one.status == two.status == Status.OK
     np.testing.assert_allclose(one.cost, two.cost, rtol=1e-8)
     torch.testing.assert_close(one.residuals, two.residuals, rtol=1e-3, atol=1e-3)
+
+
+def test_derivatives_where_poses_are_eliminated(generator: torch.Generator) -> None:
+    """Twelve views of eight points: how the shape moves with observations, against central differences."""
+    poses = orbit_poses(12, radius=5.0)
+    X = random_points(8, kind="cube", generator=generator)
+    view, point = torch.cartesian_prod(torch.arange(12), torch.arange(8)).unbind(1)
+    K = intrinsics(torch.tensor([800.0], dtype=F64), torch.zeros(1, 2, dtype=F64))
+    x = project_points((K @ poses.matrix())[view], X[point, None])[:, 0]
+    x = x + 0.5 * torch.randn(x.shape, generator=generator, dtype=F64)
+
+    def function(x: Tensor, X: Tensor) -> Tensor:
+        result = bundle_adjust(
+            poses, Camera(K), X, x, view, point, free=(), fixed_points=torch.arange(8) < 3, tolerance=1e-15, max_iterations=200
+        )
+        return result.X[3:].sum() + result.poses.t.square().sum() + result.residuals[:9].square().sum()
+
+    inputs = x, X
+    leaves = tuple(v.clone().requires_grad_() for v in inputs)
+    gradients = torch.autograd.grad(function(*leaves), leaves)
+    for k, gradient in enumerate(gradients):
+        step = (1e-3, 1e-5)[k] * torch.randn(inputs[k].shape, generator=generator, dtype=F64)
+        if k:
+            step[3:] = 0
+        plus, minus = (function(*(v + s * step if n == k else v for n, v in enumerate(inputs))) for s in (1, -1))
+        torch.testing.assert_close((gradient * step).sum(), (plus - minus) / 2, rtol=1e-4, atol=1e-9)
 
 
 def test_film_with_shared_intrinsics(data: Path) -> None:

@@ -99,7 +99,7 @@ def bundle_covariance(
     pose, camera, points = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
     sensor = None if rig is None else unit.blocks["sensor"] * scale**2
     held = 0
-    if fixed_intrinsics:
+    if fixed_intrinsics and camera.shape[-1]:
         # Those held in one camera but not in others stand in the system as directions that nothing determines.
         switch = blocks["camera"].x[:, -camera.shape[-1] :] > 0
         camera = torch.where(switch[:, :, None] & switch[:, None], camera, 0.0)
