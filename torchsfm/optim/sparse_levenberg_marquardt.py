@@ -8,7 +8,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from torchsfm._types import Status
+from torchsfm._types import Status, check_tensors
 from torchsfm.optim.covariance import to_double, usable
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
@@ -78,7 +78,8 @@ def sparse_levenberg_marquardt(
         the implicit function theorem (first derivatives, backwards); otherwise nothing is spent on it.
 
     Raises:
-        ValueError: A term names an unknown block, its tensors disagree in length, or it depends on two eliminated variables.
+        ValueError: A term names an unknown block, its tensors disagree in length, an index is out of range, or it depends on
+            two eliminated variables.
     """
     _check(blocks, terms, eliminate)
     if linear_solver not in get_args(Solver):
@@ -194,6 +195,12 @@ def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | 
         lengths = {t.shape[0] for t in (*term.index, *term.data, *weights)}
         if len(lengths) != 1:
             raise ValueError(f"terms[{k}]: wanted index, data and weights of one length, got {sorted(lengths)}")
+        for name, index in zip(term.blocks, term.index, strict=True):
+            check_tensors(**{f"terms[{k}].index": (index, f"{index.shape[0]}: int")})
+            count = blocks[name].x.shape[0]
+            if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < count:
+                got = f"{int(index.min())} to {int(index.max())}"
+                raise ValueError(f"terms[{k}].index: wanted numbers from 0 to {count - 1} for {name!r}, got {got}")
 
 
 def _length(x: dict[str, Tensor]) -> float:
