@@ -100,6 +100,21 @@ def test_derivatives_covariance_and_degeneracy(generator: torch.Generator) -> No
     assert (planar.status == Status.OK).any()
 
 
+def test_a_plane_does_not_win_over_points_off_it(generator: torch.Generator) -> None:
+    P = cameras(30, v=3, generator=generator)
+    X = points(30, n=80, generator=generator)
+    X[:, 16:, 2] = 0.4 * X[:, 16:, 0]
+    x = images(P, X) + 0.3 * torch.randn(30, 3, 80, 2, generator=generator, dtype=F64)
+    wrong = torch.rand(30, 80, generator=generator) < 0.2
+    x[:, 2] = torch.where(wrong[..., None], 600 * torch.rand(30, 80, 2, generator=generator, dtype=F64), x[:, 2])
+    found = estimate_trifocal(x, threshold=2.0, generator=generator)
+    off = ~wrong[:, :16]
+    assert (found.inliers[:, :16] & off).sum() > 0.9 * off.sum()
+    assert (found.degeneracy == Degeneracy.NONE).double().mean() > 0.9
+    held = images(P, points(30, n=40, generator=generator))
+    assert (transfer_error(found.model, held).median(-1).values < 3).double().mean() > 0.85
+
+
 def test_bad_problems_and_scale_of_the_threshold(generator: torch.Generator) -> None:
     x, _, _ = scene(5, 60, 0.3, generator)
     x[1] = torch.nan

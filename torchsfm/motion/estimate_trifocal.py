@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.motion.epipolar_fit import plane_rows
 from torchsfm.motion.multilinear_fit import frame_directions, free_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
-from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance
+from torchsfm.motion.plane_and_parallax import more_than_chance
+from torchsfm.motion.three_view_parallax import planar, rivals_of_plane
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
 from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
@@ -103,6 +103,20 @@ class TrifocalEstimator:
         moved: Tensor = model + delta.reshape(*delta.shape[:-1], 2, 3, 4)
         return moved
 
+    def rivals(
+        self,
+        model: Float[Tensor, "p 2 3 4"],
+        x1: Float[Tensor, "p n 2"],
+        x2: Float[Tensor, "p n 2"],
+        x3: Float[Tensor, "p n 2"],
+        *,
+        inside: Bool[Tensor, "p n"],
+        threshold: Float[Tensor, "p"],
+        seed: int,
+    ) -> Solutions[Float[Tensor, "p k 2 3 4"]]:
+        """Where most inliers are in a plane, the best cameras of that plane and two points off it."""
+        return rivals_of_plane(self, model, (x1, x2, x3), inside, threshold, seed)
+
     def degeneracy(
         self,
         model: Float[Tensor, "*#batch 2 3 4"],
@@ -115,13 +129,9 @@ class TrifocalEstimator:
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
         """PLANAR: homographies from the first image relate all inliers but so few as chance explains to both others."""
-        limit = 4 * threshold * threshold
-        planar = torch.ones_like(threshold, dtype=torch.bool)
-        for k, x in enumerate((x2, x3)):
-            A, e = model[..., k, :, :3], model[..., k, :, 3]
-            _, on = dominant_plane(A, e, plane_rows(x1), plane_rows(x), inliers, limit, sphere=False)
-            planar = planar & on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
-        return torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE)).to(torch.int8)
+        on = planar(model, (x1, x2, x3), inliers, threshold * threshold)
+        flat = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
+        return torch.where(flat, int(Degeneracy.PLANAR), int(Degeneracy.NONE)).to(torch.int8)
 
 
 def _rows(x: Tensor) -> list[Tensor]:
@@ -143,7 +153,8 @@ def estimate_trifocal(
 ) -> RobustResult[Float[Tensor, "*batch 3 3 4"]]:
     """Three projective cameras for each triplet of images, from correspondences of which many may be wrong.
 
-    LO-RANSAC over six-point samples, then a robust minimum of the reprojection error over the cameras and all points. Computed
+    LO-RANSAC over six-point samples; where most inliers are in a plane, also over its homographies and pairs of points off it
+    (as DEGENSAC does for two views); then a robust minimum of the reprojection error over the cameras and all points. Computed
     in float64, hypotheses scored in float32. `trifocal_from_cameras` makes the tensor of them. Points of one plane, or centres
     that coincide, leave the cameras open.
 
