@@ -15,7 +15,7 @@ from torch import Tensor
 
 Rows = tuple[Tensor, ...]
 
-COMPILED_CHUNK = 16384
+COMPILED_CHUNK = 8192
 _WIDTH = 16
 _on = False
 

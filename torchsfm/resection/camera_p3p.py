@@ -60,7 +60,7 @@ def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"])
         model, valid = _solve(rays, points, eps, differentiable=True)
     else:
         model, valid = _poses(rays, points, eps=eps)
-    return Solutions(model.t().to(d.dtype).reshape(*batch, 4, 3, 4), valid.t().reshape(*batch, 4))
+    return Solutions(model.permute(3, 2, 0, 1).to(d.dtype).reshape(*batch, 4, 3, 4), valid.t().reshape(*batch, 4))
 
 
 @kernel(chunk=8192)
@@ -69,7 +69,7 @@ def _poses(rays: Tensor, points: Tensor, *, eps: float) -> tuple[Tensor, Tensor]
 
 
 def _solve(rays: Tensor, points: Tensor, eps: float, differentiable: bool) -> tuple[Tensor, Tensor]:
-    """Poses (48, problem) and validity (slot, problem) of rays and points (9, problem) of precision eps."""
+    """Poses (row, column, slot, problem) and validity (slot, problem) of rays and points (9, problem) of precision eps."""
     rays, points = rays.contiguous(), points.contiguous()
     sound = _sound(rays.detach(), points.detach(), eps)
     safe = torch.tensor(_SAFE, dtype=rays.dtype, device=rays.device)[:, None]
@@ -81,9 +81,7 @@ def _solve(rays: Tensor, points: Tensor, eps: float, differentiable: bool) -> tu
         depths, valid = triangle.polish(depths, valid & sound)
     if differentiable:
         depths = Triangle(u, X).follow(depths, valid)
-    pose = _pose(u, X, depths, valid if differentiable else None)
-    # (row, column, slot, problem) to (slot, row, column, problem)
-    return pose.permute(2, 0, 1, 3).reshape(48, sound.shape[0]), valid
+    return _pose(u, X, depths, valid if differentiable else None), valid
 
 
 def equations(
@@ -137,5 +135,7 @@ def _pose(u: list[Vector], X: list[Vector], depths: Rows, valid: Tensor | None) 
     t = each(lambda x, y, z: (x + y + z) * (1 / 3), *Y)
     for j in range(3):
         t = each(lambda x, y, j=j: fms(y, m[j], x), t, columns[j])
-    stacked = [v if isinstance(v, Tensor) else torch.stack(v) for v in (*columns, t)]
-    return torch.stack([v if v.ndim > 2 else v[:, None] for v in stacked], 1)
+    columns.append(t)
+    if isinstance(t, Tensor):
+        return torch.stack([v for v in columns if isinstance(v, Tensor)], 1)
+    return torch.stack([v[i] for i in range(3) for v in columns]).view(3, 4, *t[0].shape)
