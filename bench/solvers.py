@@ -28,7 +28,13 @@ def short_row(case: Case, options: argparse.Namespace) -> str:
     hard = min((recall.recall(case, family, options.samples, torch.float64).share, family) for family in case.families)
     times = speed.speeds(case, options.batch, options.repeats, not options.no_compile)
     peers = ", ".join(f"{name} {1e6 * times[name]:.2f}" for name in case.peers if name in times)
-    cells = [f"`{case.name}`", str(case.size), str(case.slots), f"{double:.4f} / {single:.4f}", f"{hard[0]:.4f} ({hard[1]})"]
+    cells = [
+        f"`{case.name}`",
+        str(case.size),
+        str(case.slots),
+        f"{double:.4f} / {single:.4f}",
+        f"{hard[0]:.4f}" + (f" ({hard[1]})" if hard[0] < 1 else ""),
+    ]
     cells += [f"{1e6 * times['eager']:.2f}", f"{1e6 * times['compiled']:.2f}" if "compiled" in times else "", peers]
     return "| " + " | ".join(cells) + " |"
 

@@ -2,7 +2,8 @@
 
 A kernel is a function of tensors with the batch in the last dimension, without data-dependent shapes, called where nothing is
 differentiated. Batches are cut into pieces that stay in the cache: small ones for eager mode, larger ones when compiled. There
-is one compiled object for each dtype and device, with a dynamic batch. Dynamo is imported once the switch is on, not before.
+is one compiled object for each dtype, device and shape of a problem; the batch is dynamic. Dynamo is imported once the switch
+is on, not before.
 """
 
 from collections.abc import Callable
@@ -58,7 +59,7 @@ class Kernel:
         first = rows[0]
         # What dynamo would compile anew for.
         state = (torch.get_num_threads(), torch.is_inference_mode_enabled())
-        key = (first.dtype, first.device, *state, *options.items())
+        key = (first.dtype, first.device, *state, *options.items(), *(row.shape[:-1] for row in rows))
         compiled = self._compiled.get(key)
         # A multiple of the width of a vector needs no loop for the rest, which would be as much code again.
         batch = first.shape[-1]

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.polynomial import attach_roots
 from torchsfm.linalg.rows import take_columns
 
@@ -122,7 +123,8 @@ def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3) -> RootList:
     groups = (single, sub, pair, pair)
     item, reverse, minus, low, ends = (torch.cat(x, -1) for x in zip(*groups, strict=True))
     kind = torch.cat([x.item.new_full(x.item.shape, i) for i, x in enumerate(groups)])
-    y, found = _refine(take_columns(both, reverse * batch + item), fine, minus, low, ends, kind, steps)
+    bottom, top = _look_up(fine, low), _look_up(fine, low + torch.where(kind == 0, _PARTS, 1))
+    y, found = _refine(take_columns(both, reverse * batch + item), bottom, top, minus, ends, kind, steps=steps)
     keep = found.nonzero()[:, 0]
     item, order = item.index_select(0, keep).sort(stable=True)
     keep = keep.index_select(0, order)
@@ -195,14 +197,14 @@ def _closer(both: Float[Tensor, "m columns"], fine: Tensor, close: _Cells, batch
     return p, torch.addcmul((1 + x * x) * d, p, x, value=-n)
 
 
+@kernel(chunk=1 << 20)
 def _refine(
-    k: Tensor, fine: Tensor, minus: Tensor, low: Tensor, ends: Tensor, kind: Tensor, steps: int
+    k: Tensor, bottom: Tensor, top: Tensor, minus: Tensor, ends: Tensor, kind: Tensor, *, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """The root in each cell, as a distance from zero along its side, and whether it is one."""
+    """The root between bottom and top, as a distance from zero along its side, and whether it is one."""
     n = k.shape[0] - 1
     whole, right = kind == 0, kind == 3
     pair = kind >= 2
-    bottom, top = _look_up(fine, low), _look_up(fine, low + torch.where(whole, _PARTS, 1))
     step = torch.where(whole, _STEP, _STEP / _PARTS)
     # From here on h is positive where the path starts, and x counts along the path.
     weight = _power((1 + bottom * bottom) / (1 + top * top), n // 2)
@@ -212,9 +214,8 @@ def _refine(
     angle = begin * step
     tangent = angle * (1 + angle * angle / 3)
     y = (bottom + tangent) / (1 - bottom * tangent)
-    k = k * up
-    k[1::2] *= torch.where(minus, -1.0, 1.0).to(k.dtype)
-    rows = k.unbind(0)
+    odd = torch.where(minus, -up, up)
+    rows = [row * (odd if i % 2 else up) for i, row in enumerate(k.unbind(0))]
     p, d = _horner_slope(rows, y)
     # For a pair, h + h' a + (h'' / 2) a^2 = 0 in the angle a from the dip.
     square = 1 + y * y

@@ -6,14 +6,13 @@ from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.rows import add_rows, combine_rows
-from torchsfm.motion._five_points import cross, longest, normalised
+from torchsfm.motion._five_points import back_substitute, cross, longest, normalised
 
 
 def combine(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> Float[Tensor, "9 roots"]:
     return combine_rows(basis, u)
 
 
-@kernel(chunk=1 << 20)
 def polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     """One Newton step on the essential manifold within the null space, and how far the start was from the manifold.
 
@@ -50,3 +49,10 @@ def polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
     m12, m13, m23 = p1 * q2 - p2 * q1, p1 * q3 - p3 * q1, p2 * q3 - p3 * q2
     x, y, z = m12 * r3 - m13 * r2 + m23 * r1, m03 * r2 - m02 * r3 - m23 * r0, m01 * r3 - m03 * r1 + m13 * r0
     return normalised(torch.stack((x, y, z, m02 * r1 - m01 * r2 - m12 * r0))), error
+
+
+@kernel(chunk=1 << 20)
+def from_roots(x: Tensor, y: Tensor, w: Tensor, s: Tensor, t: Tensor, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """A Newton step from the solution for each root s / t of the determinant: the coordinates, E, and the error before."""
+    u, error = polish(back_substitute(x, y, w, s, t), basis)
+    return u, combine(u, basis), error

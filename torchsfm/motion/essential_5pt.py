@@ -15,8 +15,8 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.real_roots import real_root_list
 from torchsfm.linalg.rows import combine_rows, take_columns
-from torchsfm.motion._essential_manifold import combine, polish
-from torchsfm.motion._five_points import back_substitute, nullspace_basis, polynomial, turned
+from torchsfm.motion._essential_manifold import combine, from_roots, polish
+from torchsfm.motion._five_points import nullspace_basis, polynomial, turned
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _CHUNK = 4096
@@ -170,9 +170,9 @@ def _chunk(d1: Tensor, d2: Tensor, other_coordinates: bool) -> _Candidates:
     # From here on each root has a column of its own.
     item = roots.item
     x, y, w, basis = (take_columns(rows, item) for rows in (x, y, w, basis))
-    u, error = polish(back_substitute(x, y, w, roots.s, roots.t), basis)
+    u, E, error = from_roots(x, y, w, roots.s, roots.t, basis)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
-    return _Candidates(item, slot, combine(u, basis), error, rest, take_columns(u, rest), take_columns(basis, rest))
+    return _Candidates(item, slot, E, error, rest, take_columns(u, rest), take_columns(basis, rest))
 
 
 def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
