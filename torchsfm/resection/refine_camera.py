@@ -9,13 +9,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors, tensor_map
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import Camera, NoDistortion, Pose
 from torchsfm.optim import Loss, levenberg_marquardt
+from torchsfm.resection._pinhole import minimise_pinhole
 from torchsfm.resection._reprojection import INSIDE, Inside, Reprojection, inverse, like
 
 Data = tuple[Tensor, Tensor, Tensor, Camera]
 """Image points, points, weights, cameras."""
-PIECE = 32768
+PIECE = 16384
 """Points at a time: what is in use stays in the cache."""
 
 
@@ -176,6 +177,16 @@ def _fit(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_iter
 def _minimum(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_iterations: int) -> _Fit:
     x, X, w, camera = data
     plain = problem.loss is None
+    if plain and isinstance(camera.distortion, NoDistortion):
+        inside = Inside(tensor_map(torch.Tensor.double, camera), problem.free)
+        exact = tensor_map(torch.Tensor.double, (start, theta, x, X, w))
+        fit = minimise_pinhole(*exact, inside, max_iterations)
+        pose, theta = tensor_map(lambda v: v.to(x.dtype), (fit.pose, fit.theta))
+        covariance, determined = inverse(fit.normal)
+        total = exact[4].sum(-1)
+        error = (2 * fit.cost / torch.where(total > 0, total, 1.0)).clamp_min(0).sqrt()
+        in_front = pose.transform(X)[..., 2] > 0
+        return _Fit(pose, theta, fit.cost, fit.iterations, fit.status, covariance, determined, in_front, error)
     result = levenberg_marquardt(
         problem.residual, (start, theta), x, X, camera, retract=problem.retract, size=6 + problem.size, weights=w,
         loss=problem.loss, linearize=problem.linearize, max_iterations=max_iterations, function_tolerance=1e-6,
