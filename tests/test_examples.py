@@ -53,6 +53,18 @@ def test_train_match_weights(tmp_path: Path) -> None:
     assert number(r"with learned scores: median error ([\d.]+) px", text) < 1
 
 
+def test_ransac_variants(tmp_path: Path) -> None:
+    text = run("ransac_variants.py", tmp_path)
+    guided, uniform = (number(rf"{name} +[\d.]+ +[\d.]+ +([\d.]+)", text) for name in ("guided by scores", "uniform"))
+    assert guided < 0.7 * uniform
+    best, local = (number(rf"{name} +[\d.]+ +[\d.]+ +([\d.]+)", text) for name in ("best sample", "locally optimised"))
+    assert local < 0.5 * best
+    assert number(r"Magsac +(?:[\d.]+ +){5}([\d.]+)", text) < 0.3
+    assert {p.name for p in (tmp_path / "ransac_variants").iterdir()} == {
+        "sampling.png", "scores.png", "local_optimisation.png", "time.png"
+    }  # fmt: skip
+
+
 def test_no_example_is_forgotten() -> None:
     tested = set(re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text()))
     assert tested == {path.name for path in EXAMPLES.glob("*.py")}
