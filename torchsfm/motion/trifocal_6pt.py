@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import Solutions, broadcast_shapes, check_tensors
-from torchsfm.linalg.nullspace import nullspace_rows
-from torchsfm.linalg.polynomial import cubic_rows
+from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.rows import combine_rows
+from torchsfm.motion.dual_sixth_point import null_3x3, sixth_point
 from torchsfm.optim import attach_implicit, wants_derivative
-from torchsfm.tensors import trifocal_from_cameras, trifocal_ppp
+from torchsfm.tensors import trifocal_from_cameras
+from torchsfm.tensors.transfer import axis_lines
 
 _CHUNK = 2048
 """Problems at a time: their matrices fit the cache."""
@@ -34,14 +34,17 @@ _SIDES = [[_PAIRS.index(pair) for pair in ((i, j), (j, k), (i, k))] for i, j, k 
 _FACES = [_TRIPLES.index(face) for basis in _BASES for face in combinations(basis, 3)]
 
 
-def equations(P: Float[Tensor, "*#batch 3 3 4"], x: Float[Tensor, "*#batch 3 6 2"]) -> Float[Tensor, "*batch 72"]:
+def equations(P: Float[Tensor, "*#batch 3 3 4"], x: Float[Tensor, "*#batch 3 6 2"]) -> Float[Tensor, "*batch 42"]:
     """The incidence of the images of each point and the frame: P1 = [I | 0], P2 = [A | e] with A'e = 0, |A| = |e| = |P3| = 1.
 
-    Of the 54 + 18 equations 18 + 18 are independent, as many as there are unknowns.
+    The incidence of each point is written with the vertical and horizontal lines through its second and third image. Of the
+    24 + 18 equations 18 + 18 are independent, as many as there are unknowns.
     """
     P1, P2, P3 = P.unbind(-3)
     T = trifocal_from_cameras(P1, P2, P3)
-    points = trifocal_ppp(T, *x.unbind(-3)).flatten(-3)
+    x1, x2, x3 = x.unbind(-3)
+    h1 = torch.nn.functional.pad(x1, (0, 1), value=1.0)
+    points = torch.einsum("...ijk,...ni,...naj,...nbk->...nab", T, h1, axis_lines(x2), axis_lines(x3)).flatten(-3)
     A, e = P2[..., :3], P2[..., 3]
     first = (P1 - torch.eye(3, 4, dtype=P.dtype, device=P.device)).flatten(-2)
     norms = torch.stack(((A * A).sum((-2, -1)), (e * e).sum(-1), (P3 * P3).sum((-2, -1))), -1) - 1
@@ -93,11 +96,11 @@ def _solve(x: Float[Tensor, "6 3 2 batch"]) -> tuple[Tensor, Tensor]:
     m4, m5, m6 = (lines[:, :, 0] * p[:, 0] + lines[:, :, 1] * p[:, 1] + lines[:, :, 2] for p in (x4, x5, x6))
     m4 = torch.where(fine & (area > _FLAT), m4, 1)
     y5, y6 = _unit(m5 / m4), _unit(m6 / m4)
-    X, real, pivot = _sixth_point(y5, y6)
+    X, real, pivot = sixth_point(y5, y6)
     # a y-coordinate of each camera and d: (slot, view, batch) each.
     y5, y6 = y5[:, None], y6[:, None]
     system = [(y5[i] * X[i][:, None], (X[3] - X[i])[:, None], -y6[i]) for i in range(3)]
-    s, d, _ = _null_3x3(system)
+    s, d, _ = null_3x3(system)
     a = torch.stack([s * y5[i] - d for i in range(3)])
     # The camera's columns are x_i times these: (column, slot, view, batch).
     weights = torch.cat((a * m4[:, None], (d * (m4[0] + m4[1] + m4[2]))[None]))
@@ -140,132 +143,6 @@ def _join(p: Tensor, q: Tensor) -> Tensor:
 
 def _unit(y: Tensor) -> Tensor:
     return y * (1 / y.abs().amax(0).clamp_min(1e-300))
-
-
-def _sixth_point(y5: Tensor, y6: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
-    """The coordinates of X, (slot, batch) each; which slots are real; the smallest pivot."""
-    # Entries in the order 12 13 21 23 31 32, one equation for each view and one for the sum.
-    pairs = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-    rows = torch.stack([y6[i] * y5[j] for i, j in pairs], 1)
-    rows = rows * combine_rows(rows.unbind(1), rows.unbind(1)).clamp_min(1e-300).rsqrt()[:, None]
-    rows = torch.cat((rows, torch.full_like(rows[:1], 6**-0.5)))
-    basis, pivot = nullspace_rows(rows)
-    # det = g12 g23 g31 + g13 g21 g32.
-    c = [torch.zeros_like(pivot) for _ in range(4)]
-    for i, j, k in ((0, 3, 4), (1, 2, 5)):
-        (p0, p1), (q0, q1), (r0, r1) = basis[:, i], basis[:, j], basis[:, k]
-        inner = (p0 * q0, p0 * q1 + p1 * q0, p1 * q1)
-        c[0] = c[0] + inner[0] * r0
-        c[1] = c[1] + inner[0] * r1 + inner[1] * r0
-        c[2] = c[2] + inner[1] * r1 + inner[2] * r0
-        c[3] = c[3] + inner[2] * r1
-    # The larger of the outer coefficients leads.
-    turn = c[0].abs() > c[3].abs()
-    roots, real = cubic_rows(*(torch.where(turn, c[3 - i], c[i]) for i in range(4)))
-    one = torch.ones_like(roots)
-    g = torch.where(turn, roots, one) * basis[0, :, None] + torch.where(turn, one, roots) * basis[1, :, None]
-    some = torch.stack(c).abs().amax(0)
-    return _polished(_point_of_matrix(g), y5, y6), real, torch.minimum(pivot, some)
-
-
-def _point_of_matrix(g: Tensor) -> list[Tensor]:
-    """X with G = -[p]x diag(X_1, X_2, X_3) and p = X_4 - X_1..3, up to scale."""
-    g12, g13, g21, g23, g31, g32 = g.unbind(0)
-    # p is a left null vector: the longest of the cross products of the columns.
-    p = _longest(
-        (
-            torch.stack((g21 * g32, g31 * g12, -g21 * g12)),
-            torch.stack((-g32 * g23, g32 * g13, g12 * g23)),
-            torch.stack((g23 * g31, -g13 * g31, g13 * g21)),
-        )
-    )
-    p1, p2, p3 = (p * combine_rows(p, p).clamp_min(1e-300).rsqrt()).unbind(0)
-    s1, s2, s3 = p1 * p1, p2 * p2, p3 * p3
-    X1 = (p2 * g31 - p3 * g21) / (s2 + s3)
-    X2 = (p3 * g12 - p1 * g32) / (s1 + s3)
-    X3 = (p1 * g23 - p2 * g13) / (s1 + s2)
-    # X_1..3 = X_4 - k p: k from the differences.
-    u, v, w = p2 - p1, p3 - p2, p1 - p3
-    k = ((X1 - X2) * u + (X2 - X3) * v + (X3 - X1) * w) / (u * u + v * v + w * w)
-    X4 = (X1 + X2 + X3 + k * (p1 + p2 + p3)) / 3
-    return [X1, X2, X3, X4]
-
-
-def _polished(X: list[Tensor], y5: Tensor, y6: Tensor) -> list[Tensor]:
-    """A Newton step on the three equations det(y6, p, X_1..3 y5) = 0 along the unit sphere."""
-    X = _sphere(X)
-    rows = []
-    values = []
-    for view in range(3):
-        a, b = y6[:, view], y5[:, view]
-        # sum over i != j of +-(X_4 - X_k) X_j a_i b_j: bilinear in p and q = X b.
-        q = [X[i] * b[i] for i in range(3)]
-        p = [X[3] - X[i] for i in range(3)]
-        # Gradients by q: a x p; by p: q x a.
-        by_q = (a[1] * p[2] - a[2] * p[1], a[2] * p[0] - a[0] * p[2], a[0] * p[1] - a[1] * p[0])
-        by_p = (q[1] * a[2] - q[2] * a[1], q[2] * a[0] - q[0] * a[2], q[0] * a[1] - q[1] * a[0])
-        values.append(combine_rows(by_q, q))
-        gradient = [by_q[i] * b[i] - by_p[i] for i in range(3)]
-        rows.append((*gradient, by_p[0] + by_p[1] + by_p[2]))
-    step = _solve_4x4([*rows, tuple(X)], [*values, torch.zeros_like(values[0])])
-    size = combine_rows(step, step)
-    near = size < 1e-4
-    return _sphere([torch.where(near, x - dx, x) for x, dx in zip(X, step, strict=True)])
-
-
-def _sphere(X: list[Tensor]) -> list[Tensor]:
-    scale = combine_rows(X, X).rsqrt()
-    return [x * scale for x in X]
-
-
-def _solve_4x4(A: list[tuple[Tensor, ...]], b: list[Tensor]) -> list[Tensor]:
-    """Cramer's rule by 2x2 minors of the upper and the lower pair of rows."""
-    (a, c), (e, f) = A[:2], A[2:]
-    upper = {(i, j): a[i] * c[j] - a[j] * c[i] for i, j in combinations(range(4), 2)}
-    lower = {(i, j): e[i] * f[j] - e[j] * f[i] for i, j in combinations(range(4), 2)}
-
-    def minor(table: dict[tuple[int, int], Tensor], i: int, j: int) -> Tensor:
-        return table[i, j] if i < j else -table[j, i]
-
-    det = (
-        upper[0, 1] * lower[2, 3] - upper[0, 2] * lower[1, 3] + upper[0, 3] * lower[1, 2]
-        + upper[1, 2] * lower[0, 3] - upper[1, 3] * lower[0, 2] + upper[2, 3] * lower[0, 1]
-    )  # fmt: skip
-    solution = []
-    for i in range(4):
-        j, k, m = ((i + 1) % 4, (i + 2) % 4, (i + 3) % 4)
-        sign = 1 if i % 2 == 0 else -1
-        total = torch.zeros_like(det)
-        for row, other, table in ((0, 1, lower), (2, 3, upper)):
-            # The cofactors of the two rows: their other row times the minors of the other pair.
-            for r, o, turn in ((row, other, 1), (other, row, -1)):
-                v = A[o]
-                cofactor = v[j] * minor(table, k, m) - v[k] * minor(table, j, m) + v[m] * minor(table, j, k)
-                total = total + turn * b[r] * cofactor
-        solution.append(sign * total / det)
-    return solution
-
-
-def _longest(candidates: tuple[Tensor, ...]) -> Tensor:
-    """Of vectors (3, ...) the longest."""
-    best, length = candidates[0], combine_rows(candidates[0], candidates[0])
-    for other in candidates[1:]:
-        square = combine_rows(other, other)
-        longer = square > length
-        best, length = torch.where(longer, other, best), torch.where(longer, square, length)
-    return best
-
-
-def _null_3x3(rows: list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
-    """The unit null vector of 3x3 matrices of rank 2 given by rows: (3, ...)."""
-    shape = broadcast_shapes(*(e.shape for e in rows[0]))
-    r = [torch.stack([e.expand(shape) for e in row]) for row in rows]
-    n = _longest((_cross(r[0], r[1]), _cross(r[1], r[2]), _cross(r[2], r[0])))
-    return n * combine_rows(n, n).clamp_min(1e-300).rsqrt()
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    return torch.stack((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
 
 
 def _second_and_third(
