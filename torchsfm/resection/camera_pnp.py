@@ -88,15 +88,14 @@ def _starts(data: Rays) -> tuple[Tensor, Tensor]:
     quadratic, shift = _forms(data)
     vectors = torch.linalg.eigh(quadratic)[1][..., :_STARTS]
     R = _rotations(vectors.mT.reshape(-1, _STARTS, 3, 3).mT)
-    quadratic = quadratic[:, None]
     value = _value(quadratic, R)
     damping = torch.full_like(value, 1e-3)
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     for _ in range(_SHORT):
         # A turn w from the left moves column j of R by w x r_j.
-        J = torch.cat([_cross_matrix(-R[..., j]) for j in range(3)], -2)
-        A = quadratic @ J
-        N, g = J.mT @ A, A.mT @ R.mT.flatten(-2)[..., None]
+        J = torch.cat([_cross_matrix(R[..., j]) for j in range(3)], -1)
+        A = (J.flatten(1, 2) @ quadratic).view_as(J)
+        N, g = A @ J.mT, A @ R.mT.flatten(-2)[..., None]
         trace = N.diagonal(dim1=-2, dim2=-1).sum(-1)
         step = -torch.linalg.solve_ex(N + (damping * trace + 1e-30)[..., None, None] * eye, g)[0][..., 0]
         new = _turned(R, torch.where(torch.isfinite(step), step, 0.0))
@@ -104,7 +103,7 @@ def _starts(data: Rays) -> tuple[Tensor, Tensor]:
         better = after <= value
         R, value = torch.where(better[..., None, None], new, R), torch.where(better, after, value)
         damping = torch.where(better, damping * 0.1, (damping * 10).clamp_min(1e-4))
-    t = (shift[:, None] @ R.mT.flatten(-2)[..., None])[..., 0]
+    t = R.mT.flatten(-2) @ shift.mT
     # Of starts that ended in one minimum keep one: what is as good as a better one and no different from it.
     value = cost(data, R, t)
     order = value.argsort(-1)
@@ -166,7 +165,7 @@ def _rotations(M: Tensor) -> Tensor:
 
 def _value(quadratic: Tensor, R: Tensor) -> Tensor:
     r = R.mT.flatten(-2)
-    return (r * (quadratic @ r[..., None])[..., 0]).sum(-1)
+    return (r * (r @ quadratic)).sum(-1)
 
 
 def _turned(R: Tensor, w: Tensor) -> Tensor:
