@@ -229,19 +229,20 @@ def photographs(data: Path, work: Path) -> None:
     sets: dict[str, tuple[list[Path], list[float], Pose | None]] = {}
     folder = data / "images/fountain-P11"
     files = sorted((folder / "images").glob("*.jpg"))
-    rows = torch.from_numpy(np.stack([np.loadtxt(folder / "gt" / f"{p.stem}.txt")[:6, :3] for p in files]))
-    t = torch.from_numpy(np.stack([np.array(_numbers(folder / "gt" / f"{p.stem}.txt", 3, 6))[:, 3] for p in files]))
-    K = rows[0, :3]
-    sets["fountain-P11"] = files, [float(K[0, 0]), float(K[0, 2]), float(K[1, 2])], Pose(rows[:, 3:], t)
+    truths = [folder / "gt" / f"{path.stem}.txt" for path in files]
+    lines = [[[float(word) for word in line.split()] for line in p.read_text().splitlines()] for p in truths]
+    K = lines[0]
+    poses = torch.tensor([rows[3:6] for rows in lines], dtype=torch.float64)
+    sets["fountain-P11"] = files, [(K[0][0] + K[1][1]) / 2, K[0][2], K[1][2]], Pose(poses[..., :3], poses[..., 3])
     folder = data / "images/sceaux_castle"
     k = np.loadtxt(folder / "K.txt")
     sets["sceaux_castle"] = sorted(folder.glob("*.JPG")), [k[0, 0], k[0, 2], k[1, 2]], None
     folder = data / "images/temple_ring"
     table = [line.split() for line in (folder / "templeR_par.txt").read_text().splitlines()[1:]]
     values = torch.tensor([[float(word) for word in line[1:]] for line in table], dtype=torch.float64)
-    poses = Pose(values[:, 9:18].reshape(-1, 3, 3), values[:, 18:])
+    ring = Pose(values[:, 9:18].reshape(-1, 3, 3), values[:, 18:])
     f = float(values[0, 0] + values[0, 4]) / 2
-    sets["temple_ring"] = [folder / line[0] for line in table], [f, float(values[0, 2]), float(values[0, 5])], poses
+    sets["temple_ring"] = [folder / line[0] for line in table], [f, float(values[0, 2]), float(values[0, 5])], ring
     for name, (paths, (f, cx, cy), truth) in sets.items():
         result = reconstruct(paths, method="projective", shared_camera=True, out=work / name, resume=True)
         text = result.report.autocalibration[0] if result.report.autocalibration else "no three images hang together"
@@ -260,10 +261,6 @@ def photographs(data: Path, work: Path) -> None:
             f"({xa:.1f}, {ya:.1f}) {off:.2f}; {turn}; {model.num_registered} of {len(paths)} images; {text}",
             flush=True,
         )
-
-
-def _numbers(path: Path, first: int, last: int) -> list[list[float]]:
-    return [[float(word) for word in line.split()] for line in path.read_text().splitlines()[first:last]]
 
 
 def main() -> None:
