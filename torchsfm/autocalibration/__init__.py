@@ -1,7 +1,8 @@
 """From projective to metric: what are the cameras like inside, as far as the images alone tell?"""
 
 from torchsfm.autocalibration.algebraic_fit import IntrinsicsEstimate
-from torchsfm.autocalibration.autocalibrate_points import AssumptionFit, Autocalibration, autocalibrate_points
+from torchsfm.autocalibration.assumption_fit import AssumptionFit
+from torchsfm.autocalibration.autocalibrate_points import Autocalibration, autocalibrate_points
 from torchsfm.autocalibration.calibrate_planes import PlaneCalibration, calibrate_planes
 from torchsfm.autocalibration.constant_intrinsics import constant_intrinsics, intrinsics_from_modulus
 from torchsfm.autocalibration.diagnosis import Motion, diagnose_motion

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm.autocalibration.assumption_fit import FINALISTS, STARTS, AssumptionFit, solve_assumption
 from torchsfm.autocalibration.diagnosis import Motion, diagnose_motion
-from torchsfm.autocalibration.focal_search import search_focal
 from torchsfm.autocalibration.intrinsics_model import (
     CONSTANT,
     VARYING_FOCAL,
@@ -18,35 +18,11 @@ from torchsfm.autocalibration.intrinsics_model import (
     intrinsics_from_parameters,
     parameters_from_intrinsics,
 )
-from torchsfm.autocalibration.plane_at_infinity import metric_upgrade
-from torchsfm.autocalibration.projective_input import MAX_COUPLED, PreparedCameras, prepare_cameras
-from torchsfm.autocalibration.upgrade_fit import UpgradeProblem, fit_information, fit_upgrade
-from torchsfm.autocalibration.upgrade_residual import metric_blocks
-from torchsfm.linalg import determinant_3x3, nearest_rotation
+from torchsfm.autocalibration.metric_cameras import metric_cameras
+from torchsfm.autocalibration.projective_input import MAX_COUPLED, prepare_cameras
 
 _DOUBLES = 12_000_000
 """Entries of covariances held at once; bounds memory, changes no result."""
-_STARTS, _FINALISTS = 8, 3
-_APART = 0.15
-"""Focal lengths this far apart in logarithm are told apart by the data, or the focal length is not determined."""
-_CLEAR = 9.0
-"""By how much chi squared must differ for that: three standard deviations."""
-
-
-@dataclass(frozen=True)
-class AssumptionFit:
-    """What one assumption leads to; fields as in `Autocalibration`, and what the data say of its unknowns."""
-
-    assumption: Assumption
-    status: Int8[Tensor, "*batch"]
-    chi2: Float[Tensor, "*batch"]
-    redundancy: Float[Tensor, "*batch"]
-    singular_values: Float[Tensor, "*batch q"]
-    """Of the linearised system, the plane at infinity eliminated, in units of the noise, ascending: a combination of the
-    unknowns with singular value s is determined by the data to a standard deviation of 1 / s."""
-    combinations: Float[Tensor, "*batch q q"]
-    """Those combinations as columns, over the unknowns `assumption.names(v)`: logarithms of focal length and aspect, skew over
-    focal length, principal point over the longer side of the image."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +147,7 @@ def autocalibrate_points(
         if count == 0:
             # The shapes of the answer come from one problem of zeros.
             data = [t.new_zeros(1, *t.shape[1:]) for t in data]
-        per_problem = (12 * v) ** 2 * (2 + _FINALISTS) if v <= MAX_COUPLED else 144 * v * _STARTS
+        per_problem = (12 * v) ** 2 * (2 + FINALISTS) if v <= MAX_COUPLED else 144 * v * STARTS
         chunk = max(1, _DOUBLES // max(per_problem, 1))
         pieces = []
         for start in range(0, len(data[0]), chunk):
@@ -207,18 +183,6 @@ def _collector(into: list[Tensor]) -> Callable[[Tensor], Tensor]:
     return collect
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """The answer under one assumption, views in the order of `PreparedCameras`."""
-
-    parameters: Tensor
-    plane: Tensor
-    covariance: Tensor
-    data_deviation: Tensor
-    fit: AssumptionFit
-    unknowns: int
-
-
 def _solve(
     P: Tensor,
     X: Tensor,
@@ -238,7 +202,7 @@ def _solve(
     if K is not None:
         base = torch.nan_to_num(parameters_from_intrinsics(ready.image @ K[rows, ready.order]), 0.0, 0.0, 0.0)
         base[..., 0] = 0
-    solved = [_fit(ready, base, assumption, max_deviation) for assumption in assume]
+    solved = [solve_assumption(ready, base, assumption, max_deviation) for assumption in assume]
     taken = torch.zeros(b, dtype=torch.long, device=P.device)
     best, unknowns = solved[0].fit.chi2, torch.full((b,), float(solved[0].unknowns), dtype=P.dtype, device=P.device)
     for k, other in enumerate(solved[1:], 1):
@@ -257,7 +221,7 @@ def _solve(
     status = pick([s.fit.status for s in solved])
     inverse = ready.order.argsort(-1)
     K_ready = intrinsics_from_parameters(parameters)
-    metric = _metric(ready, K_ready, plane)
+    metric = metric_cameras(ready, K_ready, plane)
     side = 1 / ready.image[..., 0, 0]
     unit = torch.stack((*[torch.ones_like(side)] * 3, side, side), -1)
     covariance = pick([s.covariance for s in solved])[rows, inverse] * (unit[..., :, None] * unit[..., None, :])[rows, inverse]
@@ -297,154 +261,3 @@ def _unscaled(T: Tensor) -> Tensor:
     zero = torch.zeros_like(s)
     rows = (s, zero, -T[..., 0, 2] * s, zero, s, -T[..., 1, 2] * s, zero, zero, zero + 1)
     return torch.stack(rows, -1).reshape(T.shape)
-
-
-def _fit(ready: PreparedCameras, base: Tensor, assumption: Assumption, max_deviation: float) -> _Solved:
-    b, v = ready.P.shape[:2]
-    spread = assumption.spread(v, ready.P)
-    q = spread.shape[-1]
-    present = ready.present.to(ready.P.dtype)
-    problem = UpgradeProblem(ready.P, ready.covariance, base, present, spread)
-    varying = "focal" in assumption.varying
-    log_f, plane, _ = search_focal(
-        ready.P, ready.X, ready.visible.any(-2).to(ready.P.dtype), base, present, varying=varying, starts=_STARTS
-    )
-    is_focal = spread[:, 0].sum(0) > 0
-    starts = log_f.new_zeros(*log_f.shape[:2], q)
-    starts[..., is_focal] = log_f if varying else log_f[..., :1]
-    precision = assumption.precision(v, ready.P)
-    # An absent view's focal length is nobody's: it stays where it was.
-    held = present.new_full((b, q), 0.0)
-    for k, (_, view) in enumerate(assumption.columns(v)):
-        if view is not None:
-            held[:, k] = 1 - present[:, view]
-    precision = (precision + held)[:, None]
-    mean = torch.zeros_like(precision)
-    rough = fit_upgrade(problem, starts, plane, mean, precision, coupled=False, max_iterations=30)
-    ranked = (rough.objective + _impossible(problem, ready, rough.unknowns, rough.plane)).argsort(-1)
-    finalists = _distinct(ranked, rough.unknowns[..., is_focal].mean(-1), rough.plane)
-    rows = torch.arange(b, device=ready.P.device)[:, None]
-    fine = fit_upgrade(
-        problem, rough.unknowns[rows, finalists], rough.plane[rows, finalists], mean, precision, coupled=True, max_iterations=30
-    )
-    wrong = _impossible(problem, ready, fine.unknowns, fine.plane)
-    total = fine.objective + wrong
-    winner = total.argmin(-1)
-    first = torch.arange(b, device=ready.P.device)
-    unknowns, p = fine.unknowns[first, winner], fine.plane[first, winner]
-    chi2, objective = fine.cost[first, winner], total[first, winner]
-
-    number = present.sum(-1)
-    redundancy = 5 * (number - 1) - 3 - (q - held.sum(-1)) + (precision[:, 0] > 0).sum(-1) - held.sum(-1)
-    birge = (chi2 / redundancy.clamp_min(1)).clamp_min(1)
-    information = fit_information(problem, unknowns, p)
-    on_unknowns = _schur(information, q)
-    values, vectors = torch.linalg.eigh(on_unknowns)
-    values = values.clamp_min(0)
-    expected = torch.diag_embed(precision[:, 0].square())
-    tiny = 1e-12 * torch.eye(q, dtype=values.dtype, device=values.device)
-    covariance = torch.linalg.inv_ex(on_unknowns / birge[:, None, None] + expected + tiny).inverse
-    # The floor makes the deviation of what the data do not determine at all large and finite.
-    by_data = (vectors.square() @ (birge[:, None] / values.clamp_min(1e-6))[..., None])[..., 0].sqrt()
-    per_view = spread @ covariance[:, None] @ spread.mT
-    free = spread.sum(-1) > 0
-    data_deviation = torch.einsum("vmq,bq->bvm", spread, by_data) * free
-    focal = (per_view[..., 0, 0].clamp_min(0).sqrt() * present).amax(-1)
-
-    # A second answer that fits as well, or focal lengths well off that do, leave the question open.
-    others = (fine.unknowns - unknowns[:, None])[..., is_focal].abs().amax(-1) > _APART
-    rival = (others & (total < (objective + _CLEAR * birge)[:, None])).any(-1)
-    moved = unknowns[:, None].expand(b, 2, q).clone()
-    moved[:, 0, is_focal] -= _APART
-    moved[:, 1, is_focal] += _APART
-    pinned = precision.expand(b, 2, q) + 1e3 * is_focal
-    expectation = torch.where(is_focal, moved, 0.0)
-    away = fit_upgrade(problem, moved, p[:, None].expand(b, 2, 3), expectation, pinned, coupled=True, max_iterations=12)
-    flat = (away.objective < (objective + _CLEAR * birge)[:, None]).any(-1)
-
-    log_focal = (problem.intrinsics(unknowns)[..., 0, 0].log() * present).abs().amax(-1)
-    status = torch.full((b,), int(Status.OK), dtype=torch.int8, device=ready.P.device)
-    for condition, code in (
-        (flat | rival | (focal > max_deviation) | (log_focal > math.log(40)), Status.DEGENERATE),
-        (chi2 > 200 * redundancy.clamp_min(1), Status.NO_CONSENSUS),
-        (wrong[first, winner] > 0, Status.BEHIND),
-        ((number < 2) | (redundancy < 0), Status.TOO_FEW),
-        (~ready.finite, Status.NOT_FINITE),
-        (number < 2, Status.TOO_FEW),
-    ):
-        status = torch.where(condition, int(code), status)
-    fit = AssumptionFit(assumption, status.to(torch.int8), chi2, redundancy, values.sqrt(), vectors)
-    parameters = base + torch.einsum("vmq,bq->bvm", spread, unknowns).clamp(-20, 20)
-    return _Solved(parameters, p, per_view, data_deviation, fit, q)
-
-
-def _impossible(problem: UpgradeProblem, ready: PreparedCameras, unknowns: Tensor, p: Tensor) -> Tensor:
-    """A penalty where views would be mirrored or the plane at infinity would pass between points."""
-    K = problem.intrinsics(unknowns)
-    M = metric_blocks(problem.P[:, None], K, K[..., 0, :, :], p)
-    mirrored = ((determinant_3x3(M) < 0) * problem.present[:, None]).sum(-1)
-    side = (torch.cat((p, torch.ones_like(p[..., :1])), -1) @ ready.X.mT).sign()
-    seen = ready.visible.any(-2).to(p.dtype)[:, None]
-    share = (side * seen).sum(-1).abs() / seen.sum(-1).clamp_min(1)
-    return 1e12 * (mirrored + (share < 0.9))
-
-
-def _distinct(ranked: Tensor, log_f: Tensor, p: Tensor) -> Tensor:
-    """The best of `ranked`, and the best of those that differ from it in focal length or plane, and so on."""
-    rows = torch.arange(len(ranked), device=ranked.device)
-    place = torch.zeros_like(ranked).scatter(1, ranked, torch.arange(ranked.shape[1], device=ranked.device).expand_as(ranked))
-    order = place.to(p.dtype)
-    chosen = []
-    for _ in range(min(_FINALISTS, ranked.shape[1])):
-        best = order.argmin(-1)
-        chosen.append(best)
-        near = (log_f - log_f[rows, best][:, None]).abs() < 0.01
-        near &= (p - p[rows, best][:, None]).norm(dim=-1) < 0.01 * (1 + p[rows, best].norm(dim=-1, keepdim=True))
-        order = torch.where(near, order + ranked.shape[1], order)
-        order[rows, best] += 10 * ranked.shape[1]
-    return torch.stack(chosen, -1)
-
-
-def _schur(information: Tensor, q: int) -> Tensor:
-    """The information on the first q unknowns, the others being free."""
-    A, B, D = information[:, :q, :q], information[:, :q, q:], information[:, q:, q:]
-    scale = D.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    D = scale[:, :, None] * D * scale[:, None] + 1e-13 * torch.eye(3, dtype=D.dtype, device=D.device)
-    B = B * scale[:, None]
-    solved = torch.linalg.solve_ex(D, B.mT).result
-    reduced = torch.nan_to_num(A - B @ solved, 0.0, 0.0, 0.0)
-    return 0.5 * (reduced + reduced.mT)
-
-
-@dataclass(frozen=True)
-class _Metric:
-    R: Tensor
-    t: Tensor
-    X: Tensor
-    upgrade: Tensor
-    in_front: Tensor
-
-
-def _metric(ready: PreparedCameras, K: Tensor, p: Tensor) -> _Metric:
-    """Poses and points for given intrinsics and plane at infinity."""
-    inverse = torch.linalg.inv_ex(K).inverse
-    M = metric_blocks(ready.P, K, K[:, 0], p)
-    size = determinant_3x3(M).abs().clamp_min(1e-300) ** (1 / 3)
-    R = nearest_rotation(torch.nan_to_num(M))
-    t = (inverse @ ready.P[..., 3:])[..., 0] / size[..., None]
-    w = (ready.X * torch.cat((p, torch.ones_like(p[:, :1])), -1)[:, None]).sum(-1)
-    seen = ready.visible.any(-2)
-    side = torch.where((w.sign() * seen).sum(-1) < 0, -1.0, 1.0)
-    distance = (R.mT @ t[..., None]).norm(dim=(-2, -1)) * ready.present
-    unit = distance.sum(-1) / (ready.present.sum(-1) - 1).clamp_min(1)
-    unit = torch.where((unit > 1e-12) & torch.isfinite(unit), unit, 1.0)
-    t = t * (side / unit)[:, None, None]
-    H = metric_upgrade(K[:, 0], p)
-    H = torch.cat((H[..., :3], H[..., 3:] * (side / unit)[:, None, None]), -1)
-    Y = torch.linalg.solve_ex(H, ready.X.mT).result.mT
-    finite = (Y[..., 3].abs() > 1e-14 * Y.norm(dim=-1)) & torch.isfinite(Y).all(-1)
-    X = torch.where(finite[..., None], Y[..., :3], 0.0) / torch.where(finite, Y[..., 3], 1.0)[..., None]
-    depth = (R @ X[:, None, :, :].mT)[..., 2, :] + t[..., 2:]
-    front = (depth > 0) & ready.visible & finite[:, None]
-    in_front = front.sum((-2, -1)) / ready.visible.sum((-2, -1)).clamp_min(1)
-    return _Metric(R, t, X, torch.nan_to_num(ready.frame @ H), in_front.to(p.dtype))

@@ -16,6 +16,8 @@ from torchsfm.geometry import rotvec_from_rotation
 
 SMALL_ANGLE = 0.03
 """Angle in radians below which a rotation, or its part off the common axis, counts as none."""
+SMALL_TURN = 0.08
+"""The same for the part off the common axis, over the whole: noise tilts large rotations by more."""
 SMALL_SPREAD = 0.05
 """Ratio of lengths below which centres count as on a line or in a plane, and axes as meeting in a point."""
 
@@ -47,7 +49,7 @@ class Motion:
     @property
     def one_axis(self) -> Bool[Tensor, "*batch"]:
         """All rotations about one direction."""
-        return ~self.translation & (self.off_axis < SMALL_ANGLE)
+        return ~self.translation & (self.off_axis < (SMALL_TURN * self.rotation).clamp_min(SMALL_ANGLE))
 
     @property
     def collinear(self) -> Bool[Tensor, "*batch"]:
