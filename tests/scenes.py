@@ -92,6 +92,12 @@ def _two_views(kind: type, batch: tuple[int, ...], n: int, generator: torch.Gene
         data = tuple(torch.cat((x / FOCAL, torch.ones_like(x[..., :1])), -1) for x in (x1, x2))
         slack = torch.full(batch, 1e-3, dtype=torch.float64)
         return Scene(kind(slack), data, torch.cat((R, t[..., None]), -1), _pose_error, _wrong_last, noise / FOCAL)
+    if kind.model_name == "upright_pose":  # type: ignore[attr-defined]
+        data = tuple(torch.cat((x / FOCAL, torch.ones_like(x[..., :1])), -1) for x in (x1, x2))
+        slack = torch.full(batch, 1e-3, dtype=torch.float64)
+        up = torch.nn.functional.normalize(torch.randn(*batch, 3, generator=generator, dtype=torch.float64), dim=-1)
+        estimator = kind(up, (R @ up[..., None])[..., 0], slack)
+        return Scene(estimator, data, torch.cat((R, t[..., None]), -1), _pose_error, _wrong_last, noise / FOCAL)
     K = torch.diag(torch.tensor([FOCAL, FOCAL, 1.0], dtype=torch.float64))
     F = K.inverse() @ _skew(t) @ R @ K.inverse()
     e = (K @ t[..., None])[..., 0]
@@ -191,6 +197,7 @@ def _point(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generato
 _SCENES: dict[str, Callable[..., Scene]] = {
     "oriented_fundamental": _two_views,
     "relative_pose": _two_views,
+    "upright_pose": _two_views,
     "homography": _plane,
     "trifocal": _three_views,
     "camera": _camera,

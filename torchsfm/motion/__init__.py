@@ -7,6 +7,7 @@ from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_
 from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
 from torchsfm.motion.estimate_structures import estimate_fundamentals, estimate_homographies
 from torchsfm.motion.estimate_trifocal import TrifocalEstimator, estimate_trifocal
+from torchsfm.motion.estimate_upright import UprightPoseEstimator, estimate_upright
 from torchsfm.motion.factorization_affine import AffineFactorization, factorize_affine
 from torchsfm.motion.factorization_points import Factorization, factorize_points
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
@@ -22,7 +23,7 @@ from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_7pt import TrifocalFit, trifocal_7pt
 
-ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, TrifocalEstimator)
+ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, TrifocalEstimator, UprightPoseEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "SelectedMotion",
     "TrifocalEstimator",
     "TrifocalFit",
+    "UprightPoseEstimator",
     "essential_5pt",
     "essential_6pt",
     "estimate_essential",
@@ -46,6 +48,7 @@ __all__ = [
     "estimate_homographies",
     "estimate_homography",
     "estimate_trifocal",
+    "estimate_upright",
     "factorize_affine",
     "factorize_points",
     "fundamental_7pt",

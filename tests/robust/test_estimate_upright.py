@@ -1,0 +1,54 @@
+"""The door for cameras that know the vertical; the laws of its estimator are in the contract."""
+
+import pytest
+import torch
+from scenes import make_scene
+
+from torchsfm._types import Status
+from torchsfm.motion import RelativePoseEstimator, UprightPoseEstimator, estimate_essential, estimate_upright
+from torchsfm.tensors import essential_from_pose
+
+
+def test_poses_are_found_with_few_samples(generator: torch.Generator) -> None:
+    scene = make_scene(UprightPoseEstimator, (12,), 200, generator, 1e-3)
+    wrong = torch.rand(12, 200, generator=generator) < 0.5
+    d1, d2 = scene.spoil(scene.data, wrong, generator)
+    up1, up2 = scene.estimator.gravity1, scene.estimator.gravity2
+    found = estimate_upright(5 * d1, d2, 3 * up1, 0.1 * up2, threshold=2e-3, generator=generator)
+    assert (found.status == Status.OK).all()
+    assert scene.error(found.model, scene.model).median() < 0.01
+    assert ((found.model[..., :3] @ up1[..., None])[..., 0] - up2).abs().max() < 1e-9
+    free = estimate_essential(d1, d2, threshold=2e-3, generator=generator)
+    assert found.iterations.double().mean() < free.iterations.double().mean()
+    # Knowing more is better.
+    E = essential_from_pose(scene.model[..., :3], scene.model[..., 3])
+    far = torch.minimum((free.model - E).norm(dim=(-2, -1)), (free.model + E).norm(dim=(-2, -1)))
+    own = essential_from_pose(found.model[..., :3], found.model[..., 3])
+    near = torch.minimum((own - E).norm(dim=(-2, -1)), (own + E).norm(dim=(-2, -1)))
+    assert near.median() < far.median()
+
+
+def test_a_wrong_vertical_is_corrected_by_refinement(generator: torch.Generator) -> None:
+    scene = make_scene(UprightPoseEstimator, (8,), 150, generator, 3e-4)
+    up1, up2 = scene.estimator.gravity1, scene.estimator.gravity2
+    tilted = up2 + 3e-3 * torch.randn(up2.shape, generator=generator, dtype=up2.dtype)
+    found = estimate_upright(*scene.data, up1, tilted, threshold=5e-3, generator=generator)
+    model = found.model
+    free = RelativePoseEstimator(torch.full((8,), 5e-3, dtype=torch.float64))
+    for _ in range(5):
+        model = free.refine(model, *scene.data, weights=found.inliers.double())
+    assert scene.error(model, scene.model).median() < 0.5 * scene.error(found.model, scene.model).median()
+
+
+def test_dtype_bad_input_and_arguments(generator: torch.Generator, unchecked: None) -> None:
+    scene = make_scene(UprightPoseEstimator, (3,), 60, generator, 1e-3)
+    d1, d2 = (d.float() for d in scene.data)
+    up1, up2 = scene.estimator.gravity1.float(), scene.estimator.gravity2.float()
+    d1[1, ::2], up1[2] = torch.nan, 0
+    found = estimate_upright(d1, d2, up1, up2, threshold=3e-3, generator=generator)
+    assert found.model.dtype == torch.float32
+    assert found.status.tolist()[:2] == [Status.OK, Status.OK]
+    assert found.status[2] != Status.OK
+    assert torch.isfinite(found.model).all()
+    with pytest.raises(ValueError, match="gravity2"):
+        estimate_upright(d1, d2, up1, up2[..., :2], threshold=3e-3)

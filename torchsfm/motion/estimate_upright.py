@@ -1,0 +1,151 @@
+"""The relative pose of two cameras that know the vertical, from corresponding rays of which many are wrong."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+from torchsfm.geometry import cross_matrix, rotation_from_rotvec
+from torchsfm.linalg import cross
+from torchsfm.motion.epipolar_fit import cross_rows, normal_equations, sphere_rows
+from torchsfm.motion.estimate_essential import RelativePoseEstimator
+from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
+from torchsfm.robust import RobustResult, damped_solve, ransac
+
+
+@dataclass(frozen=True)
+class UprightPoseEstimator:
+    """The pose [R | t] of the second camera, |t| = 1 and R gravity1 = gravity2, from corresponding rays.
+
+    Distances are those of `RelativePoseEstimator`.
+
+    Attributes:
+        gravity1: The vertical in the first camera, of length 1, for each problem.
+        gravity2: The vertical in the second camera, of length 1.
+        slack: By which angle in radians rays must miss the front to count as behind.
+    """
+
+    gravity1: Float[Tensor, "*batch 3"]
+    gravity2: Float[Tensor, "*batch 3"]
+    slack: Float[Tensor, "*batch"]
+
+    model_name: ClassVar[str] = "upright_pose"
+    data_names: ClassVar[tuple[str, ...]] = ("d1", "d2")
+    sample_size: ClassVar[int] = 3
+    max_solutions: ClassVar[int] = 4
+    codimension: ClassVar[int] = 1
+
+    def minimal(
+        self, d1: Float[Tensor, "*#batch 3 3"], d2: Float[Tensor, "*#batch 3 3"]
+    ) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
+        """The poses for which three rays meet in front of both cameras."""
+        solutions = relative_upright_3pt(d1, d2, self.gravity1, self.gravity2)
+        wide = RelativePoseEstimator(self.slack[..., None])
+        behind = torch.isinf(wide.squared_residual(solutions.model.detach(), d1[..., None, :, :], d2[..., None, :, :]))
+        return Solutions(solutions.model, solutions.valid & ~behind.any(-1))
+
+    def squared_residual(
+        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Squared angular Sampson distance; infinite behind a camera."""
+        return RelativePoseEstimator(self.slack).squared_residual(model, d1, d2)
+
+    def residual(
+        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Sampson distance in radians."""
+        return self.squared_residual(model, d1, d2).sqrt()
+
+    def degenerate(self, d1: Float[Tensor, "*#batch 3 3"], d2: Float[Tensor, "*#batch 3 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether the first two rays coincide in an image."""
+        return ((d1[..., 0, :] == d1[..., 1, :]).all(-1)) | ((d2[..., 0, :] == d2[..., 1, :]).all(-1))
+
+    def refine(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        weights: Float[Tensor, "*#batch n"],
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """A Gauss-Newton step on Sampson's distance: R turned about the vertical, and t along the unit sphere."""
+        R, t = model[..., :3], model[..., 3]
+        A, b = normal_equations(cross_rows(t, R), sphere_rows(d1), sphere_rows(d2), weights, sphere=True)
+        R, t, up = R.double(), t.double(), self.gravity2.double()
+        axes = cross_matrix(torch.eye(3, dtype=R.dtype, device=R.device))
+        turn = cross_matrix(t) @ cross_matrix(up) @ R
+        move = axes @ R[..., None, :, :]
+        tangent = torch.cat((turn[..., None, :, :], move), -3).flatten(-2).mT
+        A, b = tangent.mT @ A @ tangent, tangent.mT @ b[..., None]
+        # A move along t changes nothing but the length of E: keep it at zero.
+        along = torch.cat((torch.zeros_like(t[..., :1]), t), -1)
+        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * along[..., :, None] * along[..., None, :]
+        step = -damped_solve(A, b)[..., 0]
+        t = t + step[..., 1:]
+        t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
+        R = rotation_from_rotvec(step[..., :1] * up) @ R
+        # What a start in lower precision lacks to a rotation, and to the vertical.
+        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
+        R = rotation_from_rotvec(cross((R @ self.gravity1.double()[..., None])[..., 0], up)) @ R
+        return torch.cat((R, t[..., None]), -1).to(d1.dtype)
+
+
+def estimate_upright(
+    d1: Float[Tensor, "*#batch n 3"],
+    d2: Float[Tensor, "*#batch n 3"],
+    gravity1: Float[Tensor, "*#batch 3"],
+    gravity2: Float[Tensor, "*#batch 3"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    scores: Float[Tensor, "*#batch n"] | None = None,
+    generator: torch.Generator | None = None,
+    confidence: float = 0.9999,
+    max_iterations: int = 10_000,
+) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
+    """The relative pose of each pair of calibrated cameras that know the vertical, from rays of which many may be wrong.
+
+    As `estimate_essential`, with samples of three rays: fewer of them are needed. R is exact about the vertical only as far as
+    the two directions are; free it afterwards by `RelativePoseEstimator.refine` on the inliers where they are not.
+
+    Args:
+        d1: Rays of the first camera, of any length, pointing to the points.
+        d2: The corresponding rays of the second camera.
+        gravity1: The vertical in the first camera, of any length.
+        gravity2: The vertical in the second camera.
+        threshold: Largest Sampson distance of an inlier in radians: pixels divided by the focal length.
+        mask: Which correspondences exist. Rows that are not finite or of length 0 are left out too.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        generator: Source of randomness.
+        confidence: Wanted probability of having drawn a sample without outliers.
+        max_iterations: Most samples to draw.
+
+    Returns:
+        [R | t] with |t| = 1; inliers, score, iterations, status.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit.
+    """
+    limit = threshold if isinstance(threshold, Tensor) else None
+    batch = check_tensors(
+        d1=(d1, "n 3"), d2=(d2, "n 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"), threshold=(limit, ""),
+        mask=(mask, "n: bool"), scores=(scores, "n"),
+    )  # fmt: skip
+    # A ray of length 0 becomes NaN, and is left out.
+    rays = [d / d.double().norm(dim=-1, keepdim=True) for d in (d1, d2)]
+    up1, up2 = ((g.double() / g.double().norm(dim=-1, keepdim=True)).expand(*batch, 3) for g in (gravity1, gravity2))
+    slack = threshold.double() if isinstance(threshold, Tensor) else rays[0].new_tensor(threshold)
+    result = ransac(
+        UprightPoseEstimator(up1, up2, slack.expand(batch)), *rays, threshold=slack, mask=mask,
+        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
+        max_iterations=max_iterations, scoring_dtype=torch.float32,
+    )  # fmt: skip
+    return replace(
+        result,
+        model=result.model.to(d1.dtype),
+        score=result.score.to(d1.dtype),
+        threshold=result.threshold.to(d1.dtype),
+    )
