@@ -148,6 +148,30 @@ def test_the_order_of_a_sample_does_not_matter(kind: type, generator: torch.Gene
     assert (solutions.valid.sum(-1) == turned.valid.sum(-1)).double().mean() > 0.99
 
 
+def test_retraction_follows_the_manifold(kind: type, generator: torch.Generator) -> None:
+    """No step is no move; every step is a model that data can have: exact data of it are found to fit after refinement."""
+    if not hasattr(kind, "retract"):
+        pytest.skip("models of this estimator do not say how they move")
+    scene = make_scene(kind, (6,), 40, generator, 1e-3)
+    size = kind.dimension  # type: ignore[attr-defined]
+    zero = torch.zeros(6, size, dtype=torch.float64)
+    torch.testing.assert_close(scene.estimator.retract(scene.model, zero), scene.model, rtol=0, atol=1e-12)
+    steps = torch.eye(size, dtype=torch.float64)[:, None].expand(size, 6, size)
+    moved = scene.estimator.retract(scene.model, 1e-4 * steps) - scene.model
+    flat = moved.reshape(size, 6, -1).transpose(0, 1) / 1e-4
+    # As many directions as the dimension says, all of them of about unit speed.
+    values = torch.linalg.svdvals(flat)
+    assert (values[:, -1] > 0.1).all()
+    assert (values[:, 0] < 30).all()
+    # And they are all there are: what refinement changes is a step.
+    weights = torch.ones(6, 40, dtype=torch.float64)
+    change = (scene.estimator.refine(scene.model, *scene.data, weights=weights) - scene.model).reshape(6, -1, 1)
+    basis = flat.mT
+    left = change - basis @ torch.linalg.lstsq(basis, change).solution
+    size = change.norm(dim=1)
+    assert (left.norm(dim=1) < 0.01 * size + size**2 + 1e-12).all()
+
+
 def test_refinement_finds_the_optimum(kind: type, generator: torch.Generator) -> None:
     """From near the truth, with noise: the cost falls, then stands still, and exact data give the exact model."""
     for noise in (0.0, 1e-3):

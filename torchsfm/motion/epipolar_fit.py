@@ -1,21 +1,18 @@
 """Sampson's distance to an epipolar geometry and its Gauss-Newton equations, for points in a plane and for rays on a sphere.
 
 With the residual e = h2' F h1 and its gradient g over the tangents of both points, the distance is e / |g| (Sampson 1982;
-Luong & Faugeras 1996). Its derivative with respect to F is, up to second order in the distance, that of e alone at the points
-corrected to first order, divided by |g|: h2 (x) h1 / |g|. So the normal matrix is the sum of (h2 h2') (x) (h1 h1') / |g|^2,
-made of 6 x 6 sums. Everything is written in rows: one tensor for each coordinate of all points.
+Luong & Faugeras 1996). Residual and gradient are linear in the products h2_i h1_j of a datum, so one matrix product gives them
+for all models and data. The derivative of e^2 / (2 |g|^2) with respect to F is written out; J' W J is the sum of
+(h2 (x) h1) (h2 (x) h1)' / |g|^2, which it is at the points corrected to first order, up to the noise.
 """
 
 from collections.abc import Sequence
+from functools import cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# Products of two coordinates in the order xx, yy, zz, xy, xz, yz.
-_PAIR = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
-# Where entry ((i, j), (k, l)) of a sum of Kronecker products (a a') (x) (b b') is among the 6 x 6 products of a and of b.
-_KRONECKER = [6 * _PAIR[i][k] + _PAIR[j][m] for i in range(3) for j in range(3) for k in range(3) for m in range(3)]
 _TINY = 1e-30
 
 
@@ -61,30 +58,63 @@ def cross_rows(t: Float[Tensor, "*#batch 3"], A: Float[Tensor, "*#batch 3 3"]) -
     return torch.stack((t1 * a2 - t2 * a1, t2 * a0 - t0 * a2, t0 * a1 - t1 * a0), -2)
 
 
-def squared_distance(
-    F: Float[Tensor, "*#batch 3 3"], h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool
-) -> Float[Tensor, "*batch n"]:
-    """The squared distance: of points, or of rays of unit length on the sphere."""
-    e, _, _, size = _by_points(F, h1, h2, sphere)
-    return e * e / size.clamp(min=_TINY)
+@cache
+def _arrangement(kind: str, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The constant matrix from the numbers of a model to the coefficients of its rows over the products of a datum.
 
-
-def _by_points(
-    F: Tensor, h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool
-) -> tuple[Tensor, list[Tensor], list[Tensor], Tensor]:
-    """The residual, its gradients over the tangents of the first and the second point, and their squared length."""
-    l2 = forms(F, h1)
-    e = h2[0] * l2[0] + h2[1] * l2[1] + h2[2] * l2[2]
+    Products are h2_i h1_j at 3 i + j; for rays followed by h1 and h2. Rows are the residual, then its gradients over the second
+    and the first point: F h1 and F' h2, of which the plane has two coordinates. After them come the rows that tell the sides.
+    """
+    sphere = kind == "sphere"
+    products, free = (15, 3) if sphere else (9, 2)
+    entries = [(0, 3 * i + j, 3 * i + j) for i in range(3) for j in range(3)]
+    for k in range(free):
+        entries += [(1 + k, (9 if sphere else 6) + j, 3 * k + j) for j in range(3)]
+        entries += [(1 + free + k, 12 + i if sphere else 3 * i + 2, 3 * i + k) for i in range(3)]
+    rows = 1 + 2 * free
+    # One more bilinear form; for rays also a linear one in each of h2 and h1.
+    entries += [(rows, i, 9 + i) for i in range(9)]
     if sphere:
-        l1 = forms(F.mT, h2)
-        l1 = [a - e * b for a, b in zip(l1, h1, strict=True)]
-        l2 = [a - e * b for a, b in zip(l2, h2, strict=True)]
-    else:
-        l1, l2 = forms(F.mT[..., :2, :], h2), l2[:2]
-    size = l1[0] * l1[0]
-    for row in (*l1[1:], *l2):
-        size = size + row * row
-    return e, l1, l2, size
+        entries += [(rows + 1, 12 + i, 18 + i) for i in range(3)] + [(rows + 2, 9 + i, 21 + i) for i in range(3)]
+    table = torch.zeros(rows + (3 if sphere else 1), products, 24 if sphere else 18, dtype=dtype)
+    for row, product, number in entries:
+        table[row, product, number] = 1
+    return table.flatten(0, 1).mT.to(device).contiguous()
+
+
+def products(h1: Sequence[Tensor], h2: Sequence[Tensor], sphere: bool) -> Float[Tensor, "*batch q n"]:
+    """The products h2_i h1_j of all data, for rays followed by their coordinates."""
+    first, second = torch.stack(list(h1), -2), torch.stack(list(h2), -2)
+    z = (second[..., :, None, :] * first[..., None, :, :]).flatten(-3, -2)
+    return torch.cat((z, first, second), -2) if sphere else z
+
+
+def apply_rows(B: Float[Tensor, "*#batch r q"], z: Float[Tensor, "*#batch q n"]) -> Float[Tensor, "*batch r n"]:
+    """B z, as one product for several models of the same data."""
+    if B.ndim == z.ndim and z.ndim > 2 and z.shape[-3] == 1 and B.shape[-3] > 1:
+        merged: Tensor = B.flatten(-3, -2) @ z[..., 0, :, :]
+        return merged.reshape(*B.shape[:-1], z.shape[-1])
+    return B @ z
+
+
+def epipolar_rows(
+    F: Float[Tensor, "*#batch 3 3"], *others: Tensor, z: Float[Tensor, "*#batch q n"], sphere: bool
+) -> Float[Tensor, "*batch r n"]:
+    """The residual h2' F h1, its gradients, and the values of the other forms (3 x 3; for rays also over h2 and over h1)."""
+    numbers = torch.cat([F.flatten(-2), others[0].flatten(-2), *others[1:]], -1)
+    table = _arrangement("sphere" if sphere else "plane", F.dtype, F.device)
+    return apply_rows((numbers @ table).reshape(*numbers.shape[:-1], -1, z.shape[-2]), z)
+
+
+def squared_from_rows(rows: Float[Tensor, "*batch r n"], sphere: bool) -> tuple[Tensor, Tensor]:
+    """The squared distance of points, or of rays of unit length on the sphere, and the squared length of the gradient."""
+    e, gradient = rows[..., 0, :], rows[..., 1 : 7 if sphere else 5, :]
+    square, size = e * e, (gradient * gradient).sum(-2)
+    if sphere:
+        # The gradients over the tangents of unit rays: those in space without their part along the rays.
+        size = size - 2 * square
+    size = size.clamp(min=_TINY)
+    return square / size, size
 
 
 def normal_equations(
@@ -94,28 +124,35 @@ def normal_equations(
     weights: Float[Tensor, "*#batch n"],
     sphere: bool,
 ) -> tuple[Float[Tensor, "*batch 9 9"], Float[Tensor, "*batch 9"]]:
-    """J' W J and J' W r of the distance with respect to the nine entries of F, in float64."""
-    e, l1, l2, size = _by_points(F, h1, h2, sphere)
-    scale = weights / size.clamp(min=_TINY)
-    shift = e / size.clamp(min=_TINY)
-    p1 = [a - shift * b for a, b in zip(h1, l1, strict=False)] + list(h1[len(l1) :])
-    p2 = [a - shift * b for a, b in zip(h2, l2, strict=False)] + list(h2[len(l2) :])
-    x, y, z = p1
-    right = _stack([x * x, y * y, z * z, x * y, x * z, y * z])
-    x, y, z = p2
-    sx, sy, sz, se = scale * x, scale * y, scale * z, scale * e
-    left = _stack([sx * x, sy * y, sz * z, sx * y, sx * z, sy * z])
-    moments = (left @ right.mT).double().flatten(-2)
-    A = matrices(moments.index_select(-1, torch.tensor(_KRONECKER, device=F.device)), 9)
-    b = _stack([x * se, y * se, z * se]) @ _stack(p1).mT
-    return A, b.double().flatten(-2)
+    """J' W J and J' W r of the distance with respect to the nine entries of F, in float64.
+
+    The right side is exact; in the matrix the measured points stand for the corrected ones.
+    """
+    z = products(h1, h2, sphere)
+    free = 3 if sphere else 2
+    numbers = F.flatten(-2)
+    table = _arrangement("sphere" if sphere else "plane", F.dtype, F.device)[:9, : (1 + 2 * free) * z.shape[-2]]
+    rows = apply_rows((numbers @ table).reshape(*numbers.shape[:-1], -1, z.shape[-2]), z)
+    squared, size = squared_from_rows(rows, sphere)
+    scale = weights / size
+    # The derivative of e^2 / (2 |g|^2): e de / |g|^2 - e^2 / |g|^4 d|g|^2 / 2.
+    share = scale * squared
+    slope = scale * rows[..., 0, :]
+    if sphere:
+        slope = slope + 2 * share * rows[..., 0, :]
+    coefficients = torch.cat((slope[..., None, :], -share[..., None, :] * rows[..., 1:, :]), -2)
+    b = sums_of_products(coefficients, z).flatten(-2) @ table.mT
+    bilinear_part = z[..., :9, :]
+    A = sums_of_products(scale[..., None, :] * bilinear_part, bilinear_part)
+    return A.double(), b.double()
 
 
-def _stack(rows: Sequence[Tensor]) -> Tensor:
-    shape = max((row.shape for row in rows), key=len)
-    for row in rows:
-        shape = shape if row.shape == shape else torch.Size(max(a, b) for a, b in zip(shape, row.shape, strict=True))
-    return torch.stack([row.expand(shape) for row in rows], -2)
+def sums_of_products(a: Tensor, z: Tensor) -> Tensor:
+    """The sums over the data a z', as one product for several models of the same data."""
+    if a.ndim == z.ndim and z.ndim > 2 and z.shape[-3] == 1 and a.shape[-3] > 1:
+        merged: Tensor = a.flatten(-3, -2) @ z[..., 0, :, :].mT
+        return merged.reshape(*a.shape[:-1], z.shape[-2])
+    return a @ z.mT
 
 
 def matrices(entries: Float[Tensor, "*batch nn"], n: int) -> Float[Tensor, "*batch n n"]:

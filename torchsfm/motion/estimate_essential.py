@@ -13,10 +13,12 @@ from torchsfm.motion.epipolar_fit import (
     bilinear,
     cofactors,
     cross_rows,
+    epipolar_rows,
     forms,
     normal_equations,
+    products,
     sphere_rows,
-    squared_distance,
+    squared_from_rows,
 )
 from torchsfm.motion.essential_5pt import essential_5pt
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, squared_transfer
@@ -79,11 +81,13 @@ class RelativePoseEstimator:
         self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared angular Sampson distance; infinite behind a camera."""
-        h1, h2 = sphere_rows(d1), sphere_rows(d2)
         R, t = model[..., :3], model[..., 3]
-        squared = squared_distance(cross_rows(t, R), h1, h2, sphere=True)
-        first, second = self._depths(R, t, h1, h2)
-        return squared.masked_fill(torch.minimum(first, second) < -self.slack[..., None], torch.inf)
+        z = products(sphere_rows(d1), sphere_rows(d2), sphere=True)
+        rows = epipolar_rows(cross_rows(t, R), R, t, (R * t[..., None]).sum(-2), z=z, sphere=True)
+        squared, _ = squared_from_rows(rows, sphere=True)
+        cosine, along2, along1 = rows[..., 7, :], rows[..., 8, :], rows[..., 9, :]
+        least = torch.minimum(along2 * cosine - along1, along2 - along1 * cosine)
+        return squared.masked_fill(least < -self.slack[..., None], torch.inf)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]

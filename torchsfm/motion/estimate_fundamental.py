@@ -9,14 +9,14 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.motion.epipolar_fit import (
-    bilinear,
     cofactors,
     cross_rows,
-    forms,
+    epipolar_rows,
     matrices,
     normal_equations,
     plane_rows,
-    squared_distance,
+    products,
+    squared_from_rows,
 )
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
@@ -46,12 +46,23 @@ class FundamentalEstimator:
     ) -> Solutions[Float[Tensor, "*batch 3 3 4"]]:
         """The F of seven points that can be in front of both cameras."""
         solutions = fundamental_7pt(x1, x2)
-        F, e = solutions.model, _left_epipole(solutions.model)
-        h1, h2 = plane_rows(x1[..., None, :, :]), plane_rows(x2[..., None, :, :])
-        a, b, c = forms(F, h1)
-        e0, e1, e2 = e[..., None].unbind(-2)
-        side = (e1 * h2[2] - e2 * h2[1]) * a + (e2 * h2[0] - e0 * h2[2]) * b + (e0 * h2[1] - e1 * h2[0]) * c
-        plus, minus = side.amin(-1) >= 0, side.amax(-1) <= 0
+        F, shape = solutions.model, solutions.valid.shape
+        # Coordinates first: the batch is long and the matrices are small.
+        columns = F.reshape(-1, 3, 3).permute(2, 1, 0).contiguous().unbind(0)
+        crosses = [torch.linalg.cross(columns[j - 2], columns[j - 1], dim=0) for j in range(3)]
+        size = [(c * c).sum(0) for c in crosses]
+        # The left epipole is across all columns; the longest cross product is the most accurate.
+        e = torch.where(size[1] > size[0], crosses[1], crosses[0])
+        longest = torch.maximum(size[0], size[1])
+        e = torch.where(size[2] > longest, crosses[2], e)
+        e = e * torch.maximum(longest, size[2]).clamp(min=1e-200).rsqrt()
+        M = torch.stack([torch.linalg.cross(e, c, dim=0) for c in columns], 1)
+        h1, h2 = (torch.cat((x, torch.ones_like(x[..., :1])), -1) for x in (x1, x2))
+        z = (h2[..., :, None] * h1[..., None, :]).flatten(-2).expand(*shape[:-1], 7, 9).reshape(-1, 7, 9)
+        side = z @ M.view(9, -1, 3).permute(1, 0, 2)
+        # h2' [e]x F h1 is negative in front of both cameras: e x h2 and F h1 point the same way.
+        plus, minus = side.amax(-2).reshape(shape) <= 0, side.amin(-2).reshape(shape) >= 0
+        e = e.mT.reshape(*shape, 3)
         e = torch.where(plus[..., None], e, -e)
         return Solutions(torch.cat((F, e[..., None]), -1), solutions.valid & (plus | minus))
 
@@ -59,9 +70,11 @@ class FundamentalEstimator:
         self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared Sampson distance; infinite for points that are behind one camera."""
-        F, e, h1, h2 = model[..., :3], model[..., 3], plane_rows(x1), plane_rows(x2)
-        squared = squared_distance(F, h1, h2, sphere=False)
-        return squared.masked_fill(bilinear(cross_rows(e, F), h1, h2) > 0, torch.inf)
+        F, e = model[..., :3], model[..., 3]
+        z = products(plane_rows(x1), plane_rows(x2), sphere=False)
+        rows = epipolar_rows(F, cross_rows(e, F), z=z, sphere=False)
+        squared, _ = squared_from_rows(rows, sphere=False)
+        return squared.masked_fill(rows[..., 5, :] > 0, torch.inf)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]

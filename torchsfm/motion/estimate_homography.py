@@ -123,12 +123,9 @@ class HomographyEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
-        """COLLINEAR: no two inliers more than chance explains are off a line, in one of the images."""
-        bad = torch.zeros_like(inliers[..., 0])
-        for x in (x1, x2):
-            off, _ = line_and_plane_distances(x, inliers)
-            number = (inliers & (off > 2 * threshold[..., None])).sum(-1)
-            bad = bad | ~more_than_chance(number, chance, -1)
+        """COLLINEAR: no two inliers more than chance explains are off a line; H takes lines to lines, so one image will do."""
+        off, _ = line_and_plane_distances(x1, inliers)
+        bad = ~more_than_chance((inliers & (off > 2 * threshold[..., None])).sum(-1), chance, -1)
         return torch.where(bad, int(Degeneracy.COLLINEAR), int(Degeneracy.NONE)).to(torch.int8)
 
 

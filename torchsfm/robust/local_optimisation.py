@@ -14,7 +14,7 @@ from torchsfm.robust.scoring import around_model, squared_residual
 
 M = TypeVar("M")
 
-LOCAL_STEPS = (9.0, 4.0, 1.5, 1.0)
+LOCAL_STEPS = (9.0, 3.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 _LEAST = 1e-6
 """Smallest variance of the noise in units of the squared threshold."""
