@@ -18,7 +18,7 @@ LOCAL_STEPS = (9.0, 3.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 _LEAST = 1e-6
 """Smallest variance of the noise in units of the squared threshold."""
-SCALE_STEPS, FIXED_STEPS = 3, 4
+SCALE_STEPS, FIXED_STEPS = 3, 5
 """Rounds of the final refinement that estimate the scale of the noise, and rounds that hold it."""
 LOCAL_DATA, SCALE_DATA = 256, 512
 """Local optimisation, and the estimation of the scale, look at so many data at most."""
