@@ -39,12 +39,12 @@ def sines(model, d, X):
 @pytest.mark.parametrize("n", [4, 5, 6, 20])
 @pytest.mark.parametrize("thickness", [1.0, 1e-2, 1e-6, 0.0])
 def test_exact_data(make_views, n, thickness):
-    d, X, R, t = make_views(1000, n=n, thickness=thickness)
+    d, X, R, t = make_views(400, n=n, thickness=thickness)
     found = camera_pnp(d, X)
     assert (found.status == Status.OK).all()
     good = (turn(found.model, R) < 1e-8) & ((found.model[..., 3] - t).norm(dim=-1) < 1e-7)
     assert good.double().mean() >= 0.999
-    torch.testing.assert_close(found.model[..., :3] @ found.model[..., :3].mT, torch.eye(3, dtype=F64).expand(1000, 3, 3))
+    torch.testing.assert_close(found.model[..., :3] @ found.model[..., :3].mT, torch.eye(3, dtype=F64).expand(400, 3, 3))
     assert (found.error[good] < 1e-8).all()
 
 
@@ -62,7 +62,7 @@ def test_rays_in_all_directions(generator):
 def test_errors_meet_the_cramer_rao_bound(make_views, generator, n, thickness):
     sigma = 1e-3
     d, X, R, t = make_views(n=n, thickness=thickness)
-    e = sigma * torch.randn(3000, n, 3, generator=generator, dtype=F64)
+    e = sigma * torch.randn(1500, n, 3, generator=generator, dtype=F64)
     u = torch.nn.functional.normalize(d, dim=-1)
     found = camera_pnp(u + e - (e * u).sum(-1, keepdim=True) * u, X)
     delta = torch.zeros(6, dtype=F64)
@@ -75,7 +75,7 @@ def test_errors_meet_the_cramer_rao_bound(make_views, generator, n, thickness):
     J = torch.autograd.functional.jacobian(residual, delta)
     bound = sigma**2 * torch.linalg.inv(J.mT @ J)
     w = rotvec_from_rotation(found.model[..., :3] @ R.mT)
-    v = found.model[..., 3] - torch.linalg.cross(w, t.expand(3000, 3)) - t
+    v = found.model[..., 3] - torch.linalg.cross(w, t.expand(1500, 3)) - t
     e = torch.cat((w, v), -1)
     ratio = (torch.linalg.solve(bound, e.T).T * e).sum(-1).mean() / 6
     assert 0.9 < ratio < 1.1
@@ -169,7 +169,8 @@ def test_derivatives_of_the_optimum(make_views, generator, solve):
     w = torch.rand(2, 6, generator=generator, dtype=F64) + 0.5
     best = (lambda f: f.model[:, 0]) if solve is camera_planar else (lambda f: f.model)
     inputs = tuple(a.requires_grad_() for a in (d, X, w))
-    assert torch.autograd.gradcheck(lambda d, X, w: best(solve(d, X, weights=w)), inputs, eps=1e-5, atol=1e-4, rtol=2e-3)
+    optimum = lambda d, X, w: best(solve(d, X, weights=w))  # noqa: E731
+    assert torch.autograd.gradcheck(optimum, inputs, eps=1e-5, atol=1e-4, rtol=2e-3, fast_mode=True)
 
 
 def test_both_planar_poses(make_views):

@@ -72,14 +72,14 @@ def distance(found: Solutions[torch.Tensor], P: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("width", [1.0, 0.3, 0.1])
 def test_recall(kind, sample, width):
-    *data, P = sample(kind, 5000, width=width)
+    *data, P = sample(kind, 2000, width=width)
     error = distance(kind.solve(*data), P)
     assert (error < 1e-6).double().mean() >= 0.999
     assert error.median() < 1e-12 / width
 
 
 def test_recall_in_single_precision(kind, sample):
-    *data, P = sample(kind, 2000)
+    *data, P = sample(kind, 1000)
     found = kind.solve(*(d.float() for d in data))
     assert found.model.dtype == torch.float32
     assert found.model.isfinite().all()
@@ -87,9 +87,9 @@ def test_recall_in_single_precision(kind, sample):
 
 
 def test_every_valid_slot_is_a_solution(kind, sample):
-    *data, _ = sample(kind, 3000)
+    *data, _ = sample(kind, 1000)
     found = kind.solve(*data)
-    assert found.model.shape == (3000, kind.slots, 3, 4)
+    assert found.model.shape == (1000, kind.slots, 3, 4)
     assert found.model.isfinite().all()
     error = kind.equations(found.model, *(d[:, None] for d in data)).abs().amax(-1) / found.model.abs().amax((-1, -2)) ** 2
     assert (error[found.valid] < 1e-8).all()
@@ -97,7 +97,7 @@ def test_every_valid_slot_is_a_solution(kind, sample):
 
 
 def test_no_solution_stands_twice(kind, sample):
-    *data, _ = sample(kind, 3000)
+    *data, _ = sample(kind, 1000)
     found = kind.solve(*data)
     size = found.model.norm(dim=(-1, -2))
     for i in range(kind.slots):
@@ -201,7 +201,7 @@ def test_derivatives(kind, sample):
 
     inputs = [(d / s).requires_grad_() for d, s in zip(data, scale, strict=True)]
     assert torch.equal(solve(*inputs), solve(*(d.detach() for d in inputs)))
-    assert torch.autograd.gradcheck(solve, inputs, eps=1e-7, rtol=1e-3, atol=1e-3)
+    assert torch.autograd.gradcheck(solve, inputs, eps=1e-7, rtol=1e-3, atol=1e-3, fast_mode=True)
 
 
 def test_empty_slots_and_bad_data_have_no_derivative(kind, sample):
