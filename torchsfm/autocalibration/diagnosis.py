@@ -16,7 +16,7 @@ from torchsfm.geometry import rotvec_from_rotation
 
 SMALL_ANGLE = 0.03
 """Angle in radians below which a rotation, or its part off the common axis, counts as none."""
-SMALL_TURN = 0.08
+SMALL_TURN = 0.2
 """The same for the part off the common axis, over the whole: noise tilts large rotations by more."""
 SMALL_SPREAD = 0.05
 """Ratio of lengths below which centres count as on a line or in a plane, and axes as meeting in a point."""
