@@ -8,18 +8,17 @@ over several ways to halve. The sets are published by others and are not part of
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from bench.real_data import data_folder
 from torchsfm import (
+    VggScene,
     estimate_trifocal,
     quadrifocal_6pt,
     quadrifocal_from_cameras,
+    read_vgg,
     transfer_points_quadrifocal,
     transfer_points_trifocal,
     trifocal_7pt,
@@ -32,45 +31,16 @@ VIEWS = {
     "merton1": ([0, 1, 2],),
     "library": ([0, 1, 2],),
 }
-SEQUENCES = tuple(VIEWS)
 
 
-@dataclass(frozen=True)
-class Sequence:
-    """One sequence of v views.
-
-    Attributes:
-        x: Points (v, n, 2); without meaning where not visible.
-        visible: Which view sees which point (v, n).
-        segments: End points of line segments (v, m, 2, 2).
-        line_visible: Which view sees which line (v, m).
-        P: Oxford's cameras (v, 3, 4).
-    """
-
-    x: Tensor
-    visible: Tensor
-    segments: Tensor
-    line_visible: Tensor
-    P: Tensor
-
-    def points(self, views: list[int]) -> Tensor:
-        """The points that all of some views see."""
-        return self.x[views][:, self.visible[views].all(0)]
-
-    def lines(self, views: list[int]) -> Tensor:
-        """The segments that all of some views see."""
-        return self.segments[views][:, self.line_visible[views].all(0)]
+def points(scene: VggScene, views: list[int]) -> Tensor:
+    """The points that all of some views see."""
+    return scene.x[views][:, scene.visible[views].all(0)]
 
 
-def read_sequence(data: Path, name: str) -> Sequence:
-    """One of `SEQUENCES`, from the folder of data sets."""
-    folder = data / "vgg" / name / "2D"
-    corners = [np.loadtxt(p) for p in sorted(folder.glob("*.corners")) if "nview" not in p.name]
-    lines = [np.loadtxt(p)[:, :4].reshape(-1, 2, 2) for p in sorted(folder.glob("*.lines")) if "nview" not in p.name]
-    cameras = sorted(folder.glob("*.P")) or sorted((folder.parent / "3D").glob("*.P"))
-    x, visible = _matched(corners, next(folder.glob("*nview-corners")))
-    segments, line_visible = _matched(lines, next(folder.glob("*nview-lines")))
-    return Sequence(x, visible, segments, line_visible, torch.tensor(np.stack([np.loadtxt(p) for p in cameras])))
+def lines(scene: VggScene, views: list[int]) -> Tensor:
+    """The segments that all of some views see."""
+    return scene.segments[views][:, scene.segments_visible[views].all(0)]
 
 
 def lines_of(segments: Tensor) -> Tensor:
@@ -81,16 +51,9 @@ def lines_of(segments: Tensor) -> Tensor:
     return torch.cat((normal, -(normal * (a + b) / 2).sum(-1, keepdim=True)), -1)
 
 
-def _matched(features: list[np.ndarray], table: Path) -> tuple[Tensor, Tensor]:
-    rows = [line.split() for line in table.read_text().splitlines() if line.strip()]
-    index = torch.tensor([[-1 if entry == "*" else int(entry) for entry in row] for row in rows]).T
-    found = [torch.tensor(f)[i.clamp_min(0)] for f, i in zip(features, index, strict=True)]
-    return torch.stack(found), index >= 0
-
-
-def methods(sequence: Sequence, views: list[int], train: Tensor) -> dict[str, Callable[[], Tensor]]:
+def methods(scene: VggScene, views: list[int], train: Tensor) -> dict[str, Callable[[], Tensor]]:
     """By name, what makes the tensor of some views."""
-    P, segments = sequence.P[views], sequence.lines(views)
+    P, segments = scene.P[views], lines(scene, views)
     if len(views) == 4:
         return {"Oxford's cameras": lambda: quadrifocal_from_cameras(*P), "points": lambda: quadrifocal_6pt(train).Q}
     found = {
@@ -101,11 +64,11 @@ def methods(sequence: Sequence, views: list[int], train: Tensor) -> dict[str, Ca
         ),
     }
     if segments.shape[1] >= 13:
-        lines, ends = lines_of(segments), segments[0]
-        found["points and lines"] = lambda: trifocal_7pt(train, lines, ends=ends).T
-        found["10 points and lines"] = lambda: trifocal_7pt(train[:, :10], lines, ends=ends).T
+        line, ends = lines_of(segments), segments[0]
+        found["points and lines"] = lambda: trifocal_7pt(train, line, ends=ends).T
+        found["10 points and lines"] = lambda: trifocal_7pt(train[:, :10], line, ends=ends).T
         found["10 points"] = lambda: trifocal_7pt(train[:, :10]).T
-        found["lines"] = lambda: trifocal_7pt(train[:, :0], lines, ends=ends).T
+        found["lines"] = lambda: trifocal_7pt(train[:, :0], line, ends=ends).T
     return found
 
 
@@ -127,19 +90,19 @@ def main() -> None:
     torch.set_num_threads(1)
     print(f"{'sequence':12s} {'views':14s} {'points':>6s} {'lines':>5s}  {'tensor from':20s} {'median px':>9s} {'rms px':>8s}")
     for name, choices in VIEWS.items():
-        sequence = read_sequence(folder, name)
+        scene = read_vgg(folder / "vgg" / name)
         for views in choices:
-            x = sequence.points(views)
+            x = points(scene, views)
             errors: dict[str, list[tuple[float, float]]] = {}
             for seed in range(options.halvings):
                 order = torch.randperm(x.shape[1], generator=torch.Generator().manual_seed(seed))
                 train, held = x[:, order[: len(order) // 2]], x[:, order[len(order) // 2 :]]
-                for method, make in methods(sequence, views, train).items():
+                for method, make in methods(scene, views, train).items():
                     errors.setdefault(method, []).append(transfer_error(make(), held))
             label = ", ".join(map(str, views))
             for method, values in errors.items():
                 median, rms = torch.tensor(values).mean(0).tolist()
-                count = sequence.lines(views).shape[1]
+                count = lines(scene, views).shape[1]
                 print(f"{name:12s} {label:14s} {x.shape[1]:6d} {count:5d}  {method:20s} {median:9.3f} {rms:8.2f}")
 
 

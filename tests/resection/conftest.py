@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchsfm.formats import VggScene, read_vgg
 from torchsfm.geometry import random_rotation
 
 Scene = tuple[Tensor, Tensor, Tensor]
@@ -41,18 +42,6 @@ def pose6dscene(data: Path) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 @pytest.fixture
-def read_vgg(data: Path) -> Callable[[str, str], tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """x (v, n, 2), visible (v, n), P (v, 3, 4), X (n, 3) of one of the Oxford sequences."""
-
-    def read(folder: str, stem: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        root = data / "vgg" / folder
-        # The sequences of three views have no stem, and keep their cameras with the images.
-        stem = stem and f"{stem}."
-        P = torch.tensor(np.stack([np.loadtxt(p) for p in sorted(root.glob(f"[23]D/{stem}*.P"))]))
-        corners = [np.loadtxt(p) for p in sorted((root / "2D").glob(f"{stem}*.corners"))]
-        table = [line.split() for line in (root / "2D" / f"{stem}nview-corners").read_text().splitlines()]
-        index = torch.tensor([[-1 if entry == "*" else int(entry) for entry in row] for row in table]).T
-        x = torch.stack([torch.tensor(c)[i.clamp_min(0)] for c, i in zip(corners, index, strict=True)])
-        return x, index >= 0, P, torch.tensor(np.loadtxt(root / "3D" / f"{stem}p3d"))
-
-    return read
+def oxford(data: Path) -> Callable[[str], VggScene]:
+    """One of the Oxford sequences by the name of its folder."""
+    return lambda folder: read_vgg(data / "vgg" / folder)

@@ -210,10 +210,11 @@ def test_wrong_arguments(make_problem):
         camera_dlt(x, X, weights=torch.ones(7, dtype=torch.float64))
 
 
-@pytest.mark.parametrize(("folder", "stem"), [("model_house", "house"), ("corridor", "bt")])
-def test_oxford_sequences(read_vgg, folder, stem):
+@pytest.mark.parametrize("folder", ["model_house", "corridor"])
+def test_oxford_sequences(oxford, folder):
     # The stored cameras and points were adjusted together; a camera from the points alone must fit its own image as well.
-    x, visible, P, X = read_vgg(folder, stem)
+    scene = oxford(folder)
+    x, visible, P, X = scene.x, scene.visible, scene.P, scene.X
     X = X.expand(len(P), -1, -1)
     found = camera_dlt(x, X, weights=visible.double())
     assert (found.status == Status.OK).all()

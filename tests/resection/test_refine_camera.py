@@ -248,9 +248,10 @@ def test_opencv_refines_to_the_same_pose(make_problem, generator):
         assert torch.allclose(torch.cat((R, torch.tensor(t)), -1), found.model[i], atol=1e-6)
 
 
-@pytest.mark.parametrize(("folder", "stem"), [("model_house", "house"), ("corridor", "bt")])
-def test_oxford_sequences(read_vgg, folder, stem):
-    x, visible, P, X = read_vgg(folder, stem)
+@pytest.mark.parametrize("folder", ["model_house", "corridor"])
+def test_oxford_sequences(oxford, folder):
+    scene = oxford(folder)
+    x, visible, P, X = scene.x, scene.visible, scene.P, scene.X
     # The worlds are mirror images; mirrored back, the cameras are K [R | t].
     mirror = torch.sign(torch.linalg.det(P[:, :, :3]))[0]
     P, X = torch.cat((P[..., :3] * mirror, P[..., 3:]), -1), (X * mirror).expand(len(P), -1, -1)

@@ -214,10 +214,11 @@ def test_wrong_arguments(sequence):
         estimate_camera_projective(x[..., :1], X, threshold=1.0)
 
 
-@pytest.mark.parametrize(("folder", "stem"), [("model_house", "house"), ("corridor", "bt"), ("merton1", ""), ("library", "")])
-def test_oxford_sequences(read_vgg, folder, stem):
+@pytest.mark.parametrize("folder", ["model_house", "corridor", "merton1", "library"])
+def test_oxford_sequences(oxford, folder):
     """The stored cameras were adjusted together with the points; one from the points alone fits its image as well."""
-    x, visible, P, X = read_vgg(folder, stem)
+    scene = oxford(folder)
+    x, visible, P, X = scene.x, scene.visible, scene.P, scene.X
     stored = torch.where(visible, (project(P, X.expand(len(P), -1, -1)) - x).square().sum(-1), 0).sum(-1)
     stored = (stored / visible.sum(-1)).sqrt()
     for threshold in (None, 3.0):

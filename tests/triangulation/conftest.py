@@ -8,6 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchsfm.formats import VggScene, read_vgg
+
 Scene = tuple[Tensor, Tensor, Tensor]
 
 
@@ -56,21 +58,9 @@ def image_of() -> Callable[[Tensor, Tensor], Tensor]:
 
 
 @pytest.fixture
-def read_vgg(data: Path) -> Callable[[str, str], tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """x (v, n, 2), visible (v, n), P (v, 3, 4), X (n, 3) of one of the Oxford sequences."""
-
-    def read(folder: str, stem: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        root = data / "vgg" / folder
-        # The sequences of three views have no stem, and keep their cameras with the images.
-        stem = stem and f"{stem}."
-        P = torch.tensor(np.stack([np.loadtxt(p) for p in sorted(root.glob(f"[23]D/{stem}*.P"))]))
-        corners = [np.loadtxt(p) for p in sorted((root / "2D").glob(f"{stem}*.corners"))]
-        table = [line.split() for line in (root / "2D" / f"{stem}nview-corners").read_text().splitlines()]
-        index = torch.tensor([[-1 if entry == "*" else int(entry) for entry in row] for row in table]).T
-        x = torch.stack([torch.tensor(c)[i.clamp_min(0)] for c, i in zip(corners, index, strict=True)])
-        return x, index >= 0, P, torch.tensor(np.loadtxt(root / "3D" / f"{stem}p3d"))
-
-    return read
+def oxford(data: Path) -> Callable[[str], VggScene]:
+    """One of the Oxford sequences by the name of its folder."""
+    return lambda folder: read_vgg(data / "vgg" / folder)
 
 
 @pytest.fixture

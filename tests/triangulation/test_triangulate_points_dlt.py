@@ -215,9 +215,10 @@ def test_opencv_agrees(make_scene):
     assert relative(found, h[:, :3] / h[:, 3:]) < 1e-6
 
 
-@pytest.mark.parametrize(("folder", "stem", "limit"), [("model_house", "house", 0.7), ("corridor", "bt", 0.6)])
-def test_oxford_sequences(read_vgg, image_of, folder, stem, limit):
-    x, visible, P, X = read_vgg(folder, stem)
+@pytest.mark.parametrize(("folder", "limit"), [("model_house", 0.7), ("corridor", 0.6)])
+def test_oxford_sequences(oxford, image_of, folder, limit):
+    scene = oxford(folder)
+    x, visible, P, X = scene.x, scene.visible, scene.P, scene.X
     seen_twice = visible.sum(0) >= 2
     found = triangulate_points_dlt(x, P, visible=visible)
     r = (image_of(P, found) - x).norm(dim=-1)[visible & seen_twice]
