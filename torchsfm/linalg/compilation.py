@@ -100,8 +100,9 @@ def _compile(function: Callable[..., Rows], options: dict[str, Any]) -> Callable
 
     assert isinstance(function, FunctionType)
     # Dynamo keeps what it compiles with the code object: each compiled object gets its own.
-    copy = FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
-    copy.__kwdefaults__ = options
+    code, names = function.__code__.replace(), function.__globals__
+    copy = FunctionType(code, names, function.__name__, function.__defaults__, function.__closure__)
+    copy.__kwdefaults__ = (function.__kwdefaults__ or {}) | options
     times = 0
 
     def once(graph: Any, inputs: list[Any]) -> Any:
