@@ -103,7 +103,7 @@ def epipolar_rows(
     """The residual h2' F h1, its gradients, and the values of the other forms (3 x 3; for rays also over h2 and over h1)."""
     numbers = torch.cat([F.flatten(-2), others[0].flatten(-2), *others[1:]], -1)
     table = _arrangement("sphere" if sphere else "plane", F.dtype, F.device)
-    return apply_rows((numbers @ table).reshape(*numbers.shape[:-1], -1, z.shape[-2]), z)
+    return apply_rows((numbers @ table).reshape(*numbers.shape[:-1], table.shape[-1] // z.shape[-2], z.shape[-2]), z)
 
 
 def squared_from_rows(rows: Float[Tensor, "*batch r n"], sphere: bool) -> tuple[Tensor, Tensor]:
@@ -132,7 +132,7 @@ def normal_equations(
     free = 3 if sphere else 2
     numbers = F.flatten(-2)
     table = _arrangement("sphere" if sphere else "plane", F.dtype, F.device)[:9, : (1 + 2 * free) * z.shape[-2]]
-    rows = apply_rows((numbers @ table).reshape(*numbers.shape[:-1], -1, z.shape[-2]), z)
+    rows = apply_rows((numbers @ table).reshape(*numbers.shape[:-1], table.shape[-1] // z.shape[-2], z.shape[-2]), z)
     squared, size = squared_from_rows(rows, sphere)
     scale = weights / size
     # The derivative of e^2 / (2 |g|^2): e de / |g|^2 - e^2 / |g|^4 d|g|^2 / 2.

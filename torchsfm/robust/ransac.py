@@ -79,7 +79,8 @@ def ransac(
     each problem is refined in float64 on all its inliers with a robust loss. A problem ends when, with the given confidence,
     one of its samples was free of outliers, by the exact probability of such a sample.
 
-    Rows with NaN or infinite numbers are left out. The result for a problem is the same whatever else is in the batch.
+    Rows with NaN or infinite numbers are left out. The result for a problem is the same, up to rounding,
+    whatever else is in the batch.
 
     Args:
         estimator: The problem: what to solve, measure and refine.
