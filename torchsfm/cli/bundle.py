@@ -82,9 +82,9 @@ def bundle(
     """
     with told(Job(out or file)) as job:
         job.set_threads(threads)
-        job.progress("read", 0, 1)
+        job.progress("problem", 0, 1)
         model = read_model(file)
-        job.progress("read", 1, 1)
+        job.progress("problem", 1, 1)
         check_output(model, out)
         names = free_names(model, free)
         before = model.residuals()
