@@ -19,7 +19,7 @@ def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def data() -> Path:
     """The folder of real data sets; tests that want it are skipped where it is missing."""
     folder = os.environ.get("TORCHSFM_DATA")

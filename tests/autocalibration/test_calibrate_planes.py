@@ -125,15 +125,10 @@ def test_wrong_input(generator, unchecked):
 
 
 @pytest.fixture(scope="module")
-def chessboard(tmp_path_factory) -> Tensor:
-    import os
-
+def chessboard(data: Path) -> Tensor:
     cv2 = pytest.importorskip("cv2")
-    folder = os.environ.get("TORCHSFM_DATA")
-    if not folder or not Path(folder, "calibration/chessboard_stereo").is_dir():
-        pytest.skip("TORCHSFM_DATA does not name a folder with calibration/chessboard_stereo")
     corners = []
-    for path in sorted(Path(folder, "calibration/chessboard_stereo").rglob("left*.*g")):
+    for path in sorted((data / "calibration/chessboard_stereo").rglob("left*.*g")):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         found, x = cv2.findChessboardCorners(image, (9, 6))
         if found:

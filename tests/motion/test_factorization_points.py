@@ -1,6 +1,5 @@
 """Projective factorisation: exact data, laws, noise, missing data, wrong tracks, degenerate data, real tracks."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -230,13 +229,9 @@ def test_wrong_input_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_dinosaur() -> None:
+def test_dinosaur(data: Path) -> None:
     """36 views on a turntable, 88 % missing, wrong tracks among them; the published cameras fit to a median of 0.26 px."""
-    folder = os.environ.get("TORCHSFM_DATA")
-    path = Path(folder or ".") / "vgg/dinosaur/viff.xy"
-    if folder is None or not path.exists():
-        pytest.skip("TORCHSFM_DATA names no folder with vgg/dinosaur")
-    x = torch.from_numpy(np.loadtxt(path)).reshape(-1, 36, 2).transpose(0, 1)
+    x = torch.from_numpy(np.loadtxt(data / "vgg/dinosaur/viff.xy")).reshape(-1, 36, 2).transpose(0, 1)
     visible = (x >= 0).all(-1)
     long = visible.sum(0) >= 3
     found = factorize_points(x[:, long], visible=visible[:, long], robust=True)

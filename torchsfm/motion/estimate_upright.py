@@ -13,6 +13,7 @@ from torchsfm.linalg import cross
 from torchsfm.motion.epipolar_fit import cross_rows, normal_equations, sphere_rows
 from torchsfm.motion.estimate_essential import RelativePoseEstimator
 from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
+from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import RobustResult, damped_solve, ransac
 
 
@@ -37,6 +38,7 @@ class UprightPoseEstimator:
     sample_size: ClassVar[int] = 3
     max_solutions: ClassVar[int] = 4
     codimension: ClassVar[int] = 1
+    dimension: ClassVar[int] = 3
 
     def minimal(
         self, d1: Float[Tensor, "*#batch 3 3"], d2: Float[Tensor, "*#batch 3 3"]
@@ -91,6 +93,12 @@ class UprightPoseEstimator:
         R = 1.5 * R - 0.5 * (R @ R.mT @ R)
         R = rotation_from_rotvec(cross((R @ self.gravity1.double()[..., None])[..., 0], up)) @ R
         return torch.cat((R, t[..., None]), -1).to(d1.dtype)
+
+    def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 4"]:
+        """R turned about the vertical by the first number of the step, and t moved along the unit sphere by the others."""
+        R = rotation_exponential(step[..., :1] * self.gravity2) @ model[..., :3]
+        t = UnitSphere(3).retract(model[..., 3].expand(R.shape[:-1]), step[..., 1:])
+        return torch.cat((R, t[..., None]), -1)
 
 
 def estimate_upright(

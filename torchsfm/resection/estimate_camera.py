@@ -42,17 +42,7 @@ class CameraEstimator:
         self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared reprojection error; infinite behind the camera."""
-        P = self.K @ model
-        points = torch.cat((X.mT, torch.ones_like(X.mT[..., :1, :])), -2)
-        if P.ndim == X.ndim and P.ndim > 2 and X.shape[-3] == 1 and P.shape[-3] > 1:
-            # Several models of the same data: one product for all.
-            product = P.reshape(*P.shape[:-3], 3 * P.shape[-3], 4) @ points[..., 0, :, :]
-            y0, y1, y2 = product.reshape(*P.shape[:-1], X.shape[-2]).unbind(-2)
-        else:
-            y0, y1, y2 = (P @ points).unbind(-2)
-        inverse = 1 / y2
-        u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
-        return (u * u + v * v).masked_fill(~(y2 > 0), torch.inf)
+        return squared_reprojection(self.K @ model, x, X)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
@@ -221,6 +211,22 @@ def estimate_camera(
         threshold=(result.threshold * focal).to(dtype),
         covariance=spread,
     )
+
+
+def squared_reprojection(
+    P: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+) -> Float[Tensor, "*batch n"]:
+    """Squared reprojection error; infinite behind the camera."""
+    points = torch.cat((X.mT, torch.ones_like(X.mT[..., :1, :])), -2)
+    if P.ndim == X.ndim and P.ndim > 2 and X.shape[-3] == 1 and P.shape[-3] > 1:
+        # Several models of the same data: one product for all.
+        product = P.reshape(*P.shape[:-3], 3 * P.shape[-3], 4) @ points[..., 0, :, :]
+        y0, y1, y2 = product.reshape(*P.shape[:-1], X.shape[-2]).unbind(-2)
+    else:
+        y0, y1, y2 = (P @ points).unbind(-2)
+    inverse = 1 / y2
+    u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
+    return (u * u + v * v).masked_fill(~(y2 > 0), torch.inf)
 
 
 def middle_and_size(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from torchsfm.geometry import line_and_plane_distances
 from torchsfm.linalg import nullspace_rows
 from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
 from torchsfm.resection._focal import incidence_rows
-from torchsfm.resection.estimate_camera import middle_and_size
+from torchsfm.resection.estimate_camera import middle_and_size, squared_reprojection
 from torchsfm.robust import Degeneracy, RobustResult, damped_solve, ransac
 
 _CHUNK = 4096
@@ -52,10 +52,7 @@ class ProjectiveCameraEstimator:
         self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared reprojection error; infinite behind the camera."""
-        y0, y1, y2 = (model[..., :3] @ X.mT + model[..., 3:]).unbind(-2)
-        inverse = 1 / y2
-        u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
-        return (u * u + v * v).masked_fill(~(y2 > 0), torch.inf)
+        return squared_reprojection(model, x, X)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
