@@ -25,13 +25,15 @@ CUBIC = list(combinations_with_replacement(range(4), 3))
 _CHUNK = 512
 """Problems at a time where the work is at all points of the circle at once: what is in use stays in the cache."""
 _MORE = 6
+"""Newton steps for those that two steps do not bring to their end."""
 _LONGEST = 0.5
+"""Longest step of these."""
 _ATTEMPTS = 2
 """Further systems of coordinates for problems of which not every root is a common point."""
-"""Newton steps for those that two steps do not bring to their end."""
 _CONVERGED = 1e-7
 """Length of the last Newton step of what is a common point: the error left is about its square."""
 _APART = 1e-9
+"""Points of one problem that are nearer than this are one point."""
 _NEAR = 1e-4
 """Length of the first Newton step from an accurate root."""
 
