@@ -26,6 +26,10 @@ class Estimator(Protocol[M]):
     An implementation may also define
 
     - `squared_residual(model, *data)`: the square of `residual`, where that is cheaper;
+    - `reweighted_step(model, *data, weigh)`: a step as `refine` does it, with weights that follow from the distances:
+      `weigh(squared) -> (weights, curvature)`, all `(*batch, n)`. The weights belong in the gradient, the curvature stands in
+      their place in the Hessian (see `local_optimisation.Weigh`). Distances and step have most of their arithmetic in common,
+      and the curvature saves steps;
     - `dimension: ClassVar[int]` and `retract(model, step)`: the model moved by a step `(*batch, dimension)` along its manifold,
       smooth in the step, `retract(model, 0) == model`. They give refined models derivatives and covariance, for which
       `residual` (or its square) must be differentiable with respect to the model and the data;

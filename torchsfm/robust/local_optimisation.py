@@ -1,7 +1,8 @@
 """From a model through a noisy sample to the optimum near it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TypeVar
 
 import torch
@@ -14,14 +15,31 @@ from torchsfm.robust.scoring import around_model, squared_residual
 
 M = TypeVar("M")
 
+Weigh = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""From squared distances `(*batch, n)` to the weights of the data and to the curvature of their losses.
+
+For a loss rho(r^2) the weight is rho' and the curvature the mean over the directions of r of rho' + 2 rho'' r r', at least 0:
+the gradient takes the one, the Hessian the other.
+"""
+
 LOCAL_STEPS = (9.0, 3.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 _LEAST = 1e-6
 """Smallest variance of the noise in units of the squared threshold."""
-SCALE_STEPS, FIXED_STEPS = 3, 5
-"""Rounds of the final refinement that estimate the scale of the noise, and rounds that hold it."""
+SCALE_STEPS = 3
+"""Rounds of the final refinement that estimate the scale of the noise."""
+FIXED_STEPS = {True: 3, False: 5}
+"""Rounds that hold it: with the curvature of the loss, and without."""
 LOCAL_DATA, SCALE_DATA = 256, 512
 """Local optimisation, and the estimation of the scale, look at so many data at most."""
+
+
+def reweighted_step(estimator: Estimator[M], model: M, data: Sequence[Tensor], weigh: Weigh) -> M:
+    """A step towards the optimum of a robust loss."""
+    if hasattr(estimator, "reweighted_step"):
+        moved: M = estimator.reweighted_step(model, *data, weigh=weigh)
+        return moved
+    return estimator.refine(model, *data, weights=weigh(squared_residual(estimator, model, *data))[0])
 
 
 def optimise_locally(
@@ -43,8 +61,13 @@ def optimise_locally(
         score: How models are compared.
     """
     for factor in LOCAL_STEPS:
-        ratio = squared_residual(estimator, model, *data) * (1 / (factor * limit))[..., None]
-        model = estimator.refine(model, *data, weights=score.weigh(ratio, estimator.codimension) * counts[:, None])
+        scale = (1 / (factor * limit))[..., None]
+
+        def weigh(squared: Tensor, scale: Tensor = scale) -> tuple[Tensor, Tensor]:
+            weights = score.weigh(squared * scale, estimator.codimension) * counts[:, None]
+            return weights, weights
+
+        model = reweighted_step(estimator, model, data, weigh)
     return model
 
 
@@ -61,7 +84,7 @@ def scale_of_noise(
     The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, estimated with the
     probabilities of being an inlier among Gaussian inliers and evenly spread outliers (expectation maximisation), and from the
     density of the outliers, counted between two and six thresholds from the model. So the answer depends little on how well
-    the threshold was chosen. One Gauss-Newton step for each round of weights.
+    the threshold was chosen. One step for each round of weights.
 
     Args:
         estimator: The problem.
@@ -79,24 +102,31 @@ def scale_of_noise(
     # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
     peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
     present = inside[:, None]
-    variance = number = None
-    for step in range(SCALE_STEPS + 1):
-        ratio = squared_residual(estimator, model, *data) * (1 / limit)[:, None, None]
+    variance = number = reach = torch.empty(0)
+
+    def weigh(squared: Tensor, first: bool = False, last: bool = False) -> tuple[Tensor, Tensor]:
+        nonlocal variance, number, reach
+        ratio = squared * (1 / limit)[:, None, None]
         density = around_model(ratio, present, k)[..., None]
-        if variance is None or number is None:
+        if first:
             core = ((ratio < 1) & present).to(ratio.dtype)
             number = core.sum(-1, keepdim=True).clamp(min=1)
             # A Gaussian cut off at the threshold looks narrower than it is.
             variance = (1.6 / k * (core * ratio.clamp(max=1)).sum(-1, keepdim=True) / number).clamp(_LEAST, 1)
         inlying = number * peak * variance ** (-k / 2)
         reach = 1.6 * k * variance * (inlying / density).clamp(min=3).log()
-        if step == SCALE_STEPS:
-            break
-        model = estimator.refine(model, *data, weights=_falling(ratio, reach, inside, weight))
+        if last:
+            return ratio, ratio
+        # What the next step takes for the noise.
         odds = density / inlying * torch.exp((0.5 * ratio / variance).clamp(max=60))
         likely = torch.where(present & (ratio < 9), 1 / (1 + odds), 0)
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1)
+        return _falling(ratio * (1 / reach), inside, weight, k)
+
+    for step in range(SCALE_STEPS):
+        model = reweighted_step(estimator, model, data, partial(weigh, first=step == 0))
+    weigh(squared_residual(estimator, model, *data), last=True)
     return model, torch.exp2((4 * reach[:, 0, 0].log2()).round() / 4)
 
 
@@ -109,15 +139,23 @@ def optimise_within(
     weight: Float[Tensor, "g n"] | None,
 ) -> M:
     """The optimum of the sum of u - u^2 / 2, u the squared distance over the squared reach, near a model `(g, 1, ...)`."""
-    for _ in range(FIXED_STEPS):
-        squared = squared_residual(estimator, model, *data)
-        model = estimator.refine(model, *data, weights=_falling(squared, reach[:, None, None], inside, weight))
+    scale = (1 / reach)[:, None, None]
+
+    def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
+        return _falling(squared * scale, inside, weight, estimator.codimension)
+
+    for _ in range(FIXED_STEPS[hasattr(estimator, "reweighted_step")]):
+        model = reweighted_step(estimator, model, data, weigh)
     return model
 
 
-def _falling(squared: Tensor, reach: Tensor, inside: Tensor, weight: Tensor | None) -> Tensor:
-    falling = (1 - squared * (1 / reach)).clamp(min=0) * (inside if weight is None else weight)[:, None]
-    return falling.nan_to_num(nan=0.0)
+def _falling(u: Tensor, inside: Tensor, weight: Tensor | None, codimension: int) -> tuple[Tensor, Tensor]:
+    """Weight and curvature of the loss u - u^2 / 2, up to its maximum."""
+    near = (u < 1) & inside[:, None]
+    slope, curvature = 1 - u, (1 - (1 + 2 / codimension) * u).clamp_(min=0)
+    if weight is not None:
+        slope, curvature = slope * weight[:, None], curvature * weight[:, None]
+    return torch.where(near, slope, 0), torch.where(near, curvature, 0)
 
 
 def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"]) -> Float[Tensor, "*batch k r"]:
