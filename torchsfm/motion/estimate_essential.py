@@ -1,13 +1,13 @@
 """The essential matrix from corresponding rays of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions
 from torchsfm.geometry import cross_matrix, rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import (
     bilinear,
@@ -23,7 +23,7 @@ from torchsfm.motion.epipolar_fit import (
 from torchsfm.motion.essential_5pt import essential_5pt
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, squared_transfer
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 from torchsfm.tensors import essential_from_pose
 
 _SLACK = 2e-3
@@ -204,46 +204,29 @@ def estimate_essential(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    batch = check_tensors(
-        d1=(d1, "n 3"),
-        d2=(d2, "n 3"),
-        threshold=(limit, ""),
-        mask=(mask, "n: bool"),
-        scores=(scores, "n"),
-        weights=(weights, "n"),
-    )
-    h1, h2 = _unit(d1.double()), _unit(d2.double())
-    slack = threshold.double() if isinstance(threshold, Tensor) else h1.new_tensor(_SLACK if threshold is None else threshold)
-    estimator = RelativePoseEstimator(slack.expand(batch))
-    if scores is not None:
-        scores = scores.double()
-    if weights is not None:
-        weights = weights.double()
-    result = ransac(
-        estimator, h1, h2, threshold=None if threshold is None else slack, mask=mask,
-        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
+    batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"))
+    estimator = RelativePoseEstimator(pose_slack(threshold, d1).expand(batch))
 
-    def essential(model: Tensor) -> Tensor:
+    def back(model: Tensor) -> Tensor:
         return essential_from_pose(model[..., :3], model[..., 3])
 
-    spread = None
-    if result.covariance is not None:
-        found = result.model.detach()
-        spread = push_forward(lambda step: essential(estimator.retract(found, step)).flatten(-2), result.covariance)
-    return replace(
-        result,
-        model=essential(result.model).to(d1.dtype),
-        score=result.score.to(d1.dtype),
-        threshold=result.threshold.to(d1.dtype),
-        covariance=None if spread is None else spread.to(d1.dtype),
-    )
+    return request.answer(estimator, unit_rays(d1), unit_rays(d2), dtype=d1.dtype, back=back)
 
 
-def _unit(d: Tensor) -> Tensor:
-    """Rays of length 1; NaN for those without direction, so that they are left out."""
+def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:
+    """By which angle rays must miss the front to count as behind: the threshold, where there is one."""
+    if isinstance(threshold, Tensor):
+        return threshold.double()
+    return torch.tensor(_SLACK if threshold is None else threshold, dtype=torch.float64, device=like.device)
+
+
+def unit_rays(d: Tensor) -> Tensor:
+    """Rays of length 1 in float64; NaN for those without direction, so that they are left out."""
+    d = d.double()
     square = (d * d).sum(-1, keepdim=True).detach()
     good = torch.isfinite(square) & (square > 0)
     safe = torch.where(good, d, 1)

@@ -1,13 +1,13 @@
 """The fundamental matrix from correspondences of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions
 from torchsfm.motion.epipolar_fit import (
     cofactors,
     cross_rows,
@@ -22,7 +22,7 @@ from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, plane_rivals
-from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 
 @dataclass(frozen=True)
@@ -228,38 +228,14 @@ def estimate_fundamental(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(
-        x1=(x1, "n 2"),
-        x2=(x2, "n 2"),
-        threshold=(limit, ""),
-        mask=(mask, "n: bool"),
-        scores=(scores, "n"),
-        weights=(weights, "n"),
-    )
-    y = common_scale(x1.double(), x2.double(), mask)
-    estimator = FundamentalEstimator()
-    if scores is not None:
-        scores = scores.double()
-    if weights is not None:
-        weights = weights.double()
-    result = ransac(
-        estimator, y.x1, y.x2, threshold=None if threshold is None else y.scale * threshold, mask=mask,
-        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
+    request.check(x1=(x1, "n 2"), x2=(x2, "n 2"))
+    y = common_scale(x1.double(), x2.double(), mask)
 
-    def in_pixels(model: Tensor) -> Tensor:
+    def back(model: Tensor) -> Tensor:
         return largest_positive(_singular(y.T2.mT @ _singular(model[..., :3]) @ y.T1))
 
-    spread = None
-    if result.covariance is not None:
-        found = result.model.detach()
-        spread = push_forward(lambda step: in_pixels(estimator.retract(found, step)).flatten(-2), result.covariance)
-    return replace(
-        result,
-        model=in_pixels(result.model).to(x1.dtype),
-        score=result.score.to(x1.dtype),
-        threshold=(result.threshold / y.scale).to(x1.dtype),
-        covariance=None if spread is None else spread.to(x1.dtype),
-    )
+    return request.answer(FundamentalEstimator(), y.x1, y.x2, dtype=x1.dtype, scale=y.scale, back=back)

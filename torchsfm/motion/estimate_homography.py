@@ -1,20 +1,20 @@
 """The homography from correspondences of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions
 from torchsfm.geometry import line_and_plane_distances
 from torchsfm.motion.epipolar_fit import forms, matrices, plane_rows
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.plane_and_parallax import more_than_chance
 from torchsfm.optim import UnitSphere
-from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 # Where entry ((i, j), (k, l)) of a sum of Kronecker products is among 6 x 6 products, both in the order 00, 01, 02, 11, 12, 22.
 _PAIR = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
@@ -185,41 +185,17 @@ def estimate_homography(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(
-        x1=(x1, "n 2"),
-        x2=(x2, "n 2"),
-        threshold=(limit, ""),
-        mask=(mask, "n: bool"),
-        scores=(scores, "n"),
-        weights=(weights, "n"),
-    )
-    y = common_scale(x1.double(), x2.double(), mask)
-    estimator = HomographyEstimator()
-    if scores is not None:
-        scores = scores.double()
-    if weights is not None:
-        weights = weights.double()
-    result = ransac(
-        estimator, y.x1, y.x2, threshold=None if threshold is None else y.scale * threshold, mask=mask,
-        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
-    back = torch.linalg.inv_ex(y.T2)[0]
+    request.check(x1=(x1, "n 2"), x2=(x2, "n 2"))
+    y = common_scale(x1.double(), x2.double(), mask)
+    T2_inverse = torch.linalg.inv_ex(y.T2)[0]
 
-    def in_pixels(model: Tensor) -> Tensor:
-        H = back @ model @ y.T1
+    def back(model: Tensor) -> Tensor:
+        H = T2_inverse @ model @ y.T1
         size = (H * H).sum(-1, keepdim=True).sum(-2, keepdim=True)
         return largest_positive(H * torch.where(size > 0, size, 1).rsqrt())
 
-    spread = None
-    if result.covariance is not None:
-        found = result.model.detach()
-        spread = push_forward(lambda step: in_pixels(estimator.retract(found, step)).flatten(-2), result.covariance)
-    return replace(
-        result,
-        model=in_pixels(result.model).to(x1.dtype),
-        score=result.score.to(x1.dtype),
-        threshold=(result.threshold / y.scale).to(x1.dtype),
-        covariance=None if spread is None else spread.to(x1.dtype),
-    )
+    return request.answer(HomographyEstimator(), y.x1, y.x2, dtype=x1.dtype, scale=y.scale, back=back)

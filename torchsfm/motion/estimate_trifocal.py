@@ -1,20 +1,20 @@
 """Three projective cameras from correspondences over three images of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions
 from torchsfm.motion.multilinear_fit import frame_directions, free_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
 from torchsfm.motion.plane_and_parallax import more_than_chance
 from torchsfm.motion.three_view_parallax import planar, rivals_of_plane
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
-from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, push_forward, ransac
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 from torchsfm.tensors import canonical_cameras
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -180,30 +180,16 @@ def estimate_trifocal(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x=(x, "3 n 2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"), weights=(weights, "n"))
-    y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), mask)
-    estimator = TrifocalEstimator()
-    result = ransac(
-        estimator, *y, threshold=None if threshold is None else scale * threshold, mask=mask,
-        scores=None if scores is None else scores.double(), weights=None if weights is None else weights.double(),
-        score=score, generator=generator, confidence=confidence, max_iterations=max_iterations,
-        scoring_dtype=torch.float32, covariance=covariance,
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
-    back = inverse_similarity(torch.stack(S, -3))
+    request.check(x=(x, "3 n 2"))
+    y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), mask)
+    S_inverse = inverse_similarity(torch.stack(S, -3))
 
-    def in_pixels(model: Tensor) -> Tensor:
+    def back(model: Tensor) -> Tensor:
         first = torch.eye(3, 4, dtype=model.dtype, device=model.device).expand(*model.shape[:-3], 1, 3, 4)
-        return canonical_cameras(back @ torch.cat((first, model), -3))
+        return canonical_cameras(S_inverse @ torch.cat((first, model), -3))
 
-    spread = None
-    if result.covariance is not None:
-        found = result.model.detach()
-        spread = push_forward(lambda step: in_pixels(estimator.retract(found, step)).flatten(-3), result.covariance)
-    return replace(
-        result,
-        model=in_pixels(result.model).to(x.dtype),
-        score=result.score.to(x.dtype),
-        threshold=(result.threshold / scale).to(x.dtype),
-        covariance=None if spread is None else spread.to(x.dtype),
-    )
+    return request.answer(TrifocalEstimator(), *y, dtype=x.dtype, scale=scale, back=back)

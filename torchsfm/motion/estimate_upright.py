@@ -1,20 +1,20 @@
 """The relative pose of two cameras that know the vertical, from corresponding rays of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions
 from torchsfm.geometry import cross_matrix, rotation_from_rotvec
 from torchsfm.linalg import cross
 from torchsfm.motion.epipolar_fit import cross_rows, normal_equations, sphere_rows
-from torchsfm.motion.estimate_essential import RelativePoseEstimator
+from torchsfm.motion.estimate_essential import RelativePoseEstimator, pose_slack, unit_rays
 from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import RobustResult, damped_solve, ransac
+from torchsfm.robust import Request, RobustResult, Score, damped_solve
 
 
 @dataclass(frozen=True)
@@ -107,12 +107,15 @@ def estimate_upright(
     gravity1: Float[Tensor, "*#batch 3"],
     gravity2: Float[Tensor, "*#batch 3"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
+    covariance: bool = False,
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The relative pose of each pair of calibrated cameras that know the vertical, from rays of which many may be wrong.
 
@@ -125,35 +128,28 @@ def estimate_upright(
         gravity1: The vertical in the first camera, of any length.
         gravity2: The vertical in the second camera.
         threshold: Largest Sampson distance of an inlier in radians: pixels divided by the focal length.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite or of length 0 are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
+        covariance: Compute the covariance of the entries of [R | t], row by row.
 
     Returns:
-        [R | t] with |t| = 1; inliers, score, iterations, status.
+        [R | t] with |t| = 1; inliers, score, iterations, status, covariance (12 x 12, of rank 3). The pose carries its
+        derivatives with respect to the inliers and the verticals (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    batch = check_tensors(
-        d1=(d1, "n 3"), d2=(d2, "n 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"), threshold=(limit, ""),
-        mask=(mask, "n: bool"), scores=(scores, "n"),
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
-    # A ray of length 0 becomes NaN, and is left out.
-    rays = [d / d.double().norm(dim=-1, keepdim=True) for d in (d1, d2)]
-    up1, up2 = ((g.double() / g.double().norm(dim=-1, keepdim=True)).expand(*batch, 3) for g in (gravity1, gravity2))
-    slack = threshold.double() if isinstance(threshold, Tensor) else rays[0].new_tensor(threshold)
-    result = ransac(
-        UprightPoseEstimator(up1, up2, slack.expand(batch)), *rays, threshold=slack, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32,
-    )  # fmt: skip
-    return replace(
-        result,
-        model=result.model.to(d1.dtype),
-        score=result.score.to(d1.dtype),
-        threshold=result.threshold.to(d1.dtype),
-    )
+    batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"))
+    up1, up2 = (unit_rays(g).expand(*batch, 3) for g in (gravity1, gravity2))
+    estimator = UprightPoseEstimator(up1, up2, pose_slack(threshold, d1).expand(batch))
+    return request.answer(estimator, unit_rays(d1), unit_rays(d2), dtype=d1.dtype)

@@ -1,17 +1,17 @@
 """The pose of a calibrated camera from correspondences with known points, of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions
 from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import Degeneracy, RobustResult, Score, damped_solve, ransac
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 
 @dataclass(frozen=True)
@@ -161,56 +161,51 @@ def estimate_camera(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    batch = check_tensors(
-        x=(x, "n 2"),
-        X=(X, "n 3"),
-        K=(K, "3 3"),
-        threshold=(limit, ""),
-        mask=(mask, "n: bool"),
-        scores=(scores, "n"),
-        weights=(weights, "n"),
-    )
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
+    )  # fmt: skip
+    batch = request.check(x=(x, "n 2"), X=(X, "n 3"), K=(K, "3 3"))
     dtype = x.dtype
     x, X, K = x.double(), X.double(), K.double()
-    usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
-    if mask is not None:
-        usable = usable & mask
-    centre, size = middle_and_size(X.detach(), usable)
+    Y, centre, size = moderate(X, present(mask, x, X))
     focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt().detach()
     focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
     # Pixels from the principal point, in focal lengths.
     middle = K[..., :2, 2].detach()
     y = (x - middle[..., None, :]) / focal[..., None, None]
-    right = (K[..., :2, 2] - middle)[..., None]
-    intrinsics = torch.cat((K[..., :2, :2] / focal[..., None, None], right / focal[..., None, None]), -1)
+    offset = (K[..., :2, 2] - middle)[..., None]
     last = torch.eye(3, dtype=K.dtype, device=K.device)[2:].expand(*K.shape[:-2], 1, 3)
-    intrinsics = torch.cat((intrinsics, last), -2)
-    Y = (X - centre[..., None, :]) / size[..., None, None]
-    if scores is not None:
-        scores = scores.double()
-    if weights is not None:
-        weights = weights.double()
-    result = ransac(
-        CameraEstimator(intrinsics.expand(*batch, 3, 3)), y, Y,
-        threshold=None if threshold is None else threshold / focal, mask=mask,
-        scores=scores, weights=weights, score=score, generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
-    )  # fmt: skip
-    R = result.model[..., :3]
-    t = result.model[..., 3] * size[..., None] - (R @ centre[..., None])[..., 0]
-    spread = result.covariance
-    if spread is not None:
-        # [R | t] <- exp(w) [R | t] + [0 | v] in the scaled world is the same in the world, with v scaled back.
-        unit = torch.cat((torch.ones_like(centre), size[..., None].expand_as(centre)), -1)
-        spread = (spread * unit[..., :, None] * unit[..., None, :]).to(dtype)
-    return replace(
-        result,
-        model=torch.cat((R, t[..., None]), -1).to(dtype),
-        score=result.score.to(dtype),
-        threshold=(result.threshold * focal).to(dtype),
-        covariance=spread,
-    )
+    intrinsics = torch.cat((torch.cat((K[..., :2, :2], offset), -1) / focal[..., None, None], last), -2)
+
+    def back(model: Tensor) -> Tensor:
+        return world_pose(model, centre, size)
+
+    # [R | t] <- exp(w) [R | t] + [0 | v] in the scaled world is the same in the world, with v scaled back.
+    unit = torch.cat((torch.ones_like(centre), size[..., None].expand_as(centre)), -1)
+    estimator = CameraEstimator(intrinsics.expand(*batch, 3, 3))
+    return request.answer(estimator, y, Y, dtype=dtype, scale=1 / focal, back=back, step_unit=unit)
+
+
+def present(mask: Tensor | None, *data: Tensor) -> Tensor:
+    """Which data exist and are finite."""
+    usable = torch.isfinite(data[0]).all(-1)
+    for d in data[1:]:
+        usable = usable & torch.isfinite(d).all(-1)
+    return usable if mask is None else usable & mask
+
+
+def moderate(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Points of moderate size around 0, and their `middle_and_size`, which are held when the points move."""
+    centre, size = middle_and_size(X.detach(), usable)
+    return (X - centre[..., None, :]) / size[..., None, None], centre, size
+
+
+def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:
+    """[R | t] in the world, from that in the world of `moderate` points."""
+    R = model[..., :3]
+    t = model[..., 3:] * size[..., None, None] - R @ centre[..., None]
+    return torch.cat((R, t), -1)
 
 
 def squared_reprojection(

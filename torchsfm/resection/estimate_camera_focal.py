@@ -1,18 +1,18 @@
 """Pose and focal length of a camera from correspondences with known points, of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, check_tensors
+from torchsfm._types import Solutions
 from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection.camera_p4pf import camera_p4pf
-from torchsfm.resection.estimate_camera import middle_and_size, squared_reprojection
-from torchsfm.robust import Degeneracy, RobustResult, damped_solve, ransac
+from torchsfm.resection.estimate_camera import middle_and_size, moderate, present, squared_reprojection, world_pose
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 
 @dataclass(frozen=True)
@@ -129,9 +129,11 @@ def estimate_camera_focal(
     X: Float[Tensor, "*#batch n 3"],
     c: Float[Tensor, "*#batch 2"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
@@ -147,8 +149,11 @@ def estimate_camera_focal(
         X: The points in the world.
         c: Principal points in pixels (the middle of the image, if nothing better is known).
         threshold: Largest reprojection error of an inlier in pixels.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
@@ -164,31 +169,24 @@ def estimate_camera_focal(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    batch = check_tensors(
-        x=(x, "n 2"), X=(X, "n 3"), c=(c, "2"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n")
-    )
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
+    )  # fmt: skip
+    request.check(x=(x, "n 2"), X=(X, "n 3"), c=(c, "2"))
     dtype = x.dtype
     x, X, c = x.double(), X.double(), c.double()
-    usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
-    usable = usable if mask is None else usable & mask
-    centre, size = middle_and_size(X.detach(), usable)
+    usable = present(mask, x, X)
+    Y, centre, size = moderate(X, usable)
     offset = x - c[..., None, :]
     _, radius = middle_and_size(torch.cat((offset, -offset), -2).detach(), torch.cat((usable, usable), -1))
-    Y = (X - centre[..., None, :]) / size[..., None, None]
-    result = ransac(
-        FocalCameraEstimator(), offset / radius[..., None, None], Y, threshold=threshold / radius, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32, covariance=covariance,
-    )  # fmt: skip
-    f, pose = _split(result.model)
-    R = pose[..., :3]
-    t = pose[..., 3] * size[..., None] - (R @ centre[..., None])[..., 0]
-    P = _join(f * radius, torch.cat((R, t[..., None]), -1))
-    P = torch.cat((P[..., :2, :] + c[..., :, None] * P[..., 2:, :], P[..., 2:, :].expand(*batch, 1, 4)), -2)
-    spread = result.covariance
-    if spread is not None:
-        unit = torch.ones(*size.shape, 7, dtype=size.dtype, device=size.device)
-        unit[..., 3:6] = size[..., None]
-        spread = (spread * unit[..., :, None] * unit[..., None, :]).to(dtype)
-    return replace(result, model=P.to(dtype), score=result.score.to(dtype), covariance=spread)
+
+    def back(model: Tensor) -> Tensor:
+        f, pose = _split(model)
+        P = _join(f * radius, world_pose(pose, centre, size))
+        return torch.cat((P[..., :2, :] + c[..., :, None] * P[..., 2:, :], P[..., 2:, :]), -2)
+
+    one = torch.ones_like(centre)
+    unit = torch.cat((one, one * size[..., None], one[..., :1]), -1)
+    y = offset / radius[..., None, None]
+    return request.answer(FocalCameraEstimator(), y, Y, dtype=dtype, scale=1 / radius, back=back, step_unit=unit)

@@ -1,6 +1,6 @@
 """An uncalibrated camera from correspondences with known points, of which many are wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -12,8 +12,8 @@ from torchsfm.geometry import line_and_plane_distances
 from torchsfm.linalg import nullspace_rows
 from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
 from torchsfm.resection._focal import incidence_rows
-from torchsfm.resection.estimate_camera import middle_and_size, squared_reprojection
-from torchsfm.robust import Degeneracy, RobustResult, damped_solve, ransac
+from torchsfm.resection.estimate_camera import moderate, present, squared_reprojection
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 _CHUNK = 4096
 
@@ -158,12 +158,15 @@ def estimate_camera_projective(
     x: Float[Tensor, "*#batch n 2"],
     X: Float[Tensor, "*#batch n 3"],
     *,
-    threshold: float | Float[Tensor, "*#batch"],
+    threshold: float | Float[Tensor, "*#batch"] | None,
     mask: Bool[Tensor, "*#batch n"] | None = None,
     scores: Float[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 10_000,
+    covariance: bool = False,
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The uncalibrated 3x4 camera of each image, from correspondences of which many may be wrong.
 
@@ -174,36 +177,37 @@ def estimate_camera_projective(
         x: Image points in pixels.
         X: The points in the world.
         threshold: Largest reprojection error of an inlier in pixels.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit.
+        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
+        weights: For how many correspondences each one counts, 0 for absent.
+        score: How models are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having drawn a sample without outliers.
         max_iterations: Most samples to draw.
+        covariance: Compute the covariance of the entries of P, row by row.
 
     Returns:
         Cameras with `|P[2, :3]| = 1` and inliers at positive third coordinates; inliers, score, iterations, status, degeneracy
-        (COLLINEAR, PLANAR: neither determines the camera). The cameras carry their derivatives with respect to the inliers.
+        (COLLINEAR, PLANAR: neither determines the camera), covariance (12 x 12, of rank 11). The cameras carry their
+        derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x=(x, "n 2"), X=(X, "n 3"), threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"))
-    dtype = x.dtype
-    x, X = x.double(), X.double()
-    usable = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
-    usable = usable if mask is None else usable & mask
-    centre, size = middle_and_size(X.detach(), usable)
-    middle, radius = middle_and_size(x.detach(), usable)
-    result = ransac(
-        ProjectiveCameraEstimator(), (x - middle[..., None, :]) / radius[..., None, None],
-        (X - centre[..., None, :]) / size[..., None, None], threshold=threshold / radius, mask=mask,
-        scores=None if scores is None else scores.double(), generator=generator, confidence=confidence,
-        max_iterations=max_iterations, scoring_dtype=torch.float32,
+    request = Request(
+        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
+        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
-    P = result.model
-    P = torch.cat((P[..., :3], P[..., 3:] * size[..., None, None] - P[..., :3] @ centre[..., None]), -1)
-    P = torch.cat((P[..., :2, :] * radius[..., None, None] + middle[..., None] * P[..., 2:, :], P[..., 2:, :]), -2)
-    third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
-    P = P / torch.where(third > 0, third, 1.0)
-    return replace(result, model=P.to(dtype), score=result.score.to(dtype))
+    request.check(x=(x, "n 2"), X=(X, "n 3"))
+    usable = present(mask, x, X)
+    y, middle, radius = moderate(x.double(), usable)
+    Y, centre, size = moderate(X.double(), usable)
+
+    def back(P: Tensor) -> Tensor:
+        P = torch.cat((P[..., :3], P[..., 3:] * size[..., None, None] - P[..., :3] @ centre[..., None]), -1)
+        P = torch.cat((P[..., :2, :] * radius[..., None, None] + middle[..., None] * P[..., 2:, :], P[..., 2:, :]), -2)
+        third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
+        return P / torch.where(third > 0, third, 1.0)
+
+    return request.answer(ProjectiveCameraEstimator(), y, Y, dtype=x.dtype, scale=1 / radius, back=back)

@@ -4,8 +4,8 @@ from torchsfm.robust.degeneracy import Degeneracy
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.local_optimisation import damped_solve
 from torchsfm.robust.multi_structure import Structures, find_structures
-from torchsfm.robust.optimum import push_forward
 from torchsfm.robust.ransac import RobustResult, ransac
+from torchsfm.robust.request import Request
 from torchsfm.robust.scores import InlierCount, LeastMedian, Magsac, Msac, Score
 from torchsfm.robust.soft_selection import SoftSelection, soft_ransac
 
@@ -16,13 +16,13 @@ __all__ = [
     "LeastMedian",
     "Magsac",
     "Msac",
+    "Request",
     "RobustResult",
     "Score",
     "SoftSelection",
     "Structures",
     "damped_solve",
     "find_structures",
-    "push_forward",
     "ransac",
     "soft_ransac",
 ]

@@ -122,6 +122,8 @@ def push_forward(function: Callable[[Tensor], Tensor], covariance: Float[Tensor,
     """The covariance of `function(step)`, `(*batch, k) -> (*batch, m)`, from that of a step around zero, to first order."""
     with torch.no_grad():
         J = derivative(function, torch.zeros_like(covariance[..., 0]))
+        # Where no model was found, what stands in its place may have no derivative; its covariance is zero.
+        J = torch.where(torch.isfinite(J), J, 0)
         return J @ covariance @ J.mT
 
 
