@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import cast
-from torchsfm.robust.sampling import compact, prosac_growth
+from torchsfm.robust.sampling import compact, prosac_growth, spread_order
 
 SMALLEST_WIDTH = 8
 
@@ -71,32 +72,59 @@ class Problems:
 def pack(
     estimator: Estimator[Any],
     data: Sequence[Float[Tensor, "p n _"]],
-    usable: Bool[Tensor, "p n"],
+    usable: Bool[Tensor, "p n"] | None,
     chosen: Bool[Tensor, "p"],
     limit: Float[Tensor, "p"],
     trust: Float[Tensor, "p n"] | None,
     weights: Float[Tensor, "p n"] | None,
 ) -> Iterator[Problems]:
-    """Sort the chosen problems by their number of usable data: one group for each power of two."""
-    count = usable.sum(-1)
-    width = SMALLEST_WIDTH * torch.ones_like(count)
-    while bool((wider := width < count).any()):
-        width = torch.where(wider, 2 * width, width)
-    for size in sorted(set(width[chosen].tolist())):
-        member = (chosen & (width == size)).nonzero()[:, 0]
-        source = compact(usable[member], count[member], size)
-        inside = torch.arange(size, device=count.device) < count[member, None]
+    """Sort the chosen problems by their number of usable data: one group for each power of two.
+
+    Args:
+        estimator: The problem, its tensor fields per problem.
+        data: The data.
+        usable: Which data to use; all of them if not given.
+        chosen: Which problems to pack.
+        limit: Squared thresholds.
+        trust: How much each datum can be trusted.
+        weights: What each datum counts.
+    """
+    p, n = data[0].shape[:2]
+    if usable is None:
+        order = spread_order(n, _width(n), limit.device)
+        count, groups = torch.full((p,), n, device=limit.device), [(len(order), chosen)]
+    else:
+        count = usable.sum(-1)
+        widths = torch.tensor([SMALLEST_WIDTH << i for i in range(_width(n).bit_length())], device=limit.device)
+        width = widths[torch.searchsorted(widths, count)]
+        groups = [(size, chosen & (width == size)) for size in sorted(set(width[chosen].tolist()))]
+    for size, group in groups:
+        member = group.nonzero()[:, 0]
+        if not len(member):
+            continue
+        every = len(member) == p
+        own = partial(_rows, index=None if every else member)
+        inside = torch.arange(size, device=count.device) < (n if usable is None else own(count)[:, None])
+        if usable is None:
+            source, inside = order.expand(len(member), -1), inside.expand(len(member), -1)
+        else:
+            source = compact(own(usable), own(count), size)
+        packed = tuple(own(d).mT.gather(2, source[:, None].expand(-1, d.shape[-1], -1)).mT for d in data)
         ranking = growth = weight = None
         if weights is not None:
-            weight = torch.where(inside, weights[member].gather(1, source), 0)
+            weight = torch.where(inside, own(weights).gather(1, source), 0)
         if trust is not None:
-            sorted_by = torch.where(inside, trust[member].gather(1, source), -torch.inf)
+            sorted_by = torch.where(inside, own(trust).gather(1, source), -torch.inf)
             ranking = sorted_by.argsort(dim=-1, descending=True, stable=True)
-            growth = prosac_growth(count[member], size, estimator.sample_size)
-        packed = tuple(d[member].mT.gather(2, source[:, None].expand(-1, d.shape[-1], -1)).mT for d in data)
-        own = _at(estimator, member)
-        yield Problems(own, packed, inside, count[member], limit[member], ranking, growth, weight, source, member)
+            growth = prosac_growth(own(count), size, estimator.sample_size)
+        fields = tensor_map(own, estimator)
+        yield Problems(fields, packed, inside, own(count), own(limit), ranking, growth, weight, source, member)
 
 
-def _at(estimator: Estimator[Any], member: Tensor) -> Estimator[Any]:
-    return tensor_map(lambda t: t[member], estimator)
+def _width(number: int) -> int:
+    """The number of slots for so many data."""
+    return max(SMALLEST_WIDTH, 1 << (number - 1).bit_length())
+
+
+def _rows(t: Tensor, index: Tensor | None) -> Tensor:
+    return t if index is None else t[index]

@@ -5,18 +5,20 @@ Sample, score, optimise locally, stop: LO-RANSAC (Chum, Matas & Kittler 2003). T
 data and the seed alone: the sizes of all arrays that touch a problem follow from its own number of data.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm.optim import wants_derivative
 from torchsfm.robust.degeneracy import Degeneracy
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.models import cast, join
+from torchsfm.robust.models import cast, tensors_of, zip_map
 from torchsfm.robust.optimum import attach_derivative, has_manifold, step_covariance
 from torchsfm.robust.problems import Problems, pack
 from torchsfm.robust.scores import LeastMedian, Msac, Score
@@ -124,83 +126,140 @@ def ransac(
     known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
     limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(1.0 if threshold is None else threshold)
     batch = check_tensors(**known, threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"), weights=(weights, "n"))
-    dtype, device, n = data[0].dtype, data[0].device, data[0].shape[-2]
+    dtype, n = data[0].dtype, data[0].shape[-2]
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
     p = batch.numel()
-    graph = [d.double().expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
-    counts = None if weights is None else weights.double().expand(*batch, n).reshape(p, n)
-    own = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
-    own = cast(own, torch.float64)
+    graph = [_in_one_batch(d.double(), batch, 2) for d in data]
+    counts = None if weights is None else _in_one_batch(weights.double(), batch, 1)
+    own = cast(tensor_map(lambda t: _in_one_batch(t, batch, t.ndim - len(batch)), estimator), torch.float64)
     with torch.no_grad():
         flat, fields = [d.detach() for d in graph], tensor_map(Tensor.detach, own)
-        bound = limit.double().expand(batch).reshape(p).clone()
+        bound = _in_one_batch(limit.detach().double(), batch, 0)
         square = bound * bound
-        exists = torch.ones(p, n, dtype=torch.bool, device=device)
-        exists = exists if mask is None else mask.expand(*batch, n).reshape(p, n)
-        usable = exists
-        for d in flat:
-            usable = usable & torch.isfinite(d).all(-1)
-        if counts is not None:
-            usable = usable & torch.isfinite(counts) & (counts > 0)
-        trust = None if scores is None else scores.expand(*batch, n).reshape(p, n)
-        enough = (usable.sum(-1) >= estimator.sample_size) & torch.isfinite(square) & (bound > 0)
-        status = torch.full((p,), int(Status.NOT_FINITE), dtype=torch.int8, device=device)
-        status[exists.sum(-1) < estimator.sample_size] = int(Status.TOO_FEW)
-        inliers = torch.zeros(p, n, dtype=torch.bool, device=device)
-        support = torch.zeros(p, dtype=torch.float64, device=device)
-        iterations = torch.zeros(p, dtype=torch.long, device=device)
-        degeneracy = torch.full((p,), int(Degeneracy.TOO_FEW), dtype=torch.int8, device=device)
-        selected, reach = torch.zeros_like(inliers), torch.ones_like(support)
-        options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype, score)
-        found: list[tuple[Tensor, M]] = []
+        enough = (bound > 0) & (square < torch.inf)
         given = None if counts is None else counts.detach()
+        exists = None if mask is None else _in_one_batch(mask, batch, 1)
+        usable = _usable(flat, exists, given)
+        if usable is not None:
+            enough &= usable.sum(-1) >= estimator.sample_size
+        elif n < estimator.sample_size:
+            enough = torch.zeros_like(enough)
+        trust = None if scores is None else _in_one_batch(scores, batch, 1)
+        options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype, score)
+        found = []
         for problems in pack(fields, flat, usable, enough, square, trust, given):
-            best = search(problems, options)
-            problems = replace(problems, limit=best.limit)
-            member = problems.member
-            bound[member] = best.limit.sqrt()
-            squared = squared_residual(problems.estimator, best.model, *problems.data)
-            near = (squared < problems.limit[:, None]) & problems.inside
-            ratio = squared / problems.limit[:, None]
-            soft = torch.where(near, 1 - ratio, 0)
-            soft = (soft if problems.weight is None else soft * problems.weight).sum(-1)
-            expected = around_model(ratio, problems.inside, estimator.codimension)
-            agreed = (near.sum(-1) > estimator.sample_size) & beyond_chance(
-                soft, problems.count, expected, estimator.sample_size
-            )
-            fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
-            status[member] = torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8)
-            found.append((member, best.model))
-            inliers[member] = problems.scatter(near, n)
-            support[member] = soft
-            iterations[member] = best.iterations
-            degeneracy[member] = _degeneracy(problems, best, near, expected)
-            optimal = agreed & best.solved & (best.reach > 0)
-            within = (squared < best.reach[:, None]) & problems.inside & optimal[:, None]
-            selected[member] = problems.scatter(within, n)
-            reach[member] = torch.where(optimal, best.reach, 1)
-    model = _together(found, fields, flat, p)
-    counts = torch.ones_like(usable, dtype=torch.float64) if counts is None else counts
-    spread = step_covariance(fields, model, flat, counts.detach(), selected, reach) if covariance else None
-    model = attach_derivative(own, model, graph, counts, selected, reach)
+            found.append((problems.member, _outcome(problems, search(problems, options), n)))
+        if len(found) == 1 and len(found[0][0]) == p:
+            result = found[0][1]
+        else:
+            result = _nothing(fields, flat, bound, exists)
+            for member, part in found:
+                result = zip_map(lambda old, new: old.index_copy(0, member, new), result, part)  # noqa: B023
+    model, spread = result.model, None
+    if covariance or (has_manifold(estimator) and wants_derivative(*graph, *tensors_of((counts, own)))):
+        counts = bound.new_ones(p, n) if counts is None else counts
+        if covariance:
+            spread = step_covariance(fields, model, flat, counts.detach(), result.selected, result.reach)
+            spread = spread.to(dtype).reshape(*batch, *spread.shape[1:])
+        model = attach_derivative(own, model, graph, counts, result.selected, result.reach)
     return RobustResult(
         tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
-        inliers.reshape(*batch, n),
-        support.to(dtype).reshape(batch),
-        bound.to(dtype).reshape(batch),
-        iterations.reshape(batch),
-        status.reshape(batch),
-        degeneracy.reshape(batch),
-        None if spread is None else spread.to(dtype).reshape(*batch, *spread.shape[1:]),
+        result.inliers.reshape(*batch, n),
+        result.support.to(dtype).reshape(batch),
+        result.bound.to(dtype).reshape(batch),
+        result.iterations.reshape(batch),
+        result.status.reshape(batch),
+        result.degeneracy.reshape(batch),
+        spread,
     )
 
 
-def _together(found: Sequence[tuple[Tensor, M]], estimator: Estimator[M], data: Sequence[Tensor], p: int) -> M:
-    """The models of all problems, zeros where there is none."""
-    if not found:
-        return no_model(estimator, data, p)
-    member = torch.cat([index for index, _ in found])
-    return tensor_map(lambda t: t.new_zeros(p, *t.shape[1:]).index_copy(0, member, t), join([model for _, model in found]))
+def _in_one_batch(t: Tensor, batch: torch.Size, own: int) -> Tensor:
+    """With all batch dimensions in one; the last `own` dimensions are its own."""
+    trailing = t.shape[t.ndim - own :]
+    if t.shape != batch + trailing:
+        t = t.expand(batch + trailing)
+    return t if len(batch) == 1 else t.reshape(batch.numel(), *trailing)
+
+
+def _usable(data: Sequence[Tensor], exists: Tensor | None, counts: Tensor | None) -> Bool[Tensor, "p n"] | None:
+    """Which data exist, are finite and count; None for all."""
+    # A sum is finite only if all numbers are.
+    finite = [math.isfinite(float(d.sum())) for d in data]
+    usable = exists
+    for d, good in zip(data, finite, strict=True):
+        if not good:
+            row = torch.isfinite(d).all(-1)
+            usable = row if usable is None else usable & row
+    if counts is not None:
+        row = torch.isfinite(counts) & (counts > 0)
+        usable = row if usable is None else usable & row
+    return usable
+
+
+@dataclass(frozen=True)
+class _Outcome(Generic[M]):
+    """What becomes of each of some problems, for the data in the caller's order.
+
+    Attributes:
+        model: The model.
+        inliers: Which data are nearer than the threshold.
+        support: The soft number of inliers.
+        bound: The threshold.
+        iterations: Number of samples drawn.
+        status: What became of it.
+        degeneracy: What the inliers lack.
+        selected: Which data are within the reach of the loss of which the model is the optimum.
+        reach: The square of that reach; 1 for a model that is none.
+    """
+
+    model: M
+    inliers: Bool[Tensor, "p n"]
+    support: Float[Tensor, "p"]
+    bound: Float[Tensor, "p"]
+    iterations: Int[Tensor, "p"]
+    status: Int[Tensor, "p"]
+    degeneracy: Int[Tensor, "p"]
+    selected: Bool[Tensor, "p n"]
+    reach: Float[Tensor, "p"]
+
+
+def _nothing(estimator: Estimator[M], data: Sequence[Tensor], bound: Tensor, exists: Tensor | None) -> _Outcome[M]:
+    """What becomes of problems that are not even tried."""
+    p, n = data[0].shape[:2]
+    none = torch.zeros(p, n, dtype=torch.bool, device=bound.device)
+    few = (torch.full_like(bound, n) if exists is None else exists.sum(-1)) < estimator.sample_size
+    status = torch.where(few, int(Status.TOO_FEW), int(Status.NOT_FINITE)).to(torch.int8)
+    zero = bound.new_zeros(p)
+    code = torch.full_like(status, int(Degeneracy.TOO_FEW))
+    return _Outcome(no_model(estimator, data, p), none, zero, bound, zero.long(), status, code, none, zero + 1)
+
+
+def _outcome(problems: Problems, best: Best, n: int) -> _Outcome[Any]:
+    """Judge the best models by all data."""
+    estimator, size, limit, reach = problems.estimator, problems.estimator.sample_size, best.limit, best.reach
+    squared = squared_residual(estimator, best.model, *problems.data)
+    ratio = torch.where(problems.inside, squared / limit[:, None], torch.inf).nan_to_num_(nan=torch.inf)
+    near = ratio < 1
+    soft = (1 - ratio).clamp_(min=0)
+    soft = (soft if problems.weight is None else soft * problems.weight).sum(-1)
+    number, expected = near.sum(-1), around_model(ratio, problems.inside, estimator.codimension)
+    agreed = (number > size) & beyond_chance(soft, problems.count, expected, size)
+    fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
+    optimal = agreed & best.solved & (reach > 0)
+    reach = torch.where(optimal, reach, 1)
+    within = (ratio < (reach / limit)[:, None]) & optimal[:, None]
+    return _Outcome(
+        best.model,
+        problems.scatter(near, n),
+        soft,
+        limit.sqrt(),
+        best.iterations,
+        torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8),
+        _degeneracy(replace(problems, limit=limit), best, near, expected),
+        problems.scatter(within, n),
+        reach,
+    )
 
 
 def _degeneracy(problems: Problems, best: Best, near: Bool[Tensor, "p n"], chance: Float[Tensor, "p"]) -> Int[Tensor, "p"]:

@@ -4,6 +4,8 @@ Each random number is a hash of (seed, size of the problem, number of the hypoth
 generator (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011), with the finaliser of SplitMix64 as the hash.
 """
 
+from functools import lru_cache
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -168,3 +170,11 @@ def compact(usable: Bool[Tensor, "p n"], count: Int[Tensor, "p"], width: int) ->
     order = (slot * step) % count[:, None].clamp(min=1)
     order = torch.where(slot < count[:, None], order, 0)
     return packed.gather(1, order)
+
+
+@lru_cache(maxsize=64)
+def spread_order(count: int, width: int, device: torch.device) -> Int[Tensor, "width"]:
+    """The order of `compact` where all data are usable."""
+    with torch.inference_mode(False):
+        usable = torch.ones(1, count, dtype=torch.bool, device=device)
+        return compact(usable, torch.tensor([count], device=device), width)[0]
