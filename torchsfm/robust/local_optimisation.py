@@ -6,7 +6,7 @@ from functools import partial
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.robust.estimator import Estimator
@@ -28,8 +28,8 @@ _LEAST = 1e-6
 """Smallest variance of the noise in units of the squared threshold."""
 SCALE_STEPS = 3
 """Rounds of the final refinement that estimate the scale of the noise."""
-FIXED_STEPS = {True: 3, False: 5}
-"""Rounds that hold it: with the curvature of the loss, and without."""
+FIRST_STEPS, LAST_STEPS = 1, 2
+"""Rounds that hold it, in the precision of scoring and in float64; twice as many without the curvature of the loss."""
 LOCAL_DATA, SCALE_DATA = 256, 512
 """Local optimisation, and the estimation of the scale, look at so many data at most."""
 
@@ -76,8 +76,7 @@ def scale_of_noise(
     model: M,
     data: Sequence[Tensor],
     limit: Float[Tensor, "g"],
-    inside: Bool[Tensor, "g n"],
-    weight: Float[Tensor, "g n"] | None,
+    counts: Tensor,
 ) -> tuple[M, Float[Tensor, "g"]]:
     """Reweighted least squares out to the distance where an outlier is as likely as an inlier, and that distance.
 
@@ -91,8 +90,7 @@ def scale_of_noise(
         model: One model of each problem, `(g, 1, ...)`.
         data: The data, each `(g, 1, n, d)`.
         limit: Squared threshold.
-        inside: Which slots hold data.
-        weight: What the data count.
+        counts: What the data count, `(g, n)`: a boolean or a weight.
 
     Returns:
         The model, and the square of its reach in units of the squared threshold, rounded to a coarse grid: so the model that
@@ -101,7 +99,7 @@ def scale_of_noise(
     k = estimator.codimension
     # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
     peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
-    present = inside[:, None]
+    present = counts[:, None] > 0
     variance = number = reach = torch.empty(0)
 
     def weigh(squared: Tensor, first: bool = False, last: bool = False) -> tuple[Tensor, Tensor]:
@@ -122,7 +120,7 @@ def scale_of_noise(
         likely = torch.where(present & (ratio < 9), 1 / (1 + odds), 0)
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1)
-        return _falling(ratio * (1 / reach), inside, weight, k)
+        return _falling(ratio * (1 / reach), counts, k)
 
     for step in range(SCALE_STEPS):
         model = reweighted_step(estimator, model, data, partial(weigh, first=step == 0))
@@ -135,27 +133,24 @@ def optimise_within(
     model: M,
     data: Sequence[Tensor],
     reach: Float[Tensor, "g"],
-    inside: Bool[Tensor, "g n"],
-    weight: Float[Tensor, "g n"] | None,
+    counts: Tensor,
+    steps: int,
 ) -> M:
     """The optimum of the sum of u - u^2 / 2, u the squared distance over the squared reach, near a model `(g, 1, ...)`."""
     scale = (1 / reach)[:, None, None]
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
-        return _falling(squared * scale, inside, weight, estimator.codimension)
+        return _falling(squared * scale, counts, estimator.codimension)
 
-    for _ in range(FIXED_STEPS[hasattr(estimator, "reweighted_step")]):
+    for _ in range(steps if hasattr(estimator, "reweighted_step") else 2 * steps):
         model = reweighted_step(estimator, model, data, weigh)
     return model
 
 
-def _falling(u: Tensor, inside: Tensor, weight: Tensor | None, codimension: int) -> tuple[Tensor, Tensor]:
+def _falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tensor]:
     """Weight and curvature of the loss u - u^2 / 2, up to its maximum."""
-    near = (u < 1) & inside[:, None]
-    slope, curvature = 1 - u, (1 - (1 + 2 / codimension) * u).clamp_(min=0)
-    if weight is not None:
-        slope, curvature = slope * weight[:, None], curvature * weight[:, None]
-    return torch.where(near, slope, 0), torch.where(near, curvature, 0)
+    u, counts = torch.where(u < 1, u, 1), counts[:, None]
+    return (1 - u) * counts, (1 - (1 + 2 / codimension) * u).clamp_(min=0) * counts
 
 
 def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"]) -> Float[Tensor, "*batch k r"]:

@@ -23,7 +23,7 @@ class Problems:
 
     Attributes:
         estimator: What to solve; its tensor fields, if any, are per problem.
-        data: `(p, width, d)` each, in memory with the coordinate before the datum, so that one coordinate is contiguous.
+        data: `(p, width, d)` each, in memory with the coordinate first, so that one coordinate of all is contiguous.
         inside: Which slots hold data; they come first.
         count: Number of data.
         limit: Squared threshold.
@@ -51,7 +51,9 @@ class Problems:
         return self.inside.shape[-1]
 
     def take(self, index: Tensor) -> "Problems":
-        """Some of the problems."""
+        """Some of the problems, in their order."""
+        if len(index) == len(self.count):
+            return self
         return tensor_map(lambda t: t[index], self)
 
     def spread(self) -> "Problems":
@@ -109,7 +111,9 @@ def pack(
             source, inside = order.expand(len(member), -1), inside.expand(len(member), -1)
         else:
             source = compact(own(usable), own(count), size)
-        packed = tuple(own(d).mT.gather(2, source[:, None].expand(-1, d.shape[-1], -1)).mT for d in data)
+        place = (source + member[:, None] * n).flatten()
+        rows = [d.permute(2, 0, 1).flatten(1).index_select(1, place) for d in data]
+        packed = tuple(r.view(-1, *source.shape).permute(1, 2, 0) for r in rows)
         ranking = growth = weight = None
         if weights is not None:
             weight = torch.where(inside, own(weights).gather(1, source), 0)

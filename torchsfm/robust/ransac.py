@@ -22,7 +22,7 @@ from torchsfm.robust.models import cast, tensors_of, zip_map
 from torchsfm.robust.optimum import attach_derivative, has_manifold, step_covariance
 from torchsfm.robust.problems import Problems, pack
 from torchsfm.robust.scores import LeastMedian, Msac, Score
-from torchsfm.robust.scoring import around_model, beyond_chance, squared_residual
+from torchsfm.robust.scoring import around_model, beyond_chance
 from torchsfm.robust.search import Best, Options, no_model, search
 
 M = TypeVar("M")
@@ -148,7 +148,7 @@ def ransac(
         options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype, score)
         found = []
         for problems in pack(fields, flat, usable, enough, square, trust, given):
-            found.append((problems.member, _outcome(problems, search(problems, options), n)))
+            found.append((problems.member, _outcome(problems, *search(problems, options), n)))
         if len(found) == 1 and len(found[0][0]) == p:
             result = found[0][1]
         else:
@@ -235,10 +235,9 @@ def _nothing(estimator: Estimator[M], data: Sequence[Tensor], bound: Tensor, exi
     return _Outcome(no_model(estimator, data, p), none, zero, bound, zero.long(), status, code, none, zero + 1)
 
 
-def _outcome(problems: Problems, best: Best, n: int) -> _Outcome[Any]:
+def _outcome(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: int) -> _Outcome[Any]:
     """Judge the best models by all data."""
     estimator, size, limit, reach = problems.estimator, problems.estimator.sample_size, best.limit, best.reach
-    squared = squared_residual(estimator, best.model, *problems.data)
     ratio = torch.where(problems.inside, squared / limit[:, None], torch.inf).nan_to_num_(nan=torch.inf)
     near = ratio < 1
     soft = (1 - ratio).clamp_(min=0)

@@ -17,8 +17,12 @@ M = TypeVar("M")
 
 NUMBERS = {True: 1 << 16, False: 1 << 24}
 """How many distances to compute at a time, on a CPU and elsewhere."""
-PREFIXES = (64, 256)
+PREFIXES = (64, 256, 1024)
 """Numbers of data on which hypotheses are judged before all data are looked at."""
+KEPT = (16, 8, 4)
+"""The fewest hypotheses that are kept after each."""
+SHARE = 64
+"""Of how many hypotheses one is kept after the first."""
 
 
 def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#batch n _"]) -> Float[Tensor, "*batch n"]:
@@ -64,16 +68,15 @@ def losses(
     return torch.cat(rows) if rows else limit.new_zeros(g, s)
 
 
-def stages(width: int, slots: int, kept: int) -> list[tuple[int, int]]:
+def stages(width: int, slots: int) -> list[tuple[int, int]]:
     """On how many data `slots` models are scored, stage by stage, and how many of the models are kept each time."""
-    prefixes = [prefix for prefix in PREFIXES if 2 * prefix <= width]
     plan = []
-    for level, prefix in enumerate(prefixes):
-        keep = max(24, slots // 12) if level == 0 and len(prefixes) > 1 else max(2 * kept, 16)
-        if keep < slots:
+    for level, (prefix, fewest) in enumerate(zip(PREFIXES, KEPT, strict=True)):
+        keep = max(fewest, slots // SHARE) if level == 0 else fewest
+        if 2 * prefix <= width and keep < slots:
             plan.append((prefix, keep))
             slots = keep
-    return [*plan, (width, kept)]
+    return [*plan, (width, KEPT[-1])]
 
 
 def smallest(score: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]:
@@ -81,11 +84,11 @@ def smallest(score: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"
     return score.topk(min(number, score.shape[-1]), dim=-1, largest=False).indices
 
 
-def gather_valid(valid: Bool[Tensor, "g s"]) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:
-    """Where the valid slots of each row are, in as few columns as the fullest row needs, and which columns are filled."""
+def gather_valid(valid: Bool[Tensor, "g s"], least: int) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:
+    """Where the valid slots of each row are, in as few columns as the fullest row needs or `least`, and which are filled."""
     g, slots = valid.shape
     rank = valid.cumsum(-1)
-    columns = max(int(rank[:, -1].max()) if valid.numel() else 0, 1)
+    columns = max(int(rank[:, -1].max()) if valid.numel() else 0, least)
     index = torch.zeros(g, columns + 1, dtype=torch.long, device=valid.device)
     position = torch.where(valid, rank - 1, columns)
     index.scatter_(1, position, torch.arange(slots, device=valid.device).expand(g, slots))

@@ -11,7 +11,15 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.local_optimisation import LOCAL_DATA, SCALE_DATA, optimise_locally, optimise_within, scale_of_noise
+from torchsfm.robust.local_optimisation import (
+    FIRST_STEPS,
+    LAST_STEPS,
+    LOCAL_DATA,
+    SCALE_DATA,
+    optimise_locally,
+    optimise_within,
+    scale_of_noise,
+)
 from torchsfm.robust.models import cast, join, select, take_slots, zip_map
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import draw_samples, draw_weighted, prosac_pools
@@ -20,10 +28,8 @@ from torchsfm.robust.scoring import gather_valid, losses, smallest, squared_resi
 
 M = TypeVar("M")
 
-ROUNDS = (16, 32, 64, 128, 256, 512, 1024, 2048)
+ROUNDS = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 """How many samples a round may draw for a problem."""
-SCORED = 8
-"""Hypotheses of a round that are scored on all data."""
 OPTIMISED = 2
 """Hypotheses of a round that are optimised locally."""
 _BY_CHANCE = 0.05
@@ -69,8 +75,8 @@ class Best:
     reach: Float[Tensor, "p"]
 
 
-def search(problems: Problems, options: Options) -> Best:
-    """Find the best model of each problem, in float64, refined."""
+def search(problems: Problems, options: Options) -> tuple[Best, Float[Tensor, "p width"]]:
+    """Find the best model of each problem, in float64, refined, and the squared distances of its data."""
     p, device = len(problems.count), problems.count.device
     infinite = torch.full((p,), torch.inf, dtype=options.dtype, device=device)
     none = torch.zeros(p, dtype=torch.long, device=device)
@@ -87,9 +93,9 @@ def search(problems: Problems, options: Options) -> Best:
 
 
 def _round_size(drawn: Int[Tensor, "g"], needed: Float[Tensor, "g"], options: Options) -> Int[Tensor, "g"]:
-    """How many samples to draw next: as many as drawn so far, or the rest if that is fewer; 0 for a problem that is done."""
+    """How many samples to draw next: so many that there are four times as many, or the rest; 0 for a problem that is done."""
     rest = torch.maximum(needed, torch.full_like(needed, options.min_iterations)).clamp(max=options.max_iterations) - drawn
-    wanted = torch.minimum(rest, drawn.clamp(min=options.min_iterations).to(rest.dtype))
+    wanted = torch.minimum(rest, (3 * drawn).clamp(min=options.min_iterations).to(rest.dtype))
     sizes = torch.tensor(ROUNDS, device=drawn.device)
     size = sizes[torch.searchsorted(sizes, wanted.ceil().long()).clamp(max=len(ROUNDS) - 1)]
     return torch.where(rest > 0, size, 0)
@@ -139,10 +145,10 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
     """Draw samples for some problems, and update the best models with what comes of them."""
     parts = []
     for part in _split(index, number, _SAMPLES):
-        models, valid = _hypotheses(fine.take(part), best.iterations[part], number, options.seed)
-        parts.append((*_cascade(coarse.take(part), cast(models, options.dtype), valid, options.score), valid.any(-1)))
+        models, valid = _hypotheses(fine, part, best.iterations[part], number, options.seed)
+        parts.append(_cascade(coarse.take(part), models, valid, options))
     models = join([part[0] for part in parts])
-    loss, solved = (torch.cat([part[i] for part in parts]) for i in (1, 2))
+    loss, solved = (torch.cat([part[i] for part in parts]) if len(parts) > 1 else parts[0][i] for i in (1, 2))
     if best.model is None:
         best = replace(best, model=tensor_map(lambda t: t.new_zeros(len(best.loss), *t.shape[2:]), models))
     best = replace(
@@ -152,8 +158,8 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
     )
     improved = (loss[:, 0] < best.minimal_loss[index]).nonzero()[:, 0]
     for part in _split(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), _NUMBERS):
-        top = tensor_map(lambda t: t[part, :OPTIMISED], models)  # noqa: B023
-        best = _optimised(coarse.take(index[part]), best, index[part], top, loss[part, :OPTIMISED], options)
+        top = tensor_map(lambda t: t[part], models)  # noqa: B023
+        best = _optimised(coarse.take(index[part]), best, index[part], top, loss[part], options)
     return best
 
 
@@ -216,77 +222,80 @@ def _rivalled(fine: Problems, coarse: Problems, best: Best, options: Options) ->
     return best
 
 
-def _hypotheses(fine: Problems, drawn: Int[Tensor, "g"], size: int, seed: int) -> tuple[Any, Bool[Tensor, "g slots"]]:
-    """The models through random samples, all solution slots of all samples in a row."""
-    m = fine.estimator.sample_size
+def _hypotheses(
+    fine: Problems, part: Int[Tensor, "g"], drawn: Int[Tensor, "g"], size: int, seed: int
+) -> tuple[Any, Bool[Tensor, "g size slots"]]:
+    """The models through random samples of some of the problems."""
+    m, count = fine.estimator.sample_size, fine.count[part]
     if fine.ranking is not None and fine.growth is not None:
-        pool, newest = prosac_pools(fine.count, fine.growth, drawn, size, m)
-        index = fine.ranking.gather(1, draw_samples(seed, fine.count, drawn, size, m, pool, newest).flatten(1))
+        pool, newest = prosac_pools(count, fine.growth[part], drawn, size, m)
+        index = draw_samples(seed, count, drawn, size, m, pool, newest)
+        index = fine.ranking[part].gather(1, index.flatten(1)).view_as(index)
     elif fine.weight is not None:
-        index = draw_weighted(seed, fine.weight, fine.count, drawn, size, m).flatten(1)
+        index = draw_weighted(seed, fine.weight[part], count, drawn, size, m)
     else:
-        index = draw_samples(seed, fine.count, drawn, size, m).flatten(1)
+        index = draw_samples(seed, count, drawn, size, m)
+    # Coordinate, position in the sample, problem, sample: as solvers want it, who have the batch last.
+    flat = (index + part[:, None, None] * fine.width).transpose(0, 1).flatten()
     sample = []
     for d in fine.data:
-        picked = d.mT.gather(2, index[:, None].expand(-1, d.shape[-1], -1))
-        sample.append(picked.reshape(*picked.shape[:2], m, size).permute(0, 3, 2, 1))
-    estimator = fine.spread().estimator
+        picked = d.permute(2, 0, 1).flatten(1).index_select(1, flat)
+        sample.append(picked.view(-1, m, len(part), size).permute(2, 3, 1, 0))
+    estimator = tensor_map(lambda t: t[part, None], fine.estimator)
     solutions = estimator.minimal(*sample)
-    valid = solutions.valid & ~estimator.degenerate(*sample)[..., None]
-    return tensor_map(lambda t: t.flatten(1, 2), solutions.model), valid.flatten(1)
+    return solutions.model, solutions.valid & ~estimator.degenerate(*sample)[..., None]
 
 
 def _cascade(
-    coarse: Problems, models: Any, valid: Bool[Tensor, "g slots"], score: Score
-) -> tuple[Any, Float[Tensor, "g kept"]]:
+    coarse: Problems, models: Any, valid: Bool[Tensor, "g size slots"], options: Options
+) -> tuple[Any, Float[Tensor, "g kept"], Bool[Tensor, "g"]]:
     """The best models and their losses over all data, best first, found by way of ever larger parts of the data."""
     wide = coarse.spread()
-    for level, (number, keep) in enumerate(stages(coarse.width, valid.shape[-1], SCORED)):
+    slots = valid.shape[-1]
+    index, there = gather_valid(valid.flatten(1), OPTIMISED)
+    row = torch.arange(len(index), device=index.device)[:, None]
+    models = cast(tensor_map(lambda t: t[row, index // slots, index % slots], models), options.dtype)
+    loss = there
+    for number, keep in stages(coarse.width, valid.shape[1] * slots):
         data = [d[:, :, :number] for d in wide.data]
         counts = counted(coarse.inside, coarse.weight, number)
-        slots = valid.shape[-1]
-        if level == 0 and coarse.estimator.max_solutions > 1:
-            column, filled = gather_valid(valid)
-            part = losses(wide.estimator, take_slots(models, column), data, coarse.limit, counts, score)
-            loss = part.new_full((len(part), slots + 1), torch.inf)
-            loss = loss.scatter_(1, torch.where(filled, column, slots), part)[:, :slots]
-        else:
-            loss = losses(wide.estimator, models, data, coarse.limit, counts, score)
-        loss = torch.where(valid, loss, torch.inf)
-        chosen = smallest(loss, keep)
-        models, loss, valid = take_slots(models, chosen), loss.gather(1, chosen), valid.gather(1, chosen)
-    return models, loss
+        loss = losses(wide.estimator, models, data, coarse.limit, counts, options.score)
+        loss = torch.where(there, loss, torch.inf)
+        loss, chosen = loss.topk(min(keep, loss.shape[-1]), dim=-1, largest=False)
+        models, there = take_slots(models, chosen), there.gather(1, chosen)
+    return tensor_map(lambda t: t[:, :OPTIMISED], models), loss[:, :OPTIMISED], there[:, 0]
 
 
-def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
-    """Refine the best models in float64 on all data, and keep what does not lose support."""
-    parts, score, k = [], Msac(), fine.estimator.codimension
+def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) -> tuple[Best, Float[Tensor, "p width"]]:
+    """Refine the best models on all data, to the end in float64, and keep what does not lose support; and their distances."""
+    parts, distances, score, k = [], [], Msac(), fine.estimator.codimension
     for part in _split(torch.arange(len(fine.count), device=fine.count.device), fine.width, _NUMBERS):
         some, rough, old = fine.take(part), coarse.take(part).spread(), _take(best, part)
-        wide = some.spread()
-        limit = old.limit.double()
-        prefix = [d[:, :, :SCALE_DATA] for d in rough.data]
-        inside = some.inside[:, :SCALE_DATA]
-        weight = None if rough.weight is None else rough.weight[:, :SCALE_DATA]
+        counts = rough.inside if rough.weight is None else rough.weight
         start = tensor_map(lambda t: t[:, None], old.model)
-        model, reach = scale_of_noise(rough.estimator, start, prefix, old.limit, inside, weight)
-        reach, start = reach.double() * limit, cast(start, torch.float64)
-        model = optimise_within(wide.estimator, cast(model, torch.float64), wide.data, reach, some.inside, some.weight)
-        both = join([model, start], 1)
-        squared = squared_residual(wide.estimator, both, *wide.data)
-        loss = score.cost(squared, limit, some.inside if some.weight is None else some.weight, k)
+        model, reach = scale_of_noise(
+            rough.estimator, start, [d[:, :, :SCALE_DATA] for d in rough.data], old.limit, counts[:, :SCALE_DATA]
+        )
+        model = optimise_within(rough.estimator, model, rough.data, reach * old.limit, counts, FIRST_STEPS)
+        old, reach = cast(old, torch.float64), reach.double() * old.limit
+        wide, counts = some.spread(), some.inside if some.weight is None else some.weight
+        model = optimise_within(wide.estimator, cast(model, torch.float64), wide.data, reach, counts, LAST_STEPS)
+        squared = squared_residual(wide.estimator, model, *wide.data)
+        loss = score.cost(squared, old.limit, counts, k)[:, 0]
+        before = squared_residual(rough.estimator, start, *rough.data)
+        before_loss = score.cost(before, old.limit, counts, k)[:, 0].double()
         # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
-        winner = (loss[:, :1] > 1.02 * loss[:, 1:] + 1).long()
+        won = loss <= 1.02 * before_loss + 1
+        distances.append(torch.where(won[:, None], squared[:, 0], before[:, 0]))
         parts.append(
             replace(
-                cast(old, torch.float64),
-                model=tensor_map(lambda t: t[:, 0], take_slots(both, winner)),
-                loss=loss.gather(1, winner)[:, 0],
-                limit=limit,
-                reach=torch.where(winner[:, 0] == 0, reach, 0),
+                old,
+                model=select(won, tensor_map(lambda t: t[:, 0], model), old.model),
+                loss=torch.where(won, loss, before_loss),
+                reach=torch.where(won, reach, 0),
             )
         )
-    return join(parts)
+    return join(parts), torch.cat(distances)
 
 
 def _take(best: Best, index: Tensor) -> Best:
