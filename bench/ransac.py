@@ -20,7 +20,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bench.ransac_peers import CONFIDENCE, MOST, PEERS, answer
+from bench.ransac_peers import CONFIDENCE, MOST, PEERS, answer, installed
 from bench.ransac_real import report
 from torchsfm.geometry import random_rotation, rotation_angle, rotation_from_rotvec
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography
@@ -149,10 +149,12 @@ def grid(arguments: argparse.Namespace) -> None:
             for ratio in arguments.inliers:
                 scene = scenes(model, most, ratio, arguments.seed, points)
                 rows: list[tuple[str, float, Tensor]] = []
-                for name in filter(None, arguments.peers.split(",")):
+                for name in installed(arguments.peers):
                     if name == "kornia" and model not in "FH":
                         continue
                     few = part(scene, slice(arguments.peer_pairs))
+                    # The first call may compile.
+                    peer(name, model, part(scene, slice(1)))
                     seconds, found = measure(lambda: peer(name, model, few))  # noqa: B023
                     rows.append((name, seconds / len(found), errors(model, few, found)))
                 ours(model, part(scene, slice(2)))
@@ -194,7 +196,7 @@ def main() -> None:
 
         cv2.setNumThreads(arguments.threads)
     if arguments.real:
-        report(arguments.real, [name for name in filter(None, arguments.peers.split(",")) if name != "kornia"])
+        report(arguments.real, [name for name in installed(arguments.peers) if name != "kornia"])
     else:
         grid(arguments)
 

@@ -5,6 +5,7 @@ Models come as 3 x 3 or 3 x 4 arrays, None where a program found nothing. All ar
 """
 
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -102,13 +103,41 @@ def kornia_ransac(model: str, a: Array, b: Array, K: Array, threshold: float) ->
     return found.double().numpy()
 
 
+def fastpose_ransac(model: str, a: Array, b: Array, K: Array, threshold: float) -> Array | None:
+    """Fastpose's LO-RANSAC compiled by numba, with no more samples than the confidence asks for."""
+    from fastpose import estimators
+
+    options = {"iterations": MOST, "min_iterations": 100, "success_prob": CONFIDENCE, "max_error": threshold, "seed": 0}
+    if model == "F":
+        found, info = estimators.estimate_fundamental(a, b, **options)
+        return found["F"] if info["num_inliers"] else None
+    if model == "H":
+        found, info = estimators.estimate_homography(a, b, **options)
+        return found["H"] if info["num_inliers"] else None
+    if model == "P":
+        found, info = estimators.estimate_absolute_pose(b, a, camera=K, **options)
+        return np.column_stack((found["R"], found["t"])) if info["num_inliers"] else None
+    found, info = estimators.estimate_relative_pose(a, b, camera1=K, camera2=K, **options)
+    t = np.ravel(found["t"])
+    length = np.linalg.norm(t)
+    return np.cross(np.eye(3), t / length).T @ found["R"] if info["num_inliers"] and length > 0 else None
+
+
 PEERS: dict[str, Callable[[str, Array, Array, Array, float], Array | None]] = {
     "PoseLib": poselib_default,
     "PL1": poselib_one,
     "MAGSAC": opencv_magsac,
     "pycolmap": pycolmap_loransac,
     "kornia": kornia_ransac,
+    "fastpose": fastpose_ransac,
 }
+MODULES = {"PoseLib": "poselib", "PL1": "poselib", "MAGSAC": "cv2"}
+"""What each is imported as, where it is not its own name."""
+
+
+def installed(names: str) -> list[str]:
+    """Those of some peers, separated by commas, that can be run here."""
+    return [name for name in filter(None, names.split(",")) if find_spec(MODULES.get(name, name)) is not None]
 
 
 def answer(name: str, model: str, a: Array, b: Array, K: Array, threshold: float) -> Array:
