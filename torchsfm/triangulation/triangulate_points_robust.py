@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, Status, check_tensors
-from torchsfm.robust import damped_solve, ransac
+from torchsfm.robust import Score, damped_solve, ransac
 from torchsfm.triangulation.triangulate_points import triangulate_points
 
 
@@ -116,20 +116,33 @@ class RobustTriangulation:
     """Which observations are nearer to the image of the point than the threshold."""
     score: Float[Tensor, "*batch n"]
     """Sum over the views of max(0, 1 - squared distance / squared threshold)."""
+    threshold: Float[Tensor, "*batch n"]
+    """The largest distance of an inlier, given or estimated."""
     iterations: Int[Tensor, "*batch n"]
     """Number of pairs of views tried."""
     status: Int[Tensor, "*batch n"]
     """OK; TOO_FEW: fewer than two observations; NOT_FINITE: fewer than two finite ones; DEGENERATE: no two rays meet at an
-    angle;
-    NO_CONSENSUS: no two views, or of three and more no three, agree on a point."""
+    angle; NO_CONSENSUS: no two views, or of three and more no three, agree on a point; else what `triangulate_points` says of
+    the inliers."""
+    parallax: Float[Tensor, "*batch n"]
+    """The largest angle between two rays of inliers, in radians; zero where `status` is not OK."""
+    covariance: Float[Tensor, "*batch n 3 3"]
+    """Of the point, for independent noise of variance 1 / weight in every image coordinate of the inliers (1 pixel where no
+    weights are given): two views say little about the noise, so it is up to the caller to multiply by its variance, of
+    which the mean of `error` squared over many points tells. Zero where `status` is not OK."""
+    error: Float[Tensor, "*batch n"]
+    """Root-mean-square distance (weighted) between the inliers and the point's images, in pixels; zero where not OK."""
 
 
 def triangulate_points_robust(
     x: Float[Tensor, "*#batch v n 2"],
     P: Float[Tensor, "*#batch v 3 4"],
     *,
-    threshold: float | Float[Tensor, "*#batch n"],
+    threshold: float | Float[Tensor, "*#batch n"] | None,
     visible: Bool[Tensor, "*#batch v n"] | None = None,
+    scores: Float[Tensor, "*#batch v n"] | None = None,
+    weights: Float[Tensor, "*#batch v n"] | None = None,
+    score: Score | None = None,
     generator: torch.Generator | None = None,
     confidence: float = 0.9999,
     max_iterations: int = 256,
@@ -145,39 +158,69 @@ def triangulate_points_robust(
     Args:
         x: Image points, in the pixels of the cameras.
         P: Cameras `K [R | t]`, of any scale and sign.
-        threshold: Largest reprojection error of an inlier, in pixels.
+        threshold: Largest reprojection error of an inlier, in pixels. None where it is not known: more than half of the
+            observations of each point must then be right (`LeastMedian`), and there should be many.
         visible: Which views see which point; all by default. Observations that are not finite are left out too.
+        scores: How much each observation can be trusted, the larger the more, in any unit: the pairs then favour the best.
+        weights: For how many observations each one counts (its inverse variance), 0 for absent.
+        score: How points are compared (see `ransac`).
         generator: Source of randomness.
         confidence: Wanted probability of having tried a pair without wrong observations.
         max_iterations: Most pairs to try for a point.
 
     Returns:
-        The points with their inliers, score, iterations and status.
+        The points with their inliers, score, iterations, status, parallax, covariance and error. The points carry their
+        derivatives with respect to the inliers, their weights and the cameras: those of the least squares over the inliers.
+        They are zero where the status is not OK.
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    batch = check_tensors(x=(x, "v n 2"), P=(P, "v 3 4"), threshold=(limit, "n"), visible=(visible, "v n: bool"))
+    batch = check_tensors(
+        x=(x, "v n 2"), P=(P, "v 3 4"), threshold=(limit, "n"), visible=(visible, "v n: bool"), scores=(scores, "v n"),
+        weights=(weights, "v n"),
+    )  # fmt: skip
     dtype, (v, n) = x.dtype, x.shape[-3:-1]
-    x, P = x.double().expand(*batch, v, n, 2), P.double()
-    seen = torch.isfinite(x).all(-1) if visible is None else (visible & torch.isfinite(x).all(-1)).expand(*batch, v, n)
+    x, P = x.double(), P.double()
     sign = torch.where(torch.linalg.det(P[..., :3]) < 0, -1.0, 1.0).to(P.dtype)
     scale = sign / P[..., 2, :3].norm(dim=-1)
-    data = (P * scale[..., None, None]).flatten(-2).expand(*batch, v, 12)
+    data = (P * scale[..., None, None]).flatten(-2).detach()
+
+    def by_point(t: Tensor | None) -> Tensor | None:
+        return None if t is None else t.detach().expand(*batch, v, n).mT
+
+    if scores is not None:
+        scores = scores.double()
+    if weights is not None:
+        weights = weights.double()
     found = ransac(
-        PointEstimator(), x.transpose(-3, -2), data[..., None, :, :].expand(*batch, n, v, 12),
-        threshold=threshold.double().expand(*batch, n) if isinstance(threshold, Tensor) else threshold,
-        mask=None if visible is None else visible.expand(*batch, v, n).mT, generator=generator, confidence=confidence,
+        PointEstimator(), x.detach().expand(*batch, v, n, 2).transpose(-3, -2), data[..., None, :, :].expand(*batch, n, v, 12),
+        threshold=threshold if limit is None else limit.double().expand(*batch, n), mask=by_point(visible),
+        scores=by_point(scores), weights=by_point(weights), score=score, generator=generator, confidence=confidence,
         min_iterations=16, max_iterations=max_iterations,
     )  # fmt: skip
     inliers = found.inliers.mT
     number = inliers.sum(-2)
+    seen = torch.isfinite(x).all(-1) & torch.isfinite(data).all(-1)[..., None]
+    seen = seen if visible is None else seen & visible
+    seen = seen if weights is None else seen & (weights > 0)
     # Two views agree by chance where their rays happen to meet, so out of more than two a third must confirm them.
     agreed = (number >= 2) & ((number >= 3) | (seen.sum(-2) == 2))
     status = torch.where((found.status == Status.NO_CONSENSUS) & agreed, int(Status.OK), found.status)
     status = torch.where((status == Status.OK) & ~agreed, int(Status.NO_CONSENSUS), status)
-    final = triangulate_points(torch.where(inliers[..., None], x, 0), P, visible=inliers)
-    settled = (status == Status.OK) & (final.status == Status.OK)
-    model = torch.where(settled[..., None], final.model, found.model)
-    return RobustTriangulation(model.to(dtype), inliers, found.score.to(dtype), found.iterations, status)
+    final = triangulate_points(x, P, visible=inliers, weights=weights)
+    status = torch.where(status == Status.OK, final.status, status)
+    settled = status == Status.OK
+
+    return RobustTriangulation(
+        model=torch.where(settled[..., None], final.model, found.model).to(dtype),
+        inliers=inliers,
+        score=found.score.to(dtype),
+        threshold=found.threshold.to(dtype),
+        iterations=found.iterations,
+        status=status,
+        parallax=torch.where(settled, final.parallax, 0).to(dtype),
+        covariance=torch.where(settled[..., None, None], final.covariance, 0).to(dtype),
+        error=torch.where(settled, final.error, 0).to(dtype),
+    )
