@@ -140,6 +140,7 @@ def _losses(
 
 def _others_replaced(d: Tensor, selected: Tensor) -> Tensor:
     """Put a selected datum of the same problem, detached, in the place of all that are not selected: nothing infinite."""
-    first = selected.to(torch.int8).argmax(-1)
-    row = d.detach()[torch.arange(len(d), device=d.device), first] if d.shape[1] else d.detach().new_zeros(len(d), d.shape[2])
+    if d.shape[1] == 0:
+        return d
+    row = d.detach()[torch.arange(len(d), device=d.device), selected.to(torch.int8).argmax(-1)]
     return torch.where(selected[..., None], d, row.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)[:, None])
