@@ -80,8 +80,14 @@ def stages(width: int, slots: int) -> list[tuple[int, int]]:
 
 
 def smallest(score: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]:
-    """The models with the smallest scores, best first."""
-    return score.topk(min(number, score.shape[-1]), dim=-1, largest=False).indices
+    """The models with the smallest scores, best first.
+
+    Of models that are equal but for rounding the first: else the number of columns, which is that of the fullest row, decides,
+    and nonsense, of which nothing agrees with anything, feels its neighbours.
+    """
+    columns = score.shape[-1]
+    later = torch.arange(columns, device=score.device, dtype=score.dtype).mul_(torch.finfo(score.dtype).eps).add_(1)
+    return (score * later).topk(min(number, columns), dim=-1, largest=False).indices
 
 
 def gather_valid(valid: Bool[Tensor, "g s"], least: int) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:

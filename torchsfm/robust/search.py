@@ -261,7 +261,8 @@ def _cascade(
         counts = counted(coarse.inside, coarse.weight, number)
         loss = losses(wide.estimator, models, data, coarse.limit, counts, options.score)
         loss = torch.where(there, loss, torch.inf)
-        loss, chosen = loss.topk(min(keep, loss.shape[-1]), dim=-1, largest=False)
+        chosen = smallest(loss, keep)
+        loss = loss.gather(1, chosen)
         models, there = take_slots(models, chosen), there.gather(1, chosen)
     return tensor_map(lambda t: t[:, :OPTIMISED], models), loss[:, :OPTIMISED], there[:, 0]
 
