@@ -1,6 +1,8 @@
 """The homography from correspondences of which many are wrong."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar
 
 import torch
@@ -9,15 +11,15 @@ from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.geometry import line_and_plane_distances
-from torchsfm.motion.epipolar_fit import forms, matrices, plane_rows
+from torchsfm.motion.epipolar_fit import matrices
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.plane_and_parallax import more_than_chance
 from torchsfm.optim import UnitSphere
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
-# Where entry ((i, j), (k, l)) of a sum of Kronecker products is among 6 x 6 products, both in the order 00, 01, 02, 11, 12, 22.
-_PAIR = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+# Where entry ((i, j), (k, l)) of a sum of Kronecker products is among 6 x 6 products, both in the order 00, 01, 11, 02, 12, 22.
+_PAIR = ((0, 1, 3), (1, 2, 4), (3, 4, 5))
 _KRONECKER = [6 * _PAIR[i][k] + _PAIR[j][m] for i in range(3) for j in range(3) for k in range(3) for m in range(3)]
 
 
@@ -25,7 +27,7 @@ _KRONECKER = [6 * _PAIR[i][k] + _PAIR[j][m] for i in range(3) for j in range(3) 
 class HomographyEstimator:
     """H with x2 ~ H x1, |H| = 1, from points of moderate size around 0. Distances are Sampson's, in the unit of the points.
 
-    With the constraint c = w x2 - y, where (y, w) = H x1, and its derivative B = x2 h3' - H_2x2 over x1 and w I over x2, the
+    With the constraint c = y - w x2, where (y, w) = H x1, and its derivatives B = H_2x2 - x2 h3' over x1 and -w I over x2, the
     squared distance is c' S^-1 c with S = B B' + w^2 I (Chum, Pajdla & Sturm 2005): to first order, the squared distance in
     both images together to the nearest pair of points that corresponds exactly.
     """
@@ -49,8 +51,10 @@ class HomographyEstimator:
         """Squared Sampson distance."""
         c0, c1, _, (s00, s01, s11), _ = _constraint(H, x1, x2)
         # The determinant and the numerator are positive but for rounding.
-        det = (s00 * s11 - s01 * s01).clamp(min=1e-30)
-        return (((s11 * c0 - 2 * s01 * c1) * c0 + s00 * c1 * c1) / det).abs()
+        det = (s00 * s11).addcmul_(s01, s01, value=-1).clamp_(min=1e-30)
+        first = (s11 * c0).addcmul_(s01, c1, value=-1)
+        second = (s00 * c1).addcmul_(s01, c0, value=-1)
+        return first.mul_(c0).addcmul_(second, c1).div_(det).abs_()
 
     def residual(
         self, H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
@@ -82,31 +86,49 @@ class HomographyEstimator:
         *,
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 3"]:
-        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1.
+        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1."""
+        return self.reweighted_step(H, x1, x2, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        H: Float[Tensor, "*#batch 3 3"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        *,
+        weigh: Callable[[Tensor], tuple[Tensor, Tensor]],
+    ) -> Float[Tensor, "*batch 3 3"]:
+        """The step with weights and curvature that follow from the squared distances.
 
         Up to second order, the derivative of the distance is that of the constraint at the points corrected to first order,
         with S held fixed. The constraint is [I, -x2] H x1, so the normal matrix is a sum of Kronecker products of 3 x 3
         matrices.
         """
-        c0, c1, w, (s00, s01, s11), B = _constraint(H, x1, x2)
-        det = s00 * s11 - s01 * s01
-        good = (det > 0) & (weights > 0)
-        inverse = torch.where(good, 1 / torch.where(good, det, 1), 0)
-        k0, k1 = (s11 * c0 - s01 * c1) * inverse, (s00 * c1 - s01 * c0) * inverse
-        x, y = x1[..., 0] - B[0] * k0 - B[2] * k1, x1[..., 1] - B[1] * k0 - B[3] * k1
-        one = torch.ones_like(x)
-        u, v = x2[..., 0] - w * k0, x2[..., 1] - w * k1
-        inverse, k0, k1 = inverse * weights, k0 * weights, k1 * weights
-        q00, q01, q11 = s11 * inverse, -s01 * inverse, s00 * inverse
-        # The distinct entries of [-I, x2]' S^-1 [-I, x2], and those of h1 h1'.
-        z0, z1 = q00 * u + q01 * v, q01 * u + q11 * v
-        metric = torch.stack((q00, q01, -z0, q11, -z1, z0 * u + z1 * v), -2)
-        moments = (metric @ torch.stack((x * x, x * y, x, y * y, y, one), -2).mT).double().flatten(-2)
-        A = matrices(moments.index_select(-1, torch.tensor(_KRONECKER, device=H.device)), 9)
-        b = (torch.stack((-k0, -k1, k0 * u + k1 * v), -2) @ torch.stack((x, y, one), -2).mT).double().flatten(-2)
+        c0, c1, w, (s00, s01, s11), (b00, b01, b10, b11) = _constraint(H, x1, x2)
+        # So large that nothing overflows, and what has no weight adds nothing.
+        least = torch.finfo(c0.dtype).tiny ** (1 / 3)
+        inverse = (s00 * s11).addcmul_(s01, s01, value=-1).clamp_(min=least).reciprocal_()
+        k0 = (s11 * c0).addcmul_(s01, c1, value=-1).mul_(inverse)
+        k1 = (s00 * c1).addcmul_(s01, c0, value=-1).mul_(inverse)
+        weights, curvature = weigh((k0 * c0).addcmul_(k1, c1).abs_())
+        (x, y), (u, v) = x1.unbind(-1), x2.unbind(-1)
+        x = torch.addcmul(x, b00, k0, value=-1).addcmul_(b10, k1, value=-1)
+        y = torch.addcmul(y, b01, k0, value=-1).addcmul_(b11, k1, value=-1)
+        u, v = torch.addcmul(u, w, k0), torch.addcmul(v, w, k1)
+        # The distinct entries of [I, -x2]' S^-1 [I, -x2] and those of S^-1 c times [I, -x2], but for their signs.
+        inverse = inverse * curvature
+        q00, q01, q11 = s11.mul_(inverse), s01.mul_(inverse), s00.mul_(inverse)
+        z0, z1 = (q00 * u).addcmul_(q01, v, value=-1), (q11 * v).addcmul_(q01, u, value=-1)
+        k0, k1 = k0.mul_(weights), k1.mul_(weights)
+        rows = torch.stack((q00, q01, q11, z0, z1, (z0 * u).addcmul_(z1, v), k0, k1, (k0 * u).addcmul_(k1, v)), -2)
+        products = torch.stack((x * x, x * y, y * y, x, y, torch.ones_like(x)), -2)
+        entries, signs = _constants(H.device)
+        moments = rows @ products.mT * signs
+        A = moments[..., :6, :].flatten(-2).index_select(-1, entries)
         h = H.double().flatten(-2)
-        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * h[..., :, None] * h[..., None, :]
-        h = h - damped_solve(A, b[..., None])[..., 0]
+        # The unit sphere's normal, as large as the rest.
+        size = A[..., ::10].mean(-1, keepdim=True)
+        A = torch.addcmul(matrices(A, 9), (size * h)[..., None], h[..., None, :])
+        h = h - damped_solve(A, moments[..., 6:, 3:].reshape(*h.shape, 1))[..., 0]
         return matrices(h / (h * h).sum(-1, keepdim=True).sqrt(), 3).to(x1.dtype)
 
     def retract(self, H: Float[Tensor, "*#batch 3 3"], step: Float[Tensor, "*#batch 8"]) -> Float[Tensor, "*batch 3 3"]:
@@ -133,14 +155,24 @@ def _constraint(
     H: Tensor, x1: Tensor, x2: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
     """The constraint c, the depth w, S, and B row by row."""
-    y0, y1, w = forms(H, plane_rows(x1))
-    u, v = x2[..., 0], x2[..., 1]
-    c0, c1 = u * w - y0, v * w - y1
-    h00, h01, h10, h11, h20, h21 = (H[..., i, j, None] for i in range(3) for j in range(2))
-    b00, b01, b10, b11 = u * h20 - h00, u * h21 - h01, v * h20 - h10, v * h21 - h11
+    h00, h01, h02, h10, h11, h12, h20, h21, h22 = H.flatten(-2).unsqueeze(-1).unbind(-2)
+    (x, y), (u, v) = x1.unbind(-1), x2.unbind(-1)
+    w = torch.addcmul(h22, h20, x).addcmul_(h21, y)
+    b00, b01 = torch.addcmul(h00, h20, u, value=-1), torch.addcmul(h01, h21, u, value=-1)
+    b10, b11 = torch.addcmul(h10, h20, v, value=-1), torch.addcmul(h11, h21, v, value=-1)
+    c0 = torch.addcmul(h02, h22, u, value=-1).addcmul_(b00, x).addcmul_(b01, y)
+    c1 = torch.addcmul(h12, h22, v, value=-1).addcmul_(b10, x).addcmul_(b11, y)
     ww = w * w
-    S = (b00 * b00 + b01 * b01 + ww, b00 * b10 + b01 * b11, b10 * b10 + b11 * b11 + ww)
-    return c0, c1, w, S, (b00, b01, b10, b11)
+    s00, s01 = torch.addcmul(ww, b00, b00).addcmul_(b01, b01), (b00 * b10).addcmul_(b01, b11)
+    s11 = ww.addcmul_(b10, b10).addcmul_(b11, b11)
+    return c0, c1, w, (s00, s01, s11), (b00, b01, b10, b11)
+
+
+@cache
+def _constants(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Where the entries of the normal matrix are among the moments, and the signs of the moments."""
+    signs = torch.tensor((1, -1, 1, -1, -1, 1, 1, 1, -1), dtype=torch.float64, device=device)
+    return torch.tensor(_KRONECKER, device=device), signs[:, None]
 
 
 def estimate_homography(
