@@ -69,14 +69,12 @@ class HomographyEstimator:
         """
         areas = []
         for x in (x1, x2):
-            (u0, u1, u2, u3), (v0, v1, v2, v3) = x[..., 0].unbind(-1), x[..., 1].unbind(-1)
-            a, b, c, d, e, f = u1 - u0, v1 - v0, u2 - u0, v2 - v0, u3 - u0, v3 - v0
-            first, second, third = a * d - b * c, a * f - b * e, c * f - d * e
-            areas.append((first, second, third, first + third - second))
-        bad = areas[0][0] * areas[1][0] <= 0
-        for one, other in zip(areas[0][1:], areas[1][1:], strict=True):
-            bad = bad | (one * other <= 0)
-        return bad
+            (u0, u1, u2), (v0, v1, v2) = (row.unbind(-1) for row in (x[..., 1:, :] - x[..., :1, :]).unbind(-1))
+            first, second = (u0 * v1).addcmul_(u1, v0, value=-1), (u1 * v2).addcmul_(u2, v1, value=-1)
+            third = (u2 * v0).addcmul_(u0, v2, value=-1)
+            areas.append((first, second, third, first + second + third))
+        a, b, c, d = (one * other for one, other in zip(*areas, strict=True))
+        return torch.minimum(torch.minimum(a, b), torch.minimum(c, d)) <= 0
 
     def refine(
         self,
