@@ -8,10 +8,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
+from torchsfm.geometry import line_and_plane_distances
 from torchsfm.optim import rotation_exponential
+from torchsfm.resection._reprojection_step import pose_step, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score
+from torchsfm.robust.local_optimisation import Weigh
 
 
 @dataclass(frozen=True)
@@ -64,31 +66,18 @@ class CameraEstimator:
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 4"]:
         """A Gauss-Newton step on the reprojection error, the pose moving from the left: [R | t] <- exp(w) [R | t] + [0 | v]."""
-        Y = model[..., :3] @ X.mT + model[..., 3:]
-        y0, y1, y2 = Y.unbind(-2)
-        good = (weights > 0) & (y2 > 0)
-        inverse = torch.where(good, 1 / torch.where(good, y2, 1), 0)
-        a, b = y0 * inverse, y1 * inverse
-        k00, k01, k02, k10, k11, k12 = (self.K[..., i, j, None] for i in range(2) for j in range(3))
-        w = torch.where(good, weights, 0)
-        root = w.sqrt()
-        zero = torch.zeros_like(a)
-        # Derivatives of (a, b) over (w, v).
-        da = torch.stack((-a * b, 1 + a * a, -b, inverse, zero, -a * inverse), -2)
-        db = torch.stack((-1 - b * b, a * b, a, zero, inverse, -b * inverse), -2)
-        ru, rv = k00 * a + k01 * b + k02 - x[..., 0], k10 * a + k11 * b + k12 - x[..., 1]
-        ju = (k00[..., None] * da + k01[..., None] * db) * root[..., None, :]
-        jv = (k10[..., None] * da + k11[..., None] * db) * root[..., None, :]
-        J, r = torch.cat((ju, jv), -1), torch.cat((ru * root, rv * root), -1)
-        full = torch.cat((J, r[..., None, :]), -2)
-        moments = (full @ J.mT).double()
-        A, g = moments[..., :6, :], moments[..., 6, :]
-        step = -damped_solve(A, g[..., None])[..., 0]
-        pose = rotation_from_rotvec(step[..., :3]) @ model.double()
-        R, t = pose[..., :3], pose[..., 3:] + step[..., 3:, None]
-        # What a start in lower precision lacks to a rotation.
-        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
-        return torch.cat((R, t), -1).to(x.dtype)
+        return self.reweighted_step(model, x, X, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        return pose_step(model, self.K, x, X, weigh)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3 4"]:
         """[R | t] <- exp(w) [R | t] + [0 | v], as `Pose.retract`."""
@@ -206,22 +195,6 @@ def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:
     R = model[..., :3]
     t = model[..., 3:] * size[..., None, None] - R @ centre[..., None]
     return torch.cat((R, t), -1)
-
-
-def squared_reprojection(
-    P: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
-) -> Float[Tensor, "*batch n"]:
-    """Squared reprojection error; infinite behind the camera."""
-    points = torch.cat((X.mT, torch.ones_like(X.mT[..., :1, :])), -2)
-    if P.ndim == X.ndim and P.ndim > 2 and X.shape[-3] == 1 and P.shape[-3] > 1:
-        # Several models of the same data: one product for all.
-        product = P.reshape(*P.shape[:-3], 3 * P.shape[-3], 4) @ points[..., 0, :, :]
-        y0, y1, y2 = product.reshape(*P.shape[:-1], X.shape[-2]).unbind(-2)
-    else:
-        y0, y1, y2 = (P @ points).unbind(-2)
-    inverse = 1 / y2
-    u, v = y0 * inverse - x[..., 0], y1 * inverse - x[..., 1]
-    return (u * u + v * v).masked_fill(~(y2 > 0), torch.inf)
 
 
 def middle_and_size(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,9 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
 from torchsfm.optim import rotation_exponential
+from torchsfm.resection._reprojection_step import squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
-from torchsfm.resection.estimate_camera import middle_and_size, moderate, present, squared_reprojection, world_pose
+from torchsfm.resection.estimate_camera import middle_and_size, moderate, present, world_pose
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 

@@ -12,7 +12,8 @@ from torchsfm.geometry import line_and_plane_distances
 from torchsfm.linalg import nullspace_rows
 from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
 from torchsfm.resection._focal import incidence_rows
-from torchsfm.resection.estimate_camera import moderate, present, squared_reprojection
+from torchsfm.resection._reprojection_step import squared_reprojection
+from torchsfm.resection.estimate_camera import moderate, present
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 _CHUNK = 4096

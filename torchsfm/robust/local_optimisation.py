@@ -156,11 +156,11 @@ def _falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tenso
 def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"]) -> Float[Tensor, "*batch k r"]:
     """Solve normal equations `A x = b`, damped as little as makes them definite; zero where even that fails.
 
-    The unknowns are scaled to a unit diagonal first, so that they may be of different units.
+    The damping is relative to the diagonal, so that the unknowns may be of different units.
     """
-    scale = A.diagonal(dim1=-2, dim2=-1).clamp(min=1e-280).rsqrt()
-    eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
-    factor, info = torch.linalg.cholesky_ex(A * scale[..., :, None] * scale[..., None, :] + 1e-10 * eye)
-    factor = torch.where((info == 0)[..., None, None], factor, eye)
-    x = torch.cholesky_solve(b * scale[..., None], factor) * scale[..., None]
-    return torch.where((info == 0)[..., None, None] & torch.isfinite(x), x, 0)
+    A = A.clone()
+    # As much as 1e-10 on the diagonal of the matrix scaled to a unit one; the scaling itself changes nothing.
+    A.diagonal(dim1=-2, dim2=-1).mul_(1 + 1e-10).add_(1e-290)
+    factor, info = torch.linalg.cholesky_ex(A)
+    x = torch.cholesky_solve(b, factor).nan_to_num_(0, 0, 0)
+    return x.mul_((info == 0)[..., None, None])
