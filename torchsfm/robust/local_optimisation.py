@@ -99,7 +99,7 @@ def scale_of_noise(
     k = estimator.codimension
     # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
     peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
-    present = counts[:, None] > 0
+    present = counts[:, None]
     variance = number = reach = torch.empty(0)
 
     def weigh(squared: Tensor, first: bool = False, last: bool = False) -> tuple[Tensor, Tensor]:
@@ -107,7 +107,7 @@ def scale_of_noise(
         ratio = squared * (1 / limit)[:, None, None]
         density = around_model(ratio, present, k)[..., None]
         if first:
-            core = ((ratio < 1) & present).to(ratio.dtype)
+            core = ((ratio < 1) * present).to(ratio.dtype)
             number = core.sum(-1, keepdim=True).clamp(min=1)
             # A Gaussian cut off at the threshold looks narrower than it is.
             variance = (1.6 / k * (core * ratio.clamp(max=1)).sum(-1, keepdim=True) / number).clamp(_LEAST, 1)
@@ -117,7 +117,7 @@ def scale_of_noise(
             return ratio, ratio
         # What the next step takes for the noise.
         odds = density / inlying * torch.exp((0.5 * ratio / variance).clamp(max=60))
-        likely = torch.where(present & (ratio < 9), 1 / (1 + odds), 0)
+        likely = torch.where(ratio < 9, 1 / (1 + odds), 0) * present
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1)
         return _falling(ratio * (1 / reach), counts, k)

@@ -38,7 +38,8 @@ class RobustResult(Generic[M]):
     Attributes:
         model: The model; finite numbers without meaning where the status says that none was found.
         inliers: Which data are nearer to the model than the threshold.
-        score: Sum over the data of max(0, 1 - squared distance / squared threshold): a soft number of inliers.
+        score: Sum over the data of (their weights times) max(0, 1 - squared distance / squared threshold): a soft number of
+            inliers.
         threshold: The largest distance of an inlier, given or estimated.
         iterations: Number of samples drawn.
         status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample
@@ -93,7 +94,7 @@ def ransac(
         scores: How much each datum can be trusted, the larger the more, in any unit. Half of the samples then favour the best
             (PROSAC, Chum & Matas 2005), and the search ends as soon as the samples of the best data suffice.
         weights: For how many data each datum counts: in sampling (without `scores`), in comparing models, in refinement. 0 is
-            absent.
+            absent. In any unit: what is consensus depends on their ratios alone.
         score: How models are compared: `Msac()` (the default), `Magsac()`, `InlierCount()`, `LeastMedian()`.
         generator: Source of randomness; PyTorch's global one if not given.
         confidence: Wanted probability of having drawn a sample without outliers.
@@ -144,6 +145,8 @@ def ransac(
             enough &= usable.sum(-1) >= estimator.sample_size
         elif n < estimator.sample_size:
             enough = torch.zeros_like(enough)
+        if given is not None and usable is not None:
+            given, unit = _evidence(given, usable)
         trust = None if scores is None else _in_one_batch(scores, batch, 1)
         options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype, score)
         found = []
@@ -156,6 +159,7 @@ def ransac(
             for member, part in found:
                 result = zip_map(lambda old, new: old.index_copy(0, member, new), result, part)  # noqa: B023
     model, spread = result.model, None
+    support = result.support if given is None else result.support * unit
     if covariance or (has_manifold(estimator) and wants_derivative(*graph, *tensors_of((counts, own)))):
         counts = bound.new_ones(p, n) if counts is None else counts
         if covariance:
@@ -165,7 +169,7 @@ def ransac(
     return RobustResult(
         tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
         result.inliers.reshape(*batch, n),
-        result.support.to(dtype).reshape(batch),
+        support.to(dtype).reshape(batch),
         result.bound.to(dtype).reshape(batch),
         result.iterations.reshape(batch),
         result.status.reshape(batch),
@@ -195,6 +199,19 @@ def _usable(data: Sequence[Tensor], exists: Tensor | None, counts: Tensor | None
         row = torch.isfinite(counts) & (counts > 0)
         usable = row if usable is None else usable & row
     return usable
+
+
+def _evidence(weights: Tensor, usable: Tensor) -> tuple[Float[Tensor, "p n"], Float[Tensor, "p"]]:
+    """Weights in a unit in which their sum is the number of equal data that tell as much (Kish 1965), and that unit.
+
+    What is consensus and what is chance cannot depend on the unit in which the caller weighs.
+    """
+    weights = torch.where(usable, weights, 0)
+    top = weights.amax(-1).clamp(min=1e-300) if weights.shape[-1] else weights.new_ones(len(weights))
+    share = weights / top[:, None]
+    unit = (share * share).sum(-1) / share.sum(-1).clamp(min=1e-300)
+    unit = torch.where(unit > 0, unit, 1)
+    return share / unit[:, None], unit * top
 
 
 @dataclass(frozen=True)
@@ -241,9 +258,14 @@ def _outcome(problems: Problems, best: Best, squared: Float[Tensor, "p width"], 
     ratio = torch.where(problems.inside, squared / limit[:, None], torch.inf).nan_to_num_(nan=torch.inf)
     near = ratio < 1
     soft = (1 - ratio).clamp_(min=0)
-    soft = (soft if problems.weight is None else soft * problems.weight).sum(-1)
     number, expected = near.sum(-1), around_model(ratio, problems.inside, estimator.codimension)
-    agreed = (number > size) & beyond_chance(soft, problems.count, expected, size)
+    if problems.weight is None:
+        soft = soft.sum(-1)
+        likely = beyond_chance(soft, problems.count, expected, size)
+    else:
+        soft, weight = (soft * problems.weight).sum(-1), problems.weight
+        likely = beyond_chance(soft, weight.sum(-1), around_model(ratio, weight, estimator.codimension), size)
+    agreed = (number > size) & likely
     fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
     optimal = agreed & best.solved & (reach > 0)
     reach = torch.where(optimal, reach, 1)

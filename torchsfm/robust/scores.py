@@ -136,14 +136,19 @@ class LeastMedian:
     needs_threshold: ClassVar[bool] = False
 
     def cost(self, squared: Tensor, limit: Tensor, weight: Tensor | None, codimension: int) -> Tensor:
-        """The median over the data of positive weight."""
+        """The median over the data."""
         n = squared.shape[-1]
         if weight is None:
             return squared.nan_to_num(nan=torch.inf).kthvalue(n // 2 + 1, dim=-1).values
         there = weight > 0
-        ordered = torch.where(there[:, None], squared, torch.inf).nan_to_num(nan=torch.inf).sort(dim=-1).values
-        rank = (there.sum(-1) // 2).clamp(max=n - 1)
-        return ordered.gather(-1, rank[:, None, None].expand(-1, squared.shape[1], 1))[..., 0]
+        ordered, order = torch.where(there[:, None], squared, torch.inf).nan_to_num(nan=torch.inf).sort(dim=-1)
+        if weight.dtype == torch.bool:
+            rank = (there.sum(-1) // 2)[:, None, None].expand(-1, squared.shape[1], 1)
+        else:
+            # The first before which and with which there is more than half of the weight.
+            below = weight[:, None].expand_as(squared).gather(-1, order).cumsum(-1)
+            rank = (below <= 0.5 * weight.sum(-1)[:, None, None]).sum(-1, keepdim=True)
+        return ordered.gather(-1, rank.clamp(max=n - 1))[..., 0]
 
     def weigh(self, ratio: Tensor, codimension: int) -> Tensor:
         """1 within the threshold."""

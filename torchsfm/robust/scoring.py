@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchsfm._types import tensor_map
@@ -103,22 +103,22 @@ def gather_valid(valid: Bool[Tensor, "g s"], least: int) -> tuple[Int[Tensor, "g
 
 
 def around_model(
-    ratio: Float[Tensor, "*batch n"], inside: Bool[Tensor, "*#batch n"], codimension: int
+    ratio: Float[Tensor, "*batch n"], counts: Shaped[Tensor, "*#batch n"], codimension: int
 ) -> Float[Tensor, "*batch"]:
     """How many data the threshold would take in if they were as dense there as between two and six thresholds from the model.
 
     Args:
         ratio: Squared distances in units of the squared threshold.
-        inside: Which slots hold data.
+        counts: What the data count: a boolean or a weight.
         codimension: The number of dimensions across the model.
     """
-    between = ((ratio > 4) & (ratio < 36) & inside).sum(-1)
+    between = ((ratio > 4) & (ratio < 36)).mul(counts).sum(-1)
     expected: Tensor = (between + 0.5) / (6**codimension - 2**codimension)
     return expected
 
 
 def beyond_chance(
-    support: Float[Tensor, "p"], count: Int[Tensor, "p"], expected: Float[Tensor, "p"], size: int
+    support: Float[Tensor, "p"], count: Shaped[Tensor, "p"], expected: Float[Tensor, "p"], size: int
 ) -> Bool[Tensor, "p"]:
     """Whether so much support is more than the best of all samples finds by chance (Moisan & Stival 2004, bounded by entropy).
 
