@@ -20,7 +20,7 @@ from torchsfm.geometry.distortion import (
     Radial,
     SimpleRadial,
 )
-from torchsfm.geometry.flatness import line_and_plane_distances
+from torchsfm.geometry.flatness import least_number_off, line_and_plane_distances
 from torchsfm.geometry.homogeneous import (
     from_homogeneous,
     normalize_sphere,
@@ -66,6 +66,7 @@ __all__ = [
     "from_homogeneous",
     "intrinsics",
     "krt_from_camera",
+    "least_number_off",
     "line_and_plane_distances",
     "normalize_shape",
     "normalize_sphere",

@@ -1,7 +1,7 @@
 """Do points lie on a line, or in a plane?"""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -38,3 +38,31 @@ def line_and_plane_distances(
             weights = torch.where(present, spread / (distance + 1e-2 * spread), 0)
         found.append(distance)
     return found[0], found[-1]
+
+
+def least_number_off(
+    X: Float[Tensor, "*batch n d"], present: Bool[Tensor, "*batch n"], tolerance: Float[Tensor, "*#batch #n"]
+) -> Int[Tensor, "*batch"]:
+    """How many points are farther than a tolerance from any hyperplane whatsoever (in two dimensions, line), at least.
+
+    The number of disjoint simplices, of points that follow one another, that fit between no two hyperplanes twice the tolerance
+    apart: of each, one corner or more is off. With the edges D from one corner, the width of a simplex in the direction of a
+    unit vector u is at least max |D u| >= 1 / (|D^-1| sqrt(d)).
+
+    Args:
+        X: Points.
+        present: Which points count.
+        tolerance: Of each point, in the unit of the points.
+    """
+    n, d = X.shape[-2:]
+    number = n // (d + 1)
+    rank = present.cumsum(-1)
+    wanted = torch.arange(1, number * (d + 1) + 1, device=X.device).expand(*rank.shape[:-1], -1).contiguous()
+    # Where there are too few points, the last one stands for the others, and the simplex has no width.
+    place = torch.searchsorted(rank, wanted).clamp_(max=n - 1)
+    corners = X.gather(-2, place[..., None].expand(*place.shape, d)).reshape(*place.shape[:-1], number, d + 1, d)
+    wide = tolerance.expand(rank.shape).gather(-1, place).reshape(corners.shape[:-1]).amax(-1)
+    inverse, info = torch.linalg.inv_ex(corners[..., 1:, :] - corners[..., :1, :])
+    thick = (inverse * inverse).sum((-2, -1)) * (wide * wide) * (4 * d) < 1
+    least: Tensor = (thick & (info == 0)).sum(-1)
+    return least

@@ -21,7 +21,8 @@ from torchsfm.motion.epipolar_fit import (
     squared_from_rows,
 )
 from torchsfm.motion.essential_5pt import essential_5pt
-from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, squared_transfer
+from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, squared_transfer
+from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 from torchsfm.tensors import essential_from_pose
@@ -131,6 +132,22 @@ class RelativePoseEstimator:
         """R <- exp(w) R, and t along the unit sphere."""
         R = rotation_exponential(step[..., :3]) @ model[..., :3]
         return torch.cat((R, UnitSphere(3).retract(model[..., 3], step[..., 3:])[..., None]), -1)
+
+    def suspect(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether R alone, or R + t n', may relate all inliers but so few as chance explains: a plane at any distance."""
+        h2 = d2.mT
+        h2 = h2 * (h2 * h2).sum(-2, keepdim=True).rsqrt()
+        limit, spare = 4 * threshold * threshold, most_by_chance(chance, 2)
+        return plane_suspected(model[..., :3], model[..., 3], d1.mT, h2, inliers, limit, spare)
 
     def degeneracy(
         self,

@@ -21,7 +21,8 @@ from torchsfm.motion.epipolar_fit import (
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.normalization import common_scale, largest_positive
-from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, plane_rivals
+from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_rivals
+from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 
 
@@ -129,6 +130,23 @@ class FundamentalEstimator:
     ) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
         """Where a plane holds most inliers: F of its homography and of two points off it (Chum, Werner & Matas 2005)."""
         return plane_rivals(self, HomographyEstimator(), model, x1, x2, inside=inside, threshold=threshold, seed=seed)
+
+    def suspect(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"] | None = None,
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
+        F, e = model[..., :3], model[..., 3]
+        h1, h2 = (torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0) for x in (x1, x2))
+        spare = 2.0 if chance is None else most_by_chance(chance, 2)
+        A = torch.linalg.cross(e[..., None], F, dim=-2)
+        return plane_suspected(A, e, h1, h2, inliers, 4 * threshold * threshold, spare)
 
     def degeneracy(
         self,

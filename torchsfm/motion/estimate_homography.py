@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import line_and_plane_distances
+from torchsfm.geometry import least_number_off, line_and_plane_distances
 from torchsfm.motion.epipolar_fit import matrices
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale, largest_positive
@@ -132,6 +132,19 @@ class HomographyEstimator:
     def retract(self, H: Float[Tensor, "*#batch 3 3"], step: Float[Tensor, "*#batch 8"]) -> Float[Tensor, "*batch 3 3"]:
         """H moved along the unit sphere."""
         return matrices(UnitSphere(9).retract(H.flatten(-2), step), 3)
+
+    def suspect(
+        self,
+        H: Float[Tensor, "*#batch 3 3"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether the inliers may be on a line."""
+        return ~more_than_chance(least_number_off(x1, inliers, 2 * threshold[..., None]), chance, -1)
 
     def degeneracy(
         self,

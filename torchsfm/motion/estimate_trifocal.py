@@ -10,8 +10,8 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.motion.multilinear_fit import frame_directions, free_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
-from torchsfm.motion.plane_and_parallax import more_than_chance
-from torchsfm.motion.three_view_parallax import planar, rivals_of_plane
+from torchsfm.motion.plane_and_parallax import more_than_chance, most_by_chance
+from torchsfm.motion.three_view_parallax import planar, planar_suspected, rivals_of_plane
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
@@ -116,6 +116,21 @@ class TrifocalEstimator:
     ) -> Solutions[Float[Tensor, "p k 2 3 4"]]:
         """Where most inliers are in a plane, the best cameras of that plane and two points off it."""
         return rivals_of_plane(self, model, (x1, x2, x3), inside, threshold, seed)
+
+    def suspect(
+        self,
+        model: Float[Tensor, "*#batch 2 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        x3: Float[Tensor, "*#batch n 2"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"] | None = None,
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
+        spare = 2.0 if chance is None else most_by_chance(chance, 2)
+        return planar_suspected(model, (x1, x2, x3), inliers, threshold * threshold, spare)
 
     def degeneracy(
         self,

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.motion.epipolar_fit import cross_rows, forms, plane_rows
+from torchsfm.motion.plane_glance import GLANCE
 from torchsfm.robust import damped_solve
 from torchsfm.robust.sampling import draw_samples
 
@@ -119,14 +120,17 @@ def plane_rivals(
         threshold: Largest distance of an inlier.
         seed: Seed for the pairs.
     """
-    limit = threshold * threshold
-    # First a look at a part, spread over all.
-    some = min(x1.shape[1], 2 * _OFF_PLANE)
-    _, on, near = _on_plane(estimator, model, x1[:, :some], x2[:, :some], inside[:, :some], limit)
-    suspect = (2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)
     out = model[:, None].expand(-1, _RIVALS, -1, -1).clone()
     valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
-    row = suspect.nonzero()[:, 0]
+    limit = threshold * threshold
+    # First a glance, then a look at a part; any part is spread over all.
+    some = slice(GLANCE)
+    near = (estimator.squared_residual(model, x1[:, some], x2[:, some]) < limit[:, None]) & inside[:, some]
+    row = estimator.suspect(model, x1[:, some], x2[:, some], inliers=near, threshold=threshold).nonzero()[:, 0]
+    if len(row):
+        some = slice(2 * _OFF_PLANE)
+        _, on, near = _on_plane(estimator, model[row], x1[row, some], x2[row, some], inside[row, some], limit[row])
+        row = row[(2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)]
     if not len(row):
         return Solutions(out, valid)
     y1, y2, there, bound = x1[row], x2[row], inside[row], limit[row]
@@ -186,9 +190,14 @@ def fundamentals_of_parallax(
     return F * torch.where(size > 1e-30, size, torch.inf).rsqrt(), e
 
 
+def most_by_chance(chance: Float[Tensor, "*batch"], free: int) -> Float[Tensor, "*batch"]:
+    """How many points may agree by chance with a model of which the others leave `free` dimensions open."""
+    return chance + 3 * chance.sqrt() + (free + 2)
+
+
 def more_than_chance(number: Int[Tensor, "*batch"], chance: Float[Tensor, "*batch"], free: int) -> Bool[Tensor, "*batch"]:
-    """Whether so many points agree with a model of which the others leave `free` dimensions open, rather than by chance."""
-    return number > free + 2 + chance + 3 * chance.sqrt()
+    """Whether so many points agree with such a model, rather than by chance."""
+    return number > most_by_chance(chance, free)
 
 
 def _parallax(A: Tensor, e: Tensor, h1: Sequence[Tensor], h2: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

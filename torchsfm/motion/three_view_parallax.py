@@ -15,6 +15,7 @@ from torchsfm._types import Solutions
 from torchsfm.motion.epipolar_fit import forms, plane_rows
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.plane_and_parallax import dominant_plane, squared_transfer
+from torchsfm.motion.plane_glance import GLANCE, plane_suspected
 from torchsfm.robust.sampling import draw_samples
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -42,17 +43,22 @@ def rivals_of_plane(
         threshold: Largest distance of an inlier.
         seed: Seed for the pairs.
     """
-    limit = threshold * threshold
-    near = (estimator.squared_residual(model, *x) < limit[:, None]) & inside
-    H, on = _planes(model, x, near, limit)
-    suspect = (2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)
     out = model[:, None].expand(-1, _RIVALS, -1, -1, -1).clone()
     valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
-    row = suspect.nonzero()[:, 0]
+    limit = threshold * threshold
+    part = [y[:, :GLANCE] for y in x]
+    near = (estimator.squared_residual(model, *part) < limit[:, None]) & inside[:, :GLANCE]
+    row = estimator.suspect(model, *part, inliers=near, threshold=threshold).nonzero()[:, 0]
     if not len(row):
         return Solutions(out, valid)
-    x, inside, limit, on = [y[row] for y in x], inside[row], limit[row], on[row]
-    H = [h[row] for h in H]
+    x, inside, limit = [y[row] for y in x], inside[row], limit[row]
+    near = (estimator.squared_residual(model[row], *x) < limit[:, None]) & inside
+    H, on = _planes(model[row], x, near, limit)
+    kept = ((2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)).nonzero()[:, 0]
+    if not len(kept):
+        return Solutions(out, valid)
+    row, x, inside, limit, on = row[kept], [y[kept] for y in x], inside[kept], limit[kept], on[kept]
+    H = [h[kept] for h in H]
     plane = HomographyEstimator()
     for _ in range(3):
         H = [plane.refine(h, x[0], y, weights=on.to(h.dtype)) for h, y in zip(H, x[1:], strict=True)]
@@ -82,6 +88,22 @@ def rivals_of_plane(
     valid[row] = (least.values < counts.sum(-1, keepdim=True)) & (count >= 2)[:, None]
     valid &= torch.isfinite(out).flatten(2).all(-1)
     return Solutions(torch.where(valid[..., None, None, None], out, model[:, None]), valid)
+
+
+def planar_suspected(
+    model: Float[Tensor, "*batch 2 3 4"],
+    x: Sequence[Tensor],
+    inliers: Bool[Tensor, "*batch n"],
+    limit: Float[Tensor, "*batch"],
+    spare: Float[Tensor, "*batch"] | float,
+) -> Bool[Tensor, "*batch"]:
+    """Whether one plane may hold half of the inliers in both pairs of views, or all but a few (see `plane_suspected`)."""
+    first, *others = (torch.nn.functional.pad(y.mT, (0, 0, 0, 1), value=1.0) for y in x)
+    pairs = [
+        plane_suspected(model[..., k, :, :3], model[..., k, :, 3], first, other, inliers, 4 * limit, spare)
+        for k, other in enumerate(others)
+    ]
+    return pairs[0] & pairs[1]
 
 
 def planar(

@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import line_and_plane_distances
 from torchsfm.optim import rotation_exponential
+from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import pose_step, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score
+from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
 
 
@@ -84,6 +84,19 @@ class CameraEstimator:
         moved = rotation_exponential(step[..., :3]) @ model
         return torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:, None]), -1)
 
+    def suspect(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether the inliers may be in a plane."""
+        return flatness_suspected(model, X, self._focal(model), inliers, threshold, 2 + chance)
+
     def degeneracy(
         self,
         model: Float[Tensor, "*#batch 3 4"],
@@ -95,14 +108,11 @@ class CameraEstimator:
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
         """COLLINEAR: all inliers but so few as chance explains are on a line, as far as can be seen; PLANAR: in a plane."""
-        line, plane = line_and_plane_distances(X, inliers)
-        focal = (self.K[..., 0, 0] * self.K[..., 1, 1]).abs().sqrt()
-        depth = (X @ model[..., 2, :3, None])[..., 0] + model[..., 2, 3:]
-        # Rounding counts too: where no sample determined a pose, there is no depth to judge by.
-        visible = 2 * threshold[..., None] * depth.abs() / focal[..., None] + 1e-9 * X.abs().amax(-1)
-        off_line, off_plane = ((inliers & (distance > visible)).sum(-1) > 2 + chance for distance in (line, plane))
-        code = torch.where(off_plane, int(Degeneracy.NONE), int(Degeneracy.PLANAR))
-        return torch.where(off_line, code, int(Degeneracy.COLLINEAR)).to(torch.int8)
+        return flatness(model, X, self._focal(model), inliers, threshold, 2 + chance)
+
+    def _focal(self, model: Tensor) -> Tensor:
+        focal: Tensor = (self.K[..., 0, 0] * self.K[..., 1, 1]).abs().sqrt()
+        return focal
 
 
 def estimate_camera(

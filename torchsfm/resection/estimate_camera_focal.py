@@ -8,12 +8,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import line_and_plane_distances, rotation_from_rotvec
+from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.optim import rotation_exponential
+from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
 from torchsfm.resection.estimate_camera import middle_and_size, moderate, present, world_pose
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
+from torchsfm.robust import Request, RobustResult, Score, damped_solve
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,19 @@ class FocalCameraEstimator:
         moved = torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:6, None]), -1)
         return _join(f * step[..., 6].exp(), moved)
 
+    def suspect(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether the inliers may be in a plane."""
+        return flatness_suspected(model, X, self._focal(model), inliers, threshold, 2 + chance)
+
     def degeneracy(
         self,
         model: Float[Tensor, "*#batch 3 4"],
@@ -105,13 +119,12 @@ class FocalCameraEstimator:
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
         """COLLINEAR: all inliers but so few as chance explains are on a line, as far as can be seen; PLANAR: in a plane."""
-        line, plane = line_and_plane_distances(X, inliers)
-        focal = torch.linalg.vector_norm(model[..., 0, :3], dim=-1).clamp_min(1e-12)
-        depth = (X @ model[..., 2, :3, None])[..., 0] + model[..., 2, 3:]
-        visible = 2 * threshold[..., None] * depth.abs() / focal[..., None] + 1e-9 * X.abs().amax(-1)
-        off_line, off_plane = ((inliers & (distance > visible)).sum(-1) > 2 + chance for distance in (line, plane))
-        code = torch.where(off_plane, int(Degeneracy.NONE), int(Degeneracy.PLANAR))
-        return torch.where(off_line, code, int(Degeneracy.COLLINEAR)).to(torch.int8)
+        return flatness(model, X, self._focal(model), inliers, threshold, 2 + chance)
+
+    @staticmethod
+    def _focal(model: Tensor) -> Tensor:
+        focal: Tensor = torch.linalg.vector_norm(model[..., 0, :3], dim=-1).clamp_min(1e-12)
+        return focal
 
 
 def _split(P: Tensor) -> tuple[Tensor, Tensor]:

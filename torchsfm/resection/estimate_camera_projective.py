@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.geometry import line_and_plane_distances
 from torchsfm.linalg import nullspace_rows
 from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
+from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._focal import incidence_rows
 from torchsfm.resection._reprojection_step import squared_reprojection
 from torchsfm.resection.estimate_camera import moderate, present
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
+from torchsfm.robust import Request, RobustResult, Score, damped_solve
 
 _CHUNK = 4096
 
@@ -102,6 +102,19 @@ class ProjectiveCameraEstimator:
         moved = UnitSphere(12).retract(model.flatten(-2), step)
         return moved.reshape(*moved.shape[:-1], 3, 4)
 
+    def suspect(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether the inliers may be in a plane."""
+        return flatness_suspected(model, X, self._focal(model), inliers, threshold, 4 + chance)
+
     def degeneracy(
         self,
         model: Float[Tensor, "*#batch 3 4"],
@@ -113,14 +126,12 @@ class ProjectiveCameraEstimator:
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
         """COLLINEAR or PLANAR: all inliers but so few as chance explains are on a line or a plane, as far as can be seen."""
-        line, plane = line_and_plane_distances(X, inliers)
-        # How far a point must move to be seen to move, at least.
-        size = torch.linalg.matrix_norm(model[..., :2, :3], dim=(-2, -1)).clamp_min(1e-12)
-        depth = (X @ model[..., 2, :3, None])[..., 0] + model[..., 2, 3:]
-        visible = 2 * threshold[..., None] * depth.abs() / size[..., None] + 1e-9 * X.abs().amax(-1)
-        off_line, off_plane = ((inliers & (distance > visible)).sum(-1) > 4 + chance for distance in (line, plane))
-        code = torch.where(off_plane, int(Degeneracy.NONE), int(Degeneracy.PLANAR))
-        return torch.where(off_line, code, int(Degeneracy.COLLINEAR)).to(torch.int8)
+        return flatness(model, X, self._focal(model), inliers, threshold, 4 + chance)
+
+    @staticmethod
+    def _focal(model: Tensor) -> Tensor:
+        focal: Tensor = torch.linalg.matrix_norm(model[..., :2, :3], dim=(-2, -1)).clamp_min(1e-12)
+        return focal
 
 
 def equations(

@@ -37,7 +37,9 @@ class Estimator(Protocol[M]):
       best model `(*batch, ...)`, from the data where `inside (*batch, n)` (the others of a plane that won, ...);
     - `degeneracy(model, *data, inliers, threshold, chance)`: a `Degeneracy` `(*batch)` as int8 for models `(*batch, ...)` with
       their `inliers (*batch, n)`, `threshold (*batch)`, and how many inliers `chance (*batch)` explains. Where no sample
-      determined a model, `inliers` are all data and the model is zero.
+      determined a model, `inliers` are all data and the model is zero;
+    - `suspect(model, *data, inliers, threshold, chance)`: `(*batch)`, from some of the data that are spread over all, whether
+      `degeneracy` over all data could find anything, for models that samples determined. A glance: most problems are clear.
     """
 
     sample_size: ClassVar[int]

@@ -27,7 +27,7 @@ from torchsfm.robust.search import Best, Options, no_model, search
 
 M = TypeVar("M")
 
-_GLANCE = 256
+_GLANCE = 128
 """How many data to look at first for a degeneracy."""
 
 
@@ -288,16 +288,22 @@ def _degeneracy(problems: Problems, best: Best, near: Bool[Tensor, "p n"], chanc
     estimator, solved = problems.estimator, best.solved
     code = torch.where(solved, int(Degeneracy.NONE), int(Degeneracy.UNDETERMINED)).to(torch.int8)
     if hasattr(estimator, "degeneracy"):
-        looked_at, found = torch.where(solved[:, None], near, problems.inside), code
-        index = torch.arange(len(near), device=near.device)
-        # What a part of the data, spread over all, already shows to be determined need not be looked at in full.
-        for part in (slice(0, _GLANCE), slice(None)) if problems.width > 2 * _GLANCE else (slice(None),):
-            some = problems.take(index)
-            model = tensor_map(lambda t: t[index], best.model)  # noqa: B023
-            data = [d[:, part] for d in some.data]
-            own = {"inliers": looked_at[index, part], "threshold": some.limit.sqrt(), "chance": chance[index]}
-            found = found.index_copy(0, index, some.estimator.degeneracy(model, *data, **own))  # type: ignore[attr-defined]
-            index = index[found[index] != Degeneracy.NONE]
-        code = torch.where(solved | (found != Degeneracy.NONE), found, code)
+        doubtful = ~solved
+        if hasattr(estimator, "suspect"):
+            data = [d[:, :_GLANCE] for d in problems.data]
+            own = {"inliers": near[:, :_GLANCE], "threshold": problems.limit.sqrt(), "chance": chance}
+            doubtful = doubtful | estimator.suspect(best.model, *data, **own)
+        index = doubtful.nonzero()[:, 0]
+        if len(index):
+            some, known, looked_at = problems.take(index), solved[index], near[index]
+            own = {
+                "inliers": torch.where(known[:, None], looked_at, some.inside),
+                "threshold": some.limit.sqrt(),
+                "chance": chance[index],
+            }
+            model = tensor_map(lambda t: t[index], best.model)
+            found = some.estimator.degeneracy(model, *some.data, **own)  # type: ignore[attr-defined]
+            found = torch.where(known | (found != Degeneracy.NONE), found, int(Degeneracy.UNDETERMINED))
+            code = code.index_copy(0, index, found.to(torch.int8))
     few = (solved & (near.sum(-1) <= estimator.sample_size)) | (problems.count <= estimator.sample_size)
     return torch.where(few, int(Degeneracy.TOO_FEW), code).to(torch.int8)
