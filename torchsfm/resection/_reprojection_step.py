@@ -95,7 +95,7 @@ def squared_reprojection(
     views = _Views(P, x, X)
     y = views.project()
     z, inverse = _minus_inverse(y[:, :, 2])
-    return _squares(torch.addcmul(views.x[:, None], y[:, :, :2], inverse[:, :, None]), y, z).view(*views.batch, -1)
+    return _squares(torch.addcmul(views.x[:, None], y[:, :, :2], inverse[:, :, None]), y, z).view(*views.batch, x.shape[-2])
 
 
 def _minus_inverse(depth: Tensor) -> tuple[Tensor, Tensor]:
