@@ -4,11 +4,11 @@ The projective line is cut into 80 cells of equal angle, x = tan(phi), in four s
 arguments between 0 and 1 and between -1 and 0. On the circle the polynomial is the form h(phi) = cos(phi)^n p(tan phi). Values
 and derivatives at the nodes tell, by the Bernstein coefficients of the cubic through them, which cells may hold several roots;
 those are cut once more, in sixteen. There a sign change is one root, and a dip towards zero one pair of roots or none. The
-cubic gives a start, Newton's method between bounds the root.
+cubic gives a start, Newton's method between bounds the root. All arithmetic has the batch in the last dimension.
 """
 
 import math
-from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -24,33 +24,28 @@ _CELLS = 20
 _PARTS = 16
 """Parts of a cell that is looked at more closely."""
 _STEP = math.pi / 4 / _CELLS
+_NODES = [math.tan(i * _STEP) for i in range(_CELLS)] + [1.0]
 _MARGIN = 2.0
 """A cubic's Bernstein coefficient is h + (step / 3) h'; 2 in the place of 3 makes up for what is not cubic."""
 
 
 class RootList(NamedTuple):
-    """Roots x = s / t one after the other, sorted by the polynomial they belong to; max(|s|, |t|) = 1."""
+    """Roots x = s / t one after the other; max(|s|, |t|) = 1."""
 
     item: Int[Tensor, " roots"]
+    """The polynomial each belongs to."""
     s: Float[Tensor, " roots"]
     t: Float[Tensor, " roots"]
 
     def slot(self) -> Int[Tensor, " roots"]:
-        """The number of each root among those of its polynomial."""
-        count = torch.bincount(self.item)
-        return torch.arange(len(self.item), device=self.item.device) - (count.cumsum(0) - count).index_select(0, self.item)
+        """The number of each root among those of its polynomial, in a sorted list."""
+        return number_among_equals(self.item)
 
 
-class _Cells(NamedTuple):
-    """Cells with a root or two, one after the other: the path goes from the node `low` on, away from zero."""
-
-    item: Tensor
-    reverse: Tensor
-    minus: Tensor
-    low: Tensor
-    """Number of the node on the fine scale."""
-    values: Tensor
-    """Value and slope at the start, value and slope at the end, (4, cells)."""
+def number_among_equals(item: Int[Tensor, " k"]) -> Int[Tensor, " k"]:
+    """How many equal numbers stand before each one, in a sorted list of numbers from 0 on."""
+    count = torch.bincount(item)
+    return torch.arange(len(item), device=item.device) - (count.cumsum(0) - count).index_select(0, item)
 
 
 def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]:
@@ -81,81 +76,98 @@ def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slot
     return attach_roots(c, x, real), real
 
 
-def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3) -> RootList:
+def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3, *, in_order: bool = True) -> RootList:
     """The real roots, infinite ones too (t = 0), of polynomials in columns; `steps` of Newton's method end the search.
 
     The list is as long as there are roots: the only thing here whose shape depends on the data. The roots of one polynomial do
-    not depend on which others are in the batch, nor does their order.
+    not depend on which others are in the batch, nor does their order. Sorted by the polynomial only if `in_order`.
     """
     n, batch = c.shape[0] - 1, c.shape[1]
     c = torch.where(torch.isfinite(c).all(0), c, 0)
+    cut, turn = _cuts(c.dtype, c.device)
     both = torch.stack((c, c.flip(0)), 1)
-    fine = torch.tan(torch.arange(_CELLS * _PARTS + 1, dtype=c.dtype, device=c.device) * (_STEP / _PARTS))
-    fine[-1] = 1
-    nodes = _nodes(both, fine[::_PARTS])
-    changes, several = _several(nodes[:, :, 0], nodes[:, :, 1], fine.new_tensor([_STEP, -_STEP])[:, None, None])
+    nodes, changes, several = _look(both)
     both = both.view(n + 1, 2 * batch)
-    values = nodes.view(-1)
-
-    def cells(bits: Tensor) -> _Cells:
-        place = bits.reshape(-1).nonzero()[:, 0]
-        cell = place // batch
-        item = place - cell * batch
-        # Cells count (node * 2 + side) * 2 + reversal, values (node * 2 + side) * 4 + slope * 2 + reversal.
-        at = ((cell >> 1) * 4 + (cell & 1)) * batch + item
-        offsets = torch.tensor([[0], [2], [8], [10]], device=c.device) * batch
-        return _Cells(item, cell & 1, (cell & 2) != 0, (cell >> 2) * _PARTS, _look_up(values, at + offsets))
-
-    single = cells(changes & ~several)
-    close = cells(several)
-    p, q = _closer(both, fine, close, batch)
-    changes, several = _several(p, q, torch.where(close.minus, -_STEP / _PARTS, _STEP / _PARTS))
-
-    def parts(bits: Tensor) -> _Cells:
-        part, which = bits.nonzero().unbind(1)
-        ends = torch.stack((p[part, which], q[part, which], p[part + 1, which], q[part + 1, which]))
-        item, reverse, minus, low = (x.index_select(0, which) for x in close[:4])
-        return _Cells(item, reverse, minus, low + part, ends)
-
-    sub = parts(changes)
-    pair = parts(several & ~changes)
-    # Each root has a cell, a pair's cell stands twice.
-    groups = (single, sub, pair, pair)
-    item, reverse, minus, low, ends = (torch.cat(x, -1) for x in zip(*groups, strict=True))
-    kind = torch.cat([x.item.new_full(x.item.shape, i) for i, x in enumerate(groups)])
-    bottom, top = _look_up(fine, low), _look_up(fine, low + torch.where(kind == 0, _PARTS, 1))
-    y, found = _refine(take_columns(both, reverse * batch + item), bottom, top, minus, ends, kind, steps=steps)
+    # A cell has the number (node * 2 + side) * 2 + reversal, and the value at its start the same place.
+    cell, item = (changes & ~several).flatten(0, 2).nonzero().unbind(1)
+    values = len(_NODES) * 4 * batch
+    offsets = torch.tensor([[0], [values], [4 * batch], [values + 4 * batch]], device=c.device)
+    single = _Intervals(
+        torch.add(item, cell & 1, alpha=batch),
+        take_columns(turn, cell),
+        _look_up(nodes.view(-1), torch.add(item, cell, alpha=batch) + offsets),
+    )
+    cell, item = several.flatten(0, 2).nonzero().unbind(1)
+    sub, pair = _cut_again(both, torch.add(item, cell & 1, alpha=batch), take_columns(cut, cell), turn[2].index_select(0, cell))
+    some = _Intervals(*(torch.cat(x, -1) for x in zip(single, sub, strict=True)))
+    x, rise = _start(some.path, some.ends, degree=n)
+    column = torch.cat((some.column, pair.column, pair.column))
+    low, high = some.path[:2].aminmax(dim=0)
+    part = _dip(pair.path, pair.ends, take_columns(both, pair.column), degree=n)
+    x, low, high, rise = (torch.cat((a, *b), -1) for a, b in zip((x, low, high, rise), part, strict=True))
+    x, found = _refine(take_columns(both, column), x, low, high, rise, steps=steps)
     keep = found.nonzero()[:, 0]
-    item, order = item.index_select(0, keep).sort(stable=True)
-    keep = keep.index_select(0, order)
-    y = torch.where(minus, -y, y).index_select(0, keep)
-    reversed_ = reverse.index_select(0, keep) == 1
-    one = torch.ones_like(y)
-    return RootList(item, torch.where(reversed_, one, y), torch.where(reversed_, y, one))
+    column = column.index_select(0, keep)
+    reversed_ = column >= batch
+    item = torch.where(reversed_, column - batch, column)
+    if in_order:
+        item, order = item.sort(stable=True)
+        keep, reversed_ = keep.index_select(0, order), reversed_.index_select(0, order)
+    x = x.index_select(0, keep)
+    return RootList(item, torch.where(reversed_, 1, x), torch.where(reversed_, x, 1))
+
+
+class _Intervals(NamedTuple):
+    """Intervals with a root or two, one after the other."""
+
+    column: Tensor
+    """Number of the polynomial or reversal."""
+    path: Tensor
+    """Begin and end, in the direction away from zero, and the angle from one to the other: (3, intervals)."""
+    ends: Tensor
+    """Value and slope at the begin, value and slope at the end: (4, intervals)."""
+
+
+@cache
+def _cuts(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """For each cell the nodes that cut it once more, `(parts + 1, cells)`, and begin, end and angle, `(3, cells)`."""
+    cuts, turns = [], []
+    for node in range(_CELLS):
+        fine = [math.tan((node * _PARTS + i) * _STEP / _PARTS) for i in range(_PARTS + 1)]
+        fine[0], fine[-1] = _NODES[node], _NODES[node + 1]
+        for sign in (1, 1, -1, -1):
+            cuts.append([sign * z for z in fine])
+            turns.append([sign * fine[0], sign * fine[-1], sign * _STEP])
+    return tuple(torch.tensor(x, dtype=dtype, device=device).mT.contiguous() for x in (cuts, turns))  # type: ignore[return-value]
 
 
 def _look_up(table: Float[Tensor, " k"], index: Int[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return table.index_select(0, index.reshape(-1)).view(index.shape)
 
 
-def _nodes(both: Float[Tensor, "m 2 batch"], z: Float[Tensor, " nodes"]) -> Float[Tensor, "nodes 2 2 2 batch"]:
-    """What cells are judged by, at [node, side (+z, -z), value or slope, polynomial or reversal].
+def _look(both: Float[Tensor, "m 2 batch"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Values and slopes at the nodes, (value or slope, node, side, reversal, batch), and what they say of the cells.
 
-    The slope is (1 + z^2) p' - n z p, the same positive multiple of h' as the value p is of h.
+    The slope is (1 + z^2) p' - n z p, the same positive multiple of h' as the value p is of h. Of each cell is said whether
+    there is a change of sign, and whether there may be two roots or more.
     """
     n = both.shape[0] - 1
     k = torch.arange(n + 1, dtype=both.dtype, device=both.device)[:, None, None]
-    q = torch.zeros_like(both)
-    q[:-1] = both[1:] * k[1:]
-    q[1:] -= both[:-1] * (n - k[:-1])
-    c = torch.stack((both, q), 1)
-    square = (z * z)[:, None, None, None]
+    c = both.new_empty(n + 1, 2, *both.shape[1:])
+    c[:, 0] = both
+    torch.mul(both[1:], k[1:], out=c[:-1, 1])
+    c[-1, 1] = 0
+    c[1:, 1].addcmul_(both[:-1], n - k[:-1], value=-1)
+    z = both.new_tensor(_NODES)[:, None, None]
+    square = z * z
+    c = c[:, :, None]
     even, odd = _horner(c[0::2], square), _horner(c[1::2], square)
-    odd *= z[:, None, None, None]
-    out = torch.empty(len(z), 2, *even.shape[1:], dtype=z.dtype, device=z.device)
-    torch.add(even, odd, out=out[:, 0])
-    torch.sub(even, odd, out=out[:, 1])
-    return out
+    odd *= z
+    nodes = both.new_empty(2, len(_NODES), 2, *both.shape[1:])
+    torch.add(even, odd, out=nodes[:, :, 0])
+    torch.sub(even, odd, out=nodes[:, :, 1])
+    step = both.new_tensor([_STEP, -_STEP])[:, None, None]
+    return nodes, *_several(nodes[0], nodes[1], step)
 
 
 def _horner(c: Tensor, x: Tensor) -> Tensor:
@@ -167,9 +179,9 @@ def _horner(c: Tensor, x: Tensor) -> Tensor:
     return value
 
 
-def _horner_slope(c: Tensor | Sequence[Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+def _horner_slope(c: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     """Values and derivatives; c are rows, lowest power first."""
-    *rest, last = c if isinstance(c, Sequence) else c.unbind(0)
+    *rest, last = c.unbind(0)
     rest.reverse()
     value, slope = torch.addcmul(rest[0], last, x), last + torch.zeros_like(x)
     for row in rest[1:]:
@@ -182,60 +194,104 @@ def _several(p: Tensor, q: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
     """Which cells between neighbours in the first dimension change sign, and which may hold two roots or more."""
     third = q * (step / _MARGIN)
     positive = p > 0
-    out, back = positive ^ (p > -third), positive ^ (p > third)
+    back = (p > third).logical_xor_(positive)[1:]
+    out = (p > third.neg_()).logical_xor_(positive)[:-1]
     changes = positive[1:] ^ positive[:-1]
-    out, back = out[:-1], back[1:]
-    return changes, (out & back) | (~changes & (out | back))
+    return changes, (out & back) | ((out | back) & ~changes)
 
 
-def _closer(both: Float[Tensor, "m columns"], fine: Tensor, close: _Cells, batch: int) -> tuple[Tensor, Tensor]:
-    """Values and slopes at the nodes that cut the given cells once more."""
+def _cut_again(
+    both: Float[Tensor, "m columns"], column: Int[Tensor, " cells"], x: Float[Tensor, "nodes cells"], turn: Tensor
+) -> tuple[_Intervals, _Intervals]:
+    """Of the parts of some cells those with one root, and those with a pair or none."""
     n = both.shape[0] - 1
-    x = _look_up(fine, close.low + torch.arange(_PARTS + 1, device=fine.device)[:, None])
-    x = torch.where(close.minus, -x, x)
-    p, d = _horner_slope(take_columns(both, close.reverse * batch + close.item)[:, None], x)
-    return p, torch.addcmul((1 + x * x) * d, p, x, value=-n)
+    p, d = _horner_slope(take_columns(both, column)[:, None], x)
+    q = torch.addcmul((1 + x * x) * d, p, x, value=-n)
+    turn = turn / _PARTS
+    changes, several = _several(p, q, turn)
+
+    def parts(bits: Tensor) -> _Intervals:
+        part, which = bits.nonzero().unbind(1)
+        place = torch.add(which, part, alpha=len(column))
+        place = torch.stack((place, place + len(column)))
+        rows = torch.stack([_look_up(table.view(-1), place) for table in (x, p, q)], 1)
+        path = torch.cat((rows[:, 0], turn.index_select(0, which)[None]))
+        return _Intervals(column.index_select(0, which), path, rows[:, 1:].reshape(4, -1))
+
+    return parts(changes), parts(several & ~changes)
 
 
 @kernel(chunk=1 << 20)
-def _refine(
-    k: Tensor, bottom: Tensor, top: Tensor, minus: Tensor, ends: Tensor, kind: Tensor, *, steps: int
-) -> tuple[Tensor, Tensor]:
-    """The root between bottom and top, as a distance from zero along its side, and whether it is one."""
-    n = k.shape[0] - 1
-    whole, right = kind == 0, kind == 3
-    pair = kind >= 2
-    step = torch.where(whole, _STEP, _STEP / _PARTS)
-    # From here on h is positive where the path starts, and x counts along the path.
-    weight = _power((1 + bottom * bottom) / (1 + top * top), n // 2)
-    up = torch.where(ends[0] > 0, torch.ones_like(bottom), -1)
-    along = torch.where(minus, -step, step) * up
-    begin, bend = _cubic_start(ends[0].abs(), ends[2] * weight * up, ends[1] * along, ends[3] * weight * along, pair)
-    angle = begin * step
+def _start(path: Tensor, ends: Tensor, *, degree: int) -> tuple[Tensor, Tensor]:
+    """Where the Hermite cubic in the angle has its root, and the sign of h at the lower bound of the interval."""
+    begin, end, turn = path.unbind(0)
+    up = torch.where(ends[0] > 0, 1.0, -1.0).to(begin.dtype)
+    h0, h1, d0, d1 = _along_path(begin, end, turn, ends, up, degree)
+    rise = h1 - h0
+    a2, a3 = (3 * rise).sub_(d0, alpha=2).sub_(d1), (d0 + d1).sub_(rise, alpha=2)
+    t = torch.full_like(h0, 0.5)
+    for half in (0.25, 0.125, 0.0625):
+        value = torch.addcmul(h0, torch.addcmul(d0, torch.addcmul(a2, a3, t), t), t)
+        t = t + torch.copysign(value.new_tensor(half), value)
+    for _ in range(2):
+        inner = torch.addcmul(a2, a3, t)
+        slope = torch.addcmul(d0, inner, t)
+        value = torch.addcmul(h0, slope, t)
+        slope.addcmul_(inner.addcmul_(a3, t), t)
+        t = (t - value.div_(slope)).clamp_(0, 1)
+    angle = t * turn
     tangent = angle * (1 + angle * angle / 3)
-    y = (bottom + tangent) / (1 - bottom * tangent)
-    odd = torch.where(minus, -up, up)
-    rows = [row * (odd if i % 2 else up) for i, row in enumerate(k.unbind(0))]
-    p, d = _horner_slope(rows, y)
-    # For a pair, h + h' a + (h'' / 2) a^2 = 0 in the angle a from the dip.
-    square = 1 + y * y
-    q = square * d - n * y * p
-    bend = bend / (step * step) * _power(square / (1 + bottom * bottom), n // 2)
-    root = (q * q - 2 * p * bend).clamp_min(0).sqrt()
-    angle = (torch.where(right, root, -root) - q) / bend
-    found = ~pair | (p < 0)
-    before = (p > 0) | right
-    bottom, top = torch.where(before, y, bottom), torch.where(before & (right | ~pair), top, y)
-    y = torch.where(pair, y + square * angle / (1 - y * angle), y - p / d)
-    for _ in range(steps):
-        # Rounding may carry a converged root over its bound.
-        inside = (y >= bottom - 1e-10) & (y <= top + 1e-10)
-        y = torch.where(inside, y, 0.5 * (bottom + top))
-        p, d = _horner_slope(rows, y)
-        before = (p > 0) ^ right
-        bottom, top = torch.where(before, y, bottom), torch.where(before, top, y)
-        y = y - p / d
-    return y, found & (y >= bottom - 1e-9) & (y <= top + 1e-9)
+    return (begin + tangent) / (1 - begin * tangent), torch.copysign(up, up * turn)
+
+
+def _along_path(begin: Tensor, end: Tensor, turn: Tensor, ends: Tensor, up: Tensor, degree: int) -> tuple[Tensor, ...]:
+    """Values and derivatives of h over the interval, as that of [0, 1], positive at its begin."""
+    weight = _power((1 + begin * begin) / (1 + end * end), degree // 2) * up
+    return ends[0].abs(), ends[2] * weight, ends[1] * (turn * up), ends[3] * (weight * turn)
+
+
+def _dip(path: Tensor, ends: Tensor, k: Tensor, degree: int) -> tuple[tuple[Tensor, Tensor], ...]:
+    """For both roots of a pair where they are, lower and upper bound, and the sign of h at the lower one.
+
+    There are none where h does not change its sign: the bounds are then the wrong way round.
+    """
+    begin, end, turn = path.unbind(0)
+    up = torch.where(ends[0] > 0, 1.0, -1.0).to(begin.dtype)
+    h0, h1, d0, d1 = _along_path(begin, end, turn, ends, up, degree)
+    rise = h1 - h0
+    a2, a3 = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
+    bend = torch.addcmul(a2 * a2, a3, d0, value=-3).clamp_min_(0).sqrt_()
+    angle = (-d0 / (a2 + bend)).clamp_(0, 1) * turn
+    tangent = angle * (1 + angle * angle / 3)
+    x = (begin + tangent) / (1 - begin * tangent)
+    p, d = (up * row for row in _horner_slope(k, x))
+    # h + h' a + (h'' / 2) a^2 = 0 in the angle a from the dip.
+    square = 1 + x * x
+    q = square * d - degree * x * p
+    bend = 2 * bend / (turn * turn) * _power(square / (1 + begin * begin), degree // 2)
+    root = torch.copysign((q * q - 2 * p * bend).clamp_min(0).sqrt(), turn)
+    first, second = (-root - q) / bend, (root - q) / bend
+    first, second = (x + square * angle / (1 - x * angle) for angle in (first, second))
+    none = torch.where(p < 0, 0, torch.inf)
+    (low1, high1), (low2, high2) = (torch.stack(b).aminmax(dim=0) for b in ((begin, x), (x, end)))
+    sign = torch.copysign(up, up * turn)
+    return (first, second), (low1 + none, low2 + none), (high1, high2), (sign, -sign)
+
+
+@kernel(chunk=1 << 20)
+def _refine(k: Tensor, x: Tensor, low: Tensor, high: Tensor, rise: Tensor, *, steps: int) -> tuple[Tensor, Tensor]:
+    """The root between the bounds, and whether there is one."""
+    for i in range(steps + 1):
+        p, d = _horner_slope(k, x)
+        if i < steps:
+            right = p * rise > 0
+            low, high = torch.where(right, x, low), torch.where(right, high, x)
+        x = x - p.div_(d)
+        if i < steps:
+            # Rounding may carry a converged root over its bound.
+            inside = (x >= low - 1e-10) & (x <= high + 1e-10)
+            x = torch.where(inside, x, 0.5 * (low + high))
+    return x, (x >= low - 1e-9) & (x <= high + 1e-9)
 
 
 def _power(x: Tensor, exponent: int) -> Tensor:
@@ -244,21 +300,3 @@ def _power(x: Tensor, exponent: int) -> Tensor:
         x = x * x
         out = out * x if exponent % 2 else out
     return out
-
-
-def _cubic_start(h0: Tensor, h1: Tensor, d0: Tensor, d1: Tensor, pair: Tensor) -> tuple[Tensor, Tensor]:
-    """Where in [0, 1] the Hermite cubic has its root, or its dip for a pair, and its second derivative at the dip."""
-    rise = h1 - h0
-    a2, a3 = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
-    t = torch.full_like(h0, 0.5)
-    for half in (0.25, 0.125, 0.0625):
-        value = torch.addcmul(h0, torch.addcmul(d0, torch.addcmul(a2, a3, t), t), t)
-        t = t + torch.where(value > 0, half, -half)
-    for _ in range(2):
-        inner = torch.addcmul(a2, a3, t)
-        slope = torch.addcmul(d0, inner, t)
-        value = torch.addcmul(h0, slope, t)
-        slope.addcmul_(torch.addcmul(inner, a3, t), t)
-        t = (t - value / slope).clamp_(0, 1)
-    bend = torch.addcmul(a2 * a2, a3, d0, value=-3).clamp_min_(0).sqrt_()
-    return torch.where(pair, (-d0 / (a2 + bend)).clamp_(0, 1), t), 2 * bend

@@ -6,49 +6,82 @@ from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.rows import add_rows, combine_rows
-from torchsfm.motion._five_points import back_substitute, cross, longest, normalised
+from torchsfm.motion._five_points import back_substitute, longest, normalised
 
 
 def combine(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> Float[Tensor, "9 roots"]:
     return combine_rows(basis, u)
 
 
-def polish(u: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+def gone_round(E: Float[Tensor, "3 3 *batch"]) -> Float[Tensor, "5 5 *batch"]:
+    """The matrices with their first two rows and columns once more behind the last."""
+    out = E.new_empty(5, 5, *E.shape[2:])
+    out[:3, :3] = E
+    out[3:, :3] = E[:2]
+    out[:, 3:] = out[:, :2]
+    return out
+
+
+def products_of_minors(round_: Float[Tensor, "5 5 *batch"]) -> Float[Tensor, "3 3 *batch"]:
+    """The matrices of cofactors, in two products, of matrices that go round."""
+    return (round_[1:4, 1:4] * round_[2:, 2:]).addcmul_(round_[1:4, 2:], round_[2:, 1:4], value=-1)
+
+
+def left_null(C: Float[Tensor, "3 3 *batch"]) -> Float[Tensor, "3 *batch"]:
+    """The unit vector u of a matrix s u v', from its longest column."""
+    return normalised(longest(add_rows((C * C).unbind(0)).unbind(0), C.unbind(1)))
+
+
+def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tuple[Tensor, Tensor]:
     """One Newton step on the essential manifold within the null space, and how far the start was from the manifold.
 
-    Around E = U diag(1, 1, 0) V' the manifold's normal space is spanned by u3 v3', u1 v1' - u2 v2' and u1 v2' + u2 v1', for any
-    u1, u2 and v1 = E' u1, v2 = E' u2. Three linear equations in (x, y, z, w) remain: the solution is their 4D cross product.
+    With u3' E = 0 and u1, u2 orthogonal to u3, E is essential if det E = 0, u1' E E' u1 = u2' E E' u2 and u1' E E' u2 = 0.
+    The gradients are the cofactors, u1 v1' - u2 v2' and u1 v2' + u2 v1', where v = E' u: a form f of degree n with gradient g
+    asks for g' E_new = (1 - 1 / n) g' E. Three linear equations in (x, y, z, w) remain: the solution is their 4D cross product.
     """
-    e = combine(u, basis)
-    cofactors = torch.stack((cross(e[3:6], e[6:]), cross(e[6:], e[:3]), cross(e[:3], e[3:6])))
-    squares = cofactors * cofactors
-    v3 = normalised(longest(add_rows(squares.unbind(1)).unbind(0), cofactors.unbind(0)))
-    u3 = normalised(longest(add_rows(squares).unbind(0), cofactors.unbind(1)))
+    E = combine(u, basis).view(3, 3, -1)
+    C = products_of_minors(gone_round(E))
+    u3 = left_null(C)
     # A frame around u3 without branches (Duff et al. 2017).
-    sign = torch.copysign(torch.ones_like(u3[2]), u3[2])
-    a = -1 / (sign + u3[2])
-    b = u3[0] * u3[1] * a
-    u1 = (1 + sign * u3[0] * u3[0] * a, sign * b, -sign * u3[0])
-    u2 = (b, sign + u3[1] * u3[1] * a, -u3[1])
-    rows = e.view(3, 3, -1)
-    v1 = combine_rows(rows, u1)
-    v1 = normalised(v1 - v3 * combine_rows(v1, v3))
-    v2 = cross(v3, v1)
-    v2 = v2 * torch.copysign(torch.ones_like(sign), combine_rows(combine_rows(rows, u2), v2))
-    # The normals' products with the basis, by rows of the basis matrices: B v, then u' B v.
-    columns = basis.view(4, 3, 3, -1).permute(2, 1, 0, 3)
-    Bv1, Bv2, Bv3 = (combine_rows(columns, v) for v in (v1, v2, v3))
-    p = combine_rows(Bv3, u3)
-    q = combine_rows(Bv1, u1).sub_(combine_rows(Bv2, u2))
-    r = combine_rows((*Bv2, *Bv1), (*u1, *u2))
-    error = torch.maximum(torch.maximum(*(combine_rows(f, u).abs_() for f in (p, q))), combine_rows(r, u).abs_())
+    x, y, z = u3.unbind(0)
+    one = torch.copysign(torch.ones_like(z), z)
+    b = (one + z).reciprocal_().neg_()
+    a = x * b
+    b *= y
+    frame = E.new_empty(3, 2, E.shape[-1])
+    torch.addcmul(frame.new_ones(()), one * x, a, out=frame[0, 0])
+    torch.mul(one * y, a, out=frame[1, 0])
+    torch.mul(one, x, out=frame[2, 0]).neg_()
+    torch.mul(a, y, out=frame[0, 1])
+    torch.addcmul(one, y, b, out=frame[1, 1])
+    torch.neg(y, out=frame[2, 1])
+    rows = E.unbind(0)
+    v = rows[0] * frame[0, :, None]
+    v.addcmul_(rows[1], frame[1, :, None])
+    v.addcmul_(rows[2], frame[2, :, None])
+    u1, u2 = frame[:, 0, None], frame[:, 1, None]
+    v1, v2 = v.unbind(0)
+    normals = E.new_empty(3, 3, 3, E.shape[-1])
+    normals[0] = C
+    torch.mul(u1, v1, out=normals[1]).addcmul_(u2, v2, value=-1)
+    torch.mul(u1, v2, out=normals[2]).addcmul_(u2, v1)
+    products = combine_rows(normals.view(3, 9, 1, -1).unbind(1), basis.unbind(1))
+    values = combine_rows(products.unbind(1), u.unbind(0))
+    values *= values.new_tensor([2 / 3, 0.5, 0.5])[:, None]
+    products.addcmul_(values[:, None], u, value=-1)
+    p, q, r = products.unbind(0)
     p0, p1, p2, p3 = p
     q0, q1, q2, q3 = q
     r0, r1, r2, r3 = r
-    m01, m02, m03 = p0 * q1 - p1 * q0, p0 * q2 - p2 * q0, p0 * q3 - p3 * q0
-    m12, m13, m23 = p1 * q2 - p2 * q1, p1 * q3 - p3 * q1, p2 * q3 - p3 * q2
-    x, y, z = m12 * r3 - m13 * r2 + m23 * r1, m03 * r2 - m02 * r3 - m23 * r0, m01 * r3 - m03 * r1 + m13 * r0
-    return normalised(torch.stack((x, y, z, m02 * r1 - m01 * r2 - m12 * r0))), error
+    m01, m02, m03 = (p0 * q[1:]).addcmul_(p[1:], q0, value=-1)
+    m12, m13 = (p1 * q[2:]).addcmul_(p[2:], q1, value=-1)
+    m23 = (p2 * q3).addcmul_(p3, q2, value=-1)
+    new = torch.empty_like(u)
+    torch.mul(m12, r3, out=new[0]).addcmul_(m13, r2, value=-1).addcmul_(m23, r1)
+    torch.mul(m03, r2, out=new[1]).addcmul_(m02, r3, value=-1).addcmul_(m23, r0, value=-1)
+    torch.mul(m01, r3, out=new[2]).addcmul_(m03, r1, value=-1).addcmul_(m13, r0)
+    torch.mul(m02, r1, out=new[3]).addcmul_(m01, r2, value=-1).addcmul_(m12, r0, value=-1)
+    return normalised(new), values.abs_().amax(0).mul_(2**0.5)
 
 
 @kernel(chunk=1 << 20)

@@ -9,13 +9,15 @@ arithmetic has the batch in the last dimension.
 
 from collections.abc import Sequence
 from itertools import product
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg.nullspace import nullspace_columns
-from torchsfm.linalg.rows import add_rows, combine_rows
+from torchsfm.linalg.real_roots import real_root_list
+from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 
 # Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w); quadratic ones as pairs, squares first.
 _CUBICS = [(0, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 1), (0, 0, 2), (0, 0, 3), (1, 1, 2), (1, 1, 3), (0, 1, 2), (0, 1, 3)]
@@ -26,6 +28,49 @@ _WAYS = [[(_SQUARES.index(q), v) for q, v in product(_SQUARES, range(4)) if tupl
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
 # A quaternion's product with any other: orthonormal.
 _TURN = [[0.5, -0.1, 0.7, -0.5], [0.1, 0.5, 0.5, 0.7], [-0.7, -0.5, 0.5, 0.1], [0.5, -0.7, -0.1, 0.5]]
+_INDEPENDENT = 1e-13
+
+
+class FivePointRoots(NamedTuple):
+    """The roots z : w = s : t of the polynomials of some problems, each with a column of its own."""
+
+    item: Tensor
+    s: Tensor
+    t: Tensor
+    x: Tensor
+    y: Tensor
+    w: Tensor
+    basis: Tensor
+    d1: Tensor
+    """The rays at length 1, (3, 5, problems)."""
+    d2: Tensor
+
+
+def five_point_roots(
+    d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], *, steps: int, other_coordinates: bool = False
+) -> FivePointRoots:
+    """All real roots, in any order, after some steps of Newton's method."""
+    d1, fine1 = _unit(d1)
+    d2, fine2 = _unit(d2)
+    basis, pivot = nullspace_basis(d1, d2)
+    if other_coordinates:
+        basis = turned(basis)
+    x, y, w, p = polynomial(basis)
+    # Without five independent equations there is no polynomial and no root.
+    fine = fine1 & fine2 & (pivot > _INDEPENDENT)
+    item, s, t = real_root_list(torch.where(fine, p, torch.nan), steps=steps, in_order=False)
+    x, y, w, basis = (take_columns(rows, item) for rows in (x, y, w, basis))
+    return FivePointRoots(item, s, t, x, y, w, basis, d1, d2)
+
+
+def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
+    """Rays of length 1, and where all are finite and have a direction; what they are elsewhere concerns no other problem."""
+    d = d.contiguous()
+    largest = d.abs().amax((0, 1))
+    # Squares neither overflow nor vanish.
+    d = d * (1 / largest)
+    square = combine_rows(d, d)
+    return d.mul_(square.rsqrt()), (largest < torch.inf) & (square > 0).all(0)
 
 
 def nullspace_basis(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,15 +13,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.linalg.rows import combine_rows, take_columns
+from torchsfm.linalg.real_roots import number_among_equals
+from torchsfm.linalg.rows import take_columns
 from torchsfm.motion._essential_manifold import combine, from_roots, polish
-from torchsfm.motion._five_points import nullspace_basis, polynomial, turned
+from torchsfm.motion._five_points import five_point_roots
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _CHUNK = 4096
 """Problems at a time: their matrices fit the cache."""
-_INDEPENDENT = 1e-13
 _NEAR = 1e-8
 """Distance from the manifold before a Newton step after which there is nothing left to gain."""
 _MORE = 4
@@ -79,7 +78,6 @@ class _Candidates(NamedTuple):
     """Solutions one after the other, in the last dimension."""
 
     item: Tensor
-    slot: Tensor
     E: Tensor
     """(9, candidates), with |E| = 1."""
     error: Tensor
@@ -99,29 +97,31 @@ def _solve(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"]) -> tu
     again = doubt.nonzero()[:, 0]
     if len(again):
         second = _starts(d1.index_select(2, again), d2.index_select(2, again), other_coordinates=True)
-        # Their solutions stand in slots from 10 on.
-        second = second._replace(item=again.index_select(0, second.item), slot=second.slot + 10)
-        found = _joined([found, second])
-    # The few that are not near yet, all together.
-    u, last = found.u, found.error.index_select(0, found.rest)
-    for _ in range(_MORE):
-        u, last = polish(u, found.basis)
-    found.E.index_copy_(1, found.rest, combine(u, found.basis))
-    found.error.index_copy_(0, found.rest, last)
+        # They stand as problems of their own behind the others.
+        found = _joined([found, second._replace(item=second.item + batch)])
+    if len(found.rest):
+        # The few that are not near yet, all together.
+        u, last = found.u, found.error.index_select(0, found.rest)
+        for _ in range(_MORE):
+            u, last = polish(u, found.basis)
+        found.E.index_copy_(1, found.rest, combine(u, found.basis))
+        found.error.index_copy_(0, found.rest, last)
     # A unit matrix is finite in all entries or in none.
-    good = (found.error < _CONVERGED) & torch.isfinite(found.E[0])
-    # An empty slot holds diag(1, 1, 0); what is no solution goes to one slot behind all others.
-    slots = 20 if len(again) else 10
-    out = d1.new_zeros(batch * slots + 1, 9)
-    out[:, ::4] = torch.tensor([1.0, 1.0, 0.0], dtype=d1.dtype, device=d1.device)
-    place = torch.where(good, found.item * slots + found.slot, batch * slots)
-    out.index_copy_(0, place, found.E.mT * 2**0.5)
-    valid = torch.zeros(batch * slots + 1, dtype=torch.bool, device=d1.device)
-    valid[place] = True
-    out, valid = out[:-1].view(batch, slots, 9), valid[:-1].view(batch, slots)
+    keep = ((found.error < _CONVERGED) & torch.isfinite(found.E[0])).nonzero()[:, 0]
+    item, order = found.item.index_select(0, keep).sort(stable=True)
+    size = batch + len(again)
+    # An empty slot holds diag(1, 1, 0).
+    out = torch.tensor([1.0, 0, 0, 0, 1, 0, 0, 0, 0], dtype=d1.dtype, device=d1.device).repeat(size * 10, 1)
+    valid = torch.zeros(size * 10, dtype=torch.bool, device=d1.device)
+    # Never more than the degree.
+    place = item * 10 + number_among_equals(item).clamp_max_(9)
+    out.index_copy_(0, place, take_columns(found.E, keep.index_select(0, order)).mT * 2**0.5)
+    valid.index_fill_(0, place, True)
+    out, valid = out.view(size, 10, 9), valid.view(size, 10)
     if len(again):
-        out[again, :10], valid[again, :10] = _once(out[again], valid[again])
-    return out[:, :10], valid[:, :10]
+        both = torch.cat((out[again], out[batch:]), 1), torch.cat((valid[again], valid[batch:]), 1)
+        out[again], valid[again] = _once(*both)
+    return out[:batch], valid[:batch]
 
 
 def _once(E: Float[Tensor, "problem 20 9"], real: Bool[Tensor, "problem 20"]) -> tuple[Tensor, Tensor]:
@@ -156,30 +156,7 @@ def _joined(parts: list[_Candidates]) -> _Candidates:
 
 def _chunk(d1: Tensor, d2: Tensor, other_coordinates: bool) -> _Candidates:
     """Every root, after a step."""
-    d1, fine1 = _unit(d1)
-    d2, fine2 = _unit(d2)
-    basis, pivot = nullspace_basis(d1, d2)
-    if other_coordinates:
-        basis = turned(basis)
-    x, y, w, p = polynomial(basis)
-    # Without five independent equations there is no polynomial and no root.
-    fine = fine1 & fine2 & (pivot > _INDEPENDENT)
-    roots = real_root_list(torch.where(fine, p, torch.nan), steps=1)
-    # Never more than the degree.
-    slot = roots.slot().clamp_max(9)
-    # From here on each root has a column of its own.
-    item = roots.item
-    x, y, w, basis = (take_columns(rows, item) for rows in (x, y, w, basis))
-    u, E, error = from_roots(x, y, w, roots.s, roots.t, basis)
+    roots = five_point_roots(d1, d2, steps=1, other_coordinates=other_coordinates)
+    u, E, error = from_roots(roots.x, roots.y, roots.w, roots.s, roots.t, roots.basis)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
-    return _Candidates(item, slot, E, error, rest, take_columns(u, rest), take_columns(basis, rest))
-
-
-def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
-    """Rays of length 1, and where all are finite and have a direction; what they are elsewhere concerns no other problem."""
-    d = d.contiguous()
-    largest = d.abs().amax((0, 1))
-    # Squares neither overflow nor vanish.
-    d = d * (1 / largest)
-    square = combine_rows(d, d)
-    return d.mul_(square.rsqrt()), (largest < torch.inf) & (square > 0).all(0)
+    return _Candidates(roots.item, E, error, rest, take_columns(u, rest), take_columns(roots.basis, rest))

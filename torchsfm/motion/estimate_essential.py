@@ -10,19 +10,16 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.geometry import cross_matrix, rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import (
-    bilinear,
-    cofactors,
     cross_rows,
     epipolar_rows,
-    forms,
     normal_equations,
     products,
     sphere_rows,
     squared_from_rows,
 )
-from torchsfm.motion.essential_5pt import essential_5pt
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, squared_transfer
 from torchsfm.motion.plane_glance import plane_suspected
+from torchsfm.motion.relative_5pt import relative_5pt
 from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
 from torchsfm.tensors import essential_from_pose
@@ -55,28 +52,7 @@ class RelativePoseEstimator:
         self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]
     ) -> Solutions[Float[Tensor, "*batch 10 3 4"]]:
         """The poses for which five rays meet in front of both cameras; at most one of the four of each E."""
-        solutions = essential_5pt(d1, d2)
-        E = solutions.model
-        h1, h2 = sphere_rows(d1[..., None, :, :]), sphere_rows(d2[..., None, :, :])
-        C = cofactors(E)
-        best = (C * C).sum(-2).argmax(-1)
-        t = C.gather(-1, best[..., None, None].expand(*best.shape, 3, 1))[..., 0]
-        t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
-        turned = cross_rows(t, E)
-        pose, valid = torch.cat((C, t[..., None]), -1), torch.zeros_like(solutions.valid)
-        # E = [t]x R or -E = [t]x R, each with t or -t (Horn 1990).
-        for sign in (-1, 1):
-            R = C + sign * turned
-            first, second = self._depths(R, t, h1, h2)
-            least, most = torch.minimum(first, second).amin(-1), torch.maximum(first, second).amax(-1)
-            slack = self.slack[..., None]
-            for direction, front in ((1, least > -slack), (-1, most < slack)):
-                front = front & solutions.valid & ~valid
-                pose = torch.where(front[..., None, None], torch.cat((R, direction * t[..., None]), -1), pose)
-                valid = valid | front
-        fallback = torch.eye(3, 4, dtype=pose.dtype, device=pose.device)
-        fallback[:, 3] = fallback[:, 2]
-        return Solutions(torch.where(valid[..., None, None], pose, fallback), valid)
+        return relative_5pt(d1, d2, self.slack)
 
     def squared_residual(
         self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
@@ -168,14 +144,6 @@ class RelativePoseEstimator:
         planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
         code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
         return torch.where(rotation, int(Degeneracy.ROTATION), code).to(torch.int8)
-
-    @staticmethod
-    def _depths(R: Tensor, t: Tensor, h1: list[Tensor], h2: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """The depths along unit rays, times the squared sine of the angle between them."""
-        cosine = bilinear(R, h1, h2)
-        (along2,) = forms(t[..., None, :], h2)
-        (along1,) = forms((R * t[..., None]).sum(-2)[..., None, :], h1)
-        return along2 * cosine - along1, along2 - along1 * cosine
 
 
 def estimate_essential(
