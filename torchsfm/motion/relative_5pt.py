@@ -23,6 +23,8 @@ _NEAR = 1e-7
 """Distance from the manifold before a Newton step after which E is as good as any data."""
 _MORE = 2
 """Newton steps for the others."""
+_POOR = 1e-4
+"""Distance of a start from the manifold that makes other coordinates worth trying."""
 _CONVERGED = 1e-4
 """Distance from the manifold before the last of these steps, of what is a solution."""
 
@@ -44,8 +46,8 @@ def relative_5pt(
 ) -> Solutions[Float[Tensor, "*batch 10 3 4"]]:
     """The poses [R | t], |t| = 1, for which five rays meet in front of both cameras; at most one of the four of each E.
 
-    Meant for hypotheses: of the rare samples whose polynomial loses most of its digits, solutions may be missing that
-    `essential_5pt` has. Differentiable in the rays.
+    Meant for hypotheses: exact to about 1e-8, and of the rare samples whose polynomial loses most of its digits, solutions may
+    be missing that `essential_5pt` has. Differentiable in the rays.
 
     Args:
         d1: Five rays of the first camera, of any length but 0.
@@ -74,23 +76,36 @@ def relative_5pt(
     return Solutions(pose, valid)
 
 
-def _poses(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack: Tensor) -> tuple[Tensor, Tensor]:
+def _poses(
+    d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack: Tensor, other_coordinates: bool = False
+) -> tuple[Tensor, Tensor]:
     """The samples, in order, and the poses (12, poses) of those in front of both cameras."""
-    roots = five_point_roots(d1, d2, steps=1)
-    columns = torch.cat((roots.d1, roots.d2)), roots.item
-    rays = take_columns(*columns)
+    roots = five_point_roots(d1, d2, steps=1, other_coordinates=other_coordinates)
+    rays = take_columns(torch.cat((roots.d1, roots.d2)), roots.item)
     angle = slack.index_select(0, roots.item)
     u, pose, front, error = _from_roots(roots.x, roots.y, roots.w, roots.s, roots.t, roots.basis, rays, angle)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
+    again = rest[:0]
     if len(rest):
+        if not other_coordinates:
+            doubt = torch.zeros_like(slack, dtype=torch.bool)
+            doubt[roots.item.index_select(0, rest[error.index_select(0, rest) >= _POOR])] = True
+            again = doubt.nonzero()[:, 0]
         u, basis = take_columns(u, rest), take_columns(roots.basis, rest)
         for _ in range(_MORE):
             u, error = polish(u, basis)
         better, ahead = _in_front(combine(u, basis), take_columns(rays, rest), angle.index_select(0, rest))
         pose.index_copy_(1, rest, better)
         front.index_copy_(0, rest, ahead & (error < _CONVERGED))
+    item = roots.item
+    if len(again):
+        # What the first coordinates gave for these counts no longer.
+        front &= ~doubt.index_select(0, item)
+        second, better = _poses(d1.index_select(2, again), d2.index_select(2, again), slack.index_select(0, again), True)
+        item, pose = torch.cat((item, again.index_select(0, second))), torch.cat((pose, better), -1)
+        front = torch.cat((front, torch.ones_like(second, dtype=torch.bool)))
     keep = front.nonzero()[:, 0]
-    item, order = roots.item.index_select(0, keep).sort(stable=True)
+    item, order = item.index_select(0, keep).sort(stable=True)
     return item, take_columns(pose, keep.index_select(0, order))
 
 
