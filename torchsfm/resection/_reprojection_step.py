@@ -14,43 +14,46 @@ from torchsfm.robust import damped_solve
 from torchsfm.robust.local_optimisation import Weigh
 
 _PRODUCTS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)]
-"""Products of the coordinates of (X, 1), as `_monomials` has them; the last four are (X, 1) itself."""
-_WIDTH = len(_PRODUCTS)
+"""Products of the coordinates of (X, 1); the last four are (X, 1) itself."""
 
 
 def _table() -> tuple[Tensor, Tensor]:
-    """Where the entries of (A | -g), 12 x 13, are among the 7 x 10 moments, and their signs, 0 for those that are 0.
+    """Where the entries of (A | -g), 12 x 13, are among the moments, and their signs, 0 for those that are 0.
 
-    The rows of the moments: 1, -u, -v, u^2 + v^2 for A, and three for g.
+    The moments: 1, -u, -v, u^2 + v^2 by ten products for A, and three by (X, 1) for g.
     """
-    where, present = torch.zeros(12, 13, dtype=torch.long), torch.ones(12, 13, dtype=torch.float64)
+    where, sign = torch.zeros(12, 13, dtype=torch.long), torch.ones(12, 13, dtype=torch.float64)
     factor = {(0, 0): 0, (1, 1): 0, (0, 2): 1, (1, 2): 2, (2, 2): 3}
     for row in range(12):
         for column in range(12):
             blocks, pair = sorted((row // 4, column // 4)), sorted((row % 4, column % 4))
             if blocks == [0, 1]:
-                present[row, column] = 0
+                sign[row, column] = 0
             else:
-                where[row, column] = _WIDTH * factor[blocks[0], blocks[1]] + _PRODUCTS.index((pair[0], pair[1]))
-        present[row, 12] = -1
-        where[row, 12] = _WIDTH * (4 + row // 4) + _PRODUCTS.index((row % 4, 3))
-    return where.flatten(), present
+                where[row, column] = 10 * factor[blocks[0], blocks[1]] + _PRODUCTS.index((pair[0], pair[1]))
+        where[row, 12], sign[row, 12] = 40 + row, -1
+    return where.flatten(), sign
 
 
 def _generators() -> Tensor:
-    """The derivatives of P exp(w, v) by (w, v) at 0, for P exp(w, v) = P [exp(w) | v; 0 1]: linear in P, 12 x (12 6)."""
-    linear = torch.zeros(3, 4, 3, 4, 6, dtype=torch.float64)
+    """Derivatives of diag(e^g, e^g, 1) P exp(w, v) by (w, v, g) at 0, linear in P: 12 x (12 7).
+
+    Here P exp(w, v) = P [exp(w) | v; 0 1].
+    """
+    linear = torch.zeros(3, 4, 3, 4, 7, dtype=torch.float64)
     for row in range(3):
         for axis in range(3):
             after, last = (axis + 1) % 3, (axis + 2) % 3
             linear[row, last, row, after, axis] = 1
             linear[row, after, row, last, axis] = -1
             linear[row, axis, row, 3, 3 + axis] = 1
-    return linear.reshape(12, 72)
+        for column in range(4 if row < 2 else 0):
+            linear[row, column, row, column, 6] = 1
+    return linear.reshape(12, 12, 7)
 
 
-_WHERE, _PRESENT = _table()
-_GENERATORS = _generators()
+_WHERE, _SIGN = _table()
+_GENERATORS = {size: _generators()[..., :size].reshape(12, -1) for size in (6, 7)}
 _CROSS = torch.zeros(3, 9, dtype=torch.float64)
 """From w to [w]x."""
 for _axis in range(3):
@@ -63,29 +66,40 @@ class _Views:
     """Cameras and data in the form (problem, camera, ...): several cameras of the same data share what is of the data."""
 
     def __init__(self, P: Tensor, x: Tensor, X: Tensor) -> None:
-        n = X.shape[-2]
+        self.n = n = X.shape[-2]
         data = broadcast_shapes(x.shape[:-2], X.shape[:-2])
         self.batch = broadcast_shapes(P.shape[:-2], data)
         shared = bool(self.batch) and (not data or data[-1] == 1)
-        lead = self.batch[:-1] if shared else self.batch
-        self.cameras = self.batch[-1] if shared else 1
+        lead, self.k = (self.batch[:-1], self.batch[-1]) if shared else (self.batch, 1)
         if shared:
             x, X = (d[..., 0, :, :] if d.ndim > 2 else d for d in (x, X))
-        self.x = _flat(x.mT, lead, 2, n)
-        self.points = torch.cat((_flat(X.mT, lead, 3, n), self.x.new_ones(1, 1, 1).expand(self.x.shape[0], 1, n)), 1)
-        self.P = _flat(P, self.batch, 3, 4).reshape(-1, 3 * self.cameras, 4)
+        self.x, self.X = _flat(x.mT, lead, 2, n).unsqueeze(1), _flat(X.mT, lead, 3, n)
+        self.P = _flat(P, self.batch, 3, 4).reshape(len(self.X), 3 * self.k, 4)
 
-    def project(self) -> Tensor:
-        """Homogeneous images (problem, camera, 3, n)."""
-        y = torch.bmm(self.P, self.points)
-        return y.view(len(y), self.cameras, 3, y.shape[-1])
+    def one(self) -> Tensor:
+        """The fourth coordinate of the points."""
+        return self.X.new_ones(1, 1, 1).expand(len(self.X), 1, self.n)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Homogeneous images (problem, camera, 2 and 1, n), the depths made positive, and -1 over them."""
+        y = torch.bmm(self.P, points).view(len(points), self.k, 3, self.n)
+        image, depth = y[:, :, :2], y[:, :, 2:]
+        z = depth.clamp_min(torch.finfo(depth.dtype).tiny ** 0.4)
+        return image, depth, z, torch.div(_MINUS, z)
+
+    def squares(self, r: Tensor, depth: Tensor, z: Tensor) -> Tensor:
+        """The squared lengths of r, infinite where the depth is not the positive one; comparing and filling would cost more."""
+        big = torch.finfo(z.dtype).max
+        u, v = r[:, :, :1], r[:, :, 1:]
+        behind = torch.sub(z.detach(), depth.detach()).mul_(big)
+        return torch.addcmul(u * u, v, v).add_(behind, alpha=big).view(*self.batch, self.n)
 
 
 def _flat(t: Tensor, batch: torch.Size, rows: int, columns: int) -> Tensor:
     """One batch dimension."""
     if t.shape[:-2] != batch:
         t = t.expand(*batch, rows, columns)
-    return t if t.ndim == 3 else t.reshape(-1, rows, columns)
+    return t if t.ndim == 3 else t.reshape(batch.numel(), rows, columns)
 
 
 def squared_reprojection(
@@ -93,23 +107,8 @@ def squared_reprojection(
 ) -> Float[Tensor, "*batch n"]:
     """Squared reprojection error; infinite behind the camera."""
     views = _Views(P, x, X)
-    y = views.project()
-    z, inverse = _minus_inverse(y[:, :, 2])
-    return _squares(torch.addcmul(views.x[:, None], y[:, :, :2], inverse[:, :, None]), y, z).view(*views.batch, x.shape[-2])
-
-
-def _minus_inverse(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths made positive, and -1 over them."""
-    z = depth.clamp_min(torch.finfo(depth.dtype).tiny ** 0.4)
-    return z, torch.div(_MINUS, z)
-
-
-def _squares(r: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """The squared lengths of r, infinite where the depth is not the positive one; comparisons and masks would cost more."""
-    big = torch.finfo(z.dtype).max
-    r0, r1 = r.unbind(2)
-    behind = (z.detach() - y[:, :, 2].detach()).mul_(big)
-    return torch.addcmul(r0 * r0, r1, r1).add_(behind, alpha=big)
+    image, depth, z, inverse = views.project(torch.cat((views.X, views.one()), 1))
+    return views.squares(torch.addcmul(views.x, image, inverse), depth, z)
 
 
 def normal_equations(
@@ -117,62 +116,53 @@ def normal_equations(
 ) -> tuple[Float[Tensor, "b 12 13"], torch.Size]:
     """(J'CJ | -J'Wr) over the entries of P in float64 with the weights W and C of `weigh`, and the batch that b stands for."""
     views = _Views(P, x, X)
-    n, points = X.shape[-2], views.points
-    y = views.project()
-    z, inverse = _minus_inverse(y[:, :, 2])
-    m = y[:, :, :2] * inverse[:, :, None]
-    r = views.x[:, None] + m
-    weights, curvature = weigh(_squares(r, y, z).view(*views.batch, n))
-    shape = inverse.shape
-    weights, curvature = (w.expand(*views.batch, n).reshape(shape) for w in (weights, curvature))
-    c = curvature * (inverse * inverse)
-    slope = (weights * inverse)[:, :, None] * r
-    first = c[:, :, None] * m
-    m0, m1 = m.unbind(2)
-    both = torch.addcmul(first[:, :, 0] * m0, first[:, :, 1], m1)
-    last = torch.addcmul(slope[:, :, 0] * m0, slope[:, :, 1], m1)
-    left = torch.cat((c[:, :, None], first, both[:, :, None], slope, last[:, :, None]), 2)
-    a, b, e = points[:, :1], points[:, 1:2], points[:, 2:3]
-    right = torch.cat((a * points[:, :3], b * points[:, 1:3], e * e, points), 1)
-    moments = torch.bmm(left.view(len(y), -1, n), right.mT).view(-1, 7 * _WIDTH).double()
-    device = moments.device
-    entries = moments.index_select(1, _WHERE.to(device)).view(-1, 12, 13) * _PRESENT.to(device)
+    X, n, k = views.X, views.n, views.k
+    products = torch.cat((X, X[:, 1:], X[:, 2:], X, views.one()), 1)
+    image, depth, z, inverse = views.project(products[:, 6:])
+    products[:, :3].mul_(X[:, :1])
+    products[:, 3:5].mul_(X[:, 1:2])
+    products[:, 5:6].mul_(X[:, 2:])
+    m = image * inverse
+    r = views.x + m
+    slope, curvature = weigh(views.squares(r, depth, z))
+    slope, curvature = (_flat(w, views.batch, 1, n) for w in (slope[..., None, :], curvature[..., None, :]))
+    c, slope = curvature.view_as(z) * (inverse * inverse), slope.view_as(z) * inverse * r
+    first, m0, m1 = c * m, m[:, :, :1], m[:, :, 1:]
+    both = torch.addcmul(first[:, :, :1] * m0, first[:, :, 1:], m1)
+    last = torch.addcmul(slope[:, :, :1] * m0, slope[:, :, 1:], m1)
+    matrix = torch.bmm(torch.cat((c, first, both), 2).view(len(X), 4 * k, n), products.mT)
+    vector = torch.bmm(torch.cat((slope, last), 2).view(len(X), 3 * k, n), products[:, 6:].mT)
+    moments = torch.cat((matrix.view(len(X) * k, 40), vector.view(len(X) * k, 12)), 1).double()
+    entries = moments.index_select(1, _WHERE.to(X.device)).view(-1, 12, 13) * _SIGN.to(X.device)
     return entries, views.batch
 
 
-def pose_step(
-    model: Float[Tensor, "*#batch 3 4"],
-    K: Float[Tensor, "*#batch 3 3"],
-    x: Float[Tensor, "*#batch n 2"],
-    X: Float[Tensor, "*#batch n 3"],
-    weigh: Weigh,
-) -> Float[Tensor, "*batch 3 4"]:
-    """The pose [R | t] of cameras K [R | t] after a step.
+def camera_step(
+    P: Float[Tensor, "*#batch 3 4"], size: int, x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"], weigh: Weigh
+) -> tuple[Float[Tensor, "b k 1"], torch.Size]:
+    """The step (w, v) or (w, v, g) of cameras diag(e^g, e^g, 1) P exp(w, v), of 6 or 7 parameters, and the batch of b.
 
     The world moves, not the camera: turning about the middle of the points has little in common with shifting them.
     """
-    P = K @ model
     S, batch = normal_equations(P, x, X, weigh)
-    B = pose_directions(_flat(P.double(), batch, 3, 4))
+    flat = _flat(P.double(), batch, 3, 4).reshape(-1, 12)
+    B = torch.mm(flat, _GENERATORS[size].to(P.device)).view(-1, 12, size)
     half = torch.bmm(B.mT, S)
-    step = damped_solve(torch.bmm(half[..., :12], B), half[..., 12:])
-    return moved_pose(_flat(model.double(), batch, 3, 4), step).to(x.dtype).view(*batch, 3, 4)
+    return damped_solve(torch.bmm(half[..., :12], B), half[..., 12:]), batch
 
 
-def pose_directions(P: Float[Tensor, "b 3 4"]) -> Float[Tensor, "b 12 6"]:
-    """The derivatives of cameras by a step (w, v) of the world."""
-    return torch.mm(P.reshape(-1, 12), _GENERATORS.to(P.device)).view(-1, 12, 6)
+def moved_pose(
+    pose: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "b k 1"], batch: torch.Size
+) -> Float[Tensor, "*batch 3 4"]:
+    """[R C(w) | t + R v] in float64 with Cayley's C, which is exp to second order.
 
-
-def moved_pose(pose: Float[Tensor, "b 3 4"], step: Float[Tensor, "b 6 1"]) -> Float[Tensor, "b 3 4"]:
-    """[R C(w) | t + R v] with Cayley's C, which is exp to second order, made a rotation to rounding.
-
-    What a start in lower precision lacks to a rotation is mended first.
+    What a start in lower precision lacks to a rotation is mended.
     """
-    R, t = pose[..., :3], pose[..., 3:]
-    w, v = step[:, :3], step[:, 3:]
-    R = torch.baddbmm(R, R, R.mT @ R, beta=1.5, alpha=-0.5)
-    W = torch.mm(w[..., 0], _CROSS.to(pose.device)).view(-1, 3, 3)
+    pose, w = _flat(pose.double(), batch, 3, 4), step[:, :3]
+    W = torch.mm(w[..., 0], _CROSS.to(w.device)).view(-1, 3, 3)
     # (1 - W/2)^-1 (1 + W/2)
-    turn = torch.baddbmm(W, W, W, alpha=0.5) / torch.baddbmm(_ONE.to(pose.device), w.mT, w, alpha=0.25)
-    return torch.cat((torch.baddbmm(R, R, turn), torch.baddbmm(t, R, v)), -1)
+    turn = torch.baddbmm(W, W, W, alpha=0.5) / torch.baddbmm(_ONE.to(w.device), w.mT, w, alpha=0.25)
+    moved = torch.baddbmm(pose, pose[..., :3], torch.cat((turn, step[:, 3:6]), -1))
+    R = moved[..., :3]
+    mended = torch.baddbmm(R, R, R.mT @ R, beta=1.5, alpha=-0.5)
+    return torch.cat((mended, moved[..., 3:]), -1).view(*batch, 3, 4)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._reprojection_step import pose_step, squared_reprojection
+from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
 from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
@@ -65,7 +65,7 @@ class CameraEstimator:
         *,
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on the reprojection error, the pose moving from the left: [R | t] <- exp(w) [R | t] + [0 | v]."""
+        """A Gauss-Newton step on the reprojection error, along the rigid motions."""
         return self.reweighted_step(model, x, X, weigh=lambda _: (weights, weights))
 
     def reweighted_step(
@@ -77,7 +77,8 @@ class CameraEstimator:
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
         """Such a step with weights that follow from the distances (see `Estimator`)."""
-        return pose_step(model, self.K, x, X, weigh)
+        step, batch = camera_step(self.K @ model, 6, x, X, weigh)
+        return moved_pose(model, step, batch).to(x.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3 4"]:
         """[R | t] <- exp(w) [R | t] + [0 | v], as `Pose.retract`."""

@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._reprojection_step import squared_reprojection
+from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
 from torchsfm.resection.estimate_camera import middle_and_size, moderate, present, world_pose
-from torchsfm.robust import Request, RobustResult, Score, damped_solve
+from torchsfm.robust import Request, RobustResult, Score
+from torchsfm.robust.local_optimisation import Weigh
 
 
 @dataclass(frozen=True)
@@ -64,29 +64,21 @@ class FocalCameraEstimator:
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 4"]:
         """A Gauss-Newton step on the reprojection error over pose and logarithm of the focal length."""
-        f, pose = _split(model)
-        Y = pose[..., :3] @ X.mT + pose[..., 3:]
-        y0, y1, y2 = Y.unbind(-2)
-        good = (weights > 0) & (y2 > 0)
-        inverse = torch.where(good, 1 / torch.where(good, y2, 1), 0)
-        a, b = y0 * inverse, y1 * inverse
-        root = torch.where(good, weights, 0).sqrt()
-        zero = torch.zeros_like(a)
-        # Derivatives over (w, v, log f).
-        da = torch.stack((-a * b, 1 + a * a, -b, inverse, zero, -a * inverse, a), -2)
-        db = torch.stack((-1 - b * b, a * b, a, zero, inverse, -b * inverse, b), -2)
-        scale = (f[..., None] * root)[..., None, :]
-        J = torch.cat((da * scale, db * scale), -1)
-        ru, rv = f[..., None] * a - x[..., 0], f[..., None] * b - x[..., 1]
-        r = torch.cat((ru * root, rv * root), -1)
-        moments = (torch.cat((J, r[..., None, :]), -2) @ J.mT).double()
-        step = -damped_solve(moments[..., :7, :], moments[..., 7, :, None])[..., 0]
-        turned = rotation_from_rotvec(step[..., :3]) @ pose.double()
-        R, t = turned[..., :3], turned[..., 3:] + step[..., 3:6, None]
-        # What a start in lower precision lacks to a rotation.
-        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
-        zoomed = f.double() * step[..., 6].clamp(-1, 1).exp()
-        return _join(zoomed, torch.cat((R, t), -1)).to(x.dtype)
+        return self.reweighted_step(model, x, X, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        step, batch = camera_step(model, 7, x, X, weigh)
+        f, pose = _split(model.double())
+        zoomed = f * step[:, 6, 0].clamp(-1, 1).exp().view(batch)
+        return _join(zoomed, moved_pose(pose, step, batch)).to(x.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
         """[R | t] <- exp(w) [R | t] + [0 | v], f <- exp(g) f for steps (w, v, g)."""

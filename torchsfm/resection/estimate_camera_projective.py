@@ -12,9 +12,10 @@ from torchsfm.linalg import nullspace_rows
 from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._focal import incidence_rows
-from torchsfm.resection._reprojection_step import squared_reprojection
+from torchsfm.resection._reprojection_step import normal_equations, squared_reprojection
 from torchsfm.resection.estimate_camera import moderate, present
 from torchsfm.robust import Request, RobustResult, Score, damped_solve
+from torchsfm.robust.local_optimisation import Weigh
 
 _CHUNK = 4096
 
@@ -76,26 +77,24 @@ class ProjectiveCameraEstimator:
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 4"]:
         """A Gauss-Newton step on the reprojection error over the entries of P, across P itself."""
-        y0, y1, y2 = (model[..., :3] @ X.mT + model[..., 3:]).unbind(-2)
-        good = (weights > 0) & (y2 > 0)
-        inverse = torch.where(good, 1 / torch.where(good, y2, 1), 0)
-        a, b = y0 * inverse, y1 * inverse
-        root = torch.where(good, weights, 0).sqrt()
-        h = torch.cat((X.mT, torch.ones_like(X.mT[..., :1, :])), -2) * (inverse * root)[..., None, :]
-        zero = torch.zeros_like(h)
-        ju = torch.cat((h, zero, -a[..., None, :] * h), -2)
-        jv = torch.cat((zero, h, -b[..., None, :] * h), -2)
-        r = torch.cat(((a - x[..., 0]) * root, (b - x[..., 1]) * root), -1)
-        J = torch.cat((ju, jv), -1)
-        moments = (torch.cat((J, r[..., None, :]), -2) @ J.mT).double()
-        A, g = moments[..., :12, :], moments[..., 12, :, None]
-        p = model.double().flatten(-2).expand(*A.shape[:-1])
+        return self.reweighted_step(model, x, X, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 2"],
+        X: Float[Tensor, "*#batch n 3"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        S, batch = normal_equations(model, x, X, weigh)
+        A, p = S[..., :12], model.double().expand(*batch, 3, 4).reshape(-1, 12, 1)
         # The scale is free: hold it, in units of the rest.
-        trace = A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
-        new = p - damped_solve(A + trace * p[..., :, None] * p[..., None, :], g)[..., 0]
-        size = torch.linalg.vector_norm(new, dim=-1, keepdim=True)
-        new = new / torch.where(size > 0, size, 1.0)
-        return new.reshape(*new.shape[:-1], 3, 4).to(x.dtype)
+        trace = A.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None]
+        new = p + damped_solve(torch.addcmul(A, trace * p, p.mT), S[..., 12:])
+        size = torch.linalg.vector_norm(new, dim=1, keepdim=True)
+        return (new / torch.where(size > 0, size, 1.0)).view(*batch, 3, 4).to(x.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 11"]) -> Float[Tensor, "*batch 3 4"]:
         """P moved along the unit sphere."""
