@@ -34,3 +34,14 @@ def test_solve_masks_bad_systems_only(generator: torch.Generator) -> None:
     assert ok.tolist() == [True, False, True, False, False, True]
     assert torch.equal(x[ok], good_x[ok])
     assert (x[~ok] == 0).all()
+
+
+def test_solve_broadcasts_columns(generator: torch.Generator) -> None:
+    """Also where torch would see a batch of vectors: one 4x4 right-hand side for four systems of four."""
+    for batch in ((4,), (3, 4), (5,)):
+        A = torch.randn(*batch, 4, 4, dtype=F64, generator=generator)
+        b = torch.randn(4, 4, dtype=F64, generator=generator)
+        x, good = solve(A, b)
+        assert good.all()
+        torch.testing.assert_close(A @ x, b.expand_as(A))
+        torch.testing.assert_close(solve(A[..., :1, :, :], A)[0], torch.linalg.inv(A[..., :1, :, :]) @ A)

@@ -39,6 +39,9 @@ def solve(
         The solutions, zero where there is none, and the mask of elements that have one: a matrix that LU finds singular, or
         an input or result that is not finite, makes an element False and touches no other.
     """
+    if b.ndim < A.ndim:
+        # One dimension less, and torch may take columns for a batch of vectors: a 4x4 matrix for four systems of four, say.
+        b = b.expand(*A.shape[:-2], *b.shape[-2:])
     x, info = torch.linalg.solve_ex(A, b)
     good = (info == 0) & torch.isfinite(x).all(-1).all(-1)
     return torch.where(good[..., None, None], x, 0.0), good
