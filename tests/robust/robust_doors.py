@@ -54,7 +54,8 @@ class Door:
         scene: Exact scenes of p problems with n data.
         call: The door, for data and known things in the unit of the second argument, a number of pixels.
         rank: The dimension of the model.
-        step: Errors of models against others in the terms of the covariance, if that is not of the model's entries.
+        step: Models against others in the terms of the covariance, if that is not of the model's entries.
+        dims: How many dimensions a model has.
     """
 
     sample_size: int
@@ -63,6 +64,7 @@ class Door:
     call: Callable[..., Any]
     rank: int
     step: Callable[[Tensor, Tensor], Tensor] | None = None
+    dims: int = 2
 
     def make(self, p: int, n: int, generator: torch.Generator, noise: float = 0.5, wrong: float = 0.3) -> Scene:
         return self.scene(p, n, generator).noisy(noise, wrong, self.images, generator)
@@ -70,6 +72,13 @@ class Door:
     def __call__(self, scene: Scene, threshold: Any = 2.0, unit: float = 1.0, **options: Any) -> Any:
         options = {"generator": torch.Generator().manual_seed(1), **options}
         return self.call(scene, unit, threshold=threshold, **options)
+
+    def difference(self, models: Tensor, others: Tensor) -> Tensor:
+        """In the terms of the covariance."""
+        if self.step is not None:
+            return self.step(models, others)
+        a, b = models.flatten(-self.dims), others.flatten(-self.dims)
+        return a * (a * b).sum(-1, keepdim=True).sign() - b
 
 
 def pixels(X: Tensor) -> Tensor:
@@ -208,11 +217,11 @@ DOORS = {
     "essential": Door(5, 2, _two_views, _of_rays(estimate_essential), 5),
     "homography": Door(4, 2, _plane, _projective(estimate_homography), 8),
     "upright": Door(3, 2, _upright, _of_rays(estimate_upright), 3),
-    "trifocal": Door(6, 3, _three_views, _trifocal, 18),
+    "trifocal": Door(6, 3, _three_views, _trifocal, 18, dims=3),
     "camera": Door(3, 1, _with_intrinsics, _calibrated, 6, pose_step),
     "focal": Door(4, 1, _with_centre, _focal, 7, focal_step),
     "projective": Door(6, 1, _camera, _projective(estimate_camera_projective), 11),
-    "point": Door(2, 1, _views_of_a_point, _triangulate, 3),
+    "point": Door(2, 1, _views_of_a_point, _triangulate, 3, dims=1),
 }
 
 

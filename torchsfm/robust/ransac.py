@@ -121,6 +121,8 @@ def ransac(
         raise ValueError(f"max_iterations: wanted a positive number, got {max_iterations}")
     if covariance and not has_manifold(estimator):
         raise ValueError(f"covariance: {type(estimator).__name__} does not say how its models move (`retract`)")
+    if isinstance(threshold, (int, float)) and not 0 < threshold < math.inf:
+        raise ValueError(f"threshold: wanted a positive number, got {threshold}")
     score = score or (LeastMedian() if threshold is None else Msac())
     if threshold is None and score.needs_threshold:
         raise ValueError(f"threshold: {type(score).__name__} wants one, got None")

@@ -1,5 +1,6 @@
 """What all doors of robust estimation share: the options of a call, checked, and answered in the unit and type of the data."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,7 +39,7 @@ class Request:
             ValueError: A shape, dtype, device or option does not fit.
         """
         limit = self.threshold if isinstance(self.threshold, Tensor) else None
-        if limit is None and self.threshold is not None and not 0 < self.threshold < float("inf"):
+        if isinstance(self.threshold, (int, float)) and not 0 < self.threshold < math.inf:
             raise ValueError(f"threshold: wanted a positive number, got {self.threshold}")
         options = {"mask": (self.mask, "n: bool"), "scores": (self.scores, "n"), "weights": (self.weights, "n")}
         return check_tensors(**data, threshold=(limit, ""), **options)

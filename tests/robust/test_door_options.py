@@ -1,0 +1,140 @@
+"""Every door has the same options, and they mean the same."""
+
+import inspect
+
+import pytest
+import torch
+from robust_doors import DOORS, F64, SIZE, Door, Scene
+
+from torchsfm import motion, resection, triangulation
+from torchsfm._types import Status
+from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac
+
+every_door = pytest.mark.parametrize("door", DOORS.values(), ids=DOORS)
+PUBLIC = [
+    motion.estimate_essential, motion.estimate_fundamental, motion.estimate_homography, motion.estimate_trifocal,
+    motion.estimate_upright, resection.estimate_camera, resection.estimate_camera_focal, resection.estimate_camera_projective,
+    triangulation.triangulate_points_robust,
+]  # fmt: skip
+
+
+def test_the_signatures_agree() -> None:
+    kinds = []
+    for door in PUBLIC:
+        parameters = inspect.signature(door).parameters.values()
+        options = {p.name: p.default for p in parameters if p.kind == p.KEYWORD_ONLY}
+        if door is triangulation.triangulate_points_robust:
+            # Points have a word of their own for the mask, fewer pairs to draw, and their covariance at no cost.
+            options = {"mask" if name == "visible" else name: value for name, value in options.items()}
+            options |= {"max_iterations": 10_000, "covariance": False}
+        kinds.append(options)
+        for name in options.keys() - {"mask", "covariance"}:
+            assert f"        {name}: " in (door.__doc__ or ""), (door, name)
+    assert all(kind == kinds[0] for kind in kinds)
+
+
+@every_door
+def test_weights_are_multiplicities(door: Door, generator: torch.Generator) -> None:
+    """A datum of weight 3 is as good as three of them, one of weight 0 none."""
+    scene = door.make(3, 81, generator)
+    weights = torch.randint(0, 4, (3, 81), generator=generator)
+    weighted = door(scene, weights=weights.double(), covariance=True)
+    plain = door(scene)
+    assert not (weighted.inliers & (weights == 0)).any()
+    size = weighted.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    apart, moved = [], []
+    for i in range(3):
+        index = torch.arange(81).repeat_interleave(weights[i])
+        repeated = door(Scene(tuple(d[i][index] for d in scene.data), tuple(k[i] for k in scene.known)))
+        assert torch.equal(weighted.inliers[i][index], repeated.inliers)
+        torch.testing.assert_close(weighted.score[i], repeated.score, rtol=5e-3, atol=0)
+        apart.append(door.difference(weighted.model[i], repeated.model).norm() / size[i])
+        moved.append(door.difference(weighted.model[i], plain.model[i]).norm() / size[i])
+    # In standard deviations; the reach of the final loss has steps, and may fall on either side of one.
+    apart, moved = torch.stack(apart), torch.stack(moved)
+    assert apart.median() < 0.05
+    assert apart.max() < 0.5
+    assert apart.mean() < 0.4 * moved.mean()
+
+
+@every_door
+def test_the_unit_of_the_weights_is_free(door: Door, generator: torch.Generator) -> None:
+    """Good data stay good and nonsense stays nonsense, whatever number stands for one."""
+    scene, nonsense = door.make(4, 100, generator), door.make(4, 100, generator, wrong=1.0)
+    plain = door(scene, weights=torch.ones(4, 100, dtype=F64))
+    for unit in (1e-3, 1e3):
+        weights = torch.full((4, 100), unit, dtype=F64)
+        found = door(scene, weights=weights)
+        assert (found.status == Status.OK).all()
+        torch.testing.assert_close(found.model, plain.model, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(found.score, unit * plain.score, rtol=1e-6, atol=0)
+        wrong = door(nonsense, 1.0, weights=weights, max_iterations=100)
+        assert (wrong.status == Status.NO_CONSENSUS).sum() >= 3
+
+
+@every_door
+def test_the_threshold_may_be_unknown(door: Door, generator: torch.Generator) -> None:
+    scene = door.make(6, 200, generator, noise=0.5, wrong=0.3)
+    found, known = door(scene, None), door(scene, 1.5)
+    assert (found.status == Status.OK).all()
+    assert (found.inliers == known.inliers).double().mean() > 0.95
+    # Some three times the noise, for the root of the sum over the coordinates that count.
+    pixels = found.threshold / known.threshold * 1.5
+    assert ((pixels > 0.7) & (pixels < 4)).all()
+    assert torch.equal(found.inliers, door(scene, None, score=LeastMedian()).inliers)
+    with pytest.raises(ValueError, match="threshold"):
+        door(scene, None, score=Msac())
+
+
+@every_door
+def test_every_score_finds_the_inliers(door: Door, generator: torch.Generator) -> None:
+    scene = door.make(3, 120, generator, noise=0.3, wrong=0.25)
+    plain = door(scene, 2.0)
+    assert torch.equal(plain.model, door(scene, 2.0, score=Msac()).model)
+    for score in (Magsac(), InlierCount(), LeastMedian()):
+        found = door(scene, 2.0, score=score)
+        assert (found.status == Status.OK).all(), score
+        assert (found.inliers == plain.inliers).double().mean() > 0.95, score
+
+
+@every_door
+def test_samples_follow_the_scores_and_stop_when_told(door: Door, generator: torch.Generator) -> None:
+    wrong = 0.6 if door.sample_size < 6 else 0.5
+    scene = door.scene(3, 200, generator).noisy(0.3, 0.0, door.images, generator)
+    spoiled = list(scene.data)
+    bad = torch.arange(200) >= 200 * (1 - wrong)
+    last = door.images - 1
+    anywhere = torch.rand(spoiled[last].shape, generator=generator, dtype=F64) * SIZE
+    spoiled[last] = torch.where(bad[:, None], anywhere, spoiled[last])
+    scene = Scene(tuple(spoiled), scene.known)
+    trust = (~bad).double() + 0.3 * torch.randn(3, 200, generator=generator, dtype=F64)
+    plain, guided = door(scene), door(scene, scores=trust)
+    assert (guided.status == Status.OK).all()
+    assert guided.iterations.sum() <= plain.iterations.sum()
+    assert torch.equal(guided.inliers, door(scene, scores=10 * trust - 3).inliers)
+    sure, quick = door(scene, confidence=1 - 1e-12), door(scene, confidence=0.5)
+    assert quick.iterations.sum() <= plain.iterations.sum() <= sure.iterations.sum()
+    assert quick.iterations.sum() < sure.iterations.sum()
+    assert (door(scene, max_iterations=32).iterations <= 32).all()
+    assert torch.equal(door(scene, mask=~bad.expand(3, 200)).inliers[:, bad], torch.zeros_like(plain.inliers[:, bad]))
+
+
+@every_door
+@pytest.mark.usefixtures("unchecked")
+def test_types_and_wrong_options(door: Door, generator: torch.Generator) -> None:
+    scene = door.make(2, 60, generator, wrong=0.1)
+    single = Scene(tuple(d.float() for d in scene.data), tuple(k.float() for k in scene.known))
+    one, weights = torch.ones(60), torch.ones(2, 60)
+    found = door(single, torch.tensor([2.0, 3.0]), scores=one, weights=weights, covariance=True)
+    for name in ("model", "score", "threshold", "covariance"):
+        assert getattr(found, name).dtype == torch.float32, name
+    torch.testing.assert_close(found.threshold[1] / found.threshold[0], torch.tensor(1.5))
+    first = door(single.at(0), torch.tensor([2.0, 3.0]))
+    assert first.status.shape == (2,)
+    for options, name in (
+        ({"weights": one.double()}, "weights"), ({"scores": torch.ones(59)}, "scores"), ({"threshold": -1.0}, "threshold"),
+        ({"threshold": float("nan")}, "threshold"), ({"confidence": 1.0}, "confidence"), ({"max_iterations": 0}, "max_iter"),
+        ({"mask": one}, "mask|visible"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=name):
+            door(single, **options)
