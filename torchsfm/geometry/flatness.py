@@ -56,13 +56,11 @@ def least_number_off(
     """
     n, d = X.shape[-2:]
     number = n // (d + 1)
-    rank = present.cumsum(-1)
-    wanted = torch.arange(1, number * (d + 1) + 1, device=X.device).expand(*rank.shape[:-1], -1).contiguous()
-    # Where there are too few points, the last one stands for the others, and the simplex has no width.
-    place = torch.searchsorted(rank, wanted).clamp_(max=n - 1)
+    place = present.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., : number * (d + 1)]
     corners = X.gather(-2, place[..., None].expand(*place.shape, d)).reshape(*place.shape[:-1], number, d + 1, d)
-    wide = tolerance.expand(rank.shape).gather(-1, place).reshape(corners.shape[:-1]).amax(-1)
+    wide = tolerance.expand(present.shape).gather(-1, place).reshape(corners.shape[:-1]).amax(-1)
     inverse, info = torch.linalg.inv_ex(corners[..., 1:, :] - corners[..., :1, :])
     thick = (inverse * inverse).sum((-2, -1)) * (wide * wide) * (4 * d) < 1
-    least: Tensor = (thick & (info == 0)).sum(-1)
+    full = torch.arange(d + 1, n + 1, d + 1, device=X.device) <= present.sum(-1, keepdim=True)
+    least: Tensor = (thick & full & (info == 0)).sum(-1)
     return least

@@ -111,14 +111,14 @@ class RelativePoseEstimator:
 
     def suspect(
         self,
-        model: Float[Tensor, "*#batch 3 4"],
-        d1: Float[Tensor, "*#batch n 3"],
-        d2: Float[Tensor, "*#batch n 3"],
+        model: Float[Tensor, "p 3 4"],
+        d1: Float[Tensor, "p n 3"],
+        d2: Float[Tensor, "p n 3"],
         *,
-        inliers: Bool[Tensor, "*#batch n"],
-        threshold: Float[Tensor, "*#batch"],
-        chance: Float[Tensor, "*#batch"],
-    ) -> Bool[Tensor, "*batch"]:
+        inliers: Bool[Tensor, "p n"],
+        threshold: Float[Tensor, "p"],
+        chance: Float[Tensor, "p"],
+    ) -> Bool[Tensor, "p"]:
         """Whether R alone, or R + t n', may relate all inliers but so few as chance explains: a plane at any distance."""
         h2 = d2.mT
         h2 = h2 * (h2 * h2).sum(-2, keepdim=True).rsqrt()
@@ -209,10 +209,13 @@ def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:
     return torch.tensor(_SLACK if threshold is None else threshold, dtype=torch.float64, device=like.device)
 
 
-def unit_rays(d: Tensor) -> Tensor:
+def unit_rays(d: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:
     """Rays of length 1 in float64; NaN for those without direction, so that they are left out."""
-    d = d.double()
-    square = (d * d).sum(-1, keepdim=True).detach()
-    good = torch.isfinite(square) & (square > 0)
-    safe = torch.where(good, d, 1)
-    return torch.where(good, safe * (safe * safe).sum(-1, keepdim=True).rsqrt(), torch.nan)
+    # One coordinate in a row: sums of three are then taken along the memory.
+    rows = d.double().mT.contiguous()
+    square = (rows * rows).sum(-2, keepdim=True)
+    good = (square > 0) & (square < torch.inf)
+    if bool(good.all()):
+        return (rows * square.rsqrt()).mT
+    safe = torch.where(good, rows, 1)
+    return torch.where(good, safe * (safe * safe).sum(-2, keepdim=True).rsqrt(), torch.nan).mT

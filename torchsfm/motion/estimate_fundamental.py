@@ -133,14 +133,14 @@ class FundamentalEstimator:
 
     def suspect(
         self,
-        model: Float[Tensor, "*#batch 3 4"],
-        x1: Float[Tensor, "*#batch n 2"],
-        x2: Float[Tensor, "*#batch n 2"],
+        model: Float[Tensor, "p 3 4"],
+        x1: Float[Tensor, "p n 2"],
+        x2: Float[Tensor, "p n 2"],
         *,
-        inliers: Bool[Tensor, "*#batch n"],
-        threshold: Float[Tensor, "*#batch"],
-        chance: Float[Tensor, "*#batch"] | None = None,
-    ) -> Bool[Tensor, "*batch"]:
+        inliers: Bool[Tensor, "p n"],
+        threshold: Float[Tensor, "p"],
+        chance: Float[Tensor, "p"] | None = None,
+    ) -> Bool[Tensor, "p"]:
         """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
         F, e = model[..., :3], model[..., 3]
         h1, h2 = (torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0) for x in (x1, x2))

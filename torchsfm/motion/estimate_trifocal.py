@@ -119,15 +119,15 @@ class TrifocalEstimator:
 
     def suspect(
         self,
-        model: Float[Tensor, "*#batch 2 3 4"],
-        x1: Float[Tensor, "*#batch n 2"],
-        x2: Float[Tensor, "*#batch n 2"],
-        x3: Float[Tensor, "*#batch n 2"],
+        model: Float[Tensor, "p 2 3 4"],
+        x1: Float[Tensor, "p n 2"],
+        x2: Float[Tensor, "p n 2"],
+        x3: Float[Tensor, "p n 2"],
         *,
-        inliers: Bool[Tensor, "*#batch n"],
-        threshold: Float[Tensor, "*#batch"],
-        chance: Float[Tensor, "*#batch"] | None = None,
-    ) -> Bool[Tensor, "*batch"]:
+        inliers: Bool[Tensor, "p n"],
+        threshold: Float[Tensor, "p"],
+        chance: Float[Tensor, "p"] | None = None,
+    ) -> Bool[Tensor, "p"]:
         """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
         spare = 2.0 if chance is None else most_by_chance(chance, 2)
         return planar_suspected(model, (x1, x2, x3), inliers, threshold * threshold, spare)

@@ -150,6 +150,6 @@ def estimate_upright(
         confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
     batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"))
-    up1, up2 = (unit_rays(g).expand(*batch, 3) for g in (gravity1, gravity2))
+    up1, up2 = (unit_rays(g[..., None, :])[..., 0, :].expand(*batch, 3) for g in (gravity1, gravity2))
     estimator = UprightPoseEstimator(up1, up2, pose_slack(threshold, d1).expand(batch))
     return request.answer(estimator, unit_rays(d1), unit_rays(d2), dtype=d1.dtype)

@@ -1,5 +1,6 @@
 """Bringing two images to a common moderate scale, so that a threshold stays a threshold."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,37 +42,47 @@ def common_scale_of_views(
     x: Sequence[Float[Tensor, "*#batch n 2"]], mask: Bool[Tensor, "*#batch n"] | None
 ) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """The same for any number of images: the points, the similarities, the common factor."""
+    # One coordinate in a row: extremes and differences are then taken along the memory.
+    rows = [view.mT.contiguous() for view in x]
     # The similarity is held when the points move.
-    fixed = [view.detach() for view in x]
-    usable = torch.isfinite(fixed[0]).all(-1)
-    for view in fixed[1:]:
-        usable = usable & torch.isfinite(view).all(-1)
+    fixed = [row.detach() for row in rows]
+    low, high = _extremes(fixed, mask)
+    centre = (low + high) / 2
+    size = (high - low).amax((-2, -1)) / 2
+    scale = torch.where((size > 0) & (size < torch.inf), 1 / size, 1)
+    s = scale[..., None, None]
+    similarities = s.new_zeros(*centre.shape[:-1], 3, 3)
+    similarities.diagonal(dim1=-2, dim2=-1)[..., :2] = s
+    similarities[..., :2, 2] = -s * centre
+    similarities[..., 2, 2] = 1
+    points = [((row - c[..., None]) * s).mT for row, c in zip(rows, centre.unbind(-2), strict=True)]
+    return points, list(similarities.unbind(-3)), scale
+
+
+def _extremes(rows: Sequence[Tensor], mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Of each coordinate of each view `(*batch, view, 2)`, the least and the largest where all views are finite, or 0."""
+    if mask is None and rows[0].shape[-1]:
+        low, high = _in_one([row.amin(-1) for row in rows]), _in_one([row.amax(-1) for row in rows])
+        if math.isfinite(float((high - low).sum())):
+            return low, high
+    usable = torch.isfinite(rows[0]).all(-2)
+    for row in rows[1:]:
+        usable = usable & torch.isfinite(row).all(-2)
     if mask is not None:
         usable = usable & mask
-    usable = usable[..., None]
-    some = usable.any(-2)
-    centres, halves = [], []
-    for view in fixed:
-        if view.shape[-2] == 0:
-            low = high = torch.where(some, torch.zeros_like(view.sum(-2)), 0)
-        else:
-            low = torch.where(some, torch.where(usable, view, torch.inf).amin(-2), 0)
-            high = torch.where(some, torch.where(usable, view, -torch.inf).amax(-2), 0)
-        centres.append((low + high) / 2)
-        halves.append(((high - low) / 2).amax(-1))
-    size = halves[0]
-    for half in halves[1:]:
-        size = torch.maximum(size, half)
-    scale = torch.where(torch.isfinite(size) & (size > 0), 1 / size, 1)
-    s = scale[..., None, None]
-    similarities = []
-    for centre in centres:
-        T = torch.zeros(*scale.shape, 3, 3, dtype=scale.dtype, device=scale.device)
-        T[..., 0, 0] = T[..., 1, 1] = scale
-        T[..., :2, 2] = -scale[..., None] * centre
-        T[..., 2, 2] = 1
-        similarities.append(T)
-    return [(view - centre[..., None, :]) * s for view, centre in zip(x, centres, strict=True)], similarities, scale
+    usable = usable[..., None, :]
+    some = usable.any(-1)
+    if not rows[0].shape[-1]:
+        none = _in_one([torch.zeros_like(some * row.sum(-1)) for row in rows])
+        return none, none
+    low = _in_one([torch.where(some, torch.where(usable, row, torch.inf).amin(-1), 0) for row in rows])
+    return low, _in_one([torch.where(some, torch.where(usable, row, -torch.inf).amax(-1), 0) for row in rows])
+
+
+def _in_one(views: list[Tensor]) -> Tensor:
+    if any(view.shape != views[0].shape for view in views):
+        views = list(torch.broadcast_tensors(*views))  # type: ignore[no-untyped-call]
+    return torch.stack(views, -2)
 
 
 def largest_positive(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

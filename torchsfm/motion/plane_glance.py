@@ -22,18 +22,18 @@ collects less than it holds. Where it holds half, 1 % stay below; where 60 %, 0.
 
 
 def plane_suspected(
-    A: Float[Tensor, "*batch 3 3"],
-    e: Float[Tensor, "*batch 3"],
-    h1: Float[Tensor, "*batch 3 n"],
-    h2: Float[Tensor, "*batch 3 n"],
-    inliers: Bool[Tensor, "*batch n"],
-    limit: Float[Tensor, "*batch"],
-    spare: Float[Tensor, "*batch"] | float,
-) -> Bool[Tensor, "*batch"]:
+    A: Float[Tensor, "p 3 3"],
+    e: Float[Tensor, "p 3"],
+    h1: Float[Tensor, "p 3 n"],
+    h2: Float[Tensor, "p 3 n"],
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p"],
+    spare: Float[Tensor, "p"] | float,
+) -> Bool[Tensor, "p"]:
     """Whether one plane may hold half of the inliers, or all but a few. What is not suspected almost never is so.
 
     Args:
-        A: A homography that agrees with the epipolar geometry. The plane of A itself is tried too.
+        A: A homography that agrees with the epipolar geometry.
         e: The epipole in the second image.
         h1: The first points, homogeneous, or rays: a part spread over all data.
         h2: The second points, or rays of unit length.
@@ -41,27 +41,28 @@ def plane_suspected(
         limit: Squared largest transfer error.
         spare: How many inliers aside of the plane do not clear it.
     """
-    side = e[..., None]
-    y = A @ h1
-    a, b = torch.linalg.cross(y, h2, dim=-2), torch.linalg.cross(h2, side, dim=-2)
-    square = (b * b).sum(-2, keepdim=True)
-    depth = (a * b).sum(-2, keepdim=True) / square
-    y = y + side * depth
-    scale = (square / ((y * y).sum(-2, keepdim=True) * limit[..., None, None])).sqrt()
+    p, n = inliers.shape
+    side = e[:, :, None]
+    y = torch.bmm(A, h1)
+    b = torch.linalg.cross(h2, side, dim=1)
+    share, square = (torch.stack((torch.linalg.cross(y, h2, dim=1), b)) * b).sum(2, keepdim=True).unbind(0)
+    depth = share / square
+    y = torch.addcmul(y, side, depth)
+    scale = (square / ((y * y).sum(1, keepdim=True) * limit[:, None, None])).sqrt()
     # A point at the epipole is on every plane, an outlier far from each.
-    rows = (torch.cat((h1, depth), -2) * scale).nan_to_num_(nan=0.0)
-    rows[..., 3, :].masked_fill_(~inliers, torch.inf)
+    rows = torch.cat((h1, depth), 1).mul_(scale).nan_to_num_(nan=0.0)
+    rows[:, 3].masked_fill_(~inliers, torch.inf)
     # The inliers that a triple takes are at three places of their order.
-    rank = inliers.cumsum(-1, dtype=rows.dtype)
-    count = rank[..., -1:]
-    place = torch.searchsorted(rank, count * _places(rows.dtype, rows.device))[..., None, :]
-    corners = rows.gather(-1, place.expand(*rows.shape[:-1], -1)).unflatten(-1, (3, _TRIPLES)).movedim(-1, -3).mT
+    count = inliers.sum(-1, keepdim=True)
+    place = (count * _places(rows.dtype, rows.device)).long()
+    place = inliers.to(torch.int8).argsort(dim=-1, descending=True, stable=True).gather(-1, place)
+    corners = rows.gather(-1, place[:, None].expand(-1, 4, -1)).view(p, 4, 3, _TRIPLES).permute(0, 3, 2, 1)
     v = torch.linalg.solve_ex(corners[..., :3], corners[..., 3])[0]
-    v = torch.cat((v, torch.zeros_like(v[..., :1, :])), -2)
-    error = v @ rows[..., :3, :] - rows[..., 3:, :]
-    loss: Tensor = (error * error).clamp_(max=1).sum(-1).nan_to_num(nan=torch.inf).amin(-1)
-    count = count[..., 0]
-    off: Tensor = loss - (rows.shape[-1] - count)
+    error = torch.baddbmm(rows[:, 3:], v, rows[:, :3], beta=-1)
+    # In place: with so many numbers new memory costs more than arithmetic.
+    loss = error.mul_(error).clamp_(max=1).sum(-1).nan_to_num_(nan=torch.inf).amin(-1)
+    count = count[:, 0]
+    off: Tensor = loss - (n - count)
     return (off < (1 - _SHARE) * count) | (off <= spare)
 
 
@@ -69,6 +70,6 @@ def plane_suspected(
 def _places(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "m"]:
     """Where in an order from 0 to 1 the corners of the triples are: first all first corners, one in each third."""
     step = torch.arange(1, _TRIPLES + 1, dtype=dtype)
-    # Multiples of two irrational numbers and of their sum, independent of each other, in (0, 1].
-    parts = [1 - (step * factor) % 1 for factor in (0.7548776662466927, 0.5698402909980532, 0.3247179572447461)]
-    return torch.cat([(i + part) / 3 for i, part in enumerate(parts)]).clamp(max=1).to(device)
+    # Multiples of irrational numbers, independent of each other.
+    parts = [(step * factor) % 1 for factor in (0.7548776662466927, 0.5698402909980532, 0.4142135623730951)]
+    return torch.cat([(i + part) / 3 for i, part in enumerate(parts)]).to(device)

@@ -91,12 +91,12 @@ def rivals_of_plane(
 
 
 def planar_suspected(
-    model: Float[Tensor, "*batch 2 3 4"],
+    model: Float[Tensor, "p 2 3 4"],
     x: Sequence[Tensor],
-    inliers: Bool[Tensor, "*batch n"],
-    limit: Float[Tensor, "*batch"],
-    spare: Float[Tensor, "*batch"] | float,
-) -> Bool[Tensor, "*batch"]:
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p"],
+    spare: Float[Tensor, "p"] | float,
+) -> Bool[Tensor, "p"]:
     """Whether one plane may hold half of the inliers in both pairs of views, or all but a few (see `plane_suspected`)."""
     first, *others = (torch.nn.functional.pad(y.mT, (0, 0, 0, 1), value=1.0) for y in x)
     pairs = [
