@@ -61,6 +61,6 @@ def least_number_off(
     wide = tolerance.expand(present.shape).gather(-1, place).reshape(corners.shape[:-1]).amax(-1)
     inverse, info = torch.linalg.inv_ex(corners[..., 1:, :] - corners[..., :1, :])
     thick = (inverse * inverse).sum((-2, -1)) * (wide * wide) * (4 * d) < 1
-    full = torch.arange(d + 1, n + 1, d + 1, device=X.device) <= present.sum(-1, keepdim=True)
+    full = torch.arange(1, number + 1, device=X.device) * (d + 1) <= present.sum(-1, keepdim=True)
     least: Tensor = (thick & full & (info == 0)).sum(-1)
     return least

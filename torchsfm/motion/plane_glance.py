@@ -60,9 +60,11 @@ def plane_suspected(
     v = torch.linalg.solve_ex(corners[..., :3], corners[..., 3])[0]
     error = torch.baddbmm(rows[:, 3:], v, rows[:, :3], beta=-1)
     # In place: with so many numbers new memory costs more than arithmetic.
-    loss = error.mul_(error).clamp_(max=1).sum(-1).nan_to_num_(nan=torch.inf).amin(-1)
+    loss = error.mul_(error).clamp_(max=1).sum(-1).nan_to_num_(nan=torch.inf)
+    # Where no triple determines a plane, nothing is known.
+    least = loss.amin(-1).nan_to_num_(posinf=0.0)
     count = count[:, 0]
-    off: Tensor = loss - (n - count)
+    off: Tensor = least - (n - count)
     return (off < (1 - _SHARE) * count) | (off <= spare)
 
 
