@@ -8,20 +8,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import cross_matrix, rotation_from_rotvec
-from torchsfm.motion.epipolar_fit import (
-    cross_rows,
-    epipolar_rows,
-    normal_equations,
-    products,
-    sphere_rows,
-    squared_from_rows,
-)
+from torchsfm.geometry import rotation_from_rotvec
+from torchsfm.motion.epipolar_fit import sphere_rows
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, squared_transfer
 from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.motion.relative_5pt import relative_5pt
+from torchsfm.motion.sampson_sphere import pose_step, squared_distance, step_equations
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
+from torchsfm.robust import Degeneracy, Request, RobustResult, Score
+from torchsfm.robust.local_optimisation import Weigh
 from torchsfm.tensors import essential_from_pose
 
 _SLACK = 2e-3
@@ -58,13 +53,7 @@ class RelativePoseEstimator:
         self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared angular Sampson distance; infinite behind a camera."""
-        R, t = model[..., :3], model[..., 3]
-        z = products(sphere_rows(d1), sphere_rows(d2), sphere=True)
-        rows = epipolar_rows(cross_rows(t, R), R, t, (R * t[..., None]).sum(-2), z=z, sphere=True)
-        squared, _ = squared_from_rows(rows, sphere=True)
-        cosine, along2, along1 = rows[..., 7, :], rows[..., 8, :], rows[..., 9, :]
-        least = torch.minimum(along2 * cosine - along1, along2 - along1 * cosine)
-        return squared.masked_fill(least < -self.slack[..., None], torch.inf)
+        return squared_distance(model, d1, d2, self.slack)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
@@ -85,18 +74,20 @@ class RelativePoseEstimator:
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 4"]:
         """A Gauss-Newton step on Sampson's distance: R <- exp(w) R, and t along the unit sphere."""
-        R, t = model[..., :3], model[..., 3]
-        A, b = normal_equations(cross_rows(t, R), sphere_rows(d1), sphere_rows(d2), weights, sphere=True)
-        R, t = R.double(), t.double()
-        axes = cross_matrix(torch.eye(3, dtype=R.dtype, device=R.device))
-        turn = cross_matrix(t)[..., None, :, :] @ axes @ R[..., None, :, :]
-        move = axes @ R[..., None, :, :]
-        tangent = torch.cat((turn, move), -3).flatten(-2).mT
-        A, b = tangent.mT @ A @ tangent, tangent.mT @ b[..., None]
-        # A move along t changes nothing but the length of E: keep it at zero.
-        along = torch.cat((torch.zeros_like(t), t), -1)
-        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * along[..., :, None] * along[..., None, :]
-        step = -damped_solve(A, b)[..., 0]
+        return self.reweighted_step(model, d1, d2, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """The step of `refine` with weights that follow from the distances."""
+        A, b = step_equations(model, d1, d2, self.slack, weigh)
+        R, t = model[..., :3].double(), model[..., 3].double()
+        step = pose_step(A, b, t)
         t = t + step[..., 3:]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
         R = rotation_from_rotvec(step[..., :3]) @ R

@@ -8,22 +8,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.motion.epipolar_fit import (
-    cofactors,
-    cross_rows,
-    epipolar_rows,
-    matrices,
-    normal_equations,
-    plane_rows,
-    products,
-    squared_from_rows,
-)
+from torchsfm.motion.epipolar_fit import cofactors, cross_rows, matrices, plane_rows
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_rivals
 from torchsfm.motion.plane_glance import plane_suspected
+from torchsfm.motion.sampson_plane import squared_distance, step_equations
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
+from torchsfm.robust.local_optimisation import Weigh
 
 
 @dataclass(frozen=True)
@@ -71,11 +64,7 @@ class FundamentalEstimator:
         self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared Sampson distance; infinite for points that are behind one camera."""
-        F, e = model[..., :3], model[..., 3]
-        z = products(plane_rows(x1), plane_rows(x2), sphere=False)
-        rows = epipolar_rows(F, cross_rows(e, F), z=z, sphere=False)
-        squared, _ = squared_from_rows(rows, sphere=False)
-        return squared.masked_fill(rows[..., 5, :] > 0, torch.inf)
+        return squared_distance(model, x1, x2)
 
     def residual(
         self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
@@ -95,11 +84,22 @@ class FundamentalEstimator:
         *,
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and, to second order, of determinant 0.
+        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and, to second order, of determinant 0."""
+        return self.reweighted_step(model, x1, x2, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """The step of `refine` with weights that follow from the distances.
 
         The step minimises the quadratic model under the linearised constraint (sequential quadratic programming).
         """
-        A, b = normal_equations(model[..., :3], plane_rows(x1), plane_rows(x2), weights, sphere=False)
+        A, b = step_equations(model, x1, x2, weigh)
         F, e = model[..., :3].double(), model[..., 3].double()
         f, normal = F.flatten(-2), cofactors(F).flatten(-2)
         A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * f[..., :, None] * f[..., None, :]

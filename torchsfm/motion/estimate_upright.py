@@ -8,13 +8,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import cross_matrix, rotation_from_rotvec
+from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.linalg import cross
-from torchsfm.motion.epipolar_fit import cross_rows, normal_equations, sphere_rows
 from torchsfm.motion.estimate_essential import RelativePoseEstimator, pose_slack, unit_rays
 from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
+from torchsfm.motion.sampson_sphere import pose_step, step_equations
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import Request, RobustResult, Score, damped_solve
+from torchsfm.robust import Request, RobustResult, Score
+from torchsfm.robust.local_optimisation import Weigh
 
 
 @dataclass(frozen=True)
@@ -74,18 +75,23 @@ class UprightPoseEstimator:
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3 4"]:
         """A Gauss-Newton step on Sampson's distance: R turned about the vertical, and t along the unit sphere."""
-        R, t = model[..., :3], model[..., 3]
-        A, b = normal_equations(cross_rows(t, R), sphere_rows(d1), sphere_rows(d2), weights, sphere=True)
-        R, t, up = R.double(), t.double(), self.gravity2.double()
-        axes = cross_matrix(torch.eye(3, dtype=R.dtype, device=R.device))
-        turn = cross_matrix(t) @ cross_matrix(up) @ R
-        move = axes @ R[..., None, :, :]
-        tangent = torch.cat((turn[..., None, :, :], move), -3).flatten(-2).mT
-        A, b = tangent.mT @ A @ tangent, tangent.mT @ b[..., None]
-        # A move along t changes nothing but the length of E: keep it at zero.
-        along = torch.cat((torch.zeros_like(t[..., :1]), t), -1)
-        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * along[..., :, None] * along[..., None, :]
-        step = -damped_solve(A, b)[..., 0]
+        return self.reweighted_step(model, d1, d2, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """The step of `refine` with weights that follow from the distances."""
+        A, b = step_equations(model, d1, d2, self.slack, weigh)
+        R, t, up = model[..., :3].double(), model[..., 3].double(), self.gravity2.double()
+        # Of all turns the one about the vertical.
+        A = torch.cat(((up[..., None, :] @ A[..., :3, :]), A[..., 3:, :]), -2)
+        A = torch.cat((A[..., :3] @ up[..., None], A[..., 3:]), -1)
+        step = pose_step(A, torch.cat(((up * b[..., :3]).sum(-1, keepdim=True), b[..., 3:]), -1), t)
         t = t + step[..., 1:]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
         R = rotation_from_rotvec(step[..., :1] * up) @ R
