@@ -109,14 +109,13 @@ def step_equations(
     scale = weights / size
     share = scale * squared
     slope = e * (scale + 2 * share)
-    turn, move = (J @ slope[..., None])[..., 0].chunk(2, -1)
-    near = (p @ (share * along1)[..., None])[..., 0]
-    far = sums_of_products((share * along2)[..., None, :], h2)[..., 0, :]
-    turn, move = (turn + torch.linalg.cross(near, t)).double(), (move + near + far).double()
-    t = t.double()
-    move = move - t * (t * move).sum(-1, keepdim=True)
-    A = ((curvature / size)[..., None, :] * J) @ J.mT
-    return A.double(), torch.cat((turn, move), -1)
+    # A product with a single column would be rounded otherwise for one problem than for several.
+    both = torch.cat(((curvature / size)[..., None, :] * J, slope[..., None, :]), -2) @ J.mT
+    A, (turn, move) = both[..., :6, :].double(), both[..., 6, :].double().chunk(2, -1)
+    pair = torch.stack((share * along1, share * along2), -2)
+    near, far, t = (pair @ p.mT)[..., 0, :].double(), sums_of_products(pair, h2)[..., 1, :].double(), t.double()
+    turn, move = turn + torch.linalg.cross(near, t), move + near + far
+    return A, torch.cat((turn, move - t * (t * move).sum(-1, keepdim=True)), -1)
 
 
 def pose_step(

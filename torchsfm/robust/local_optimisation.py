@@ -28,7 +28,7 @@ _LEAST = 1e-6
 """Smallest variance of the noise in units of the squared threshold."""
 SCALE_STEPS = 3
 """Rounds of the final refinement that estimate the scale of the noise."""
-FIRST_STEPS, LAST_STEPS = 1, 2
+FIRST_STEPS, LAST_STEPS = 1, 3
 """Rounds that hold it, in the precision of scoring and in float64; twice as many without the curvature of the loss."""
 LOCAL_DATA, SCALE_DATA = 256, 512
 """Local optimisation, and the estimation of the scale, look at so many data at most."""
@@ -148,9 +148,17 @@ def optimise_within(
 
 
 def _falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tensor]:
-    """Weight and curvature of the loss u - u^2 / 2, up to its maximum."""
-    u, counts = torch.where(u < 1, u, 1), counts[:, None]
-    return (1 - u) * counts, (1 - (1 + 2 / codimension) * u).clamp_(min=0) * counts
+    """Weight and curvature of the loss u - u^2 / 2, up to its maximum.
+
+    Negative curvatures could make the Hessian indefinite. They are taken from all positive ones in proportion instead, so that
+    steps are as long as they should be on average.
+    """
+    u, counts = u.clamp(max=1), counts[:, None]
+    slope = 1 - u
+    curvature = slope - (2 / codimension) * u * (slope > 0)
+    total, curvature = (curvature * counts).sum(-1, keepdim=True), curvature.clamp_(min=0) * counts
+    share = total / curvature.sum(-1, keepdim=True).clamp(min=_LEAST)
+    return slope * counts, curvature * share.clamp(min=0.3)
 
 
 def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"]) -> Float[Tensor, "*batch k r"]:
