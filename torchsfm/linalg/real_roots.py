@@ -8,6 +8,7 @@ cubic gives a start, Newton's method between bounds the root. All arithmetic has
 """
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -86,26 +87,19 @@ def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3, *, in_order: boo
     c = torch.where(torch.isfinite(c).all(0), c, 0)
     cut, turn = _cuts(c.dtype, c.device)
     both = torch.stack((c, c.flip(0)), 1)
-    nodes, changes, several = _look(both)
+    changes, several = (bits.flatten(0, 2) for bits in _look(both))
     both = both.view(n + 1, 2 * batch)
-    # A cell has the number (node * 2 + side) * 2 + reversal, and the value at its start the same place.
-    cell, item = (changes & ~several).flatten(0, 2).nonzero().unbind(1)
-    values = len(_NODES) * 4 * batch
-    offsets = torch.tensor([[0], [values], [4 * batch], [values + 4 * batch]], device=c.device)
-    single = _Intervals(
-        torch.add(item, cell & 1, alpha=batch),
-        take_columns(turn, cell),
-        _look_up(nodes.view(-1), torch.add(item, cell, alpha=batch) + offsets),
-    )
-    cell, item = several.flatten(0, 2).nonzero().unbind(1)
-    sub, pair = _cut_again(both, torch.add(item, cell & 1, alpha=batch), take_columns(cut, cell), turn[2].index_select(0, cell))
-    some = _Intervals(*(torch.cat(x, -1) for x in zip(single, sub, strict=True)))
-    x, rise = _start(some.path, some.ends, degree=n)
-    column = torch.cat((some.column, pair.column, pair.column))
-    low, high = some.path[:2].aminmax(dim=0)
-    part = _dip(pair.path, pair.ends, take_columns(both, pair.column), degree=n)
-    x, low, high, rise = (torch.cat((a, *b), -1) for a, b in zip((x, low, high, rise), part, strict=True))
-    x, found = _refine(take_columns(both, column), x, low, high, rise, steps=steps)
+    # A cell has the number (node * 2 + side) * 2 + reversal.
+    cell, item = (changes & ~several).nonzero().unbind(1)
+    column, path = torch.add(item, cell & 1, alpha=batch), take_columns(turn, cell)
+    cell, item = several.nonzero().unbind(1)
+    close = torch.add(item, cell & 1, alpha=batch)
+    single, pair = _cut_again(take_columns(both, close), take_columns(cut, cell), turn[2].index_select(0, cell))
+    column, path = torch.cat((column, close.index_select(0, single[0]))), torch.cat((path, single[1]), -1)
+    x, found = _find(take_columns(both, column), path, steps=steps)
+    other = close.index_select(0, pair[0])
+    x2, found2 = _find_two(take_columns(both, other), *pair[1:], steps=steps)
+    column, x, found = torch.cat((column, other, other)), torch.cat((x, x2)), torch.cat((found, found2))
     keep = found.nonzero()[:, 0]
     column = column.index_select(0, keep)
     reversed_ = column >= batch
@@ -115,17 +109,6 @@ def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3, *, in_order: boo
         keep, reversed_ = keep.index_select(0, order), reversed_.index_select(0, order)
     x = x.index_select(0, keep)
     return RootList(item, torch.where(reversed_, 1, x), torch.where(reversed_, x, 1))
-
-
-class _Intervals(NamedTuple):
-    """Intervals with a root or two, one after the other."""
-
-    column: Tensor
-    """Number of the polynomial or reversal."""
-    path: Tensor
-    """Begin and end, in the direction away from zero, and the angle from one to the other: (3, intervals)."""
-    ends: Tensor
-    """Value and slope at the begin, value and slope at the end: (4, intervals)."""
 
 
 @cache
@@ -141,33 +124,24 @@ def _cuts(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     return tuple(torch.tensor(x, dtype=dtype, device=device).mT.contiguous() for x in (cuts, turns))  # type: ignore[return-value]
 
 
-def _look_up(table: Float[Tensor, " k"], index: Int[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    return table.index_select(0, index.reshape(-1)).view(index.shape)
-
-
-def _look(both: Float[Tensor, "m 2 batch"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Values and slopes at the nodes, (value or slope, node, side, reversal, batch), and what they say of the cells.
-
-    The slope is (1 + z^2) p' - n z p, the same positive multiple of h' as the value p is of h. Of each cell is said whether
-    there is a change of sign, and whether there may be two roots or more.
-    """
-    n = both.shape[0] - 1
-    k = torch.arange(n + 1, dtype=both.dtype, device=both.device)[:, None, None]
-    c = both.new_empty(n + 1, 2, *both.shape[1:])
-    c[:, 0] = both
-    torch.mul(both[1:], k[1:], out=c[:-1, 1])
-    c[-1, 1] = 0
-    c[1:, 1].addcmul_(both[:-1], n - k[:-1], value=-1)
-    z = both.new_tensor(_NODES)[:, None, None]
+@kernel(chunk=1024)
+def _look(c: Float[Tensor, "m 2 batch"]) -> tuple[Tensor, Tensor]:
+    """Which cells, (node, side, reversal, batch), have a change of sign, and which may have two roots or more."""
+    n = c.shape[0] - 1
+    # The slope is (1 + z^2) p' - n z p, the same positive multiple of h' as the value p is of h.
+    k = torch.arange(n + 1, dtype=c.dtype, device=c.device)[:, None, None]
+    both = c.new_empty(n + 1, 2, *c.shape[1:])
+    both[:, 0] = c
+    torch.mul(c[1:], k[1:], out=both[:-1, 1])
+    both[-1, 1] = 0
+    both[1:, 1].addcmul_(c[:-1], n - k[:-1], value=-1)
+    z = c.new_tensor(_NODES)[:, None, None]
     square = z * z
-    c = c[:, :, None]
-    even, odd = _horner(c[0::2], square), _horner(c[1::2], square)
+    both = both[:, :, None]
+    even, odd = _horner(both[0::2], square), _horner(both[1::2], square)
     odd *= z
-    nodes = both.new_empty(2, len(_NODES), 2, *both.shape[1:])
-    torch.add(even, odd, out=nodes[:, :, 0])
-    torch.sub(even, odd, out=nodes[:, :, 1])
-    step = both.new_tensor([_STEP, -_STEP])[:, None, None]
-    return nodes, *_several(nodes[0], nodes[1], step)
+    values, slopes = torch.stack((even + odd, even.sub_(odd)), 2).unbind(0)
+    return _several(values, slopes, c.new_tensor([_STEP, -_STEP])[:, None, None])
 
 
 def _horner(c: Tensor, x: Tensor) -> Tensor:
@@ -201,32 +175,40 @@ def _several(p: Tensor, q: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _cut_again(
-    both: Float[Tensor, "m columns"], column: Int[Tensor, " cells"], x: Float[Tensor, "nodes cells"], turn: Tensor
-) -> tuple[_Intervals, _Intervals]:
-    """Of the parts of some cells those with one root, and those with a pair or none."""
-    n = both.shape[0] - 1
-    p, d = _horner_slope(take_columns(both, column)[:, None], x)
+    k: Float[Tensor, "m cells"], x: Float[Tensor, "nodes cells"], turn: Float[Tensor, " cells"]
+) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+    """Of the parts of some cells those with one root, and those with a pair or none.
+
+    For each: the number of the cell, begin, end and angle, and value and slope at the begin, value and slope at the end.
+    """
+    n, cells = k.shape[0] - 1, k.shape[1]
+    p, d = _horner_slope(k[:, None], x)
     q = torch.addcmul((1 + x * x) * d, p, x, value=-n)
     turn = turn / _PARTS
     changes, several = _several(p, q, turn)
+    table = torch.stack((x, p, q)).flatten(1)
 
-    def parts(bits: Tensor) -> _Intervals:
+    def parts(bits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         part, which = bits.nonzero().unbind(1)
-        place = torch.add(which, part, alpha=len(column))
-        place = torch.stack((place, place + len(column)))
-        rows = torch.stack([_look_up(table.view(-1), place) for table in (x, p, q)], 1)
-        path = torch.cat((rows[:, 0], turn.index_select(0, which)[None]))
-        return _Intervals(column.index_select(0, which), path, rows[:, 1:].reshape(4, -1))
+        place = torch.add(which, part, alpha=cells)
+        begin, end = take_columns(table, place), take_columns(table, place + cells)
+        path = torch.stack((begin[0], end[0], turn.index_select(0, which)))
+        return which, path, torch.cat((begin[1:], end[1:]))
 
     return parts(changes), parts(several & ~changes)
 
 
 @kernel(chunk=1 << 20)
-def _start(path: Tensor, ends: Tensor, *, degree: int) -> tuple[Tensor, Tensor]:
-    """Where the Hermite cubic in the angle has its root, and the sign of h at the lower bound of the interval."""
+def _find(k: Tensor, path: Tensor, *, steps: int) -> tuple[Tensor, Tensor]:
+    """The root between begin and end, where h has different signs, and whether the search ended there."""
+    n = k.shape[0] - 1
     begin, end, turn = path.unbind(0)
-    up = torch.where(ends[0] > 0, 1.0, -1.0).to(begin.dtype)
-    h0, h1, d0, d1 = _along_path(begin, end, turn, ends, up, degree)
+    p0, d0 = _horner_slope(k, begin)
+    p1, d1 = _horner_slope(k, end)
+    d0, d1 = (torch.addcmul((1 + x * x) * d, p, x, value=-n) for x, p, d in ((begin, p0, d0), (end, p1, d1)))
+    up = torch.where(p0 > 0, 1.0, -1.0).to(begin.dtype)
+    h0, h1, d0, d1 = _along_path(begin, end, turn, (p0, d0, p1, d1), up, n)
+    # The Hermite cubic in the angle.
     rise = h1 - h0
     a2, a3 = (3 * rise).sub_(d0, alpha=2).sub_(d1), (d0 + d1).sub_(rise, alpha=2)
     t = torch.full_like(h0, 0.5)
@@ -239,48 +221,52 @@ def _start(path: Tensor, ends: Tensor, *, degree: int) -> tuple[Tensor, Tensor]:
         value = torch.addcmul(h0, slope, t)
         slope.addcmul_(inner.addcmul_(a3, t), t)
         t = (t - value.div_(slope)).clamp_(0, 1)
-    angle = t * turn
-    tangent = angle * (1 + angle * angle / 3)
-    return (begin + tangent) / (1 - begin * tangent), torch.copysign(up, up * turn)
+    x = _turned(begin, t * turn)
+    return _newton(k, x, torch.minimum(begin, end), torch.maximum(begin, end), torch.copysign(up, up * turn), steps)
 
 
-def _along_path(begin: Tensor, end: Tensor, turn: Tensor, ends: Tensor, up: Tensor, degree: int) -> tuple[Tensor, ...]:
-    """Values and derivatives of h over the interval, as that of [0, 1], positive at its begin."""
+def _along_path(
+    begin: Tensor, end: Tensor, turn: Tensor, ends: Sequence[Tensor], up: Tensor, degree: int
+) -> tuple[Tensor, ...]:
+    """Values at begin and end and derivatives of h over the interval, as that of [0, 1], positive at its begin."""
+    p0, d0, p1, d1 = ends
     weight = _power((1 + begin * begin) / (1 + end * end), degree // 2) * up
-    return ends[0].abs(), ends[2] * weight, ends[1] * (turn * up), ends[3] * (weight * turn)
+    return p0.abs(), p1 * weight, d0 * (turn * up), d1 * (weight * turn)
 
 
-def _dip(path: Tensor, ends: Tensor, k: Tensor, degree: int) -> tuple[tuple[Tensor, Tensor], ...]:
-    """For both roots of a pair where they are, lower and upper bound, and the sign of h at the lower one.
+def _turned(begin: Tensor, angle: Tensor) -> Tensor:
+    tangent = angle * (1 + angle * angle / 3)
+    return (begin + tangent) / (1 - begin * tangent)
 
-    There are none where h does not change its sign: the bounds are then the wrong way round.
-    """
+
+def _find_two(k: Tensor, path: Tensor, ends: Tensor, *, steps: int) -> tuple[Tensor, Tensor]:
+    """First all first roots, then all second ones, from the dip between them; there are none where h keeps its sign there."""
+    n = k.shape[0] - 1
     begin, end, turn = path.unbind(0)
     up = torch.where(ends[0] > 0, 1.0, -1.0).to(begin.dtype)
-    h0, h1, d0, d1 = _along_path(begin, end, turn, ends, up, degree)
+    h0, h1, d0, d1 = _along_path(begin, end, turn, ends.unbind(0), up, n)
     rise = h1 - h0
     a2, a3 = 3 * rise - 2 * d0 - d1, d0 + d1 - 2 * rise
     bend = torch.addcmul(a2 * a2, a3, d0, value=-3).clamp_min_(0).sqrt_()
-    angle = (-d0 / (a2 + bend)).clamp_(0, 1) * turn
-    tangent = angle * (1 + angle * angle / 3)
-    x = (begin + tangent) / (1 - begin * tangent)
+    x = _turned(begin, (-d0 / (a2 + bend)).clamp_(0, 1) * turn)
     p, d = (up * row for row in _horner_slope(k, x))
     # h + h' a + (h'' / 2) a^2 = 0 in the angle a from the dip.
     square = 1 + x * x
-    q = square * d - degree * x * p
-    bend = 2 * bend / (turn * turn) * _power(square / (1 + begin * begin), degree // 2)
+    q = square * d - n * x * p
+    bend = 2 * bend / (turn * turn) * _power(square / (1 + begin * begin), n // 2)
     root = torch.copysign((q * q - 2 * p * bend).clamp_min(0).sqrt(), turn)
-    first, second = (-root - q) / bend, (root - q) / bend
-    first, second = (x + square * angle / (1 - x * angle) for angle in (first, second))
-    none = torch.where(p < 0, 0, torch.inf)
-    (low1, high1), (low2, high2) = (torch.stack(b).aminmax(dim=0) for b in ((begin, x), (x, end)))
-    sign = torch.copysign(up, up * turn)
-    return (first, second), (low1 + none, low2 + none), (high1, high2), (sign, -sign)
+    angle = torch.stack((-root - q, root - q)) / bend
+    start = (x + square * angle / (1 - x * angle)).flatten()
+    left, right = torch.cat((begin, x)), torch.cat((x, end))
+    up = torch.copysign(up, up * turn)
+    x, found = _newton(
+        torch.cat((k, k), -1), start, torch.minimum(left, right), torch.maximum(left, right), torch.cat((up, -up)), steps
+    )
+    return x, found & (p < 0).repeat(2)
 
 
-@kernel(chunk=1 << 20)
-def _refine(k: Tensor, x: Tensor, low: Tensor, high: Tensor, rise: Tensor, *, steps: int) -> tuple[Tensor, Tensor]:
-    """The root between the bounds, and whether there is one."""
+def _newton(k: Tensor, x: Tensor, low: Tensor, high: Tensor, rise: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """The root between the bounds, at the lower of which h has the sign `rise`, and whether there is one."""
     for i in range(steps + 1):
         p, d = _horner_slope(k, x)
         if i < steps:

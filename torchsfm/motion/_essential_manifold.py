@@ -6,25 +6,11 @@ from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.rows import add_rows, combine_rows
-from torchsfm.motion._five_points import back_substitute, longest, normalised
+from torchsfm.motion._five_points import back_substitute, gone_round, longest, normalised, products_of_minors
 
 
 def combine(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> Float[Tensor, "9 roots"]:
     return combine_rows(basis, u)
-
-
-def gone_round(E: Float[Tensor, "3 3 *batch"]) -> Float[Tensor, "5 5 *batch"]:
-    """The matrices with their first two rows and columns once more behind the last."""
-    out = E.new_empty(5, 5, *E.shape[2:])
-    out[:3, :3] = E
-    out[3:, :3] = E[:2]
-    out[:, 3:] = out[:, :2]
-    return out
-
-
-def products_of_minors(round_: Float[Tensor, "5 5 *batch"]) -> Float[Tensor, "3 3 *batch"]:
-    """The matrices of cofactors, in two products, of matrices that go round."""
-    return (round_[1:4, 1:4] * round_[2:, 2:]).addcmul_(round_[1:4, 2:], round_[2:, 1:4], value=-1)
 
 
 def left_null(C: Float[Tensor, "3 3 *batch"]) -> Float[Tensor, "3 *batch"]:
@@ -85,7 +71,7 @@ def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tu
 
 
 @kernel(chunk=1 << 20)
-def from_roots(x: Tensor, y: Tensor, w: Tensor, s: Tensor, t: Tensor, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def from_roots(rows: Tensor, s: Tensor, t: Tensor, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """A Newton step from the solution for each root s / t of the determinant: the coordinates, E, and the error before."""
-    u, error = polish(back_substitute(x, y, w, s, t), basis)
+    u, error = polish(back_substitute(rows, s, t), basis)
     return u, combine(u, basis), error

@@ -8,7 +8,6 @@ arithmetic has the batch in the last dimension.
 """
 
 from collections.abc import Sequence
-from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -19,13 +18,14 @@ from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.real_roots import real_root_list
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 
-# Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w); quadratic ones as pairs, squares first.
-_CUBICS = [(0, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 1), (0, 0, 2), (0, 0, 3), (1, 1, 2), (1, 1, 3), (0, 1, 2), (0, 1, 3)]
-_CUBICS += [(0, 2, 2), (0, 2, 3), (0, 3, 3), (1, 2, 2), (1, 2, 3), (1, 3, 3), (2, 2, 2), (2, 2, 3), (2, 3, 3), (3, 3, 3)]
+# Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w), the last ones by powers of z; quadratic
+# ones as pairs, squares first.
+_CUBICS: list[tuple[int, ...]] = [(0, 0, 0), (1, 1, 1), (0, 0, 1), (0, 1, 1), (0, 0, 2), (0, 0, 3), (1, 1, 2), (1, 1, 3)]
+_CUBICS += [(0, 1, 2), (0, 1, 3)]
+_CUBICS += [(0, 3, 3), (0, 2, 3), (0, 2, 2), (1, 3, 3), (1, 2, 3), (1, 2, 2), (3, 3, 3), (2, 3, 3), (2, 2, 3), (2, 2, 2)]
 _SQUARES = [(0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
-# The ways to write a monomial as a square, by its number, times a variable.
-_WAYS = [[(_SQUARES.index(q), v) for q, v in product(_SQUARES, range(4)) if tuple(sorted((*q, v))) == m] for m in _CUBICS]
-_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
+# Number of the monomial that a quadratic one times a variable is, by variable.
+_TIMES = [[_CUBICS.index((*sorted((*q, v)),)) for q in _SQUARES] for v in range(4)]
 # A quaternion's product with any other: orthonormal.
 _TURN = [[0.5, -0.1, 0.7, -0.5], [0.1, 0.5, 0.5, 0.7], [-0.7, -0.5, 0.5, 0.1], [0.5, -0.7, -0.1, 0.5]]
 _INDEPENDENT = 1e-13
@@ -37,9 +37,8 @@ class FivePointRoots(NamedTuple):
     item: Tensor
     s: Tensor
     t: Tensor
-    x: Tensor
-    y: Tensor
-    w: Tensor
+    rows: Tensor
+    """See `polynomial`."""
     basis: Tensor
     d1: Tensor
     """The rays at length 1, (3, 5, problems)."""
@@ -55,12 +54,11 @@ def five_point_roots(
     basis, pivot = nullspace_basis(d1, d2)
     if other_coordinates:
         basis = turned(basis)
-    x, y, w, p = polynomial(basis)
+    rows, p = polynomial(basis)
     # Without five independent equations there is no polynomial and no root.
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
     item, s, t = real_root_list(torch.where(fine, p, torch.nan), steps=steps, in_order=False)
-    x, y, w, basis = (take_columns(rows, item) for rows in (x, y, w, basis))
-    return FivePointRoots(item, s, t, x, y, w, basis, d1, d2)
+    return FivePointRoots(item, s, t, take_columns(rows, item), take_columns(basis, item), d1, d2)
 
 
 def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
@@ -94,53 +92,68 @@ def turned(basis: Float[Tensor, "4 9 batch"]) -> Float[Tensor, "4 9 batch"]:
     return torch.stack([combine_rows(basis, [basis.new_tensor(entry) for entry in row]) for row in _TURN])
 
 
-def polynomial(basis: Float[Tensor, "4 9 batch"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Three rows of polynomials that multiply x, y and 1, `(power, row, batch)`, and their determinant `(power, batch)`."""
-    x, y, w = three_rows(eliminate(constraints(basis.view(4, 3, 3, -1))))
-    n = convolve(y[:, _NEXT], w[:, _AFTER]) - convolve(y[:, _AFTER], w[:, _NEXT])
-    return x, y, w, add_rows(convolve(x, n).unbind(1))
+def polynomial(basis: Float[Tensor, "4 9 batch"]) -> tuple[Tensor, Tensor]:
+    """Three rows of polynomials in z that multiply x, y and 1, and their determinant.
+
+    The rows are x^2 z - z x^2, y^2 z - z y^2 and xyz - z xy.
+
+    Returns:
+        Coefficients of all four, four and five powers as `(13, 3, batch)`, and of the determinant as `(11, batch)`.
+    """
+    batch = basis.shape[-1]
+    A = eliminate(constraints(basis.view(4, 3, 3, -1)))
+    a, b = A[:, 0::2], A[:, 1::2]
+    # The first two rows again behind the third.
+    rows = basis.new_zeros(13, 5, batch)
+    for begin, first, last in ((0, 0, 3), (4, 3, 6), (8, 6, 10)):
+        size = last - first
+        rows[begin : begin + size, :3] = a[first:last]
+        rows[begin + 1 : begin + 1 + size, :3] -= b[first:last]
+    rows[:, 3:] = rows[:, :2]
+    x, y, w = rows[:4, :3], rows[4:8], rows[8:]
+    n = basis.new_zeros(8, 3, batch)
+    for i, (left, right) in enumerate(zip(y[:, 1:4].unbind(0), y[:, 2:].unbind(0), strict=True)):
+        n[i : i + 5].addcmul_(left, w[:, 2:]).addcmul_(right, w[:, 1:4], value=-1)
+    p = basis.new_zeros(11, 3, batch)
+    for i, row in enumerate(x.unbind(0)):
+        p[i : i + 8].addcmul_(row, n)
+    return rows[:, :3], add_rows(p.unbind(1))
 
 
 def constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"]:
     """Coefficients of the monomials in (E E' - tr(E E') / 2) E = 0 and det E = 0."""
     batch = E.shape[-1]
-    # Coefficients of the squares: the symmetric E E' by columns, and the cofactors of the first column of E.
+    # Coefficients of the squares: the symmetric E E', and the cofactors of the first column of E.
     S = E.new_empty(10, 3, 3, batch)
-    columns = [matrix[:, :, None].unbind(1) for matrix in E.unbind(0)]
-    lines = [matrix.unbind(0) for matrix in E.transpose(1, 2).unbind(0)]
-    for (i, j), square in zip(_SQUARES, S.unbind(0), strict=True):
-        torch.mul(columns[i][0], lines[j][0], out=square)
-        for k in (1, 2):
-            square.addcmul_(columns[i][k], lines[j][k])
-        if i != j:
-            square += square.transpose(0, 1).clone()
+    columns, lines = E[:, :, None].unbind(3), E[:, None].unbind(3)
+    _sum_of_products(columns, lines, S[:4])
+    for i, part in enumerate((S[4:7], S[7:9], S[9:])):
+        _sum_of_products([c[i] for c in columns], [r[i + 1 :] for r in lines], part)
+    S[4:] = S[4:] + S[4:].transpose(1, 2)
     diagonal = S.view(10, 9, batch)[:, ::4]
-    diagonal -= (S[:, 0, 0] + S[:, 1, 1]).add_(S[:, 2, 2]).mul_(0.5)[:, None]
-    C = E.new_empty(3, 10, batch)
-    first, second = E[:, None, :, 1], E[None, :, :, 2]
-    for k, cofactors in enumerate(C.unbind(0)):
-        minors = first[:, :, _NEXT[k]] * second[:, :, _AFTER[k]]
-        minors.addcmul_(first[:, :, _AFTER[k]], second[:, :, _NEXT[k]], value=-1)
-        cofactors[:4] = minors.diagonal().mT
-        for number, (i, j) in enumerate(_SQUARES[4:], 4):
-            torch.add(minors[i, j], minors[j, i], out=cofactors[number])
-    out = E.new_empty(20, 10, batch)
-    traces = [square.unbind(1) for square in S[:, :, :, None].unbind(0)]
-    entries = [matrix.unbind(0) for matrix in E.unbind(0)]
-    determinants = [combine_rows(C, matrix[:, 0]).unbind(0) for matrix in E.unbind(0)]
-    for row, ways in zip(out.unbind(0), _WAYS, strict=True):
-        trace, determinant = row[:9].view(3, 3, batch), row[9]
-        for way, (which, variable) in enumerate(ways):
-            for k in range(3):
-                if way + k:
-                    trace.addcmul_(traces[which][k], entries[variable][k])
-                else:
-                    torch.mul(traces[which][k], entries[variable][k], out=trace)
-            if way:
-                determinant += determinants[variable][which]
-            else:
-                determinant.copy_(determinants[variable][which])
+    diagonal -= add_rows(diagonal.unbind(1)).mul_(0.5)[:, None]
+    round_ = E.new_empty(4, 5, 2, batch)
+    round_[:, :3] = E[:, :, 1:]
+    round_[:, 3:] = round_[:, :2]
+    left, right = round_[:, None, :, 0], round_[None, :, :, 1]
+    C = (left[:, :, 1:4] * right[:, :, 2:]).addcmul_(left[:, :, 2:], right[:, :, 1:4], value=-1)
+    C += C.transpose(0, 1).clone()
+    C = torch.stack([C[i, j] for i, j in _SQUARES])
+    C[:4] *= 0.5
+    # Times E, one variable after the other.
+    out = E.new_zeros(20, 10, batch)
+    part = E.new_empty(10, 10, batch)
+    trace, determinant = part[:, :9].view(10, 3, 3, batch), part[:, 9]
+    squares, cofactors = S[:, :, :, None].unbind(2), C.unbind(1)
+    for times, matrix in zip(_TIMES, E.unbind(0), strict=True):
+        _sum_of_products(squares, matrix.unbind(0), trace)
+        _sum_of_products(cofactors, matrix[:, 0].unbind(0), determinant)
+        out.index_add_(0, torch.tensor(times, device=E.device), part)
     return out
+
+
+def _sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor], out: Tensor) -> None:
+    torch.mul(left[0], right[0], out=out).addcmul_(left[1], right[1]).addcmul_(left[2], right[2])
 
 
 def eliminate(A: Float[Tensor, "20 10 batch"]) -> Float[Tensor, "10 6 batch"]:
@@ -152,31 +165,34 @@ def eliminate(A: Float[Tensor, "20 10 batch"]) -> Float[Tensor, "10 6 batch"]:
     return A[10:, 4:] / torch.stack([A[k, k] for k in range(4, 10)])
 
 
-def three_rows(C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Polynomials in z (power, row, batch) that multiply x, y and 1: rows x^2 z - z x^2, y^2 z - z y^2, xyz - z xy."""
-    a, b = C[:, 0::2], C[:, 1::2]
-    x = torch.stack((a[2], a[1] - b[2], a[0] - b[1], -b[0]))
-    y = torch.stack((a[5], a[4] - b[5], a[3] - b[4], -b[3]))
-    return x, y, torch.stack((a[9], a[8] - b[9], a[7] - b[8], a[6] - b[7], -b[6]))
-
-
-def convolve(p: Tensor, q: Tensor) -> Tensor:
-    out = torch.zeros(p.shape[0] + q.shape[0] - 1, *q.shape[1:], dtype=q.dtype, device=q.device)
-    for i in range(p.shape[0]):
-        out[i : i + q.shape[0]].addcmul_(p[i], q)
-    return out
-
-
-def back_substitute(x: Tensor, y: Tensor, w: Tensor, s: Tensor, c: Tensor) -> Tensor:
+def back_substitute(rows: Float[Tensor, "13 3 roots"], s: Tensor, c: Tensor) -> Float[Tensor, "4 roots"]:
     """The unit (x, y, z, w) for every root z = s / c: a null vector of the three rows, from the best-conditioned pair."""
     cc, ss = c * c, s * s
     powers = (cc * c, cc * s, ss * c, ss * s)
-    X, Y, W = (combine_rows(p[:4], powers) for p in (x, y, w))
-    W = (W * c).addcmul_(w[4], ss * ss)
-    rows = list(zip(X, Y, W, strict=True))
-    n = [cross(rows[i], rows[j]) for i, j in ((1, 2), (2, 0), (0, 1))]
-    n0, n1, n2 = longest([combine_rows(v, v) for v in n], n)
-    return normalised(torch.stack((n0, n1, s * n2, c * n2)))
+    lines = rows.unbind(0)
+    X, Y, W = (combine_rows(lines[i : i + 4], powers) for i in (0, 4, 8))
+    M = torch.stack((X, Y, (W * c).addcmul_(lines[12], ss * ss)), 1)
+    C = products_of_minors(gone_round(M))
+    n = longest(add_rows((C * C).unbind(1)).unbind(0), C.unbind(0))
+    u = n.new_empty(4, n.shape[-1])
+    u[:2] = n[:2]
+    torch.mul(s, n[2], out=u[2])
+    torch.mul(c, n[2], out=u[3])
+    return normalised(u)
+
+
+def gone_round(E: Float[Tensor, "3 3 *batch"]) -> Float[Tensor, "5 5 *batch"]:
+    """The matrices with their first two rows and columns once more behind the last."""
+    out = E.new_empty(5, 5, *E.shape[2:])
+    out[:3, :3] = E
+    out[3:, :3] = E[:2]
+    out[:, 3:] = out[:, :2]
+    return out
+
+
+def products_of_minors(round_: Float[Tensor, "5 5 *batch"]) -> Float[Tensor, "3 3 *batch"]:
+    """The matrices of cofactors, whose rows are cross products of rows, in two products, of matrices that go round."""
+    return (round_[1:4, 1:4] * round_[2:, 2:]).addcmul_(round_[1:4, 2:], round_[2:, 1:4], value=-1)
 
 
 def longest(squares: Sequence[Tensor], vectors: Sequence[Tensor]) -> Tensor:
@@ -188,9 +204,3 @@ def longest(squares: Sequence[Tensor], vectors: Sequence[Tensor]) -> Tensor:
 
 def normalised(u: Tensor) -> Tensor:
     return u * combine_rows(u, u).rsqrt()
-
-
-def cross(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Tensor:
-    a0, a1, a2 = a
-    b0, b1, b2 = b
-    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0))

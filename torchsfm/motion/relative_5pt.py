@@ -13,8 +13,8 @@ from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.real_roots import number_among_equals
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
-from torchsfm.motion._essential_manifold import combine, gone_round, left_null, polish, products_of_minors
-from torchsfm.motion._five_points import back_substitute, five_point_roots
+from torchsfm.motion._essential_manifold import combine, left_null, polish
+from torchsfm.motion._five_points import back_substitute, five_point_roots, gone_round, products_of_minors
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _CHUNK = 4096
@@ -23,8 +23,6 @@ _NEAR = 1e-7
 """Distance from the manifold before a Newton step after which E is as good as any data."""
 _MORE = 2
 """Newton steps for the others."""
-_POOR = 1e-4
-"""Distance of a start from the manifold that makes other coordinates worth trying."""
 _CONVERGED = 1e-4
 """Distance from the manifold before the last of these steps, of what is a solution."""
 
@@ -46,8 +44,8 @@ def relative_5pt(
 ) -> Solutions[Float[Tensor, "*batch 10 3 4"]]:
     """The poses [R | t], |t| = 1, for which five rays meet in front of both cameras; at most one of the four of each E.
 
-    Meant for hypotheses: exact to about 1e-8, and of the rare samples whose polynomial loses most of its digits, solutions may
-    be missing that `essential_5pt` has. Differentiable in the rays.
+    Meant for hypotheses: exact to about 1e-8, and of the rare samples whose polynomial loses most of its digits (some in a
+    thousand, more where the baseline is small) solutions may be missing that `essential_5pt` has. Differentiable in the rays.
 
     Args:
         d1: Five rays of the first camera, of any length but 0.
@@ -76,44 +74,30 @@ def relative_5pt(
     return Solutions(pose, valid)
 
 
-def _poses(
-    d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack: Tensor, other_coordinates: bool = False
-) -> tuple[Tensor, Tensor]:
+def _poses(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack: Tensor) -> tuple[Tensor, Tensor]:
     """The samples, in order, and the poses (12, poses) of those in front of both cameras."""
-    roots = five_point_roots(d1, d2, steps=1, other_coordinates=other_coordinates)
+    roots = five_point_roots(d1, d2, steps=1)
     rays = take_columns(torch.cat((roots.d1, roots.d2)), roots.item)
     angle = slack.index_select(0, roots.item)
-    u, pose, front, error = _from_roots(roots.x, roots.y, roots.w, roots.s, roots.t, roots.basis, rays, angle)
+    u, pose, front, error = _from_roots(roots.rows, roots.s, roots.t, roots.basis, rays, angle)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
-    again = rest[:0]
     if len(rest):
-        if not other_coordinates:
-            doubt = torch.zeros_like(slack, dtype=torch.bool)
-            doubt[roots.item.index_select(0, rest[error.index_select(0, rest) >= _POOR])] = True
-            again = doubt.nonzero()[:, 0]
         u, basis = take_columns(u, rest), take_columns(roots.basis, rest)
         for _ in range(_MORE):
             u, error = polish(u, basis)
         better, ahead = _in_front(combine(u, basis), take_columns(rays, rest), angle.index_select(0, rest))
         pose.index_copy_(1, rest, better)
         front.index_copy_(0, rest, ahead & (error < _CONVERGED))
-    item = roots.item
-    if len(again):
-        # What the first coordinates gave for these counts no longer.
-        front &= ~doubt.index_select(0, item)
-        second, better = _poses(d1.index_select(2, again), d2.index_select(2, again), slack.index_select(0, again), True)
-        item, pose = torch.cat((item, again.index_select(0, second))), torch.cat((pose, better), -1)
-        front = torch.cat((front, torch.ones_like(second, dtype=torch.bool)))
     keep = front.nonzero()[:, 0]
-    item, order = item.index_select(0, keep).sort(stable=True)
+    item, order = roots.item.index_select(0, keep).sort(stable=True)
     return item, take_columns(pose, keep.index_select(0, order))
 
 
 @kernel(chunk=1 << 20)
 def _from_roots(
-    x: Tensor, y: Tensor, w: Tensor, s: Tensor, t: Tensor, basis: Tensor, rays: Tensor, slack: Tensor
+    matrices: Tensor, s: Tensor, t: Tensor, basis: Tensor, rays: Tensor, slack: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    u, error = polish(back_substitute(x, y, w, s, t), basis)
+    u, error = polish(back_substitute(matrices, s, t), basis)
     return u, *_in_front(combine(u, basis), rays, slack), error
 
 
