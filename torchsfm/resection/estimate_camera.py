@@ -1,5 +1,6 @@
 """The pose of a calibrated camera from correspondences with known points, of which many are wrong."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,6 +15,10 @@ from torchsfm.resection._reprojection_step import camera_step, moved_pose, squar
 from torchsfm.resection.camera_p3p import camera_p3p
 from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust.sampling import spread_order
+
+_MANY = 128
+"""Of how many points to take the median."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +178,7 @@ def estimate_camera(
     focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
     # Pixels from the principal point, in focal lengths.
     middle = K[..., :2, 2].detach()
-    y = (x - middle[..., None, :]) / focal[..., None, None]
+    y = moved_and_scaled(x, middle, focal)
     offset = (K[..., :2, 2] - middle)[..., None]
     last = torch.eye(3, dtype=K.dtype, device=K.device)[2:].expand(*K.shape[:-2], 1, 3)
     intrinsics = torch.cat((torch.cat((K[..., :2, :2], offset), -1) / focal[..., None, None], last), -2)
@@ -187,18 +192,26 @@ def estimate_camera(
     return request.answer(estimator, y, Y, dtype=dtype, scale=1 / focal, back=back, step_unit=unit)
 
 
-def present(mask: Tensor | None, *data: Tensor) -> Tensor:
-    """Which data exist and are finite."""
-    usable = torch.isfinite(data[0]).all(-1)
-    for d in data[1:]:
-        usable = usable & torch.isfinite(d).all(-1)
-    return usable if mask is None else usable & mask
+def present(mask: Tensor | None, *data: Tensor) -> Tensor | None:
+    """Which data exist and are finite; None for all."""
+    usable = mask
+    for d in data:
+        # A sum is finite only if all numbers are.
+        if not math.isfinite(float(d.detach().sum())):
+            row = torch.isfinite(d).all(-1)
+            usable = row if usable is None else usable & row
+    return usable
 
 
-def moderate(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def moderate(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Points of moderate size around 0, and their `middle_and_size`, which are held when the points move."""
     centre, size = middle_and_size(X.detach(), usable)
-    return (X - centre[..., None, :]) / size[..., None, None], centre, size
+    return moved_and_scaled(X, centre, size), centre, size
+
+
+def moved_and_scaled(X: Tensor, centre: Tensor, size: Tensor) -> Tensor:
+    """(X - centre) / size, computed with one coordinate in a row."""
+    return ((X.mT.contiguous() - centre[..., None]) / size[..., None, None]).mT
 
 
 def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:
@@ -208,14 +221,35 @@ def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:
     return torch.cat((R, t), -1)
 
 
-def middle_and_size(X: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
-    """Medians of the usable points and of their distances from it: points far away must not cost the others precision."""
-    some = usable.any(-1)[..., None]
-    if X.shape[-2] == 0:
-        centre = X.new_zeros(*usable.shape[:-1], X.shape[-1])
+def middle_and_size(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Medians of the usable points and of their distances from it: points far away must not cost the others precision.
+
+    Of many points, some that are spread over all will do. Which ones is a matter of the problem alone.
+    """
+    n = X.shape[-2]
+    if n <= 2 * _MANY:
+        return _medians(X, usable)
+    part = spread_order(n, n, X.device)[:_MANY]
+    if usable is None:
+        return _medians(X[..., part, :], None)
+    some = usable[..., part]
+    found = _medians(X[..., part, :], some)
+    enough = 4 * some.sum(-1) >= _MANY
+    if bool(enough.all()):
+        return found
+    centre, size = _medians(X, usable)
+    return torch.where(enough[..., None], found[0], centre), torch.where(enough, found[1], size)
+
+
+def _medians(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
+    rows = X.mT.contiguous()
+    if not rows.shape[-1]:
+        centre = rows.new_zeros(rows.shape[:-1] if usable is None else (*usable.shape[:-1], rows.shape[-2]))
         return centre, torch.ones_like(centre[..., 0])
-    centre = torch.where(usable[..., None], X, torch.nan).nanmedian(dim=-2).values
-    centre = torch.where(some, centre, 0)
-    distance = torch.where(usable, (X - centre[..., None, :]).abs().amax(-1), torch.nan)
-    size = distance.nanmedian(dim=-1).values
-    return centre, torch.where(torch.isfinite(size) & (size > 0), size, 1)
+    if usable is not None:
+        rows = torch.where(usable[..., None, :], rows, torch.nan)
+    centre = rows.nanmedian(dim=-1).values
+    if usable is not None:
+        centre = torch.where(usable.any(-1)[..., None], centre, 0)
+    size = (rows - centre[..., None]).abs_().amax(-2).nanmedian(dim=-1).values
+    return centre, torch.where((size > 0) & (size < torch.inf), size, 1)

@@ -12,7 +12,7 @@ from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
-from torchsfm.resection.estimate_camera import middle_and_size, moderate, present, world_pose
+from torchsfm.resection.estimate_camera import middle_and_size, moderate, moved_and_scaled, present, world_pose
 from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
 
@@ -184,8 +184,9 @@ def estimate_camera_focal(
     x, X, c = x.double(), X.double(), c.double()
     usable = present(mask, x, X)
     Y, centre, size = moderate(X, usable)
-    offset = x - c[..., None, :]
-    _, radius = middle_and_size(torch.cat((offset, -offset), -2).detach(), torch.cat((usable, usable), -1))
+    offset = (x - c[..., None, :]).detach()
+    both = None if usable is None else torch.cat((usable, usable), -1)
+    _, radius = middle_and_size(torch.cat((offset, -offset), -2), both)
 
     def back(model: Tensor) -> Tensor:
         f, pose = _split(model)
@@ -194,5 +195,5 @@ def estimate_camera_focal(
 
     one = torch.ones_like(centre)
     unit = torch.cat((one, one * size[..., None], one[..., :1]), -1)
-    y = offset / radius[..., None, None]
+    y = moved_and_scaled(x, c, radius)
     return request.answer(FocalCameraEstimator(), y, Y, dtype=dtype, scale=1 / radius, back=back, step_unit=unit)
