@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.polynomial import attach_roots
-from torchsfm.linalg.rows import take_columns
+from torchsfm.linalg.rows import multiply_into, take_columns
 
 _CELLS = 20
 """Cells from 0 to 45 degrees."""
@@ -132,7 +132,7 @@ def _look(c: Float[Tensor, "m 2 batch"]) -> tuple[Tensor, Tensor]:
     k = torch.arange(n + 1, dtype=c.dtype, device=c.device)[:, None, None]
     both = c.new_empty(n + 1, 2, *c.shape[1:])
     both[:, 0] = c
-    torch.mul(c[1:], k[1:], out=both[:-1, 1])
+    multiply_into(both[:-1, 1], c[1:], k[1:])
     both[-1, 1] = 0
     both[1:, 1].addcmul_(c[:-1], n - k[:-1], value=-1)
     z = c.new_tensor(_NODES)[:, None, None]

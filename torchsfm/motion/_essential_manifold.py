@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
-from torchsfm.linalg.rows import add_rows, combine_rows
+from torchsfm.linalg.rows import add_rows, combine_rows, multiply_into
 from torchsfm.motion._five_points import back_substitute, gone_round, longest, normalised, products_of_minors
 
 
@@ -34,13 +34,10 @@ def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tu
     b = (one + z).reciprocal_().neg_()
     a = x * b
     b *= y
-    frame = E.new_empty(3, 2, E.shape[-1])
-    torch.addcmul(frame.new_ones(()), one * x, a, out=frame[0, 0])
-    torch.mul(one * y, a, out=frame[1, 0])
-    torch.mul(one, x, out=frame[2, 0]).neg_()
-    torch.mul(a, y, out=frame[0, 1])
-    torch.addcmul(one, y, b, out=frame[1, 1])
-    torch.neg(y, out=frame[2, 1])
+    ax = one * a
+    frame = torch.stack((torch.addcmul(torch.ones_like(z), ax, x), a * y, ax * y, torch.addcmul(one, y, b), -one * x, -y)).view(
+        3, 2, -1
+    )
     rows = E.unbind(0)
     v = rows[0] * frame[0, :, None]
     v.addcmul_(rows[1], frame[1, :, None])
@@ -49,8 +46,8 @@ def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tu
     v1, v2 = v.unbind(0)
     normals = E.new_empty(3, 3, 3, E.shape[-1])
     normals[0] = C
-    torch.mul(u1, v1, out=normals[1]).addcmul_(u2, v2, value=-1)
-    torch.mul(u1, v2, out=normals[2]).addcmul_(u2, v1)
+    multiply_into(normals[1], u1, v1).addcmul_(u2, v2, value=-1)
+    multiply_into(normals[2], u1, v2).addcmul_(u2, v1)
     products = combine_rows(normals.view(3, 9, 1, -1).unbind(1), basis.unbind(1))
     values = combine_rows(products.unbind(1), u.unbind(0))
     values *= values.new_tensor([2 / 3, 0.5, 0.5])[:, None]
@@ -63,10 +60,10 @@ def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tu
     m12, m13 = (p1 * q[2:]).addcmul_(p[2:], q1, value=-1)
     m23 = (p2 * q3).addcmul_(p3, q2, value=-1)
     new = torch.empty_like(u)
-    torch.mul(m12, r3, out=new[0]).addcmul_(m13, r2, value=-1).addcmul_(m23, r1)
-    torch.mul(m03, r2, out=new[1]).addcmul_(m02, r3, value=-1).addcmul_(m23, r0, value=-1)
-    torch.mul(m01, r3, out=new[2]).addcmul_(m03, r1, value=-1).addcmul_(m13, r0)
-    torch.mul(m02, r1, out=new[3]).addcmul_(m01, r2, value=-1).addcmul_(m12, r0, value=-1)
+    multiply_into(new[0], m12, r3).addcmul_(m13, r2, value=-1).addcmul_(m23, r1)
+    multiply_into(new[1], m03, r2).addcmul_(m02, r3, value=-1).addcmul_(m23, r0, value=-1)
+    multiply_into(new[2], m01, r3).addcmul_(m03, r1, value=-1).addcmul_(m13, r0)
+    multiply_into(new[3], m02, r1).addcmul_(m01, r2, value=-1).addcmul_(m12, r0, value=-1)
     return normalised(new), values.abs_().amax(0).mul_(2**0.5)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.real_roots import number_among_equals
-from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
+from torchsfm.linalg.rows import add_rows, combine_rows, multiply_into, take_columns
 from torchsfm.motion._essential_manifold import combine, left_null, polish
 from torchsfm.motion._five_points import back_substitute, five_point_roots, gone_round, products_of_minors
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -127,6 +127,6 @@ def _in_front(
     ahead = torch.minimum(depth1, depth2).amin(0) > -slack
     behind = torch.maximum(depth1, depth2).amax(0) < slack
     pose = E.new_empty(3, 4, E.shape[-1])
-    torch.addcmul(C, T, sign, out=pose[:, :3])
-    torch.mul(t, torch.where(ahead, 1.0, -1.0).to(t.dtype), out=pose[:, 3])
+    multiply_into(pose[:, :3], T, sign).add_(C)
+    multiply_into(pose[:, 3], t, torch.where(ahead, 1.0, -1.0).to(t.dtype))
     return pose.view(12, -1), ahead | behind
