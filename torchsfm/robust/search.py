@@ -24,7 +24,7 @@ from torchsfm.robust.models import cast, join, select, take_slots, zip_map
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import draw_samples, draw_weighted, prosac_pools
 from torchsfm.robust.scores import Msac, Score, counted, limits
-from torchsfm.robust.scoring import gather_valid, losses, smallest, squared_residual, stages
+from torchsfm.robust.scoring import around_model, gather_valid, losses, smallest, squared_residual, stages
 
 M = TypeVar("M")
 
@@ -32,6 +32,12 @@ ROUNDS = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 30
 """How many samples a round may draw for a problem."""
 OPTIMISED = 2
 """Hypotheses of a round that are optimised locally."""
+STARTS = (2, 4, 8, 16, 32, 64)
+"""From how many samples of the inliers the best model may be sought once more."""
+EXPLORED_DATA = 512
+"""How many data that looks at."""
+_PER_START, _AMBIGUOUS = 128, 0.5
+"""One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers."""
 _BY_CHANCE = 0.05
 """Share of wrong data taken to agree with a wrong model, as PROSAC's end assumes."""
 _SAMPLES, _NUMBERS = 1 << 12, 1 << 15
@@ -89,6 +95,7 @@ def search(problems: Problems, options: Options) -> tuple[Best, Float[Tensor, "p
         for number in sorted(set(size.tolist()) - {0}):
             best = _round(problems, coarse, best, active[size == number], number, options)
         active = active[size > 0]
+    best = _explored(problems, coarse, best, options)
     return _polished(problems, coarse, _rivalled(problems, coarse, best, options), options)
 
 
@@ -163,7 +170,9 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
     return best
 
 
-def _optimised(coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, loss: Tensor, options: Options) -> Best:
+def _optimised(
+    coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, loss: Tensor, options: Options, looked_at: int = LOCAL_DATA
+) -> Best:
     """Update the best models of some problems with what local optimisation makes of the best hypotheses of a round.
 
     Args:
@@ -173,12 +182,13 @@ def _optimised(coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, 
         top: Hypotheses, the best first.
         loss: The costs of the hypotheses.
         options: How to compare.
+        looked_at: How many data to optimise on.
     """
     wide, size, k = coarse.spread(), coarse.estimator.sample_size, coarse.estimator.codimension
     counts = coarse.inside if coarse.weight is None else coarse.weight
-    prefix = [d[:, :, :LOCAL_DATA] for d in wide.data]
+    prefix = [d[:, :, :looked_at] for d in wide.data]
     limit = limits(options.score, loss, coarse.limit, coarse.count, size, k)
-    better = optimise_locally(wide.estimator, top, prefix, limit, counts[:, :LOCAL_DATA], options.score)
+    better = optimise_locally(wide.estimator, top, prefix, limit, counts[:, :looked_at], options.score)
     candidates = join([better, tensor_map(lambda t: t[:, :1], top)], 1)
     squared = squared_residual(wide.estimator, candidates, *wide.data)
     candidate_loss = options.score.cost(squared, coarse.limit, counts, k)
@@ -197,6 +207,36 @@ def _optimised(coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, 
         minimal_loss=torch.minimum(loss[:, 0], old.minimal_loss),
     )
     return _put(best, index, new)
+
+
+def _explored(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
+    """Optimise locally from many samples of the inliers alone, where wrong data may pass for inliers.
+
+    Each of these is in or out: the cost has many minima, and a model straight from a sample leads to one of them. The effort
+    is a part of that of the search.
+    """
+    near, number = [], []
+    for part in _split(torch.arange(len(fine.count), device=fine.count.device), fine.width, _NUMBERS):
+        some, old = coarse.take(part), _take(best, part)
+        ratio = squared_residual(some.estimator, old.model, *some.data) / old.limit[:, None]
+        near.append((ratio < 1) & some.inside)
+        chance = around_model(ratio, some.inside, fine.estimator.codimension)
+        worthwhile = (chance >= _AMBIGUOUS) & (near[-1].sum(-1) > 2 * fine.estimator.sample_size)
+        number.append(torch.where(worthwhile & old.solved, old.iterations // _PER_START, 0))
+    sizes = torch.tensor((0, *STARTS), device=fine.count.device)
+    starts, inlying = sizes[torch.searchsorted(sizes, torch.cat(number), right=True) - 1], torch.cat(near)
+    for size in sorted(set(starts.tolist()) - {0}):
+        drawn = max(4 * size, 64)
+        for part in _split((starts == size).nonzero()[:, 0], drawn, _SAMPLES):
+            ranking = inlying[part].to(torch.int8).argsort(dim=-1, descending=True, stable=True)
+            among = ranking, inlying[part].sum(-1, keepdim=True).expand(-1, drawn)
+            models, valid = _hypotheses(fine, part, best.iterations[part], drawn, options.seed, among)
+            some = coarse.take(part)
+            models, loss, _ = _cascade(some, models, valid, options, [(min(LOCAL_DATA, coarse.width), size)])
+            for row in _split(torch.arange(len(part), device=part.device), size * EXPLORED_DATA, _NUMBERS):
+                top = tensor_map(lambda t: t[row], models)  # noqa: B023
+                best = _optimised(some.take(row), best, part[row], top, loss[row], options, EXPLORED_DATA)
+    return best
 
 
 def _rivalled(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
@@ -223,14 +263,30 @@ def _rivalled(fine: Problems, coarse: Problems, best: Best, options: Options) ->
 
 
 def _hypotheses(
-    fine: Problems, part: Int[Tensor, "g"], drawn: Int[Tensor, "g"], size: int, seed: int
+    fine: Problems,
+    part: Int[Tensor, "g"],
+    drawn: Int[Tensor, "g"],
+    size: int,
+    seed: int,
+    among: tuple[Int[Tensor, "g width"], Int[Tensor, "g size"]] | None = None,
 ) -> tuple[Any, Bool[Tensor, "g size slots"]]:
-    """The models through random samples of some of the problems."""
-    m, count = fine.estimator.sample_size, fine.count[part]
-    if fine.ranking is not None and fine.growth is not None:
+    """The models through random samples of some of the problems.
+
+    Args:
+        fine: All problems.
+        part: Which of them to draw for.
+        drawn: How many samples each had before.
+        size: How many to draw.
+        seed: The seed.
+        among: An order of the data, and from how many of the first to draw each sample; as the problems want it if not given.
+    """
+    m, count, newest = fine.estimator.sample_size, fine.count[part], None
+    if among is None and fine.ranking is not None and fine.growth is not None:
         pool, newest = prosac_pools(count, fine.growth[part], drawn, size, m)
-        index = draw_samples(seed, count, drawn, size, m, pool, newest)
-        index = fine.ranking[part].gather(1, index.flatten(1)).view_as(index)
+        among = fine.ranking[part], pool
+    if among is not None:
+        index = draw_samples(seed, count, drawn, size, m, among[1], newest)
+        index = among[0].gather(1, index.flatten(1)).view_as(index)
     elif fine.weight is not None:
         index = draw_weighted(seed, fine.weight[part], count, drawn, size, m)
     else:
@@ -247,16 +303,30 @@ def _hypotheses(
 
 
 def _cascade(
-    coarse: Problems, models: Any, valid: Bool[Tensor, "g size slots"], options: Options
+    coarse: Problems,
+    models: Any,
+    valid: Bool[Tensor, "g size slots"],
+    options: Options,
+    plan: Sequence[tuple[int, int]] | None = None,
 ) -> tuple[Any, Float[Tensor, "g kept"], Bool[Tensor, "g"]]:
-    """The best models and their losses over all data, best first, found by way of ever larger parts of the data."""
-    wide = coarse.spread()
-    slots = valid.shape[-1]
-    index, there = gather_valid(valid.flatten(1), OPTIMISED)
+    """The best models and their losses, best first, found by way of ever larger parts of the data.
+
+    Args:
+        coarse: The problems.
+        models: Their hypotheses.
+        valid: Which of these are any.
+        options: How to compare.
+        plan: On how many data to compare, and how many to keep, stage by stage; all data at last, and the few to be optimised,
+            if not given.
+    """
+    wide, slots = coarse.spread(), valid.shape[-1]
+    kept = OPTIMISED if plan is None else plan[-1][1]
+    plan = plan or stages(coarse.width, valid.shape[1] * slots)
+    index, there = gather_valid(valid.flatten(1), kept)
     row = torch.arange(len(index), device=index.device)[:, None]
     models = cast(tensor_map(lambda t: t[row, index // slots, index % slots], models), options.dtype)
     loss = there
-    for number, keep in stages(coarse.width, valid.shape[1] * slots):
+    for number, keep in plan:
         data = [d[:, :, :number] for d in wide.data]
         counts = counted(coarse.inside, coarse.weight, number)
         loss = losses(wide.estimator, models, data, coarse.limit, counts, options.score)
@@ -264,7 +334,7 @@ def _cascade(
         chosen = smallest(loss, keep)
         loss = loss.gather(1, chosen)
         models, there = take_slots(models, chosen), there.gather(1, chosen)
-    return tensor_map(lambda t: t[:, :OPTIMISED], models), loss[:, :OPTIMISED], there[:, 0]
+    return tensor_map(lambda t: t[:, :kept], models), loss[:, :kept], there[:, 0]
 
 
 def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) -> tuple[Best, Float[Tensor, "p width"]]:
