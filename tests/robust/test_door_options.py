@@ -52,7 +52,7 @@ def test_weights_are_multiplicities(door: Door, generator: torch.Generator) -> N
         moved.append(door.difference(weighted.model[i], plain.model[i]).norm() / size[i])
     # In standard deviations; the reach of the final loss has steps, and may fall on either side of one.
     apart, moved = torch.stack(apart), torch.stack(moved)
-    assert apart.median() < 0.05
+    assert apart.median() < 0.1
     assert apart.max() < 0.5
     assert apart.mean() < 0.4 * moved.mean()
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.hypotheses import OPTIMISED, hypotheses, sift
 from torchsfm.robust.local_optimisation import (
     FIRST_STEPS,
     LAST_STEPS,
@@ -22,16 +23,13 @@ from torchsfm.robust.local_optimisation import (
 )
 from torchsfm.robust.models import cast, join, select, take_slots, zip_map
 from torchsfm.robust.problems import Problems
-from torchsfm.robust.sampling import draw_samples, draw_weighted, prosac_pools
-from torchsfm.robust.scores import Msac, Score, counted, limits
-from torchsfm.robust.scoring import around_model, gather_valid, losses, smallest, squared_residual, stages
+from torchsfm.robust.scores import Msac, Score, limits
+from torchsfm.robust.scoring import around_model, losses, smallest, squared_residual
 
 M = TypeVar("M")
 
 ROUNDS = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 """How many samples a round may draw for a problem."""
-OPTIMISED = 2
-"""Hypotheses of a round that are optimised locally."""
 STARTS = (2, 4, 8, 16, 32, 64)
 """From how many samples of the inliers the best model may be sought once more."""
 EXPLORED_DATA = 512
@@ -152,8 +150,8 @@ def _round(fine: Problems, coarse: Problems, best: Best, index: Int[Tensor, "g"]
     """Draw samples for some problems, and update the best models with what comes of them."""
     parts = []
     for part in _split(index, number, _SAMPLES):
-        models, valid = _hypotheses(fine, part, best.iterations[part], number, options.seed)
-        parts.append(_cascade(coarse.take(part), models, valid, options))
+        models, valid = hypotheses(fine, part, best.iterations[part], number, options.seed)
+        parts.append(sift(coarse.take(part), models, valid, options.score, options.dtype))
     models = join([part[0] for part in parts])
     loss, solved = (torch.cat([part[i] for part in parts]) if len(parts) > 1 else parts[0][i] for i in (1, 2))
     if best.model is None:
@@ -230,9 +228,9 @@ def _explored(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         for part in _split((starts == size).nonzero()[:, 0], drawn, _SAMPLES):
             ranking = inlying[part].to(torch.int8).argsort(dim=-1, descending=True, stable=True)
             among = ranking, inlying[part].sum(-1, keepdim=True).expand(-1, drawn)
-            models, valid = _hypotheses(fine, part, best.iterations[part], drawn, options.seed, among)
+            models, valid = hypotheses(fine, part, best.iterations[part], drawn, options.seed, among)
             some = coarse.take(part)
-            models, loss, _ = _cascade(some, models, valid, options, [(min(LOCAL_DATA, coarse.width), size)])
+            models, loss, _ = sift(some, models, valid, options.score, options.dtype, [(min(LOCAL_DATA, coarse.width), size)])
             for row in _split(torch.arange(len(part), device=part.device), size * EXPLORED_DATA, _NUMBERS):
                 top = tensor_map(lambda t: t[row], models)  # noqa: B023
                 best = _optimised(some.take(row), best, part[row], top, loss[row], options, EXPLORED_DATA)
@@ -260,81 +258,6 @@ def _rivalled(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         order = smallest(loss, OPTIMISED)
         best = _optimised(chosen, best, part[row], take_slots(rivals, order), loss.gather(1, order), options)
     return best
-
-
-def _hypotheses(
-    fine: Problems,
-    part: Int[Tensor, "g"],
-    drawn: Int[Tensor, "g"],
-    size: int,
-    seed: int,
-    among: tuple[Int[Tensor, "g width"], Int[Tensor, "g size"]] | None = None,
-) -> tuple[Any, Bool[Tensor, "g size slots"]]:
-    """The models through random samples of some of the problems.
-
-    Args:
-        fine: All problems.
-        part: Which of them to draw for.
-        drawn: How many samples each had before.
-        size: How many to draw.
-        seed: The seed.
-        among: An order of the data, and from how many of the first to draw each sample; as the problems want it if not given.
-    """
-    m, count, newest = fine.estimator.sample_size, fine.count[part], None
-    if among is None and fine.ranking is not None and fine.growth is not None:
-        pool, newest = prosac_pools(count, fine.growth[part], drawn, size, m)
-        among = fine.ranking[part], pool
-    if among is not None:
-        index = draw_samples(seed, count, drawn, size, m, among[1], newest)
-        index = among[0].gather(1, index.flatten(1)).view_as(index)
-    elif fine.weight is not None:
-        index = draw_weighted(seed, fine.weight[part], count, drawn, size, m)
-    else:
-        index = draw_samples(seed, count, drawn, size, m)
-    # Coordinate, position in the sample, problem, sample: as solvers want it, who have the batch last.
-    flat = (index + part[:, None, None] * fine.width).transpose(0, 1).flatten()
-    sample = []
-    for d in fine.data:
-        picked = d.permute(2, 0, 1).flatten(1).index_select(1, flat)
-        sample.append(picked.view(-1, m, len(part), size).permute(2, 3, 1, 0))
-    estimator = tensor_map(lambda t: t[part, None], fine.estimator)
-    solutions = estimator.minimal(*sample)
-    return solutions.model, solutions.valid & ~estimator.degenerate(*sample)[..., None]
-
-
-def _cascade(
-    coarse: Problems,
-    models: Any,
-    valid: Bool[Tensor, "g size slots"],
-    options: Options,
-    plan: Sequence[tuple[int, int]] | None = None,
-) -> tuple[Any, Float[Tensor, "g kept"], Bool[Tensor, "g"]]:
-    """The best models and their losses, best first, found by way of ever larger parts of the data.
-
-    Args:
-        coarse: The problems.
-        models: Their hypotheses.
-        valid: Which of these are any.
-        options: How to compare.
-        plan: On how many data to compare, and how many to keep, stage by stage; all data at last, and the few to be optimised,
-            if not given.
-    """
-    wide, slots = coarse.spread(), valid.shape[-1]
-    kept = OPTIMISED if plan is None else plan[-1][1]
-    plan = plan or stages(coarse.width, valid.shape[1] * slots)
-    index, there = gather_valid(valid.flatten(1), kept)
-    row = torch.arange(len(index), device=index.device)[:, None]
-    models = cast(tensor_map(lambda t: t[row, index // slots, index % slots], models), options.dtype)
-    loss = there
-    for number, keep in plan:
-        data = [d[:, :, :number] for d in wide.data]
-        counts = counted(coarse.inside, coarse.weight, number)
-        loss = losses(wide.estimator, models, data, coarse.limit, counts, options.score)
-        loss = torch.where(there, loss, torch.inf)
-        chosen = smallest(loss, keep)
-        loss = loss.gather(1, chosen)
-        models, there = take_slots(models, chosen), there.gather(1, chosen)
-    return tensor_map(lambda t: t[:, :kept], models), loss[:, :kept], there[:, 0]
 
 
 def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) -> tuple[Best, Float[Tensor, "p width"]]:
