@@ -102,7 +102,9 @@ class UprightPoseEstimator:
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 4"]:
         """R turned about the vertical by the first number of the step, and t moved along the unit sphere by the others."""
-        R = rotation_exponential(step[..., :1] * self.gravity2) @ model[..., :3]
+        # Where the verticals move, R moves with them.
+        upright = rotation_exponential(cross((model[..., :3] @ self.gravity1[..., None])[..., 0], self.gravity2))
+        R = rotation_exponential(step[..., :1] * self.gravity2) @ upright @ model[..., :3]
         t = UnitSphere(3).retract(model[..., 3].expand(R.shape[:-1]), step[..., 1:])
         return torch.cat((R, t[..., None]), -1)
 
@@ -145,8 +147,8 @@ def estimate_upright(
         covariance: Compute the covariance of the entries of [R | t], row by row.
 
     Returns:
-        [R | t] with |t| = 1; inliers, score, iterations, status, covariance (12 x 12, of rank 3). The pose carries its
-        derivatives with respect to the inliers and the verticals (see `ransac`).
+        [R | t] with |t| = 1; inliers, score, iterations, status (NOT_FINITE also where a vertical has no direction), covariance
+        (12 x 12, of rank 3). The pose carries its derivatives with respect to the inliers and the verticals (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
@@ -157,5 +159,10 @@ def estimate_upright(
     )  # fmt: skip
     batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"))
     up1, up2 = (unit_rays(g[..., None, :])[..., 0, :].expand(*batch, 3) for g in (gravity1, gravity2))
+    known = torch.isfinite(up1 + up2).all(-1)[..., None]
+    down = torch.eye(3, dtype=up1.dtype, device=up1.device)[2]
+    up1, up2 = (torch.where(known, up, down) for up in (up1, up2))
     estimator = UprightPoseEstimator(up1, up2, pose_slack(threshold, d1).expand(batch))
-    return request.answer(estimator, unit_rays(d1), unit_rays(d2), dtype=d1.dtype)
+    # Without verticals there are no data either.
+    rays1 = torch.where(known[..., None], unit_rays(d1), torch.nan)
+    return request.answer(estimator, rays1, unit_rays(d2), dtype=d1.dtype)

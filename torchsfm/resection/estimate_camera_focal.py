@@ -191,9 +191,11 @@ def estimate_camera_focal(
     def back(model: Tensor) -> Tensor:
         f, pose = _split(model)
         P = _join(f * radius, world_pose(pose, centre, size))
-        return torch.cat((P[..., :2, :] + c[..., :, None] * P[..., 2:, :], P[..., 2:, :]), -2)
+        return torch.cat((P[..., :2, :] + origin[..., :, None] * P[..., 2:, :], P[..., 2:, :]), -2)
 
     one = torch.ones_like(centre)
     unit = torch.cat((one, one * size[..., None], one[..., :1]), -1)
     y = moved_and_scaled(x, c, radius)
+    # Where it is not finite there are no data, but the zeros in place of a camera are to stay finite.
+    origin = torch.where(torch.isfinite(c), c, 0.0)
     return request.answer(FocalCameraEstimator(), y, Y, dtype=dtype, scale=1 / radius, back=back, step_unit=unit)

@@ -56,10 +56,16 @@ def attach_derivative(
         own: Any = tensor_map(lambda _: next(parts), estimator)
         return _losses(own, own.retract(model, step), inputs[:k], inputs[k], selected, reach).sum(-1)
 
-    step = attach_optimum(objective, tangent, *safe, weights, *fields, valid=selected.any(-1))
+    optimal = selected.any(-1)
+
+    def at_optima(t: Tensor, other: Tensor | float) -> Tensor:
+        return torch.where(optimal.reshape(-1, *(1,) * (t.ndim - 1)), t, other)
+
+    step = attach_optimum(objective, tangent, *safe, weights, *fields, valid=optimal)
+    own: Any = tensor_map(lambda t: at_optima(t, t.detach()), estimator)
+    moved: M = own.retract(model, step)
     # The value stays as it is, bit for bit.
-    moved: M = estimator.retract(model, step)  # type: ignore[attr-defined]
-    return zip_map(lambda value, free: value + (free - free.detach()), model, moved)
+    return zip_map(lambda value, free: value + at_optima(free - free.detach(), 0.0), model, moved)
 
 
 def step_covariance(
