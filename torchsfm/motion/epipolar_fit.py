@@ -76,3 +76,18 @@ def cofactors(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The matrix of cofactors: the gradient of the determinant. Its rows are cross products of rows."""
     C: Tensor = torch.linalg.cross(F.roll(-1, -2), F.roll(-2, -2))
     return C
+
+
+def left_epipole(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """The left null vector, of norm 1: the largest column of the matrix of cofactors."""
+    C = cofactors(F)
+    square = (C * C).sum(-2)
+    best = square.argmax(-1, keepdim=True)
+    e = C.gather(-1, best[..., None, :].expand(*C.shape[:-1], 1))[..., 0]
+    return e * square.gather(-1, best).clamp(min=1e-200).rsqrt()
+
+
+def with_left_epipole(F: Float[Tensor, "*#batch 3 3"], e: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 4"]:
+    """F and its left null vector, on the side of a given one."""
+    turned = left_epipole(F)
+    return torch.cat((F, torch.where((turned * e).sum(-1, keepdim=True) < 0, -turned, turned)[..., None]), -1)

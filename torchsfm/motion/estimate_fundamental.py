@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.motion.epipolar_fit import cofactors, cross_rows, matrices, plane_rows
+from torchsfm.motion.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, with_left_epipole
 from torchsfm.motion.estimate_homography import HomographyEstimator
-from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.normalization import common_scale, largest_positive
+from torchsfm.motion.oriented_7pt import oriented_7pt
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_rivals
 from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.motion.sampson_plane import squared_distance, step_equations
@@ -39,26 +39,7 @@ class FundamentalEstimator:
         self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]
     ) -> Solutions[Float[Tensor, "*batch 3 3 4"]]:
         """The F of seven points that can be in front of both cameras."""
-        solutions = fundamental_7pt(x1, x2)
-        F, shape = solutions.model, solutions.valid.shape
-        # Coordinates first: the batch is long and the matrices are small.
-        columns = F.reshape(-1, 3, 3).permute(2, 1, 0).contiguous().unbind(0)
-        crosses = [torch.linalg.cross(columns[j - 2], columns[j - 1], dim=0) for j in range(3)]
-        size = [(c * c).sum(0) for c in crosses]
-        # The left epipole is across all columns; the longest cross product is the most accurate.
-        e = torch.where(size[1] > size[0], crosses[1], crosses[0])
-        longest = torch.maximum(size[0], size[1])
-        e = torch.where(size[2] > longest, crosses[2], e)
-        e = e * torch.maximum(longest, size[2]).clamp(min=1e-200).rsqrt()
-        M = torch.stack([torch.linalg.cross(e, c, dim=0) for c in columns], 1)
-        h1, h2 = (torch.cat((x, torch.ones_like(x[..., :1])), -1) for x in (x1, x2))
-        z = (h2[..., :, None] * h1[..., None, :]).flatten(-2).expand(*shape[:-1], 7, 9).reshape(-1, 7, 9)
-        side = z @ M.view(9, -1, 3).permute(1, 0, 2)
-        # h2' [e]x F h1 is negative in front of both cameras: e x h2 and F h1 point the same way.
-        plus, minus = side.amax(-2).reshape(shape) <= 0, side.amin(-2).reshape(shape) >= 0
-        e = e.mT.reshape(*shape, 3)
-        e = torch.where(plus[..., None], e, -e)
-        return Solutions(torch.cat((F, e[..., None]), -1), solutions.valid & (plus | minus))
+        return oriented_7pt(x1, x2)
 
     def squared_residual(
         self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
@@ -108,7 +89,7 @@ class FundamentalEstimator:
         share = (normal * bound).sum(-1)
         f = f - free - (gap / torch.where(share > 0, share, torch.inf))[..., None] * bound
         F = matrices(f * (f * f).sum(-1, keepdim=True).rsqrt(), 3)
-        return _with_epipole(F, e).to(x1.dtype)
+        return with_left_epipole(F, e).to(x1.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
         """F moved along a basis of the tangent space, then to determinant 0 up to fourth order, and to norm 1."""
@@ -116,7 +97,7 @@ class FundamentalEstimator:
         normals = torch.stack((f, _cofactors(f)), -2)
         basis = torch.linalg.svd(normals, full_matrices=True)[2][..., 2:, :]
         f = model[..., :3].flatten(-2) + (step[..., None, :] @ basis)[..., 0, :]
-        return _with_epipole(matrices(_determinant_step(f), 3), model[..., 3])
+        return with_left_epipole(matrices(_determinant_step(f), 3), model[..., 3])
 
     def rivals(
         self,
@@ -164,21 +145,6 @@ class FundamentalEstimator:
         _, on = dominant_plane(cross_rows(e, F), e, plane_rows(x1), plane_rows(x2), inliers, limit, sphere=False)
         planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
         return torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE)).to(torch.int8)
-
-
-def _left_epipole(F: Tensor) -> Tensor:
-    """The left null vector, of norm 1: the largest column of the matrix of cofactors."""
-    C = cofactors(F)
-    square = (C * C).sum(-2)
-    best = square.argmax(-1, keepdim=True)
-    e = C.gather(-1, best[..., None, :].expand(*C.shape[:-1], 1))[..., 0]
-    return e * square.gather(-1, best).clamp(min=1e-200).rsqrt()
-
-
-def _with_epipole(F: Tensor, e: Tensor) -> Tensor:
-    """F and its left null vector, on the side of a given one."""
-    turned = _left_epipole(F)
-    return torch.cat((F, torch.where((turned * e).sum(-1, keepdim=True) < 0, -turned, turned)[..., None]), -1)
 
 
 def _cofactors(f: Tensor) -> Tensor:

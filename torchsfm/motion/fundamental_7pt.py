@@ -52,9 +52,7 @@ def fundamental_7pt(
     """
     batch = check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
     with torch.no_grad():
-        # (coordinate, point, problem)
-        rows1, rows2 = (x.detach().double().expand(*batch, 7, 2).reshape(-1, 7, 2).permute(2, 1, 0) for x in (x1, x2))
-        rows, good = _solve(rows1, rows2)
+        rows, good = solve(batch_last(x1, batch), batch_last(x2, batch))
         F = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 3).to(x1.dtype)
         valid = good.mT.reshape(*batch, 3)
     if wants_derivative(x1, x2):
@@ -62,8 +60,14 @@ def fundamental_7pt(
     return Solutions(F, valid)
 
 
+def batch_last(x: Float[Tensor, "*#batch 7 2"], batch: tuple[int, ...]) -> Float[Tensor, "2 7 n"]:
+    """Points as (coordinate, point, problem), in float64."""
+    x = x.detach().expand(*batch, 7, 2)
+    return x.permute(-1, -2, *range(len(batch))).reshape(2, 7, -1).double()
+
+
 @kernel(chunk=8192)
-def _solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tuple[Tensor, Tensor]:
+def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tuple[Tensor, Tensor]:
     """F as (9, 3, batch) and valid as (3, batch)."""
     (u, v), c1, size1 = _around_the_first(x1)
     (a, b), c2, size2 = _around_the_first(x2)
