@@ -88,12 +88,54 @@ def cross(a: Vector, b: Vector) -> Vector:
     return vector(fms(a2, b1, a1 * b2), fms(a0, b2, a2 * b0), fms(a1, b0, a0 * b1))
 
 
-def largest(keys: Vector, values: list[Vector]) -> tuple[Tensor, Vector]:
-    """The largest of three keys and the one of three vectors that belongs to it."""
+def ahead(v: Vector) -> tuple[Vector, Vector]:
+    """`(v1, v2, v0)` and `(v2, v0, v1)`."""
+    if isinstance(v, Tensor):
+        twice = torch.cat((v, v[:2]))
+        return twice[1:4], twice[2:]
+    return (v[1], v[2], v[0]), (v[2], v[0], v[1])
+
+
+def matrix(rows: list[list[Tensor]]) -> Tensor | list[Vector]:
+    """Three vectors of numbers, as a tensor (3, 3, ..., problem) or a list."""
+    if torch.compiler.is_compiling():
+        return [vector(*row) for row in rows]
+    return torch.stack([x for row in rows for x in row]).view(3, 3, *rows[0][0].shape)
+
+
+def dots(rows: Tensor | list[Vector], v: Vector | None = None) -> Vector:
+    """The products of the rows of a matrix with a vector, or with themselves."""
+    if isinstance(rows, Tensor):
+        other = rows if v is None else v
+        assert isinstance(other, Tensor)
+        return (rows * other).sum(1)
+    return tuple(dot(row, row if v is None else v) for row in rows)
+
+
+def total(v: Vector) -> Tensor:
+    """The sum of the three."""
+    return v.sum(0) if isinstance(v, Tensor) else v[0] + v[1] + v[2]
+
+
+def greatest(v: Vector) -> Tensor:
+    """The greatest of the three."""
+    return v.amax(0) if isinstance(v, Tensor) else torch.maximum(torch.maximum(v[0], v[1]), v[2])
+
+
+def least(v: Vector) -> Tensor:
+    """The least of the three."""
+    return v.amin(0) if isinstance(v, Tensor) else torch.minimum(torch.minimum(v[0], v[1]), v[2])
+
+
+def largest(keys: Vector, rows: Tensor | list[Vector]) -> tuple[Tensor, Vector]:
+    """The largest of three keys and the row of a matrix that belongs to it."""
+    if isinstance(rows, Tensor) and isinstance(keys, Tensor):
+        key, index = keys.max(0)
+        return key, rows.gather(0, index.expand(1, *rows.shape[1:]))[0]
     second = keys[1] > keys[0]
     key = torch.maximum(keys[0], keys[1])
-    value = chosen(second, values[1], values[0])
-    return torch.maximum(key, keys[2]), chosen(keys[2] > key, values[2], value)
+    value = chosen(second, rows[1], rows[0])
+    return torch.maximum(key, keys[2]), chosen(keys[2] > key, rows[2], value)
 
 
 def triad(a: Vector, b: Vector) -> tuple[Vector, Vector, Vector]:

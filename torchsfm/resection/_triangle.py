@@ -11,51 +11,61 @@ import torch
 from torch import Tensor
 
 from torchsfm.linalg.vectors import (
-    Rows,
     Vector,
     across,
+    ahead,
     chosen,
     combined,
     cross,
     dot,
+    dots,
     each,
     fma,
     fms,
+    greatest,
     largest,
+    least,
+    matrix,
     minus,
     scaled,
     together,
+    total,
     vector,
 )
 
 SQRT2 = 2.0**0.5
 
 
+Points = Tensor | list[Vector]
+"""Three vectors, as a tensor (point, coordinate, problem) or as a list."""
+
+
 class Triangle:
     """The three quadrics in the depths.
 
-    Pairs of points come in the order 01, 02, 12. Every form is written with `1 - u_i'u_j` taken from the difference of
-    the rays: for narrow fields of view the scalar product itself has lost the angle.
+    What belongs to a pair of points stands where the third point is: 12, 20, 01. Every form is written with `1 - u_i'u_j`
+    taken from the difference of the rays: for narrow fields of view the scalar product itself has lost the angle.
     """
 
-    def __init__(self, u: list[Vector], X: list[Vector]) -> None:
-        edges = minus(X[0], X[1]), minus(X[0], X[2]), minus(X[1], X[2])
-        chords = minus(u[0], u[1]), minus(u[0], u[2]), minus(u[1], u[2])
-        self.a = tuple(dot(e, e) for e in edges)
-        self.n2 = tuple(dot(c, c) for c in chords)
+    def __init__(self, u: Points, X: Points) -> None:
+        self.a, self.m = _squared_sides(X), _squared_sides(u)
         self.volume = dot(u[0], cross(u[1], u[2]))
+        # For the depths of all slots.
+        self.side, self.m_slots = (each(lambda x: x.unsqueeze(-2), v) for v in (self.a, self.m))
+        self.side_inverse, self.side_minus = each(torch.reciprocal, self.side), each(torch.neg, self.side)
 
-    def candidates(self) -> tuple[Rows, Tensor]:
-        """The depths in four slots, rows (slot, problem), and which of them are real and positive."""
+    def candidates(self) -> tuple[Vector, Tensor]:
+        """The depths in four slots, (slot, problem), and which of them are real and positive."""
         p, q = self._pencil()
-        n = each(lambda m: 0.5 * m, vector(*self.n2))
+        n = each(lambda m: 0.5 * m, self.m)
         s = each(lambda k: k * (2 - k), n)
-        mixed = fms(self.volume, self.volume, s[0] + s[1] + s[2])
+        mixed = fms(self.volume, self.volume, total(s))
 
         def determinant(w: Vector) -> Tensor:
             w0, w1, w2 = w
-            f = fma(w0 + w1, w2 * w2 * s[2], (w1 + w2) * (w0 * w0 * s[0]))
-            return fma(w0 * w1 * w2, mixed, fma(w0 + w2, w1 * w1 * s[1], f))
+            sum_w = total(w)
+            wide = s.unsqueeze(1) if isinstance(s, Tensor) and w0.ndim > 1 else s
+            return fma(w0 * w1 * w2, mixed, total(each(lambda x, k: (sum_w - x) * (x * x * k), w, wide)))
 
         # The cubic along the pencil from four directions, the one with the largest value turned to infinity.
         u, v = each(lambda x, y: (x + y) * (1 / SQRT2), p, q), each(lambda x, y: (y - x) * (1 / SQRT2), p, q)
@@ -70,147 +80,149 @@ class Triangle:
         inverse = 1 / g[0]
         c2, c1 = SQRT2 * (g[1] + g[3]) - g[2], SQRT2 * (g[1] - g[3]) - g[0]
         root = separate_root(c2 * inverse, c1 * inverse, g[2] * inverse)
-        size = fma(root, root, torch.ones_like(root)).rsqrt()
+        size = torch.rsqrt(root * root + 1)
         w = each(lambda x, y: fma(root, x, y) * size, p, q)
         other = each(lambda x, y: fms(root, y, x) * size, p, q)
-        total = self.a[0] + self.a[1] + self.a[2]
-        slots = [slot for line in together(list(self._lines(w, n))) for slot in self._meet(line, other, n, total)]
-        if len(slots) == 4:
-            # Slots in the order that stacked lines have.
-            parts = zip(*((*depths, real) for depths, real in (slots[0], slots[2], slots[1], slots[3])), strict=True)
-            l0, l1, l2, real = (torch.stack(part) for part in parts)
-        else:
-            parts = zip(*((*depths, real) for depths, real in slots), strict=True)
-            l0, l1, l2, real = (torch.cat(part) for part in parts)
-        return (l0, l1, l2), real
+        slots = [slot for line in together(list(self._lines(w, n, s))) for slot in self._meet(line, other)]
+        if len(slots) == 1:
+            return slots[0]
+        # In the order that stacked lines have.
+        order = [slots[i] for i in (0, 2, 1, 3)]
+        return each(lambda *x: torch.stack(x), *(v for v, _ in order)), torch.stack([real for _, real in order])
 
     def _pencil(self) -> tuple[Vector, Vector]:
         """Orthonormal weights of the three forms that cancel the right-hand sides."""
         a0, a1, a2 = self.a
-        root = fma(a0, a0, a1 * a1).rsqrt()
-        p0, p1 = a1 * root, -a0 * root
-        q = vector(-a2 * p1, a2 * p0, fms(a1, p0, a0 * p1))
-        return vector(p0, p1, torch.zeros_like(p0)), scaled(q, dot(q, q).rsqrt())
+        root = fma(a1, a1, a2 * a2).rsqrt()
+        p2, p1 = a1 * root, -a2 * root
+        q = vector(fms(a2, p1, a1 * p2), -a0 * p2, a0 * p1)
+        return vector(torch.zeros_like(p1), p1, p2), scaled(q, dot(q, q).rsqrt())
 
-    def _lines(self, w: Vector, n: Vector) -> tuple[Vector, Vector]:
+    def _lines(self, w: Vector, n: Vector, s: Vector) -> tuple[Vector, Vector]:
         """The two lines of the member of the pencil with weights w, which must be degenerate."""
-        w0, w1, w2 = w
-        k0, k1, k2 = each(lambda m, x: fma(m, x, -x), n, w)
-        d0, d1, d2 = w0 + w1, w0 + w2, w1 + w2
+        w1, w2 = ahead(w)
+        k, d = each(lambda m, x: fma(m, x, -x), n, w), each(torch.add, w1, w2)
+        k1, k2 = ahead(k)
         # Minus the adjugate is v v' with v the common point of the lines; its diagonal without cancellation.
-        mixed = fma(w0, d2, w1 * w2)
-        s0, s1, s2 = each(lambda m, x: -fma(m * (2 - m) * x, x, mixed), n, w)
-        b01, b02, b12 = fms(k1, k2, k0 * d2), fms(k0, k2, k1 * d1), fms(k0, k1, k2 * d0)
-        size, column = largest((s2, s1, s0), [vector(s2, b01, b02), vector(b01, s1, b12), vector(b02, b12, s0)])
-        v0, v1, v2 = scaled(column, size.clamp_min(1e-300).rsqrt())
-        rows = [vector(d0, k0 - v2, k1 + v1), vector(k0 + v2, d1, k2 - v0), vector(k1 - v1, k2 + v0, d2)]
-        size, row = largest(tuple(dot(r, r) for r in rows), rows)
+        mixed = fma(w[0], d[0], w[1] * w[2])
+        c = each(lambda m, x: -fma(m * x, x, mixed), s, w)
+        (c0, c1, c2), (b0, b1, b2) = c, each(lambda x, y, z, e: fms(y, z, x * e), k, k1, k2, d)
+        size, column = largest(c, matrix([[c0, b2, b1], [b2, c1, b0], [b1, b0, c2]]))
+        point = scaled(column, size.clamp_min(1e-300).rsqrt())
+        (x0, x1, x2), (y0, y1, y2), (d0, d1, d2) = each(torch.add, k, point), minus(k, point), d
+        rows = matrix([[d0, y2, x1], [x2, d1, y0], [y1, x0, d2]])
+        size, row = largest(dots(rows), rows)
         first = scaled(row, size.clamp_min(1e-300).rsqrt())
-        second = vector(*(dot(r, first) for r in rows))
+        second = dots(rows, first)
         return first, scaled(second, dot(second, second).clamp_min(1e-300).rsqrt())
 
-    def _meet(self, line: Vector, w: Vector, n: Vector, total: Tensor) -> list[tuple[Rows, Tensor]]:
+    def _meet(self, line: Vector, w: Vector) -> list[tuple[Vector, Tensor]]:
         """The two points where a line meets the member of the pencil with weights w, scaled to the triangle, and if real."""
         e1, e2 = across(line)
+        m = self.m_slots if isinstance(line, Tensor) else self.m
+        if isinstance(w, Tensor):
+            w = w.unsqueeze(1)
         # q11 x^2 + 2 q12 x y + q22 y^2 along the line.
-        q11, q12, q22 = self._square(w, e1), self._bilinear(w, n, e1, e2), self._square(w, e2)
+        (x1, x2), (y1, y2) = ahead(e1), ahead(e2)
+        d, e = minus(x1, x2), minus(y1, y2)
+        q11, q22 = dot(w, _forms(m, x1, x2, d)), dot(w, _forms(m, y1, y2, e))
+        q12 = dot(w, each(lambda r, s, x, y, z, t, k: fma(r, s, 0.5 * k * fma(x, t, y * z)), d, e, x1, x2, y1, y2, m))
         product = q11 * q22
         discriminant = fma(q12, q12, -product)
         real = discriminant >= -1e-9 * fma(q12, q12, product.abs())
         z = -(q12 + torch.copysign(discriminant.clamp_min(0).sqrt(), q12))
-        slots: list[tuple[Rows, Tensor]] = []
+        slots: list[tuple[Vector, Tensor]] = []
         for depths in together([combined(z, e1, q11, e2), combined(q22, e1, z, e2)]):
             # All of one sign, and of the size that the sides of the triangle ask for.
-            l0, l1, l2 = depths
-            size = torch.copysign((total / self._square(None, depths)).sqrt(), l0 + l1 + l2)
-            rows = l0 * size, l1 * size, l2 * size
+            second, third = ahead(depths)
+            square = total(_forms(m, second, third, minus(second, third)))
+            rows = scaled(depths, torch.copysign((total(self.a) / square).sqrt(), total(depths)))
             # False for NaN too.
-            ahead = (rows[0] > 0) & (rows[1] > 0) & (rows[2] > 0) & (rows[0] + rows[1] + rows[2] < torch.inf)
-            both = real if ahead.shape == real.shape else torch.cat((real, real))
-            slots.append((rows, both & ahead))
+            front = (least(rows) > 0) & (greatest(rows) < torch.inf)
+            slots.append((rows, (real if front.shape == real.shape else torch.cat((real, real))) & front))
         return slots
 
+    def _quadrics(self, depths: Vector) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
+        """The values of the quadrics, and of the depths that each is in the first, the second, and their difference."""
+        first, second = ahead(depths)
+        e = minus(first, second)
+        r = each(lambda m, x, y, d, a: fma(m * x, y, fma(d, d, a)), self.m_slots, first, second, e, self.side_minus)
+        return r, (first, second, e)
+
+    def _inverse(self, pairs: tuple[Vector, Vector, Vector], valid: Tensor | None) -> tuple[Vector, Vector, Vector]:
+        """The inverse of the derivative of the quadrics: in each row what belongs to a depth's own quadric and the next two."""
+        first, second, e = pairs
+        # The derivatives of a quadric by its first depth, and by its second.
+        A = each(lambda y, d, m: torch.add(m * y, d, alpha=2), second, e, self.m_slots)
+        B = each(lambda x, d, m: torch.sub(m * x, d, alpha=2), first, e, self.m_slots)
+        (A1, _), (_, B2) = ahead(A), ahead(B)
+        cofactors = each(torch.mul, A1, B2), each(torch.mul, B, B2), each(torch.mul, A, A1)
+        # The rows are (0, A0, B0), (B1, 0, A1), (A2, B2, 0).
+        x, y = A[2] * cofactors[2][0], B[1] * cofactors[1][0]
+        det = x + y
+        if valid is not None:
+            # At a double root there is no derivative to speak of.
+            valid = valid & (det.detach().abs() > 1e-13 * (x - y).detach().abs())
+            inverse = torch.where(valid, 1 / torch.where(valid, det, 1.0), 0.0)
+        else:
+            inverse = 1 / det
+        own, next_one, last = (scaled(c, inverse) for c in cofactors)
+        return own, next_one, last
+
     @staticmethod
-    def _bilinear(w: Vector, n: Vector, x: Vector, y: Vector) -> Tensor:
-        """The bilinear form with weights w of the three pairs."""
-        x0, x1, x2 = x
-        y0, y1, y2 = y
-        f = w[0] * fma(x0 - x1, y0 - y1, n[0] * fma(x0, y1, x1 * y0))
-        f = fma(w[1], fma(x0 - x2, y0 - y2, n[1] * fma(x0, y2, x2 * y0)), f)
-        return fma(w[2], fma(x1 - x2, y1 - y2, n[2] * fma(x1, y2, x2 * y1)), f)
+    def _moved(depths: Vector, inverse: tuple[Vector, Vector, Vector], r: Vector) -> Vector:
+        return each(lambda x, a, b, c, r0, r1, r2: fma(a, r0, fms(b, r1, fms(c, r2, x))), depths, *inverse, r, *ahead(r))
 
-    def _square(self, w: Vector | None, x: Vector) -> Tensor:
-        """The quadratic form with weights w, all 1 if not given."""
-        x0, x1, x2 = x
-        m = self.n2
-        e0, e1, e2 = x0 - x1, x0 - x2, x1 - x2
-        f0, f1, f2 = fma(e0, e0, m[0] * x0 * x1), fma(e1, e1, m[1] * x0 * x2), fma(e2, e2, m[2] * x1 * x2)
-        return f0 + f1 + f2 if w is None else fma(w[0], f0, fma(w[1], f1, w[2] * f2))
-
-    def newton(self, depths: Rows, valid: Tensor | None = None) -> Rows:
+    def newton(self, depths: Vector, valid: Tensor | None = None) -> Vector:
         """One Newton step on the three quadrics.
 
         Slots that are not `valid`, if given, stay as they are and have no derivative; otherwise what divides by zero comes
         out as it does.
         """
-        l0, l1, l2 = depths
-        m0, m1, m2 = self.n2
-        e0, e1, e2 = l0 - l1, l0 - l2, l1 - l2
-        m00, m01, m10, m12, m21, m22 = m0 * l0, m0 * l1, m1 * l0, m1 * l2, m2 * l1, m2 * l2
-        r0, r1, r2 = self._residuals(depths, (e0, e1, e2), (m00, m10, m21))
-        a0, a1 = torch.add(m01, e0, alpha=2), torch.sub(m00, e0, alpha=2)
-        b0, b2 = torch.add(m12, e1, alpha=2), torch.sub(m10, e1, alpha=2)
-        c1, c2 = torch.add(m22, e2, alpha=2), torch.sub(m21, e2, alpha=2)
-        p, q, m = b2 * c1, b0 * c2, fms(b2, r2, r1 * c2)
-        det = fma(a0, p, a1 * q)
-        if valid is not None:
-            # At a double root there is no derivative to speak of.
-            valid = valid & (det.detach().abs() > 1e-13 * (fma(a0, p, -a1 * q)).detach().abs())
-            det = torch.where(valid, det, 1.0)
-        inverse = 1 / det if valid is None else torch.where(valid, 1 / det, 0.0)
-        s0, s1 = fma(r0, p, a1 * m), fms(a0, m, r0 * q)
-        s2 = fms(fms(a0, r1, r0 * b0), c1, a1 * b0 * r2)
-        return fms(s0, inverse, l0), fms(s1, inverse, l1), fms(s2, inverse, l2)
+        r, pairs = self._quadrics(depths)
+        return self._moved(depths, self._inverse(pairs, valid), r)
 
-    def _residuals(self, depths: Rows, differences: Rows, products: Rows) -> Rows:
-        _, l1, l2 = depths
-        squares = [fma(e, e, -a) for e, a in zip(differences, self.a, strict=True)]
-        return tuple(fma(m, x, square) for m, x, square in zip(products, (l1, l2, l2), squares, strict=True))
-
-    def _worst(self, r0: Tensor, r1: Tensor, r2: Tensor) -> Tensor:
-        a0, a1, a2 = self.a
-        return torch.maximum(torch.maximum((r0 / a0).abs(), (r1 / a1).abs()), (r2 / a2).abs())
-
-    def error(self, depths: Rows) -> Tensor:
+    def _worst(self, r: Vector) -> Tensor:
         """The largest error of a quadric relative to its side of the triangle."""
-        l0, l1, l2 = depths
-        m0, m1, m2 = self.n2
-        return self._worst(*self._residuals(depths, (l0 - l1, l0 - l2, l1 - l2), (m0 * l0, m1 * l0, m2 * l1)))
+        return greatest(each(lambda x, k: (x * k).abs(), r, self.side_inverse))
 
-    def polish(self, depths: Rows, valid: Tensor) -> tuple[Rows, Tensor]:
+    def polish(self, depths: Vector, valid: Tensor) -> tuple[Vector, Tensor]:
         """Newton steps, unless they lead astray as at a double root; and which slots meet the quadrics in the end.
 
         Where two of the points are close to each other the start has a small error in the quadrics and a large one in the
         depths. The first step then trades one for the other, so that what counts is the error after three.
         """
-        before = self.error(depths)
+        before = self._worst(self._quadrics(depths)[0])
         rows = self.newton(self.newton(self.newton(depths)))
-        after = self.error(rows)
+        after = self._worst(self._quadrics(rows)[0])
         # False for NaN too.
         better = after <= before
-        l0, l1, l2 = (torch.where(better, new, old) for new, old in zip(rows, depths, strict=True))
-        reach = torch.maximum(torch.maximum(l0, l1), l2)
-        shortest = torch.minimum(torch.minimum(self.a[0], self.a[1]), self.a[2])
+        rows = chosen(better, rows, depths)
+        reach = greatest(rows)
+        shortest = least(self.a)
         # Rounding of far points against a small triangle; but not so far that any depth would do.
-        rounding = (1e-14 * reach * reach / shortest).clamp_max(1e-5)
+        rounding = (1e-14 / shortest * reach * reach).clamp_max(1e-5)
         close = torch.where(better, after, before) <= 1e-10 + rounding
-        valid = valid & close & (l0 > 0) & (l1 > 0) & (l2 > 0)
-        return tuple(torch.where(valid, depth, 1.0) for depth in (l0, l1, l2)), valid
+        valid = valid & close & (least(rows) > 0)
+        return each(lambda x: torch.where(valid, x, 1.0), rows), valid
 
-    def follow(self, depths: Rows, valid: Tensor) -> Rows:
+    def follow(self, depths: Vector, valid: Tensor) -> Vector:
         """The same depths with their derivatives: those of two Newton steps from the solution, exact to second order."""
         rows = self.newton(self.newton(depths, valid), valid)
-        return tuple(depth + (row - row.detach()) for depth, row in zip(depths, rows, strict=True))
+        return each(lambda depth, row: depth + (row - row.detach()), depths, rows)
+
+
+def _squared_sides(points: Points) -> Vector:
+    """The squared lengths of 12, 20, 01."""
+    if isinstance(points, Tensor):
+        side = torch.roll(points, -1, 0) - torch.roll(points, 1, 0)
+        return (side * side).sum(1)
+    return tuple(dot(e, e) for e in (minus(points[(i + 1) % 3], points[(i + 2) % 3]) for i in range(3)))
+
+
+def _forms(m: Vector, x: Vector, y: Vector, d: Vector) -> Vector:
+    """`|x u - y v|^2` with `m = |u - v|^2` and `d = x - y`, u and v of length 1."""
+    return each(lambda k, a, b, e: fma(k * a, b, e * e), m, x, y, d)
 
 
 def separate_root(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
