@@ -6,7 +6,8 @@ from torch import Tensor
 
 from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import cross_rows
-from torchsfm.motion.plane_glance import GLANCE, plane_suspected
+from torchsfm.motion.plane_glance import plane_suspected
+from torchsfm.robust.glance import GLANCE
 
 F64 = torch.float64
 
@@ -39,7 +40,7 @@ def suspected(
         h1, h2 = (h / h.norm(dim=1, keepdim=True) for h in (h1, h2))
     else:
         A = cross_rows(t, cross_rows(t, R))
-    return plane_suspected(A, t, h1, h2, inliers, limit, 2.0)
+    return plane_suspected(A, t, h1, h2, inliers, limit, torch.full_like(limit, 4.0))
 
 
 @pytest.mark.parametrize("how", ["pose", "fundamental"])

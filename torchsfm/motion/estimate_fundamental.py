@@ -120,12 +120,12 @@ class FundamentalEstimator:
         *,
         inliers: Bool[Tensor, "p n"],
         threshold: Float[Tensor, "p"],
-        chance: Float[Tensor, "p"] | None = None,
+        chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
         """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
         F, e = model[..., :3], model[..., 3]
         h1, h2 = (torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0) for x in (x1, x2))
-        spare = 2.0 if chance is None else most_by_chance(chance, 2)
+        spare = most_by_chance(chance, 2)
         A = torch.linalg.cross(e[..., None], F, dim=-2)
         return plane_suspected(A, e, h1, h2, inliers, 4 * threshold * threshold, spare)
 

@@ -126,10 +126,10 @@ class TrifocalEstimator:
         *,
         inliers: Bool[Tensor, "p n"],
         threshold: Float[Tensor, "p"],
-        chance: Float[Tensor, "p"] | None = None,
+        chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
         """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
-        spare = 2.0 if chance is None else most_by_chance(chance, 2)
+        spare = most_by_chance(chance, 2)
         return planar_suspected(model, (x1, x2, x3), inliers, threshold * threshold, spare)
 
     def degeneracy(

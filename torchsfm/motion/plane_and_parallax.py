@@ -14,7 +14,6 @@ from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.motion.epipolar_fit import cross_rows, forms, plane_rows
-from torchsfm.motion.plane_glance import GLANCE
 from torchsfm.robust import damped_solve
 from torchsfm.robust.sampling import draw_samples
 
@@ -123,14 +122,10 @@ def plane_rivals(
     out = model[:, None].expand(-1, _RIVALS, -1, -1).clone()
     valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
     limit = threshold * threshold
-    # First a glance, then a look at a part; any part is spread over all.
-    some = slice(GLANCE)
-    near = (estimator.squared_residual(model, x1[:, some], x2[:, some]) < limit[:, None]) & inside[:, some]
-    row = estimator.suspect(model, x1[:, some], x2[:, some], inliers=near, threshold=threshold).nonzero()[:, 0]
-    if len(row):
-        some = slice(2 * _OFF_PLANE)
-        _, on, near = _on_plane(estimator, model[row], x1[row, some], x2[row, some], inside[row, some], limit[row])
-        row = row[(2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)]
+    # First a look at a part, spread over all.
+    some = slice(2 * _OFF_PLANE)
+    _, on, near = _on_plane(estimator, model, x1[:, some], x2[:, some], inside[:, some], limit)
+    row = ((2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)).nonzero()[:, 0]
     if not len(row):
         return Solutions(out, valid)
     y1, y2, there, bound = x1[row], x2[row], inside[row], limit[row]

@@ -11,8 +11,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-GLANCE = 128
-"""How many data to look at."""
 _TRIPLES = 48
 """Planes to try. If half of the inliers are in one plane, so is an eighth of the triples, and none of these with a probability
 of (7/8)^48 = 0.2 %; if 60 %, of 1e-5."""
@@ -28,7 +26,7 @@ def plane_suspected(
     h2: Float[Tensor, "p 3 n"],
     inliers: Bool[Tensor, "p n"],
     limit: Float[Tensor, "p"],
-    spare: Float[Tensor, "p"] | float,
+    spare: Float[Tensor, "p"],
 ) -> Bool[Tensor, "p"]:
     """Whether one plane may hold half of the inliers, or all but a few. What is not suspected almost never is so.
 

@@ -15,7 +15,7 @@ from torchsfm._types import Solutions
 from torchsfm.motion.epipolar_fit import forms, plane_rows
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.plane_and_parallax import dominant_plane, squared_transfer
-from torchsfm.motion.plane_glance import GLANCE, plane_suspected
+from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.robust.sampling import draw_samples
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -46,19 +46,13 @@ def rivals_of_plane(
     out = model[:, None].expand(-1, _RIVALS, -1, -1, -1).clone()
     valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
     limit = threshold * threshold
-    part = [y[:, :GLANCE] for y in x]
-    near = (estimator.squared_residual(model, *part) < limit[:, None]) & inside[:, :GLANCE]
-    row = estimator.suspect(model, *part, inliers=near, threshold=threshold).nonzero()[:, 0]
+    near = (estimator.squared_residual(model, *x) < limit[:, None]) & inside
+    H, on = _planes(model, x, near, limit)
+    row = ((2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)).nonzero()[:, 0]
     if not len(row):
         return Solutions(out, valid)
-    x, inside, limit = [y[row] for y in x], inside[row], limit[row]
-    near = (estimator.squared_residual(model[row], *x) < limit[:, None]) & inside
-    H, on = _planes(model[row], x, near, limit)
-    kept = ((2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)).nonzero()[:, 0]
-    if not len(kept):
-        return Solutions(out, valid)
-    row, x, inside, limit, on = row[kept], [y[kept] for y in x], inside[kept], limit[kept], on[kept]
-    H = [h[kept] for h in H]
+    x, inside, limit, on = [y[row] for y in x], inside[row], limit[row], on[row]
+    H = [h[row] for h in H]
     plane = HomographyEstimator()
     for _ in range(3):
         H = [plane.refine(h, x[0], y, weights=on.to(h.dtype)) for h, y in zip(H, x[1:], strict=True)]
@@ -95,7 +89,7 @@ def planar_suspected(
     x: Sequence[Tensor],
     inliers: Bool[Tensor, "p n"],
     limit: Float[Tensor, "p"],
-    spare: Float[Tensor, "p"] | float,
+    spare: Float[Tensor, "p"],
 ) -> Bool[Tensor, "p"]:
     """Whether one plane may hold half of the inliers in both pairs of views, or all but a few (see `plane_suspected`)."""
     first, *others = (torch.nn.functional.pad(y.mT, (0, 0, 0, 1), value=1.0) for y in x)

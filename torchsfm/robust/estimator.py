@@ -39,7 +39,8 @@ class Estimator(Protocol[M]):
       their `inliers (*batch, n)`, `threshold (*batch)`, and how many inliers `chance (*batch)` explains. Where no sample
       determined a model, `inliers` are all data and the model is zero;
     - `suspect(model, *data, inliers, threshold, chance)`: `(*batch)`, from some of the data that are spread over all, whether
-      `degeneracy` over all data could find anything, for models that samples determined. A glance: most problems are clear.
+      `degeneracy` or `rivals` could find anything, for models that samples determined: they are asked about no others. Most
+      problems should be clear at a glance.
     """
 
     sample_size: ClassVar[int]

@@ -18,6 +18,7 @@ from torchsfm._types import Status, check_tensors, tensor_map
 from torchsfm.optim import wants_derivative
 from torchsfm.robust.degeneracy import Degeneracy
 from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.glance import suspected
 from torchsfm.robust.models import cast, tensors_of, zip_map
 from torchsfm.robust.optimum import attach_derivative, has_manifold, step_covariance
 from torchsfm.robust.problems import Problems, pack
@@ -26,9 +27,6 @@ from torchsfm.robust.scoring import around_model, beyond_chance
 from torchsfm.robust.search import Best, Options, no_model, search
 
 M = TypeVar("M")
-
-_GLANCE = 128
-"""How many data to look at first for a degeneracy."""
 
 
 @dataclass(frozen=True)
@@ -290,11 +288,10 @@ def _degeneracy(problems: Problems, best: Best, near: Bool[Tensor, "p n"], chanc
     estimator, solved = problems.estimator, best.solved
     code = torch.where(solved, int(Degeneracy.NONE), int(Degeneracy.UNDETERMINED)).to(torch.int8)
     if hasattr(estimator, "degeneracy"):
-        doubtful = ~solved
-        if hasattr(estimator, "suspect"):
-            data = [d[:, :_GLANCE] for d in problems.data]
-            own = {"inliers": near[:, :_GLANCE], "threshold": problems.limit.sqrt(), "chance": chance}
-            doubtful = doubtful | estimator.suspect(best.model, *data, **own)
+        doubtful = best.doubtful
+        if hasattr(estimator, "suspect") and not hasattr(estimator, "rivals"):
+            doubtful = suspected(problems, best.model, problems.limit, near, chance)
+        doubtful = doubtful | ~solved
         index = doubtful.nonzero()[:, 0]
         if len(index):
             some, known, looked_at = problems.take(index), solved[index], near[index]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.glance import suspected
 from torchsfm.robust.hypotheses import OPTIMISED, hypotheses, sift
 from torchsfm.robust.local_optimisation import (
     FIRST_STEPS,
@@ -67,6 +68,7 @@ class Best:
         solved: Whether any sample had a solution.
         iterations: Number of samples drawn.
         reach: The squared distance at which weights vanish in the loss of which the model is the optimum; 0 if it is none.
+        doubtful: Whether a glance left open that the inliers are degenerate; True where nobody looked.
     """
 
     model: Any
@@ -77,6 +79,7 @@ class Best:
     solved: Bool[Tensor, "p"]
     iterations: Int[Tensor, "p"]
     reach: Float[Tensor, "p"]
+    doubtful: Bool[Tensor, "p"]
 
 
 def search(problems: Problems, options: Options) -> tuple[Best, Float[Tensor, "p width"]]:
@@ -85,7 +88,7 @@ def search(problems: Problems, options: Options) -> tuple[Best, Float[Tensor, "p
     infinite = torch.full((p,), torch.inf, dtype=options.dtype, device=device)
     none = torch.zeros(p, dtype=torch.long, device=device)
     limit = problems.limit.to(options.dtype)
-    best = Best(None, infinite, limit, infinite.double(), infinite, none > 0, none, torch.zeros_like(infinite))
+    best = Best(None, infinite, limit, infinite.double(), infinite, none > 0, none, torch.zeros_like(infinite), none == 0)
     coarse = problems.cast(options.dtype)
     active = torch.arange(p, device=device)
     while len(active):
@@ -241,7 +244,11 @@ def _rivalled(fine: Problems, coarse: Problems, best: Best, options: Options) ->
     """Look for better models in places that samples do not lead to, where the estimator knows such."""
     if not hasattr(fine.estimator, "rivals"):
         return best
-    for part in _split(torch.arange(len(fine.count), device=fine.count.device), fine.width, _NUMBERS):
+    index = torch.arange(len(fine.count), device=fine.count.device)
+    if hasattr(fine.estimator, "suspect"):
+        best = replace(best, doubtful=suspected(fine, cast(best.model, torch.float64), best.limit.double()))
+        index = best.doubtful.nonzero()[:, 0]
+    for part in _split(index, fine.width, _NUMBERS):
         some = fine.take(part)
         model = cast(tensor_map(lambda t: t[part], best.model), torch.float64)  # noqa: B023
         found = some.estimator.rivals(  # type: ignore[attr-defined]
