@@ -15,7 +15,7 @@ from torchsfm.resection._reprojection_step import camera_step, moved_pose, squar
 from torchsfm.resection.camera_p3p import camera_p3p
 from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
-from torchsfm.robust.sampling import spread_order
+from torchsfm.robust.sampling import compact, spread_order
 
 _MANY = 128
 """Of how many points to take the median."""
@@ -224,21 +224,23 @@ def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:
 def middle_and_size(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
     """Medians of the usable points and of their distances from it: points far away must not cost the others precision.
 
-    Of many points, some that are spread over all will do. Which ones is a matter of the problem alone.
+    Of many points, some that are spread over all will do. Which ones depends on the usable points alone.
     """
     n = X.shape[-2]
     if n <= 2 * _MANY:
         return _medians(X, usable)
-    part = spread_order(n, n, X.device)[:_MANY]
     if usable is None:
-        return _medians(X[..., part, :], None)
-    some = usable[..., part]
-    found = _medians(X[..., part, :], some)
-    enough = 4 * some.sum(-1) >= _MANY
-    if bool(enough.all()):
-        return found
+        return _medians(X[..., spread_order(n, n, X.device)[:_MANY], :], None)
+    count = usable.sum(-1)
+    many = count > 2 * _MANY
+    if not bool(many.any()):
+        return _medians(X, usable)
+    part = compact(usable.reshape(-1, n), count.flatten(), n)[:, :_MANY].reshape(*usable.shape[:-1], _MANY, 1)
+    middle, radius = _medians(X.expand(*usable.shape, -1).gather(-2, part.expand(*part.shape[:-1], X.shape[-1])), None)
+    if bool(many.all()):
+        return middle, radius
     centre, size = _medians(X, usable)
-    return torch.where(enough[..., None], found[0], centre), torch.where(enough, found[1], size)
+    return torch.where(many[..., None], middle, centre), torch.where(many, radius, size)
 
 
 def _medians(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
