@@ -36,6 +36,11 @@ def compile_kernels(on: bool = True) -> None:
     _on = on
 
 
+def wanted() -> bool:
+    """Whether to run what is compiled: the switch is on, and nothing around is being compiled."""
+    return _on and not torch.compiler.is_compiling()
+
+
 class Kernel:
     """A function of rows that is cut into pieces and compiled on demand."""
 
@@ -48,7 +53,7 @@ class Kernel:
     def __call__(self, *rows: Tensor, **options: Any) -> Rows:
         """The function's value, the pieces joined along the last dimension; options are constants to the compiler."""
         run, size, batch = self.function, self.chunk, rows[0].shape[-1]
-        if _on and batch > 0 and not torch.compiler.is_compiling():
+        if batch > 0 and wanted():
             run, size = self._run_compiled, COMPILED_CHUNK
         if batch <= size:
             return run(*rows, **options)

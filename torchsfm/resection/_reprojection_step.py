@@ -5,6 +5,8 @@ A camera P sees X at (u, v) = (p, q) / z. With h = (X, 1) / z the derivatives of
 u^2 + v^2 over z^2, which belong to the camera. Those of a camera with fewer parameters follow from them.
 """
 
+from math import prod
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -99,7 +101,7 @@ def _flat(t: Tensor, batch: torch.Size, rows: int, columns: int) -> Tensor:
     """One batch dimension."""
     if t.shape[:-2] != batch:
         t = t.expand(*batch, rows, columns)
-    return t if t.ndim == 3 else t.reshape(batch.numel(), rows, columns)
+    return t if t.ndim == 3 else t.reshape(prod(batch), rows, columns)
 
 
 def squared_reprojection(

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.scores import Score
 from torchsfm.robust.scoring import around_model, squared_residual
@@ -61,14 +61,19 @@ def optimise_locally(
         score: How models are compared.
     """
     for factor in LOCAL_STEPS:
-        scale = (1 / (factor * limit))[..., None]
-
-        def weigh(squared: Tensor, scale: Tensor = scale) -> tuple[Tensor, Tensor]:
-            weights = score.weigh(squared * scale, estimator.codimension) * counts[:, None]
-            return weights, weights
-
-        model = reweighted_step(estimator, model, data, weigh)
+        model = _local_step(estimator, model, data, factor * limit, counts, score)
     return model
+
+
+@fused("g 1", "g k", "g 1 n", "g k", "g n")
+def _local_step(estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Tensor, counts: Tensor, score: Score) -> M:
+    scale = (1 / limit)[..., None]
+
+    def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
+        weights = score.weigh(squared * scale, estimator.codimension) * counts[:, None]
+        return weights, weights
+
+    return reweighted_step(estimator, model, data, weigh)
 
 
 def scale_of_noise(
@@ -96,36 +101,67 @@ def scale_of_noise(
         The model, and the square of its reach in units of the squared threshold, rounded to a coarse grid: so the model that
         `optimise_within` makes is the optimum of one fixed loss, also when the data move a little, and has a derivative.
     """
-    k = estimator.codimension
-    # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
-    peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
-    present = counts[:, None]
-    variance = number = reach = torch.empty(0)
+    model, noise = _scale_step(estimator, model, data, limit, counts, None)
+    for _ in range(SCALE_STEPS - 1):
+        model, noise = _scale_step(estimator, model, data, limit, counts, noise)
+    return model, _reach_at(estimator, model, data, limit, counts, noise)
 
-    def weigh(squared: Tensor, first: bool = False, last: bool = False) -> tuple[Tensor, Tensor]:
-        nonlocal variance, number, reach
+
+@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
+def _scale_step(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    limit: Tensor,
+    counts: Tensor,
+    noise: tuple[Tensor, Tensor] | None,
+) -> tuple[M, tuple[Tensor, Tensor]]:
+    """A step, and the noise by the distances before it: its variance and the number of inliers, `(g, 1, 1)`."""
+    k, present, found = estimator.codimension, counts[:, None], noise
+
+    def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
+        nonlocal found
         ratio = squared * (1 / limit)[:, None, None]
-        density = around_model(ratio, present, k)[..., None]
-        if first:
+        if noise is None:
             core = ((ratio < 1) * present).to(ratio.dtype)
             number = core.sum(-1, keepdim=True).clamp(min=1)
             # A Gaussian cut off at the threshold looks narrower than it is.
             variance = (1.6 / k * (core * ratio.clamp(max=1)).sum(-1, keepdim=True) / number).clamp(_LEAST, 1)
-        inlying = number * peak * variance ** (-k / 2)
-        reach = 1.6 * k * variance * (inlying / density).clamp(min=3).log()
-        if last:
-            return ratio, ratio
-        # What the next step takes for the noise.
-        odds = density / inlying * torch.exp((0.5 * ratio / variance).clamp(max=60))
+        else:
+            variance, number = noise
+        odds, reach = _odds_and_reach(ratio, present, variance, number, k)
+        odds = odds * torch.exp((0.5 * ratio / variance).clamp(max=60))
         likely = torch.where(ratio < 9, 1 / (1 + odds), 0) * present
         number = likely.sum(-1, keepdim=True).clamp(min=1)
-        variance = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1)
+        found = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1), number
         return _falling(ratio * (1 / reach), counts, k)
 
-    for step in range(SCALE_STEPS):
-        model = reweighted_step(estimator, model, data, partial(weigh, first=step == 0))
-    weigh(squared_residual(estimator, model, *data), last=True)
-    return model, torch.exp2((4 * reach[:, 0, 0].log2()).round() / 4)
+    model = reweighted_step(estimator, model, data, weigh)
+    assert found is not None
+    return model, found
+
+
+@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
+def _reach_at(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    limit: Tensor,
+    counts: Tensor,
+    noise: tuple[Tensor, Tensor],
+) -> Tensor:
+    """The squared reach `(g)` in units of the squared threshold, rounded."""
+    ratio = squared_residual(estimator, model, *data) * (1 / limit)[:, None, None]
+    _, reach = _odds_and_reach(ratio, counts[:, None], *noise, estimator.codimension)
+    return torch.exp2((4 * reach[:, 0, 0].log2()).round() / 4)
+
+
+def _odds_and_reach(ratio: Tensor, present: Tensor, variance: Tensor, number: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The odds of an outlier where a model is, and the squared distance at which they are even, for ratios `(g, 1, n)`."""
+    # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
+    peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
+    odds = around_model(ratio, present, k)[..., None] / (number * peak * variance ** (-k / 2))
+    return odds, 1.6 * k * variance * (1 / odds).clamp(min=3).log()
 
 
 def optimise_within(
@@ -137,14 +173,19 @@ def optimise_within(
     steps: int,
 ) -> M:
     """The optimum of the sum of u - u^2 / 2, u the squared distance over the squared reach, near a model `(g, 1, ...)`."""
+    for _ in range(steps if hasattr(estimator, "reweighted_step") else 2 * steps):
+        model = _step_within(estimator, model, data, reach, counts)
+    return model
+
+
+@fused("g 1", "g 1", "g 1 n", "g", "g n")
+def _step_within(estimator: Estimator[M], model: M, data: Sequence[Tensor], reach: Tensor, counts: Tensor) -> M:
     scale = (1 / reach)[:, None, None]
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
         return _falling(squared * scale, counts, estimator.codimension)
 
-    for _ in range(steps if hasattr(estimator, "reweighted_step") else 2 * steps):
-        model = reweighted_step(estimator, model, data, weigh)
-    return model
+    return reweighted_step(estimator, model, data, weigh)
 
 
 def _falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tensor]:

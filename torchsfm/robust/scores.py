@@ -6,6 +6,7 @@ Distances come squared. A score says which of two models is better; the final re
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -101,13 +102,13 @@ class Magsac:
         end = BLUNT[self.dof] / 2
         y = (squared * (end / limit)[:, None, None]).clamp(max=end)
         upper, lower = self._gammas(y)
-        edge, most = (float(g) for g in self._gammas(torch.tensor(end, dtype=torch.float64)))
+        edge, most = _at_threshold(self.dof)
         return _total((y * (upper - edge) + lower) * (1 / most), weight)
 
     def weigh(self, ratio: Tensor, codimension: int) -> Tensor:
         """Falling from 1 to 0 at the threshold."""
         end = BLUNT[self.dof] / 2
-        edge = float(self._gammas(torch.tensor(end, dtype=torch.float64))[0])
+        edge, _ = _at_threshold(self.dof)
         top = math.gamma((self.dof - 1) / 2)
         upper, _ = self._gammas((ratio * end).clamp(max=end))
         return ((upper - edge) / (top - edge)).clamp(min=0).nan_to_num(nan=0.0)
@@ -124,6 +125,12 @@ class Magsac:
         if self.dof == 2:
             return half, lower_three
         return three, 1.5 * lower_three - y * root * decay
+
+
+@cache
+def _at_threshold(dof: int) -> tuple[float, float]:
+    upper, lower = Magsac(dof)._gammas(torch.tensor(BLUNT[dof] / 2, dtype=torch.float64))
+    return float(upper), float(lower)
 
 
 @dataclass(frozen=True)

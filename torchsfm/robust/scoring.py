@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchsfm._types import tensor_map
+from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import tensors_of
 from torchsfm.robust.scores import Score
@@ -58,14 +59,21 @@ def losses(
     g, s = first.shape[:2]
     each = s * data[0].shape[-2]
     portion = max(1, NUMBERS[first.device.type == "cpu"] // max(each, 1))
+    if portion >= g > 0 or _costs.compiles(estimator):
+        return _costs(estimator, models, data, limit, counts, score)
     rows = []
     for i in range(0, g, portion):
         some = slice(i, i + portion)
-        own = tensor_map(lambda t: t[some], estimator)  # noqa: B023
-        squared = squared_residual(own, tensor_map(lambda t: t[some], models), *(d[some] for d in data))  # noqa: B023
-        part = None if counts is None else counts[some]
-        rows.append(score.cost(squared, limit[some], part, estimator.codimension))
+        own, of, at, edge, part = tensor_map(lambda t: t[some], (estimator, models, tuple(data), limit, counts))  # noqa: B023
+        rows.append(_costs(own, of, at, edge, part, score))
     return torch.cat(rows) if rows else limit.new_zeros(g, s)
+
+
+@fused("g 1", "g s", "g 1 n", "g", "g n")
+def _costs(
+    estimator: Estimator[Any], models: Any, data: Sequence[Tensor], limit: Tensor, counts: Tensor | None, score: Score
+) -> Tensor:
+    return score.cost(squared_residual(estimator, models, *data), limit, counts, estimator.codimension)
 
 
 def stages(width: int, slots: int) -> list[tuple[int, int]]:
