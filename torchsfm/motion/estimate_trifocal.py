@@ -15,6 +15,7 @@ from torchsfm.motion.three_view_parallax import planar, planar_suspected, rivals
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
+from torchsfm.robust.local_optimisation import Weigh
 from torchsfm.tensors import canonical_cameras
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -86,7 +87,19 @@ class TrifocalEstimator:
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 2 3 4"]:
         """A Gauss-Newton step on the reprojection error over cameras and points, the frame and scales of the cameras held."""
-        A, b = normal_equations(model, [_rows(x) for x in (x1, x2, x3)], weights)
+        return self.reweighted_step(model, x1, x2, x3, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        model: Float[Tensor, "*#batch 2 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        x3: Float[Tensor, "*#batch n 2"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 2 3 4"]:
+        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        A, b = normal_equations(model, [_rows(x) for x in (x1, x2, x3)], weigh)
         P = model.double()
         G = frame_directions(P)
         G = G / (G * G).sum(-2, keepdim=True).clamp(min=1e-200).sqrt()

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchsfm._types import broadcast_shapes
 from torchsfm.motion.epipolar_fit import forms
+from torchsfm.robust.local_optimisation import Weigh
 
 Rows = Sequence[Tensor]
 _TINY = 1e-30
@@ -75,13 +76,21 @@ def linear_depths(model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows]) -> F
 
 
 def normal_equations(
-    model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows], weights: Float[Tensor, "*#batch n"]
+    model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows], weigh: Weigh
 ) -> tuple[Float[Tensor, "*batch 24 24"], Float[Tensor, "*batch 24"]]:
-    """J' W J and J' W r over the entries of both cameras, the points eliminated, in float64."""
-    X = _start(model, x)
-    for _ in range(2):
-        X = _step(model, x, X)
-    views = [_project(model[..., k, :, :], X, x[k + 1]) for k in range(2)]
+    """J' C J and J' W r over the entries of both cameras, the points eliminated, in float64.
+
+    The weights W and C are those of `weigh` for the distances of `squared_distance`.
+    """
+    X = _step(model, x, _start(model, x))
+    views = _projections(model, x, X)
+    squared = (X[0] - x[0][0]).square() + (X[1] - x[0][1]).square()
+    for e in (e for view in views for e in view.r):
+        squared = torch.addcmul(squared, e, e)
+    front = torch.minimum(views[0].inverse_depth, views[1].inverse_depth) > 0
+    weights, curvature = weigh(squared.masked_fill(~front, torch.inf))
+    X = _moved(x, X, views)
+    views = _projections(model, x, X)
     L, g = _point_equations(X, x, views)
     # Residuals and derivatives by the rows of the cameras: D = [1 0 -u; 0 1 -v] / z for each view, times X.
     J = [row for view in views for row in view.J]
@@ -107,7 +116,7 @@ def normal_equations(
     left = []
     for a, b in _SIX:
         absorbed = V[a][0] * V[b][0] + V[a][1] * V[b][1] + V[a][2] * V[b][2]
-        left.append(((S[a, b] - absorbed) if (a, b) in S else -absorbed) * weights)
+        left.append(((S[a, b] - absorbed) if (a, b) in S else -absorbed) * curvature)
     right = [X[i] * X[j] for i, j in _FOUR]
     moments = torch.stack(left, -2) @ torch.stack(right, -2).mT
     index = torch.tensor(_KRONECKER, device=moments.device)
@@ -185,9 +194,16 @@ def _backward(L: Rows, y: Rows) -> list[Tensor]:
     return [(y[0] - L[1] * x1 - L[3] * x2) / L[0], x1, x2]
 
 
+def _projections(model: Tensor, x: Sequence[Rows], X: Rows) -> list[Projection]:
+    return [_project(model[..., k, :, :], X, x[k + 1]) for k in range(2)]
+
+
 def _step(model: Tensor, x: Sequence[Rows], X: list[Tensor]) -> list[Tensor]:
     """A Gauss-Newton step of the points."""
-    views = [_project(model[..., k, :, :], X, x[k + 1]) for k in range(2)]
+    return _moved(x, X, _projections(model, x, X))
+
+
+def _moved(x: Sequence[Rows], X: list[Tensor], views: Sequence[Projection]) -> list[Tensor]:
     L, g = _point_equations(X, x, views)
     d = _backward(L, _forward(L, g))
     return [X[0] - d[0], X[1] - d[1], X[2], X[3] - d[2]]

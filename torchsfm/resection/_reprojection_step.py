@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import broadcast_shapes
+from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.robust import damped_solve
 from torchsfm.robust.local_optimisation import Weigh
 
@@ -61,7 +62,7 @@ _CROSS = torch.zeros(3, 9, dtype=torch.float64)
 for _axis in range(3):
     _CROSS[_axis, 3 * ((_axis + 2) % 3) + (_axis + 1) % 3] = 1
     _CROSS[_axis, 3 * ((_axis + 1) % 3) + (_axis + 2) % 3] = -1
-_ONE, _MINUS = torch.ones(1, 1, 1, dtype=torch.float64), torch.tensor(-1.0, dtype=torch.float64)
+_ONE = torch.ones(1, 1, 1, dtype=torch.float64)
 
 
 class _Views:
@@ -86,15 +87,11 @@ class _Views:
         """Homogeneous images (problem, camera, 2 and 1, n), the depths made positive, and -1 over them."""
         y = torch.bmm(self.P, points).view(len(points), self.k, 3, self.n)
         image, depth = y[:, :, :2], y[:, :, 2:]
-        z = depth.clamp_min(torch.finfo(depth.dtype).tiny ** 0.4)
-        return image, depth, z, torch.div(_MINUS, z)
+        return image, depth, *positive_depth(depth)
 
     def squares(self, r: Tensor, depth: Tensor, z: Tensor) -> Tensor:
-        """The squared lengths of r, infinite where the depth is not the positive one; comparing and filling would cost more."""
-        big = torch.finfo(z.dtype).max
-        u, v = r[:, :, :1], r[:, :, 1:]
-        behind = torch.sub(z.detach(), depth.detach()).mul_(big)
-        return torch.addcmul(u * u, v, v).add_(behind, alpha=big).view(*self.batch, self.n)
+        """The squared lengths of r; infinite behind the camera."""
+        return squared_in_front(r[:, :, :1], r[:, :, 1:], depth, z).view(*self.batch, self.n)
 
 
 def _flat(t: Tensor, batch: torch.Size, rows: int, columns: int) -> Tensor:

@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, Status, check_tensors
+from torchsfm._types import Solutions, Status, broadcast_shapes, check_tensors
+from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.robust import Score, damped_solve, ransac
+from torchsfm.robust.local_optimisation import Weigh
 from torchsfm.triangulation.triangulate_points import triangulate_points
 
 
@@ -61,9 +63,9 @@ class PointEstimator:
         self, X: Float[Tensor, "*#batch 3"], x: Float[Tensor, "*#batch n 2"], P: Float[Tensor, "*#batch n 12"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared reprojection error; infinite behind the camera."""
-        u, v, depth = _project(X, P)
-        u, v = u / depth - x[..., 0], v / depth - x[..., 1]
-        return (u * u + v * v).masked_fill(~(depth > 0), torch.inf)
+        views = _Views(X, x, P)
+        u, v = torch.addcmul(views.x, views.image, views.inverse).unbind(-3)
+        return squared_in_front(u, v, views.depth, views.z).view(*views.batch, x.shape[-2])
 
     def residual(
         self, X: Float[Tensor, "*#batch 3"], x: Float[Tensor, "*#batch n 2"], P: Float[Tensor, "*#batch n 12"]
@@ -84,26 +86,65 @@ class PointEstimator:
         weights: Float[Tensor, "*#batch n"],
     ) -> Float[Tensor, "*batch 3"]:
         """A Gauss-Newton step on the reprojection error."""
-        u, v, depth = _project(X, P)
-        good = (weights > 0) & (depth > 0)
-        inverse = torch.where(good, 1 / torch.where(good, depth, 1), 0)
-        root = torch.where(good, weights, 0).sqrt()
-        u, v = u * inverse, v * inverse
-        p = P.unbind(-1)
-        scale = inverse * root
-        ju = torch.stack([(p[j] - u * p[8 + j]) * scale for j in range(3)], -2)
-        jv = torch.stack([(p[4 + j] - v * p[8 + j]) * scale for j in range(3)], -2)
-        J = torch.cat((ju, jv), -1)
-        r = torch.cat(((u - x[..., 0]) * root, (v - x[..., 1]) * root), -1)
-        A, g = (J @ J.mT).double(), (J @ r[..., None]).double()
-        return (X - damped_solve(A, g)[..., 0]).to(x.dtype)
+        return self.reweighted_step(X, x, P, weigh=lambda _: (weights, weights))
+
+    def reweighted_step(
+        self,
+        X: Float[Tensor, "*#batch 3"],
+        x: Float[Tensor, "*#batch n 2"],
+        P: Float[Tensor, "*#batch n 12"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3"]:
+        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        views, n = _Views(X, x, P), x.shape[-2]
+        m = views.image * views.inverse
+        r = views.x + m
+        weights, curvature = weigh(squared_in_front(r[:, 0], r[:, 1], views.depth, views.z).view(*views.batch, n))
+        shape = views.depth.shape
+        weights, curvature = (w.expand(*views.batch, n).reshape(shape) for w in (weights, curvature))
+        # Derivatives of -u and -v by X: (problem, image coordinate, coordinate of X, point, n).
+        first, last = views.rows[:, :2, :3, None], views.rows[:, 2:, :3, None]
+        J = torch.addcmul(first, m[:, :, None], last) * views.inverse[:, None]
+        J = J.permute(0, 3, 2, 1, 4)
+        flat, weighted = J.reshape(-1, 3, 2 * n), (J * curvature[:, :, None, None]).reshape(-1, 3, 2 * n)
+        pull = (r * weights[:, None]).transpose(1, 2).reshape(-1, 2 * n, 1)
+        A, g = torch.bmm(weighted, flat.mT).double(), torch.bmm(flat, pull).double()
+        return (X - damped_solve(A, g).view(*views.batch, 3)).to(x.dtype)
 
 
-def _project(X: Tensor, P: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    X0, X1, X2 = X[..., None].unbind(-2)
-    p = P.unbind(-1)
-    u, v, w = (p[i] * X0 + p[i + 1] * X1 + p[i + 2] * X2 + p[i + 3] for i in (0, 4, 8))
-    return u, v, w
+class _Views:
+    """Images of points as rows (problem, image coordinate, point, n); several points of the same data share the cameras.
+
+    Attributes:
+        batch: The batch dimensions of the answer.
+        x: Measurements, (problem, 2, 1, n).
+        rows: The cameras, (problem, 3, 4, n).
+        image: The first two homogeneous coordinates of the images.
+        depth: The third.
+        z: The third made positive.
+        inverse: -1 over it.
+    """
+
+    def __init__(self, X: Tensor, x: Tensor, P: Tensor) -> None:
+        n = x.shape[-2]
+        data = broadcast_shapes(x.shape[:-2], P.shape[:-2])
+        self.batch = broadcast_shapes(X.shape[:-1], data)
+        shared = bool(self.batch) and (not data or data[-1] == 1)
+        lead, k = (self.batch[:-1], self.batch[-1]) if shared else (self.batch, 1)
+        if shared:
+            x, P = (d[..., 0, :, :] if d.ndim > 2 else d for d in (x, P))
+        size = lead.numel()
+        self.x = x.mT.expand(*lead, 2, n).reshape(size, 2, 1, n)
+        self.rows = P.mT.expand(*lead, 12, n).reshape(size, 3, 4, n)
+        X = X.expand(*self.batch, 3).reshape(size, 1, k, 3, 1)
+        column = self.rows.unsqueeze(3).unbind(2)
+        y = column[3]
+        for j in range(3):
+            y = torch.addcmul(y, column[j], X[:, :, :, j])
+        self.image, self.depth = y[:, :2], y[:, 2]
+        self.z, inverse = positive_depth(self.depth)
+        self.inverse = inverse[:, None]
 
 
 @dataclass(frozen=True)
