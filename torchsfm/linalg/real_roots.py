@@ -18,8 +18,10 @@ from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.polynomial import attach_roots
-from torchsfm.linalg.rows import multiply_into, take_columns
+from torchsfm.linalg.rows import take_columns
 
+_CHUNK = 2048
+"""Polynomials to look at a time: their values at all nodes fit the cache."""
 _CELLS = 20
 """Cells from 0 to 45 degrees."""
 _PARTS = 16
@@ -87,9 +89,10 @@ def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3, *, in_order: boo
     c = torch.where(torch.isfinite(c).all(0), c, 0)
     cut, turn = _cuts(c.dtype, c.device)
     both = torch.stack((c, c.flip(0)), 1)
-    changes, several = (bits.flatten(0, 2) for bits in _look(both))
+    pieces = [_look(both[..., i : i + _CHUNK]) for i in range(0, max(batch, 1), _CHUNK)]
+    changes, several = (torch.cat(bits, -1).flatten(0, 2) for bits in zip(*pieces, strict=True))
     both = both.view(n + 1, 2 * batch)
-    # A cell has the number (node * 2 + side) * 2 + reversal.
+    # A cell has the number (side * 20 + node) * 2 + reversal.
     cell, item = (changes & ~several).nonzero().unbind(1)
     column, path = torch.add(item, cell & 1, alpha=batch), take_columns(turn, cell)
     cell, item = several.nonzero().unbind(1)
@@ -115,33 +118,31 @@ def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3, *, in_order: boo
 def _cuts(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """For each cell the nodes that cut it once more, `(parts + 1, cells)`, and begin, end and angle, `(3, cells)`."""
     cuts, turns = [], []
-    for node in range(_CELLS):
-        fine = [math.tan((node * _PARTS + i) * _STEP / _PARTS) for i in range(_PARTS + 1)]
-        fine[0], fine[-1] = _NODES[node], _NODES[node + 1]
-        for sign in (1, 1, -1, -1):
-            cuts.append([sign * z for z in fine])
-            turns.append([sign * fine[0], sign * fine[-1], sign * _STEP])
+    for sign in (1, -1):
+        for node in range(_CELLS):
+            fine = [sign * math.tan((node * _PARTS + i) * _STEP / _PARTS) for i in range(_PARTS + 1)]
+            fine[0], fine[-1] = sign * _NODES[node], sign * _NODES[node + 1]
+            # The polynomial and its reversal.
+            cuts += [fine, fine]
+            turns += [[fine[0], fine[-1], sign * _STEP]] * 2
     return tuple(torch.tensor(x, dtype=dtype, device=device).mT.contiguous() for x in (cuts, turns))  # type: ignore[return-value]
 
 
-@kernel(chunk=1024)
 def _look(c: Float[Tensor, "m 2 batch"]) -> tuple[Tensor, Tensor]:
-    """Which cells, (node, side, reversal, batch), have a change of sign, and which may have two roots or more."""
+    """Which cells, (side, node, reversal, batch), have a change of sign, and which may have two roots or more."""
     n = c.shape[0] - 1
     # The slope is (1 + z^2) p' - n z p, the same positive multiple of h' as the value p is of h.
     k = torch.arange(n + 1, dtype=c.dtype, device=c.device)[:, None, None]
-    both = c.new_empty(n + 1, 2, *c.shape[1:])
-    both[:, 0] = c
-    multiply_into(both[:-1, 1], c[1:], k[1:])
-    both[-1, 1] = 0
-    both[1:, 1].addcmul_(c[:-1], n - k[:-1], value=-1)
+    up, down = c[1:] * k[1:], c[:-1] * (n - k[:-1])
+    both = torch.stack((c, torch.cat((up[:1], up[1:] - down[:-1], -down[-1:]))), 1)[:, :, None]
     z = c.new_tensor(_NODES)[:, None, None]
     square = z * z
-    both = both[:, :, None]
     even, odd = _horner(both[0::2], square), _horner(both[1::2], square)
     odd *= z
-    values, slopes = torch.stack((even + odd, even.sub_(odd)), 2).unbind(0)
-    return _several(values, slopes, c.new_tensor([_STEP, -_STEP])[:, None, None])
+    nodes = c.new_empty(2, *even.shape)
+    torch.add(even, odd, out=nodes[0])
+    torch.sub(even, odd, out=nodes[1])
+    return _several(nodes[:, 0], nodes[:, 1], c.new_tensor([_STEP, -_STEP])[:, None, None, None], 1)
 
 
 def _horner(c: Tensor, x: Tensor) -> Tensor:
@@ -164,13 +165,14 @@ def _horner_slope(c: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     return value, slope
 
 
-def _several(p: Tensor, q: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-    """Which cells between neighbours in the first dimension change sign, and which may hold two roots or more."""
-    third = q * (step / _MARGIN)
+def _several(p: Tensor, q: Tensor, step: Tensor, dim: int = 0) -> tuple[Tensor, Tensor]:
+    """Which cells between neighbours in a dimension change sign, and which may hold two roots or more."""
+    third, cells = q * (step / _MARGIN), p.shape[dim] - 1
     positive = p > 0
-    back = (p > third).logical_xor_(positive)[1:]
-    out = (p > third.neg_()).logical_xor_(positive)[:-1]
-    changes = positive[1:] ^ positive[:-1]
+    back = (p > third) ^ positive
+    out = (p > -third) ^ positive
+    out, back = out.narrow(dim, 0, cells), back.narrow(dim, 1, cells)
+    changes = positive.narrow(dim, 1, cells) ^ positive.narrow(dim, 0, cells)
     return changes, (out & back) | ((out | back) & ~changes)
 
 

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.rows import add_rows, combine_rows, multiply_into
+from torchsfm.motion import _essential_numbers
 from torchsfm.motion._five_points import back_substitute, gone_round, longest, normalised, products_of_minors
 
 
@@ -70,5 +71,7 @@ def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tu
 @kernel(chunk=1 << 20)
 def from_roots(rows: Tensor, s: Tensor, t: Tensor, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """A Newton step from the solution for each root s / t of the determinant: the coordinates, E, and the error before."""
+    if torch.compiler.is_compiling():
+        return _essential_numbers.from_roots(rows, s, t, basis)
     u, error = polish(back_substitute(rows, s, t), basis)
     return u, combine(u, basis), error

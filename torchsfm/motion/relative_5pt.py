@@ -13,12 +13,17 @@ from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.real_roots import number_among_equals
 from torchsfm.linalg.rows import add_rows, combine_rows, multiply_into, take_columns
-from torchsfm.motion._essential_manifold import combine, left_null, polish
-from torchsfm.motion._five_points import back_substitute, five_point_roots, gone_round, products_of_minors
+from torchsfm.motion import _essential_numbers
+from torchsfm.motion._essential_manifold import combine, polish
+from torchsfm.motion._five_points import back_substitute, five_point_roots, gone_round, longest, normalised, products_of_minors
 from torchsfm.optim import attach_implicit, wants_derivative
 
 _CHUNK = 4096
 """Samples at a time: their matrices fit the cache."""
+_MARGIN = 1e-3
+"""Angle in radians that starts may be farther from the front than solutions."""
+_GAP = 1e-7
+"""Of a poor start, see `_in_front`: it is about 1e-4 from the essential manifold."""
 _NEAR = 1e-7
 """Distance from the manifold before a Newton step after which E is as good as any data."""
 _MORE = 2
@@ -77,41 +82,62 @@ def relative_5pt(
 def _poses(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack: Tensor) -> tuple[Tensor, Tensor]:
     """The samples, in order, and the poses (12, poses) of those in front of both cameras."""
     roots = five_point_roots(d1, d2, steps=1)
-    rays = take_columns(torch.cat((roots.d1, roots.d2)), roots.item)
-    angle = slack.index_select(0, roots.item)
-    u, pose, front, error = _from_roots(roots.rows, roots.s, roots.t, roots.basis, rays, angle)
+    item, u, basis = roots.item, roots.s, roots.basis
+    rays = take_columns(torch.cat((roots.d1, roots.d2)), item)
+    angle = slack.index_select(0, item)
+    # Of wrong data most solutions are behind a camera, which the start tells unless it is a poor one.
+    u, worth = _starts(roots.rows, roots.s, roots.t, basis, rays, angle)
+    keep = worth.nonzero()[:, 0]
+    item, angle = item.index_select(0, keep), angle.index_select(0, keep)
+    u, basis, rays = (take_columns(x, keep) for x in (u, basis, rays))
+    u, pose, front, error = _polished(u, basis, rays, angle)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
     if len(rest):
-        u, basis = take_columns(u, rest), take_columns(roots.basis, rest)
+        u, basis = take_columns(u, rest), take_columns(basis, rest)
         for _ in range(_MORE):
             u, error = polish(u, basis)
-        better, ahead = _in_front(combine(u, basis), take_columns(rays, rest), angle.index_select(0, rest))
+        better, ahead, _ = _in_front(combine(u, basis), take_columns(rays, rest), angle.index_select(0, rest))
         pose.index_copy_(1, rest, better)
         front.index_copy_(0, rest, ahead & (error < _CONVERGED))
     keep = front.nonzero()[:, 0]
-    item, order = roots.item.index_select(0, keep).sort(stable=True)
+    item, order = item.index_select(0, keep).sort(stable=True)
     return item, take_columns(pose, keep.index_select(0, order))
 
 
 @kernel(chunk=1 << 20)
-def _from_roots(
-    matrices: Tensor, s: Tensor, t: Tensor, basis: Tensor, rays: Tensor, slack: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    u, error = polish(back_substitute(matrices, s, t), basis)
-    return u, *_in_front(combine(u, basis), rays, slack), error
+def _starts(matrices: Tensor, s: Tensor, t: Tensor, basis: Tensor, rays: Tensor, slack: Tensor) -> tuple[Tensor, Tensor]:
+    """The coordinates of the solution for each root s / t, and whether it may have a pose in front."""
+    slack = slack + _MARGIN
+    if torch.compiler.is_compiling():
+        return _essential_numbers.starts(matrices, s, t, basis, rays, slack, _GAP)
+    u = back_substitute(matrices, s, t)
+    _, front, gap = _in_front(combine(u, basis), rays, slack, only_whether=True)
+    return u, front | ~(gap < _GAP)
+
+
+@kernel(chunk=1 << 20)
+def _polished(u: Tensor, basis: Tensor, rays: Tensor, slack: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A Newton step: coordinates, pose, whether it is in front, and the error before."""
+    if torch.compiler.is_compiling():
+        return _essential_numbers.polished(u, basis, rays, slack)
+    u, error = polish(u, basis)
+    return u, *_in_front(combine(u, basis), rays, slack)[:2], error
 
 
 def _in_front(
-    E: Float[Tensor, "9 batch"], rays: Float[Tensor, "6 5 batch"], slack: Float[Tensor, " batch"]
-) -> tuple[Tensor, Tensor]:
-    """The pose (12, batch) of a unit E, and whether it has five unit rays in front.
+    E: Float[Tensor, "9 batch"], rays: Float[Tensor, "6 5 batch"], slack: Float[Tensor, " batch"], only_whether: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The pose (12, batch) of a unit E, whether it has five unit rays in front, and how far E is from an essential matrix.
 
     With C the cofactors of E = [t]x R, the rotations are R = C + T and C - T with T = [t]x E (Horn 1990). For both of them
     t' R = t' C; d2' R d1 is the product of the cosines of the angles to t, plus or minus that of the sines.
     """
     round_ = gone_round(E.view(3, 3, -1))
     C = products_of_minors(round_)
-    t = left_null(C)
+    squares = add_rows((C * C).unbind(0))
+    # 4 |C|^2 = 1 for unit essential matrices, and nearly so near them.
+    gap = (4 * add_rows(squares) - 1).abs_()
+    t = normalised(longest(squares.unbind(0), C.unbind(1)))
     around = torch.cat((t, t[:2]))[:, None]
     T = (around[1:4] * round_[2:, :3]).addcmul_(around[2:], round_[1:4, :3], value=-1)
     C *= 2
@@ -126,7 +152,9 @@ def _in_front(
     depth1, depth2 = (cosine * along2).sub_(along1), torch.addcmul(along2, cosine, along1, value=-1)
     ahead = torch.minimum(depth1, depth2).amin(0) > -slack
     behind = torch.maximum(depth1, depth2).amax(0) < slack
+    if only_whether:
+        return C, ahead | behind, gap
     pose = E.new_empty(3, 4, E.shape[-1])
     multiply_into(pose[:, :3], T, sign).add_(C)
     multiply_into(pose[:, 3], t, torch.where(ahead, 1.0, -1.0).to(t.dtype))
-    return pose.view(12, -1), ahead | behind
+    return pose.view(12, -1), ahead | behind, gap
