@@ -8,12 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import sphere_rows
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, squared_transfer
 from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.motion.relative_5pt import relative_5pt
-from torchsfm.motion.sampson_sphere import pose_step, squared_distance, step_equations
+from torchsfm.motion.sampson_sphere import pose_step, squared_distance, step_equations, turned
 from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import Degeneracy, Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
@@ -90,10 +89,7 @@ class RelativePoseEstimator:
         step = pose_step(A, b, t)
         t = t + step[..., 3:]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
-        R = rotation_from_rotvec(step[..., :3]) @ R
-        # What a start in lower precision lacks to a rotation.
-        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
-        return torch.cat((R, t[..., None]), -1).to(d1.dtype)
+        return torch.cat((turned(step[..., :3], R), t[..., None]), -1).to(d1.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 5"]) -> Float[Tensor, "*batch 3 4"]:
         """R <- exp(w) R, and t along the unit sphere."""

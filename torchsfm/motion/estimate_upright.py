@@ -12,7 +12,7 @@ from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.linalg import cross
 from torchsfm.motion.estimate_essential import RelativePoseEstimator, pose_slack, unit_rays
 from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
-from torchsfm.motion.sampson_sphere import pose_step, step_equations
+from torchsfm.motion.sampson_sphere import pose_step, step_equations, turned
 from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
@@ -94,9 +94,8 @@ class UprightPoseEstimator:
         step = pose_step(A, torch.cat(((up * b[..., :3]).sum(-1, keepdim=True), b[..., 3:]), -1), t)
         t = t + step[..., 1:]
         t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
-        R = rotation_from_rotvec(step[..., :1] * up) @ R
-        # What a start in lower precision lacks to a rotation, and to the vertical.
-        R = 1.5 * R - 0.5 * (R @ R.mT @ R)
+        R = turned(step[..., :1] * up, R)
+        # What a start in lower precision lacks to the vertical.
         R = rotation_from_rotvec(cross((R @ self.gravity1.double()[..., None])[..., 0], up)) @ R
         return torch.cat((R, t[..., None]), -1).to(d1.dtype)
 

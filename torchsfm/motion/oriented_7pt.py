@@ -11,12 +11,9 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.linalg.vectors import cross, fma, fms
-from torchsfm.motion.epipolar_fit import with_left_epipole
+from torchsfm.motion.epipolar_fit import MIXTURE, with_left_epipole
 from torchsfm.motion.fundamental_7pt import batch_last, equations, solve
 from torchsfm.optim import attach_implicit, wants_derivative
-
-_FIRST, _SECOND = 0.37, -0.61
-"""Shares of the third column: the epipole would be lost where e1 is on the line 0.37 x - 0.61 y = 1, for all digits."""
 
 
 def oriented_7pt(
@@ -54,8 +51,8 @@ def _orient(
     """[F | e2] as (12, 3, batch) and valid as (3, batch)."""
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = F.unbind(0)
     # The left epipole is across all columns: across two mixtures of them, so that no choice is needed.
-    left = [torch.add(a, b, alpha=_FIRST) for a, b in ((f0, f2), (f3, f5), (f6, f8))]
-    right = [torch.add(a, b, alpha=_SECOND) for a, b in ((f1, f2), (f4, f5), (f7, f8))]
+    left = [torch.add(a, b, alpha=MIXTURE[0]) for a, b in ((f0, f2), (f3, f5), (f6, f8))]
+    right = [torch.add(a, b, alpha=MIXTURE[1]) for a, b in ((f1, f2), (f4, f5), (f7, f8))]
     e0, e1, e2 = cross(tuple(left), tuple(right))
     e = [e0, e1, e2]
     scale = combine_rows(e, e).clamp(min=1e-200).rsqrt()

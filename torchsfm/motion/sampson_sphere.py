@@ -118,6 +118,17 @@ def step_equations(
     return A, torch.cat((turn, move - t * (t * move).sum(-1, keepdim=True)), -1)
 
 
+def turned(w: Float[Tensor, "*#batch 3"], R: Float[Tensor, "*#batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """R turned by w up to third order (Cayley's map), and what it lacked to a rotation made good, to second order."""
+    half = 0.5 * w
+    once = torch.linalg.cross(half[..., None], R, dim=-2)
+    twice = torch.linalg.cross(half[..., None], once, dim=-2)
+    share = 2 / (1 + (half * half).sum(-1))
+    R = R + share[..., None, None] * (once + twice)
+    product: Tensor = 1.5 * R - 0.5 * (R @ (R.mT @ R))
+    return product
+
+
 def pose_step(
     A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k"], t: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch k"]:
