@@ -14,10 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 Term = tuple[int, int, int, int, float]
-"""The form, the monomial, two of the numbers of a model (-2 stands for 1) and a factor."""
-ONE = -2
+"""The form, the monomial, two of the numbers of a model and a factor."""
+ONE = -1
 """The number 1 among the numbers of a model."""
-_ZERO = -1
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Forms:
         left, right, numbers, factors = _tables(self, model.dtype, model.device)
         z = h.index_select(-2, left) * h.index_select(-2, right)
         rows = model.mT
-        rows = torch.cat((rows, torch.ones_like(rows[..., :1, :]), torch.zeros_like(rows[..., :1, :])), -2)
+        rows = torch.cat((rows, rows.new_ones(*rows.shape[:-2], 1, rows.shape[-1])), -2)
         first, second = rows.index_select(-2, numbers).chunk(2, -2)
         one, other = (first * second * factors).chunk(2, -2)
         # (monomial, form and model): the forms come out one after the other.
@@ -62,15 +61,18 @@ class Forms:
 
 @lru_cache
 def _tables(forms: Forms, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The coordinates of the monomials; the numbers, by factor, term, monomial and form; the factors of the terms."""
-    left, right = torch.tensor(forms.monomials, device=device).unbind(-1)
-    shape = (2, len(forms.monomials), forms.count)
-    numbers = torch.full((2, *shape), forms.numbers + 2 + _ZERO)
-    factors, used = torch.zeros(shape, dtype=dtype), torch.zeros(shape[1:], dtype=torch.long)
+    """The coordinates of the monomials; the numbers, by side, term, monomial and form; the factors of the terms."""
+    size = len(forms.monomials) * forms.count
+    slots = [[ONE] * size for _ in range(4)]
+    factors = [[0.0] * size for _ in range(2)]
     for form, monomial, first, second, factor in forms.terms:
-        slot = int(used[monomial, form])
-        used[monomial, form] += 1
-        for side, number in enumerate((first, second)):
-            numbers[side, slot, monomial, form] = number if number >= 0 else forms.numbers + 2 + number
-        factors[slot, monomial, form] = factor
-    return left.contiguous(), right.contiguous(), numbers.flatten().to(device), factors.reshape(-1, 1).to(device)
+        place = monomial * forms.count + form
+        slot = int(factors[0][place] != 0)
+        slots[slot][place], slots[2 + slot][place] = first, second
+        factors[slot][place] = factor
+    numbers = [number % (forms.numbers + 1) for row in slots for number in row]
+    columns = [list(column) for column in zip(*forms.monomials, strict=True)]
+    # Whoever asks first may be in inference mode; others may not.
+    with torch.inference_mode(False):
+        left, right, chosen = (torch.tensor(row, device=device) for row in (*columns, numbers))
+        return left, right, chosen, torch.tensor(factors, dtype=dtype, device=device).reshape(-1, 1)

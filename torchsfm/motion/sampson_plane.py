@@ -129,6 +129,6 @@ def _square_of_products(device: torch.device) -> Tensor:
     place = {pair: n for n, pair in enumerate(_DEGREE_TWO)}
     place |= {(j, i): n for (i, j), n in place.items()}
     three = range(3)
-    return torch.tensor(
-        [6 * place[i, k] + place[j, m] for i in three for j in three for k in three for m in three], device=device
-    )
+    index = [6 * place[i, k] + place[j, m] for i in three for j in three for k in three for m in three]
+    with torch.inference_mode(False):
+        return torch.tensor(index, device=device)
