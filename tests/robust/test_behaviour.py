@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from robust_doors import DOORS, Door, extremes
+from robust_doors import DOORS, F64, Door, extremes
 
 from torchsfm._types import Status
 from torchsfm.robust import Degeneracy
@@ -70,6 +70,20 @@ def test_extremes_in_one_batch(door: Door, generator: torch.Generator) -> None:
         few = batch.degeneracy[[i for i, size in enumerate(sizes.values()) if size <= door.sample_size]]
         assert (few == Degeneracy.TOO_FEW).all()
         assert status["collinear"] == ("OK" if door is DOORS["upright"] else "DEGENERATE")
+
+
+@every_door
+def test_what_is_given_once_holds_for_all(door: Door, generator: torch.Generator) -> None:
+    """Mask, weights, scores and thresholds without batch dimensions, and several of them for one problem."""
+    n = 400
+    scene = door.make(2, n, generator)
+    mask, some = torch.rand(n, generator=generator) < 0.9, torch.rand(n, generator=generator, dtype=F64)
+    for option, value in (("mask", mask), ("weights", some), ("scores", some), ("threshold", torch.tensor(2.0, dtype=F64))):
+        once = door(scene, **{option: value})
+        each = door(scene, **{option: value.expand(2, *value.shape)})
+        assert torch.equal(once.inliers, each.inliers), option
+        alone = door(scene.at(0), **{option: value.expand(2, *value.shape)})
+        assert torch.equal(alone.inliers, once.inliers[:1].expand(2, n)), option
 
 
 MEMORY = """

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions
+from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
@@ -231,6 +231,7 @@ def middle_and_size(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
         return _medians(X, usable)
     if usable is None:
         return _medians(X[..., spread_order(n, n, X.device)[:_MANY], :], None)
+    usable = usable.expand(*broadcast_shapes(X.shape[:-2], usable.shape[:-1]), n)
     count = usable.sum(-1)
     many = count > 2 * _MANY
     if not bool(many.any()):
