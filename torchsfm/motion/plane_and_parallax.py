@@ -14,11 +14,12 @@ from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.motion.epipolar_fit import cross_rows, forms, plane_rows
+from torchsfm.motion.plane_glance import best_triple, plane_errors
 from torchsfm.robust import damped_solve
 from torchsfm.robust.sampling import draw_samples
 
-_TRIPLES, _JUDGES = 32, 96
-"""Triples of inliers to put a plane through, and inliers to judge the planes by."""
+_JUDGES = 256
+"""How many data to judge planes by before all of them are looked at."""
 _PAIRS, _OFF_PLANE, _RIVALS = 1024, 256, 4
 """Pairs of points off a plane, points off it to judge them by, and how many of the best to return."""
 
@@ -39,17 +40,17 @@ def squared_transfer(
 
 
 def dominant_plane(
-    A: Float[Tensor, "*batch 3 3"],
-    e: Float[Tensor, "*batch 3"],
+    A: Float[Tensor, "p 3 3"],
+    e: Float[Tensor, "p 3"],
     h1: Sequence[Tensor],
     h2: Sequence[Tensor],
-    inliers: Bool[Tensor, "*batch n"],
-    limit: Float[Tensor, "*batch"],
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p"],
     sphere: bool,
-) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch n"]]:
+) -> tuple[Float[Tensor, "p 3 3"], Bool[Tensor, "p n"]]:
     """The homography A + e v' that most inliers agree with, and which do.
 
-    Tries planes through triples of inliers: the data come in an order of which any part is spread over all of them.
+    Tries planes through triples of inliers: the data come in an order of which any part is spread over all.
 
     Args:
         A: One homography that agrees with the epipolar geometry.
@@ -63,35 +64,18 @@ def dominant_plane(
     Returns:
         The homography, and the inliers that agree with it; zeros and none where no three inliers determine a plane.
     """
-    n = inliers.shape[-1]
-    if n < 3:
+    if inliers.shape[-1] < 3:
         return torch.zeros_like(A), torch.zeros_like(inliers)
-    depth, weight = _parallax(A, e, h1, h2)
-    few = min(_JUDGES, n)
-    # The first inliers, in their order.
-    index = inliers.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., :few]
-    there = inliers.gather(-1, index)
-    count = there.sum(-1, keepdim=True).clamp(min=1)
-    triple = torch.arange(3 * _TRIPLES, device=index.device) % count
-    corner = index.gather(-1, triple)
-    shape = (*corner.shape[:-1], _TRIPLES, 3)
-    rows = torch.stack([h.expand(inliers.shape) for h in h1], -2)
-    picked = [row.gather(-1, corner).reshape(shape) for row in rows.unbind(-2)]
-    right = depth.gather(-1, corner).reshape(shape)
-    v = _solve3(torch.stack(picked, -1), right)
-    H = A[..., None, :, :] + e[..., None, :, None] * v[..., None, :]
-    g1, g2 = ([h.expand(inliers.shape).gather(-1, index)[..., None, :] for h in rows] for rows in (h1, h2))
-    loss = (squared_transfer(H, g1, g2, sphere) / limit[..., None, None]).clamp(max=1).nan_to_num(nan=1.0)
-    best = torch.where(there[..., None, :], loss, 0).sum(-1).argmin(-1, keepdim=True)
-    v = v.gather(-2, best[..., None].expand(*best.shape, 3))[..., 0, :]
-    for _ in range(2):
-        on = inliers & (squared_transfer(A + e[..., :, None] * v[..., None, :], h1, h2, sphere) < limit[..., None])
-        w = torch.where(on, weight, 0)
-        normal = (rows * w[..., None, :]) @ rows.mT
-        refined = damped_solve(normal.double(), ((rows * w[..., None, :]) @ depth[..., None]).double())[..., 0].to(v.dtype)
-        v = torch.where((on.sum(-1) >= 3)[..., None], refined, v)
-    H = A + e[..., :, None] * v[..., None, :]
-    return H, inliers & (squared_transfer(H, h1, h2, sphere) < limit[..., None])
+    rows = plane_errors(A, e, torch.stack(list(h1), 1), torch.stack(list(h2), 1), limit)
+    v, _ = best_triple(rows[..., :_JUDGES], inliers[:, :_JUDGES])
+    for _ in range(3):
+        error = (v[:, None] @ rows[:, :3])[:, 0] - rows[:, 3]
+        on = inliers & (error * error < 1)
+        moments = (rows * on[:, None]) @ rows[:, :3].mT
+        refined = damped_solve(moments[:, :3], moments[:, 3:].mT)[..., 0]
+        v = torch.where((on.sum(-1) >= 3)[:, None], refined, v)
+    H = A + e[:, :, None] * v[:, None, :]
+    return H, inliers & (squared_transfer(H, h1, h2, sphere) < limit[:, None])
 
 
 def plane_rivals(
@@ -195,25 +179,5 @@ def more_than_chance(number: Int[Tensor, "*batch"], chance: Float[Tensor, "*batc
     return number > most_by_chance(chance, free)
 
 
-def _parallax(A: Tensor, e: Tensor, h1: Sequence[Tensor], h2: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Of each point, v' x1 and the square of how far the second point moves with it."""
-    y = forms(A, h1)
-    a = _cross(h2, y)
-    b = _cross(h2, [e[..., i, None] for i in range(3)])
-    square = b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
-    depth = -(a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / square.clamp(min=1e-30)
-    y = [a + depth * e[..., i, None] for i, a in enumerate(y)]
-    return depth, square / (y[0] * y[0] + y[1] * y[1] + y[2] * y[2]).clamp(min=1e-12)
-
-
 def _cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _solve3(M: Tensor, right: Tensor) -> Tensor:
-    """Solve 3 x 3 systems by cofactors; zeros where singular."""
-    r0, r1, r2 = M.unbind(-2)
-    c0, c1, c2 = torch.linalg.cross(r1, r2), torch.linalg.cross(r2, r0), torch.linalg.cross(r0, r1)
-    det = (r0 * c0).sum(-1, keepdim=True)
-    x = c0 * right[..., :1] + c1 * right[..., 1:2] + c2 * right[..., 2:]
-    return torch.where(det.abs() > 1e-12, x / torch.where(det == 0, 1, det), 0)

@@ -39,7 +39,20 @@ def plane_suspected(
         limit: Squared largest transfer error.
         spare: How many inliers aside of the plane do not clear it.
     """
-    p, n = inliers.shape
+    _, least = best_triple(plane_errors(A, e, h1, h2, limit), inliers)
+    count = inliers.sum(-1)
+    off: Tensor = least - (inliers.shape[-1] - count)
+    return (off < (1 - _SHARE) * count) | (off <= spare)
+
+
+def plane_errors(
+    A: Float[Tensor, "p 3 3"],
+    e: Float[Tensor, "p 3"],
+    h1: Float[Tensor, "p 3 n"],
+    h2: Float[Tensor, "p 3 n"],
+    limit: Float[Tensor, "p"],
+) -> Float[Tensor, "p 4 n"]:
+    """The rows a, a, a, b of which v' a - b is the transfer error of a plane v in units of the limit, to first order."""
     side = e[:, :, None]
     y = torch.bmm(A, h1)
     b = torch.linalg.cross(h2, side, dim=1)
@@ -47,23 +60,27 @@ def plane_suspected(
     depth = share / square
     y = torch.addcmul(y, side, depth)
     scale = (square / ((y * y).sum(1, keepdim=True) * limit[:, None, None])).sqrt()
-    # A point at the epipole is on every plane, an outlier far from each.
-    rows = torch.cat((h1, depth), 1).mul_(scale).nan_to_num_(nan=0.0)
-    rows[:, 3].masked_fill_(~inliers, torch.inf)
+    # A point at the epipole is on every plane.
+    return torch.cat((h1, depth), 1).mul_(scale).nan_to_num_(nan=0.0)
+
+
+def best_triple(rows: Float[Tensor, "p 4 n"], inliers: Bool[Tensor, "p n"]) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"]]:
+    """The plane through three of the inliers with the least sum of squared errors, none counted for more than 1.
+
+    Where no triple determines a plane, nothing is known: zeros.
+    """
+    # An outlier is far from every plane.
+    rows = torch.cat((rows[:, :3], torch.where(inliers, rows[:, 3], torch.inf)[:, None]), 1)
     # The inliers that a triple takes are at three places of their order.
-    count = inliers.sum(-1, keepdim=True)
-    place = (count * _places(rows.dtype, rows.device)).long()
+    place = (inliers.sum(-1, keepdim=True) * _places(rows.dtype, rows.device)).long()
     place = inliers.to(torch.int8).argsort(dim=-1, descending=True, stable=True).gather(-1, place)
-    corners = rows.gather(-1, place[:, None].expand(-1, 4, -1)).view(p, 4, 3, _TRIPLES).permute(0, 3, 2, 1)
+    corners = rows.gather(-1, place[:, None].expand(-1, 4, -1)).view(-1, 4, 3, _TRIPLES).permute(0, 3, 2, 1)
     v = torch.linalg.solve_ex(corners[..., :3], corners[..., 3])[0]
     error = torch.baddbmm(rows[:, 3:], v, rows[:, :3], beta=-1)
     # In place: with so many numbers new memory costs more than arithmetic.
-    loss = error.mul_(error).clamp_(max=1).sum(-1).nan_to_num_(nan=torch.inf)
-    # Where no triple determines a plane, nothing is known.
-    least = loss.amin(-1).nan_to_num_(posinf=0.0)
-    count = count[:, 0]
-    off: Tensor = least - (n - count)
-    return (off < (1 - _SHARE) * count) | (off <= spare)
+    loss, best = error.mul_(error).clamp_(max=1).sum(-1).nan_to_num_(nan=torch.inf).min(-1)
+    v = v.gather(1, best[:, None, None].expand(-1, -1, 3))[:, 0]
+    return v.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0), loss.nan_to_num_(posinf=0.0)
 
 
 @cache
