@@ -100,9 +100,10 @@ def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3, *, in_order: boo
     single, pair = _cut_again(take_columns(both, close), take_columns(cut, cell), turn[2].index_select(0, cell))
     column, path = torch.cat((column, close.index_select(0, single[0]))), torch.cat((path, single[1]), -1)
     x, found = _find(take_columns(both, column), path, steps=steps)
-    other = close.index_select(0, pair[0])
-    x2, found2 = _find_two(take_columns(both, other), *pair[1:], steps=steps)
-    column, x, found = torch.cat((column, other, other)), torch.cat((x, x2)), torch.cat((found, found2))
+    if len(pair[0]):
+        other = close.index_select(0, pair[0])
+        x2, found2 = _find_two(take_columns(both, other), *pair[1:], steps=steps)
+        column, x, found = torch.cat((column, other, other)), torch.cat((x, x2)), torch.cat((found, found2))
     keep = found.nonzero()[:, 0]
     column = column.index_select(0, keep)
     reversed_ = column >= batch
