@@ -47,7 +47,7 @@ def squared_distance(
     """The squared distance of points to models [F | e2]; infinite behind a camera."""
     if one_data_set_for_many(model, x1[..., 0]) and model.shape[-3] >= MANY:
         return _squared_distances(model, x1, x2)
-    e, side, _, size = _forms(model, homogeneous_rows(x1), homogeneous_rows(x2))
+    e, side, _, _, size = _forms(model, homogeneous_rows(x1), homogeneous_rows(x2))
     return infinite_where_positive(e * e / size, side)
 
 
@@ -85,17 +85,18 @@ def _squared_distances(model: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
 
 def _forms(
     model: Float[Tensor, "*#batch 3 4"], h1: Float[Tensor, "*#batch 3 n"], h2: Float[Tensor, "*#batch 3 n"]
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """The residual, the side, the gradient over the second and the first point, and its squared length."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The residual, the side, the gradients over the first and over the second point, and their squared length."""
     F = model[..., :3]
-    first = apply_rows(torch.cat((F, cross_rows(model[..., 3], F)), -2), h1)
-    u, v, w, a, b, c = first.unbind(-2)
-    u1, v1 = apply_rows(F[..., :2].mT, h2).unbind(-2)
+    lines = apply_rows(torch.cat((F, cross_rows(model[..., 3], F)), -2), h1)
+    u, v, w, a, b, c = lines.unbind(-2)
+    first = apply_rows(F[..., :2].mT, h2)
+    u1, v1 = first.unbind(-2)
     x, y, _ = h2.unbind(-2)
     e = torch.addcmul(torch.addcmul(w, x, u), y, v)
     side = torch.addcmul(torch.addcmul(c, x, a), y, b)
     size = torch.addcmul(torch.addcmul(torch.addcmul(u * u, v, v), u1, u1), v1, v1)
-    return e, side, (u, v, u1, v1), size.clamp(min=_TINY)
+    return e, side, first, lines[..., :2, :], size.clamp(min=_TINY)
 
 
 def step_equations(
@@ -106,16 +107,16 @@ def step_equations(
     The right side is exact; in the matrix the measured points stand for those corrected to first order.
     """
     h1, h2 = homogeneous_rows(x1), homogeneous_rows(x2)
-    e, side, (u, v, u1, v1), size = _forms(model, h1, h2)
+    e, side, first, second, size = _forms(model, h1, h2)
     squared = e * e / size
     weights, curvature = weigh(infinite_where_positive(squared, side))
     # The derivative of e^2 / (2 |g|^2): e de / |g|^2 - e^2 / |g|^4 d|g|^2 / 2.
     scale = weights / size
     share, slope = scale * squared, scale * e
-    x, y, _ = h2.unbind(-2)
-    left = torch.stack((slope * x - share * u, slope * y - share * v, slope), -2)
-    right = torch.stack((share * u1, share * v1), -2)
-    b = sums_of_products(left, h1) - torch.nn.functional.pad(sums_of_products(right, h2).mT, (0, 1))
+    left = slope[..., None, :] * h2
+    left[..., :2, :].addcmul_(share[..., None, :], second, value=-1)
+    b = sums_of_products(left, h1)
+    b[..., :2] -= sums_of_products(share[..., None, :] * first, h2).mT
     # (h2 (x) h1) (h2 (x) h1)' has 36 different entries.
     weighted = (curvature / size)[..., None, :] * quadratic(h2)
     S = sums_of_products(weighted, quadratic(h1)).flatten(-2)
