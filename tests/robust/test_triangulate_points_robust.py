@@ -43,7 +43,11 @@ def test_clean_tracks_are_those_of_least_squares(generator: torch.Generator) -> 
     x, P, _, _ = ring(5, 50, 0.0, generator)
     result = triangulate_points_robust(x, P, threshold=5.0, generator=seed())
     assert result.inliers.all()
-    torch.testing.assert_close(result.model, triangulate_points(x, P).model)
+    plain = triangulate_points(x, P)
+    for name in ("model", "covariance", "parallax", "error"):
+        torch.testing.assert_close(getattr(result, name), getattr(plain, name))
+    # The noise is half a pixel, and three of the ten coordinates of a point are spent on it.
+    assert abs((result.error.square().mean() * 10 / 7 / 2).sqrt() - 0.5) < 0.05
 
 
 def test_scale_and_sign_of_cameras_do_not_matter(generator: torch.Generator) -> None:
@@ -101,6 +105,9 @@ def test_nonsense_has_no_consensus(generator: torch.Generator) -> None:
     x, P, _, _ = ring(6, 60, 1.0, generator)
     result = triangulate_points_robust(x, P, threshold=2.5, generator=seed())
     assert (result.status == Status.NO_CONSENSUS).double().mean() > 0.9
+    lost = result.status != Status.OK
+    for value in (result.covariance, result.parallax, result.error):
+        assert (value[lost] == 0).all()
 
 
 @pytest.mark.usefixtures("unchecked")
