@@ -103,6 +103,32 @@ def test_residual_and_refinement_broadcast_models_against_data(kind: type, gener
             torch.testing.assert_close(alone, refined[i, k], rtol=1e-6, atol=1e-8)
 
 
+def test_steps_with_weights_of_their_own(kind: type, generator: torch.Generator) -> None:
+    """The distances that weights are asked for are the residuals'; weights belong in the gradient, curvature in the Hessian."""
+    if not hasattr(kind, "reweighted_step"):
+        pytest.skip("this estimator measures and steps one after the other")
+    scene = make_scene(kind, (4,), 40, generator, 1e-4)
+    models = torch.stack([scene.model, scene.model + 1e-5], 1)
+    wide, data = tensor_map(lambda t: t[:, None], scene.estimator), [d[:, None] for d in scene.data]
+    weights = torch.rand(4, 2, 40, generator=generator, dtype=torch.float64)
+    seen = []
+
+    def step(factor: float) -> torch.Tensor:
+        def weigh(squared: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            seen.append(squared)
+            return weights, factor * weights
+
+        moved: torch.Tensor = wide.reweighted_step(models, *data, weigh=weigh)
+        return moved - models
+
+    full, half = step(1), step(2)
+    torch.testing.assert_close(seen[0], wide.squared_residual(models, *data), rtol=1e-6, atol=1e-15)
+    torch.testing.assert_close(full, wide.refine(models, *data, weights=weights) - models, rtol=1e-9, atol=1e-12)
+    # What is left is of second order, or mends a model that is not quite on its manifold.
+    size = full[:, 0].flatten(1).norm(dim=-1)
+    assert ((half - 0.5 * full)[:, 0].flatten(1).norm(dim=-1) < 0.02 * size).all()
+
+
 def test_squared_residual_is_the_square(kind: type, generator: torch.Generator) -> None:
     scene = make_scene(kind, (3,), 15, generator, 1e-2)
     residual = scene.estimator.residual(scene.model, *scene.data)

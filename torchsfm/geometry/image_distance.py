@@ -15,5 +15,7 @@ def positive_depth(depth: Tensor) -> tuple[Tensor, Tensor]:
 def squared_in_front(u: Tensor, v: Tensor, depth: Tensor, z: Tensor) -> Tensor:
     """`u^2 + v^2`, infinite without derivative where the depth is not the one that `positive_depth` made of it, z."""
     big = torch.finfo(z.dtype).max
-    behind = torch.sub(z.detach(), depth.detach()).mul_(big)
+    if torch.is_grad_enabled():
+        z, depth = z.detach(), depth.detach()
+    behind = torch.sub(z, depth).mul_(big)
     return torch.addcmul(u * u, v, v).add_(behind, alpha=big)

@@ -81,7 +81,7 @@ class _Views:
 
     def one(self) -> Tensor:
         """The fourth coordinate of the points."""
-        return self.X.new_ones(1, 1, 1).expand(len(self.X), 1, self.n)
+        return torch.ones_like(self.X[:, :1])
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Homogeneous images (problem, camera, 2 and 1, n), the depths made positive, and -1 over them."""
@@ -117,7 +117,8 @@ def normal_equations(
     views = _Views(P, x, X)
     X, n, k = views.X, views.n, views.k
     products = torch.cat((X, X[:, 1:], X[:, 2:], X, views.one()), 1)
-    image, depth, z, inverse = views.project(products[:, 6:])
+    points = products[:, 6:]
+    image, depth, z, inverse = views.project(points)
     products[:, :3].mul_(X[:, :1])
     products[:, 3:5].mul_(X[:, 1:2])
     products[:, 5:6].mul_(X[:, 2:])
@@ -130,7 +131,7 @@ def normal_equations(
     both = torch.addcmul(first[:, :, :1] * m0, first[:, :, 1:], m1)
     last = torch.addcmul(slope[:, :, :1] * m0, slope[:, :, 1:], m1)
     matrix = torch.bmm(torch.cat((c, first, both), 2).view(len(X), 4 * k, n), products.mT)
-    vector = torch.bmm(torch.cat((slope, last), 2).view(len(X), 3 * k, n), products[:, 6:].mT)
+    vector = torch.bmm(torch.cat((slope, last), 2).view(len(X), 3 * k, n), points.mT)
     moments = torch.cat((matrix.view(len(X) * k, 40), vector.view(len(X) * k, 12)), 1).double()
     entries = moments.index_select(1, _WHERE.to(X.device)).view(-1, 12, 13) * _SIGN.to(X.device)
     return entries, views.batch
