@@ -22,10 +22,12 @@ _on = False
 
 
 def compile_kernels(on: bool = True) -> None:
-    """Compile the hot kernels of solvers with `torch.compile`, from now on and everywhere, or no longer.
+    """Compile the hot kernels of solvers and of robust estimation, from now on and everywhere, or no longer.
 
     The first call of a solver then takes seconds, up to minutes where PyTorch's disk cache is empty, for each dtype; later ones
-    are several times faster for batches of thousands, and slower for single problems. Needs a C++ compiler. Results may differ
+    are several times faster for batches of thousands, and slower for single problems. Robust estimation compiles the distances
+    of data to models and the steps of refinement, about ten loops for each kind of model, in a minute or more, and is faster
+    for single problems too. Needs a C++ compiler. Results may differ
     from those of eager mode by rounding. Whatever keeps a kernel from being compiled whole and once is an error, not a fall
     back to eager mode. No effect on what runs inside a function that is itself being compiled.
 

@@ -30,6 +30,9 @@ class Estimator(Protocol[M]):
       `weigh(squared) -> (weights, curvature)`, all `(*batch, n)`. The weights belong in the gradient, the curvature stands in
       their place in the Hessian (see `local_optimisation.Weigh`). Distances and step have most of their arithmetic in common,
       and the curvature saves steps;
+    - `traceable: ClassVar[bool]`: False if distances and steps cannot be traced with symbolic sizes, and so not be compiled
+      (`compile_kernels`): if they look at the values of tensors, take Python integers of sizes, or call what is no operation of
+      PyTorch. Constant tensors may be kept from one call to the next;
     - `dimension: ClassVar[int]` and `retract(model, step)`: the model moved by a step `(*batch, dimension)` along its manifold,
       smooth in the step, `retract(model, 0) == model`. They give refined models derivatives and covariance, for which
       `residual` (or its square) must be differentiable with respect to the model and the data;
