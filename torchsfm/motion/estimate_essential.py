@@ -198,11 +198,11 @@ def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:
 
 def unit_rays(d: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:
     """Rays of length 1 in float64; NaN for those without direction, so that they are left out."""
-    # One coordinate in a row: sums of three are then taken along the memory.
-    rows = d.double().mT.contiguous()
-    square = (rows * rows).sum(-2, keepdim=True)
+    # Coordinates first: sums of three are then taken along the memory.
+    rows = d.double().movedim(-1, 0).contiguous()
+    square = (rows * rows).sum(0)
     good = (square > 0) & (square < torch.inf)
     if bool(good.all()):
-        return (rows * square.rsqrt()).mT
+        return (rows * square.rsqrt()).movedim(0, -1)
     safe = torch.where(good, rows, 1)
-    return torch.where(good, safe * (safe * safe).sum(-2, keepdim=True).rsqrt(), torch.nan).mT
+    return torch.where(good, safe * (safe * safe).sum(0).rsqrt(), torch.nan).movedim(0, -1)
