@@ -133,6 +133,7 @@ def ransac(
     graph = [_in_one_batch(d.double(), batch, 2) for d in data]
     counts = None if weights is None else _in_one_batch(weights.double(), batch, 1)
     own = cast(tensor_map(lambda t: _in_one_batch(t, batch, t.ndim - len(batch)), estimator), torch.float64)
+    followed = covariance or (has_manifold(estimator) and wants_derivative(*graph, *tensors_of((counts, own))))
     with torch.no_grad():
         flat, fields = [d.detach() for d in graph], tensor_map(Tensor.detach, own)
         bound = _in_one_batch(limit.detach().double(), batch, 0)
@@ -151,16 +152,16 @@ def ransac(
         options = Options(seed, confidence, min_iterations, max_iterations, scoring_dtype or dtype, score)
         found = []
         for problems in pack(fields, flat, usable, enough, square, trust, given):
-            found.append((problems.member, _outcome(problems, *search(problems, options), n)))
+            found.append((problems.member, _outcome(problems, *search(problems, options), n, followed)))
         if len(found) == 1 and len(found[0][0]) == p:
             result = found[0][1]
         else:
-            result = _nothing(fields, flat, bound, exists)
+            result = _nothing(fields, flat, bound, exists, followed)
             for member, part in found:
                 result = zip_map(lambda old, new: old.index_copy(0, member, new), result, part)  # noqa: B023
     model, spread = result.model, None
     support = result.support if given is None else result.support * unit
-    if covariance or (has_manifold(estimator) and wants_derivative(*graph, *tensors_of((counts, own)))):
+    if result.selected is not None:
         counts = bound.new_ones(p, n) if counts is None else counts
         if covariance:
             spread = step_covariance(fields, model, flat, counts.detach(), result.selected, result.reach)
@@ -226,7 +227,7 @@ class _Outcome(Generic[M]):
         iterations: Number of samples drawn.
         status: What became of it.
         degeneracy: What the inliers lack.
-        selected: Which data are within the reach of the loss of which the model is the optimum.
+        selected: Which data are within the reach of the loss of which the model is the optimum; None if nobody asks.
         reach: The square of that reach; 1 for a model that is none.
     """
 
@@ -237,11 +238,13 @@ class _Outcome(Generic[M]):
     iterations: Int[Tensor, "p"]
     status: Int[Tensor, "p"]
     degeneracy: Int[Tensor, "p"]
-    selected: Bool[Tensor, "p n"]
+    selected: Bool[Tensor, "p n"] | None
     reach: Float[Tensor, "p"]
 
 
-def _nothing(estimator: Estimator[M], data: Sequence[Tensor], bound: Tensor, exists: Tensor | None) -> _Outcome[M]:
+def _nothing(
+    estimator: Estimator[M], data: Sequence[Tensor], bound: Tensor, exists: Tensor | None, followed: bool
+) -> _Outcome[M]:
     """What becomes of problems that are not even tried."""
     p, n = data[0].shape[:2]
     none = torch.zeros(p, n, dtype=torch.bool, device=bound.device)
@@ -249,11 +252,13 @@ def _nothing(estimator: Estimator[M], data: Sequence[Tensor], bound: Tensor, exi
     status = torch.where(few, int(Status.TOO_FEW), int(Status.NOT_FINITE)).to(torch.int8)
     zero = bound.new_zeros(p)
     code = torch.full_like(status, int(Degeneracy.TOO_FEW))
-    return _Outcome(no_model(estimator, data, p), none, zero, bound, zero.long(), status, code, none, zero + 1)
+    return _Outcome(
+        no_model(estimator, data, p), none, zero, bound, zero.long(), status, code, none if followed else None, zero + 1
+    )
 
 
-def _outcome(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: int) -> _Outcome[Any]:
-    """Judge the best models by all data."""
+def _outcome(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: int, followed: bool) -> _Outcome[Any]:
+    """Judge the best models by all data, and say which of these they are the optimum of if that is to be followed."""
     estimator, size, limit, reach = problems.estimator, problems.estimator.sample_size, best.limit, best.reach
     ratio = torch.where(problems.inside, squared / limit[:, None], torch.inf).nan_to_num_(nan=torch.inf)
     near = ratio < 1
@@ -269,7 +274,7 @@ def _outcome(problems: Problems, best: Best, squared: Float[Tensor, "p width"], 
     fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
     optimal = agreed & best.solved & (reach > 0)
     reach = torch.where(optimal, reach, 1)
-    within = (ratio < (reach / limit)[:, None]) & optimal[:, None]
+    selected = problems.scatter((ratio < (reach / limit)[:, None]) & optimal[:, None], n) if followed else None
     return _Outcome(
         best.model,
         problems.scatter(near, n),
@@ -278,7 +283,7 @@ def _outcome(problems: Problems, best: Best, squared: Float[Tensor, "p width"], 
         best.iterations,
         torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8),
         _degeneracy(replace(problems, limit=limit), best, near, expected),
-        problems.scatter(within, n),
+        selected,
         reach,
     )
 
