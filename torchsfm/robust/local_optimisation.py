@@ -8,12 +8,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm._types import tensor_map
 from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.models import join, take_slots, zip_map
 from torchsfm.robust.scores import Score
-from torchsfm.robust.scoring import around_model, squared_residual
+from torchsfm.robust.scoring import squared_residual
 
 M = TypeVar("M")
+T = TypeVar("T")
 
 Weigh = Callable[[Tensor], tuple[Tensor, Tensor]]
 """From squared distances `(*batch, n)` to the weights of the data and to the curvature of their losses.
@@ -25,13 +28,26 @@ the gradient takes the one, the Hessian the other.
 LOCAL_STEPS = (9.0, 3.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 _LEAST = 1e-6
-"""Smallest variance of the noise in units of the squared threshold."""
+_MOST = 16.0
+"""Smallest and largest variance of the noise in units of the squared threshold."""
+_VARIANCES = tuple(4.0**i for i in range(-4, 3))
+"""The variances of which the estimation of the scale starts with the likeliest, and how often the share of inliers is"""
+_SHARE_STEPS = 2
+"""improved on for each."""
+WINDOW = 16.0
+"""How far from the model its noise is looked for, in thresholds."""
+WIDE_STEPS = (16.0, 8.0, 4.0)
+"""Reaches, in thresholds, of the steps that look for a model of more noise than the threshold says."""
+_CROWD = 0.1
+_MARGIN = 10.0
+"""How many data beyond the threshold, for one within, make that worth while, and how much larger the logarithm of the
+likelihood of what they find must be: of data that are all wrong nothing is found that rounding would decide on."""
 SCALE_STEPS = 3
 """Rounds of the final refinement that estimate the scale of the noise."""
 FIRST_STEPS, LAST_STEPS = 1, 3
 """Rounds that hold it, in the precision of scoring and in float64; twice as many without the curvature of the loss."""
-LOCAL_DATA, SCALE_DATA = 256, 512
-"""Local optimisation, and the estimation of the scale, look at so many data at most."""
+_GLANCE, LOCAL_DATA, SCALE_DATA = 128, 256, 512
+"""The first guess of the scale, local optimisation, and the estimation of the scale look at so many data at most."""
 
 
 def reweighted_step(estimator: Estimator[M], model: M, data: Sequence[Tensor], weigh: Weigh) -> M:
@@ -85,10 +101,10 @@ def scale_of_noise(
 ) -> tuple[M, Float[Tensor, "g"]]:
     """Reweighted least squares out to the distance where an outlier is as likely as an inlier, and that distance.
 
-    The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, estimated with the
-    probabilities of being an inlier among Gaussian inliers and evenly spread outliers (expectation maximisation), and from the
-    density of the outliers, counted between two and six thresholds from the model. So the answer depends little on how well
-    the threshold was chosen. One step for each round of weights.
+    The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, that of Gaussian inliers among
+    evenly spread outliers within many thresholds: the likeliest of a few at first, then by expectation maximisation, one step
+    for each round of weights. So the answer depends little on how well the threshold was chosen. Where many data are beyond
+    the threshold but not far from it, a model through the best of them may be wrong: then that from all of them is tried too.
 
     Args:
         estimator: The problem.
@@ -101,10 +117,57 @@ def scale_of_noise(
         The model, and the square of its reach in units of the squared threshold, rounded to a coarse grid: so the model that
         `optimise_within` makes is the optimum of one fixed loss, also when the data move a little, and has a derivative.
     """
-    model, noise = _scale_step(estimator, model, data, limit, counts, None)
-    for _ in range(SCALE_STEPS - 1):
+    _, noise, crowd = _first_noise(estimator, model, [d[:, :, :_GLANCE] for d in data], limit, counts[:, :_GLANCE])
+    rows = crowd.nonzero()[:, 0]
+    if len(rows):
+
+        def take(tree: T) -> T:
+            return tensor_map(lambda t: t[rows], tree)
+
+        found, own = _widened(take(estimator), take(model), take(data), limit[rows], counts[rows])
+        model, noise = zip_map(lambda t, new: t.index_copy(0, rows, new), (model, noise), (found, own))
+    for _ in range(SCALE_STEPS):
         model, noise = _scale_step(estimator, model, data, limit, counts, noise)
     return model, _reach_at(estimator, model, data, limit, counts, noise)
+
+
+def _widened(
+    estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Float[Tensor, "g"], counts: Tensor
+) -> tuple[M, tuple[Tensor, Tensor]]:
+    """The likelier of a model and what becomes of it with far larger thresholds, and the noise."""
+    data, counts, wide = [d[:, :, :LOCAL_DATA] for d in data], counts[:, :LOCAL_DATA], model
+    for factor in WIDE_STEPS:
+        wide = optimise_within(estimator, wide, data, factor**2 * limit, counts, 1)
+    both = join([model, wide], 1)
+    evidence, noise, _ = _first_noise(estimator, both, data, limit, counts)
+    winner = (evidence[:, 1:] > evidence[:, :1] + _MARGIN).long()
+    variance, share = (t.gather(1, winner[..., None]) for t in noise)
+    return take_slots(both, winner), (variance, share)
+
+
+@fused("g 1", "g k", "g 1 n", "g", "g n")
+def _first_noise(
+    estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Tensor, counts: Tensor
+) -> tuple[Tensor, tuple[Tensor, Tensor], Tensor]:
+    """The likeliest scale of Gaussian noise among evenly spread outliers within the window.
+
+    Returns:
+        The logarithm of the likelihood `(g, k)` against that of outliers alone; the variance and the share of inliers among
+        the data in the window, `(g, k, 1)`; and whether there are many data beyond the threshold of the first model, `(g)`.
+    """
+    k = estimator.codimension
+    ratio, there, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
+    core = ((ratio < 1) * there).sum(-1)
+    crowd = ((total[..., 0] - core) > _CROWD * core)[:, 0]
+    variance = torch.tensor(_VARIANCES, dtype=ratio.dtype, device=ratio.device)[:, None]
+    # The density of an inlier in units of that of an outlier.
+    density = torch.exp(ratio[..., None, :] * (-0.5 / variance)) * (_peak(k) * WINDOW**k * variance ** (-k / 2))
+    gain, there, some = density - 1, there[..., None, :], total[..., None].clamp(min=1)
+    share = torch.full_like(gain[..., :1], 0.5)
+    for _ in range(_SHARE_STEPS):
+        share = ((there * share * density / (1 + share * gain)).sum(-1, keepdim=True) / some).clamp(max=0.999)
+    evidence, index = (there * torch.log1p(share * gain)).sum(-1).max(-1, keepdim=True)
+    return evidence[..., 0], (variance[:, 0][index], share[..., 0].gather(-1, index)), crowd
 
 
 @fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
@@ -114,30 +177,22 @@ def _scale_step(
     data: Sequence[Tensor],
     limit: Tensor,
     counts: Tensor,
-    noise: tuple[Tensor, Tensor] | None,
+    noise: tuple[Tensor, Tensor],
 ) -> tuple[M, tuple[Tensor, Tensor]]:
-    """A step, and the noise by the distances before it: its variance and the number of inliers, `(g, 1, 1)`."""
-    k, present, found = estimator.codimension, counts[:, None], noise
+    """A step, and the noise by the distances before it: its variance and the share of inliers in the window, `(g, 1, 1)`."""
+    k, found = estimator.codimension, noise
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
         nonlocal found
-        ratio = squared * (1 / limit)[:, None, None]
-        if noise is None:
-            core = ((ratio < 1) * present).to(ratio.dtype)
-            number = core.sum(-1, keepdim=True).clamp(min=1)
-            # A Gaussian cut off at the threshold looks narrower than it is.
-            variance = (1.6 / k * (core * ratio.clamp(max=1)).sum(-1, keepdim=True) / number).clamp(_LEAST, 1)
-        else:
-            variance, number = noise
-        odds, reach = _odds_and_reach(ratio, present, variance, number, k)
-        odds = odds * torch.exp((0.5 * ratio / variance).clamp(max=60))
-        likely = torch.where(ratio < 9, 1 / (1 + odds), 0) * present
+        ratio, there, total = _within_window(squared, limit, counts)
+        odds, reach = _odds_and_reach(total, *noise, k)
+        likely = there / (1 + odds * torch.exp((0.5 * ratio / noise[0]).clamp(max=60)))
         number = likely.sum(-1, keepdim=True).clamp(min=1)
-        found = ((likely * ratio.clamp(max=9)).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, 1), number
+        variance = ((likely * ratio).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, _MOST)
+        found = variance, number / total.clamp(min=1)
         return _falling(ratio * (1 / reach), counts, k)
 
     model = reweighted_step(estimator, model, data, weigh)
-    assert found is not None
     return model, found
 
 
@@ -151,17 +206,31 @@ def _reach_at(
     noise: tuple[Tensor, Tensor],
 ) -> Tensor:
     """The squared reach `(g)` in units of the squared threshold, rounded."""
-    ratio = squared_residual(estimator, model, *data) * (1 / limit)[:, None, None]
-    _, reach = _odds_and_reach(ratio, counts[:, None], *noise, estimator.codimension)
+    _, _, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
+    _, reach = _odds_and_reach(total, *noise, estimator.codimension)
     return torch.exp2((4 * reach[:, 0, 0].log2()).round() / 4)
 
 
-def _odds_and_reach(ratio: Tensor, present: Tensor, variance: Tensor, number: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The odds of an outlier where a model is, and the squared distance at which they are even, for ratios `(g, 1, n)`."""
-    # The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius one threshold is 1.
-    peak = (2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1)
-    odds = around_model(ratio, present, k)[..., None] / (number * peak * variance ** (-k / 2))
-    return odds, 1.6 * k * variance * (1 / odds).clamp(min=3).log()
+def _within_window(squared: Tensor, limit: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Squared distances in units of the squared threshold, at most those of the window, what is within counts, and its sum."""
+    ratio = squared * (1 / limit)[:, None, None]
+    near = ratio < WINDOW**2
+    there = (near * counts[:, None]).to(ratio.dtype)
+    return torch.where(near, ratio, WINDOW**2), there, there.sum(-1, keepdim=True)
+
+
+def _odds_and_reach(total: Tensor, variance: Tensor, share: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The odds of an outlier where a model is, and the squared distance at which they are even."""
+    number = (share * total).clamp(min=1)
+    # Never less than half an outlier between two and six thresholds.
+    outlying = (total - number).clamp(min=0) / WINDOW**k + 0.5 / (6**k - 2**k)
+    odds = outlying / (number * _peak(k) * variance ** (-k / 2))
+    return odds, (1.6 * k * variance * (1 / odds).clamp(min=3).log()).clamp(max=WINDOW**2)
+
+
+def _peak(k: int) -> float:
+    """The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius 1 is 1."""
+    return float((2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1))
 
 
 def optimise_within(

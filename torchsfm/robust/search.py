@@ -282,9 +282,11 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         wide, counts = some.spread(), some.inside if some.weight is None else some.weight
         model = optimise_within(wide.estimator, cast(model, torch.float64), wide.data, reach, counts, LAST_STEPS)
         squared = squared_residual(wide.estimator, model, *wide.data)
-        loss = score.cost(squared, old.limit, counts, k)[:, 0]
+        # A threshold smaller than the noise would blame the better model.
+        judged = torch.maximum(old.limit, reach)
+        loss = score.cost(squared, judged, counts, k)[:, 0]
         before = squared_residual(rough.estimator, start, *rough.data)
-        before_loss = score.cost(before, old.limit, counts, k)[:, 0].double()
+        before_loss = score.cost(before, judged, counts, k)[:, 0].double()
         # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
         won = loss <= 1.02 * before_loss + 1
         distances.append(torch.where(won[:, None], squared[:, 0], before[:, 0]))
