@@ -39,7 +39,7 @@ WINDOW = 16.0
 WIDE_STEPS = (16.0, 8.0, 4.0)
 """Reaches, in thresholds, of the steps that look for a model of more noise than the threshold says."""
 _CROWD = 0.1
-_MARGIN = 10.0
+_MARGIN = 3.0
 """How many data beyond the threshold, for one within, make that worth while, and how much larger the logarithm of the
 likelihood of what they find must be: of data that are all wrong nothing is found that rounding would decide on."""
 SCALE_STEPS = 3
