@@ -17,17 +17,21 @@ y = torch.cat((x1, torch.ones_like(x1[..., :1])), -1) @ H.mT
 x2 = y[..., :2] / y[..., 2:] + 1e-3 * torch.randn(3, 120, 2, dtype=torch.float64, generator=g)
 x2[:, :40] = torch.rand(3, 40, 2, dtype=torch.float64, generator=g)
 
-def answer():
-    return estimate_homography(x1, x2, threshold=4e-3, generator=torch.Generator().manual_seed(1))
+def answer(threshold):
+    return estimate_homography(x1, x2, threshold=threshold, generator=torch.Generator().manual_seed(1))
 
-plain = answer()
-compile_kernels()
-fast, again = answer(), answer()
-compile_kernels(False)
-assert torch.equal(answer().model, plain.model)
-assert torch.equal(fast.model, again.model)
-assert (fast.inliers == plain.inliers).double().mean() > 0.99
-torch.testing.assert_close(fast.model, plain.model, rtol=1e-3, atol=1e-4)
+# The second is tighter than the noise.
+for threshold in (4e-3, 1e-3):
+    compile_kernels(False)
+    plain = answer(threshold)
+    compile_kernels()
+    fast, again = answer(threshold), answer(threshold)
+    compile_kernels(False)
+    assert torch.equal(answer(threshold).model, plain.model)
+    assert torch.equal(fast.model, again.model)
+    assert (fast.inliers == plain.inliers).double().mean() > 0.99
+    # Refined, both are the same optimum.
+    torch.testing.assert_close(fast.model, plain.model, rtol=1e-5, atol=1e-6)
 """
 
 

@@ -134,8 +134,11 @@ def _named(arguments: tuple[Any, ...], dims: tuple[tuple[str, ...], ...]) -> Ite
 
 
 def _is_swapped(value: Tensor) -> bool:
-    """Whether the last two dimensions lie in memory the other way round."""
-    return value.ndim > 1 and value.stride(-1) > value.stride(-2) and value.shape[-1] > 1
+    """Whether the last two dimensions lie in memory the other way round; masks are laid out anew, which is cheap.
+
+    The compiler misreads boolean tensors that do (PyTorch 2.13).
+    """
+    return value.dtype.is_floating_point and value.ndim > 1 and value.stride(-1) > value.stride(-2) and value.shape[-1] > 1
 
 
 def _compile(
