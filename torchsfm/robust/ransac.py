@@ -8,6 +8,7 @@ data and the seed alone: the sizes of all arrays that touch a problem follow fro
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -130,6 +131,7 @@ def ransac(
     dtype, n = data[0].dtype, data[0].shape[-2]
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
     p = batch.numel()
+    _keep_freed_memory()
     graph = [_in_one_batch(d.double(), batch, 2) for d in data]
     counts = None if weights is None else _in_one_batch(weights.double(), batch, 1)
     own = cast(tensor_map(lambda t: _in_one_batch(t, batch, t.ndim - len(batch)), estimator), torch.float64)
@@ -177,6 +179,15 @@ def ransac(
         result.degeneracy.reshape(batch),
         spread,
     )
+
+
+@cache
+def _keep_freed_memory() -> None:
+    """Let the C library keep what is freed: otherwise it gives it back, and every step faults its memory in anew.
+
+    glibc raises its limits to the largest block ever freed (mallopt, M_MMAP_THRESHOLD); nothing is written to this one.
+    """
+    torch.empty(31 << 20, dtype=torch.uint8)
 
 
 def _in_one_batch(t: Tensor, batch: torch.Size, own: int) -> Tensor:

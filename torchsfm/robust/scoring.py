@@ -16,7 +16,7 @@ from torchsfm.robust.scores import Score
 
 M = TypeVar("M")
 
-NUMBERS = {True: 1 << 16, False: 1 << 24}
+NUMBERS = {True: 1 << 17, False: 1 << 24}
 """How many distances to compute at a time, on a CPU and elsewhere."""
 PREFIXES = (64, 256, 1024)
 """Numbers of data on which hypotheses are judged before all data are looked at."""

@@ -39,7 +39,7 @@ _PER_START, _AMBIGUOUS = 128, 0.5
 """One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers."""
 _BY_CHANCE = 0.05
 """Share of wrong data taken to agree with a wrong model, as PROSAC's end assumes."""
-_SAMPLES, _NUMBERS = 1 << 12, 1 << 15
+_SAMPLES, _NUMBERS = 1 << 13, 1 << 15
 """Samples to solve at a time, and numbers in one row of all data of several models, on a CPU: what fits its cache."""
 
 
