@@ -35,6 +35,8 @@ class TrifocalEstimator:
     max_solutions: ClassVar[int] = 3
     codimension: ClassVar[int] = 3
     dimension: ClassVar[int] = 18
+    traceable: ClassVar[bool] = False
+    """Compiled steps differ from those of eager mode (PyTorch 2.13)."""
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#batch 6 2"], x3: Float[Tensor, "*#batch 6 2"]

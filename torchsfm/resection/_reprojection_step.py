@@ -77,7 +77,7 @@ class _Views:
         if shared:
             x, X = (d[..., 0, :, :] if d.ndim > 2 else d for d in (x, X))
         self.x, self.X = _flat(x.mT, lead, 2, n).unsqueeze(1), _flat(X.mT, lead, 3, n)
-        self.P = _flat(P, self.batch, 3, 4).reshape(len(self.X), 3 * self.k, 4)
+        self.P = _flat(P, self.batch, 3, 4).reshape(self.X.shape[0], 3 * self.k, 4)
 
     def one(self) -> Tensor:
         """The fourth coordinate of the points."""
@@ -85,7 +85,7 @@ class _Views:
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Homogeneous images (problem, camera, 2 and 1, n), the depths made positive, and -1 over them."""
-        y = torch.bmm(self.P, points).view(len(points), self.k, 3, self.n)
+        y = torch.bmm(self.P, points).view(points.shape[0], self.k, 3, self.n)
         image, depth = y[:, :, :2], y[:, :, 2:]
         return image, depth, *positive_depth(depth)
 
@@ -130,9 +130,9 @@ def normal_equations(
     first, m0, m1 = c * m, m[:, :, :1], m[:, :, 1:]
     both = torch.addcmul(first[:, :, :1] * m0, first[:, :, 1:], m1)
     last = torch.addcmul(slope[:, :, :1] * m0, slope[:, :, 1:], m1)
-    matrix = torch.bmm(torch.cat((c, first, both), 2).view(len(X), 4 * k, n), products.mT)
-    vector = torch.bmm(torch.cat((slope, last), 2).view(len(X), 3 * k, n), points.mT)
-    moments = torch.cat((matrix.view(len(X) * k, 40), vector.view(len(X) * k, 12)), 1).double()
+    matrix = torch.bmm(torch.cat((c, first, both), 2).view(X.shape[0], 4 * k, n), products.mT)
+    vector = torch.bmm(torch.cat((slope, last), 2).view(X.shape[0], 3 * k, n), points.mT)
+    moments = torch.cat((matrix.view(X.shape[0] * k, 40), vector.view(X.shape[0] * k, 12)), 1).double()
     entries = moments.index_select(1, _WHERE.to(X.device)).view(-1, 12, 13) * _SIGN.to(X.device)
     return entries, views.batch
 

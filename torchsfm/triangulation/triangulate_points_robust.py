@@ -1,6 +1,7 @@
 """Points from many views of which some are wrong."""
 
 from dataclasses import dataclass
+from math import prod
 from typing import ClassVar
 
 import torch
@@ -134,7 +135,7 @@ class _Views:
         lead, k = (self.batch[:-1], self.batch[-1]) if shared else (self.batch, 1)
         if shared:
             x, P = (d[..., 0, :, :] if d.ndim > 2 else d for d in (x, P))
-        size = lead.numel()
+        size = prod(lead)
         self.x = x.mT.expand(*lead, 2, n).reshape(size, 2, 1, n)
         self.rows = P.mT.expand(*lead, 12, n).reshape(size, 3, 4, n)
         X = X.expand(*self.batch, 3).reshape(size, 1, k, 3, 1)
