@@ -37,6 +37,8 @@ EXPLORED_DATA = 512
 """How many data that looks at."""
 _PER_START, _AMBIGUOUS = 128, 0.5
 """One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers."""
+_SUPPORT = 0.6
+"""How much of its support within the threshold a model may lose by refinement."""
 _BY_CHANCE = 0.05
 """Share of wrong data taken to agree with a wrong model, as PROSAC's end assumes."""
 _SAMPLES, _NUMBERS = 1 << 13, 1 << 15
@@ -289,6 +291,9 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         before_loss = score.cost(before, judged, counts, k)[:, 0].double()
         # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
         won = loss <= 1.02 * before_loss + 1
+        # Noise that leaves the threshold so much less support is none: the model is not quite that of the data.
+        within, within_before = (((d < old.limit[:, None, None]) * counts[:, None]).sum(-1)[:, 0] for d in (squared, before))
+        won &= within >= _SUPPORT * within_before
         distances.append(torch.where(won[:, None], squared[:, 0], before[:, 0]))
         parts.append(
             replace(
