@@ -54,9 +54,6 @@ def test_estimators_keep_the_protocol(kind: type, generator: torch.Generator) ->
 def test_recall(kind: type, dtype: torch.dtype, tolerance: float, recall: float, generator: torch.Generator) -> None:
     scene = sample_scene(kind, (1000,), generator)
     estimator, data = cast(scene, dtype)
-    if kind.model_name == "relative_pose":  # type: ignore[attr-defined]
-        # Hypotheses leave out the second solution in other coordinates that `essential_5pt` affords for poor samples.
-        recall -= 0.002
     assert (nearest(scene, estimator.minimal(*data)) < tolerance).double().mean() >= recall
 
 

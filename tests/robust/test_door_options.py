@@ -36,25 +36,28 @@ def test_the_signatures_agree() -> None:
 @every_door
 def test_weights_are_multiplicities(door: Door, generator: torch.Generator) -> None:
     """A datum of weight 3 is as good as three of them, one of weight 0 none."""
-    scene = door.make(3, 81, generator)
-    weights = torch.randint(0, 4, (3, 81), generator=generator)
+    problems = 12
+    scene = door.make(problems, 81, generator)
+    weights = torch.randint(0, 4, (problems, 81), generator=generator)
     weighted = door(scene, weights=weights.double(), covariance=True)
     plain = door(scene)
     assert not (weighted.inliers & (weights == 0)).any()
     size = weighted.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    apart, moved = [], []
-    for i in range(3):
+    apart, moved, score = [], [], []
+    for i in range(problems):
         index = torch.arange(81).repeat_interleave(weights[i])
         repeated = door(Scene(tuple(d[i][index] for d in scene.data), tuple(k[i] for k in scene.known)))
-        assert torch.equal(weighted.inliers[i][index], repeated.inliers)
-        torch.testing.assert_close(weighted.score[i], repeated.score, rtol=5e-3, atol=0)
+        score.append((weighted.score[i] / repeated.score - 1).abs())
         apart.append(door.difference(weighted.model[i], repeated.model).norm() / size[i])
         moved.append(door.difference(weighted.model[i], plain.model[i]).norm() / size[i])
-    # In standard deviations; the reach of the final loss has steps, and may fall on either side of one.
-    apart, moved = torch.stack(apart), torch.stack(moved)
-    assert apart.median() < 0.1
-    assert apart.max() < 0.5
-    assert apart.mean() < 0.4 * moved.mean()
+        assert (weighted.inliers[i][index] == repeated.inliers).double().mean() > 0.95
+    # In standard deviations; the reach of the final loss has steps, and may fall on either side of one. Samples differ: of
+    # several minima that cost nearly the same either may be found.
+    apart, moved, score = torch.stack(apart), torch.stack(moved), torch.stack(score)
+    assert apart.median() < 0.05
+    assert score.median() < 5e-3
+    assert apart.quantile(0.75) < 0.5
+    assert apart.median() < 0.4 * moved.median()
 
 
 @every_door

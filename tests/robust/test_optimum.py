@@ -34,7 +34,8 @@ def test_the_derivative_is_that_of_the_whole_estimation(door: Door, generator: t
     mix = torch.randn(result.model.shape, generator=generator, dtype=F64)
     gradients = torch.autograd.grad((mix * result.model).sum(), free)
     for d, g in zip(inputs[:data], gradients, strict=False):
-        assert (g.abs().sum(-1) > 0)[plain.inliers].double().mean() > 0.98, d.shape
+        # The reach of the final loss may end a little before the threshold.
+        assert ((g == 0).all(-1) & plain.inliers).sum() <= 2, d.shape
     for i, (x, g) in enumerate(zip(inputs, gradients, strict=True)):
         assert torch.isfinite(g).all()
         step = 1e-3 * torch.randn(x.shape, generator=generator, dtype=F64)
@@ -44,7 +45,7 @@ def test_the_derivative_is_that_of_the_whole_estimation(door: Door, generator: t
         slope = (g * step).flatten(1).sum(-1)
         ends = [estimate(door, data, [*inputs[:i], x + s * step, *inputs[i + 1 :]]).model for s in (-1, 1)]
         difference = ((ends[1] - ends[0]) * mix).flatten(1).sum(-1) / 2
-        assert ((slope - difference).abs() < 0.02 * difference.abs().max() + 1e-12).all(), (i, slope, difference)
+        assert ((slope - difference).abs() < 2e-3 * difference.abs().max() + 1e-12).all(), (i, slope, difference)
 
 
 @every_door

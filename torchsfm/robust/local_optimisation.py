@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsfm._types import tensor_map
 from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.models import join, take_slots, zip_map
+from torchsfm.robust.models import join, take_slots, tensors_of, zip_map
 from torchsfm.robust.scores import Score
 from torchsfm.robust.scoring import squared_residual
 
@@ -27,25 +27,24 @@ the gradient takes the one, the Hessian the other.
 
 LOCAL_STEPS = (9.0, 3.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
-_LEAST = 1e-6
-_MOST = 16.0
+_LEAST, _MOST = 1e-6, 16.0
 """Smallest and largest variance of the noise in units of the squared threshold."""
-_VARIANCES = tuple(4.0**i for i in range(-4, 3))
-"""The variances of which the estimation of the scale starts with the likeliest, and how often the share of inliers is"""
-_SHARE_STEPS = 2
-"""improved on for each."""
+_VARIANCES, _SHARE_STEPS = tuple(4.0**i for i in range(-4, 3)), 2
+"""Variances of which the estimation of the scale starts with the likeliest, and rounds that find the share of inliers."""
 WINDOW = 16.0
 """How far from the model its noise is looked for, in thresholds."""
 WIDE_STEPS = (16.0, 8.0, 4.0)
 """Reaches, in thresholds, of the steps that look for a model of more noise than the threshold says."""
 _CROWD = 0.1
+"""How many data beyond the threshold, for one within, make that worth while."""
 _MARGIN = 3.0
-"""How many data beyond the threshold, for one within, make that worth while, and how much larger the logarithm of the
-likelihood of what they find must be: of data that are all wrong nothing is found that rounding would decide on."""
+"""How much larger the logarithm of the likelihood of what they find must be: rounding must not decide on nonsense."""
 SCALE_STEPS = 3
 """Rounds of the final refinement that estimate the scale of the noise."""
 FIRST_STEPS, LAST_STEPS = 1, 3
 """Rounds that hold it, in the precision of scoring and in float64; twice as many without the curvature of the loss."""
+_MOST_STEPS, _STILL, _SMALL = 24, 3e-4, 1e-10
+"""More of the last ones for what still moves so much, compared to the first of them and to the model: at most so many."""
 _GLANCE, LOCAL_DATA, SCALE_DATA = 128, 256, 512
 """The first guess of the scale, local optimisation, and the estimation of the scale look at so many data at most."""
 
@@ -231,6 +230,42 @@ def _odds_and_reach(total: Tensor, variance: Tensor, share: Tensor, k: int) -> t
 def _peak(k: int) -> float:
     """The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius 1 is 1."""
     return float((2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1))
+
+
+def optimise_fully(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    reach: Float[Tensor, "g"],
+    counts: Tensor,
+) -> M:
+    """The same to convergence, of each problem: its derivative is that of an optimum."""
+    before, first = model, None
+    for _ in range(LAST_STEPS if hasattr(estimator, "reweighted_step") else 2 * LAST_STEPS):
+        before, model = model, _step_within(estimator, model, data, reach, counts)
+        first = _size(before, model) if first is None else first
+    assert first is not None
+    last = _size(before, model)
+    row = ((last > _STILL * first) & (last > _SMALL * _size(model))).nonzero()[:, 0]
+    for _ in range(_MOST_STEPS):
+        if not len(row):
+            break
+
+        def take(tree: T, row: Tensor = row) -> T:
+            return tensor_map(lambda t: t[row], tree)
+
+        old = take(model)
+        new = _step_within(take(estimator), old, take(data), reach[row], counts[row])
+        model = zip_map(lambda t, part: t.index_copy(0, row, part), model, new)  # noqa: B023
+        last = _size(old, new)
+        row = row[(last > _STILL * first[row]) & (last > _SMALL * _size(new))]
+    return model
+
+
+def _size(model: M, other: M | None = None) -> Float[Tensor, "g"]:
+    """The length of the entries of models `(g, 1, ...)`, or of their differences."""
+    change = model if other is None else zip_map(torch.sub, model, other)
+    return torch.stack([(t * t).flatten(1).sum(-1) for t in tensors_of(change)]).sum(0).sqrt()
 
 
 def optimise_within(

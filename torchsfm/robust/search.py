@@ -15,9 +15,9 @@ from torchsfm.robust.glance import suspected
 from torchsfm.robust.hypotheses import OPTIMISED, hypotheses, sift
 from torchsfm.robust.local_optimisation import (
     FIRST_STEPS,
-    LAST_STEPS,
     LOCAL_DATA,
     SCALE_DATA,
+    optimise_fully,
     optimise_locally,
     optimise_within,
     scale_of_noise,
@@ -282,7 +282,7 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         model = optimise_within(rough.estimator, model, rough.data, reach * old.limit, counts, FIRST_STEPS)
         old, reach = cast(old, torch.float64), reach.double() * old.limit
         wide, counts = some.spread(), some.inside if some.weight is None else some.weight
-        model = optimise_within(wide.estimator, cast(model, torch.float64), wide.data, reach, counts, LAST_STEPS)
+        model = optimise_fully(wide.estimator, cast(model, torch.float64), wide.data, reach, counts)
         squared = squared_residual(wide.estimator, model, *wide.data)
         # A threshold smaller than the noise would blame the better model.
         judged = torch.maximum(old.limit, reach)
