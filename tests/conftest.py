@@ -1,4 +1,4 @@
-"""What all tests share: one thread, fixed seeds, real data by environment variable, tolerances by dtype."""
+"""What all tests share: one thread, seeds by option, real data by environment variable, tolerances by dtype."""
 
 import os
 from collections.abc import Iterator
@@ -7,16 +7,41 @@ from pathlib import Path
 import jaxtyping
 import pytest
 import torch
+from chance import seeded, set_seed, stream_seed
+from hypothesis import settings
 
 torch.set_num_threads(1)
+# No run remembers another.
+settings.register_profile("torchsfm", deadline=None, database=None)
+settings.load_profile("torchsfm")
 
 TOLERANCE = {torch.float64: 1e-8, torch.float32: 1e-3}
 """Relative error wanted on exact data."""
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--seed", type=int, default=0, help="other random numbers in every test")
+
+
+@pytest.hookimpl(tryfirst=True)  # before hypothesis reads its own
+def pytest_configure(config: pytest.Config) -> None:
+    set_seed(config.option.seed)
+    if config.option.hypothesis_seed is None:
+        config.option.hypothesis_seed = config.option.seed
+
+
+def pytest_report_header(config: pytest.Config) -> str:
+    return f"seed {config.option.seed}, {torch.backends.cpu.get_cpu_capability()} arithmetic"
+
+
+@pytest.fixture(autouse=True)
+def _global_stream() -> None:
+    torch.manual_seed(stream_seed())
+
+
 @pytest.fixture
 def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
+    return seeded()
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ from shutil import copy
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 from typer.testing import CliRunner
 
@@ -36,7 +37,7 @@ def torchsfm(*words: object) -> tuple[int, str, str]:
 
 
 def render(poses: Pose, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     scene = courtyard_scene(texel=0.015, generator=generator)
     K = intrinsics(torch.tensor(FOCAL).double(), torch.tensor([(WIDTH - 1) / 2, (HEIGHT - 1) / 2]).double())
     options = {"width": WIDTH, "height": HEIGHT, "points": 0, "supersample": 2}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from chance import seeded
 from typer.testing import CliRunner
 
 from torchsfm.cli import app
@@ -42,7 +43,7 @@ def table(text: str) -> dict[str, list[float]]:
 @pytest.fixture(scope="module")
 def problem() -> BundleProblem:
     """Small enough to be quick."""
-    return random_bundle_problem(6, 80, 260, layout="path", generator=torch.Generator().manual_seed(3)).problem
+    return random_bundle_problem(6, 80, 260, layout="path", generator=seeded(3)).problem
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from chance import seeded
 from scenes import Scene, make_scene
 
 import torchsfm
@@ -261,15 +262,14 @@ def test_ransac_recovers_with_40_percent_outliers(kind: type, generator: torch.G
 def test_ransac_is_deterministic_alone_and_in_a_batch(kind: type, generator: torch.Generator) -> None:
     scene, data, _ = spoiled(kind, (2, 3), 90, generator)
     mask = torch.rand(2, 3, 90, generator=generator) < 0.9
-    seed = lambda: torch.Generator().manual_seed(3)  # noqa: E731
-    together = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seed())
-    again = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seed())
+    together = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seeded(3))
+    again = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seeded(3))
     assert torch.equal(together.model, again.model)
     for i in range(2):
         for j in range(3):
             estimator = tensor_map(lambda t: t[i, j], scene.estimator)  # noqa: B023
             own = [d[i, j] for d in data]
-            alone = ransac(estimator, *own, threshold=3 * scene.noise, mask=mask[i, j], generator=seed())
+            alone = ransac(estimator, *own, threshold=3 * scene.noise, mask=mask[i, j], generator=seeded(3))
             assert torch.equal(alone.inliers, together.inliers[i, j])
             assert torch.equal(alone.iterations, together.iterations[i, j])
             torch.testing.assert_close(alone.model, together.model[i, j], rtol=1e-9, atol=1e-9)
@@ -297,7 +297,7 @@ def test_ragged_extremes_in_one_batch(kind: type, generator: torch.Generator) ->
         d[7, ::2] = torch.nan
     result = ransac(
         scene.estimator, *data, threshold=3 * scene.noise, mask=mask, max_iterations=3000,
-        generator=torch.Generator().manual_seed(0),
+        generator=seeded(),
     )  # fmt: skip
     status = result.status.tolist()
     assert status[:2] == [Status.TOO_FEW, Status.TOO_FEW]
@@ -313,7 +313,7 @@ def test_ragged_extremes_in_one_batch(kind: type, generator: torch.Generator) ->
         estimator = tensor_map(lambda t: t[problem], scene.estimator)  # noqa: B023
         alone = ransac(
             estimator, *(d[problem] for d in data), threshold=3 * scene.noise, mask=mask[problem], max_iterations=3000,
-            generator=torch.Generator().manual_seed(0),
+            generator=seeded(),
         )  # fmt: skip
         assert torch.equal(alone.inliers, result.inliers[problem])
     data[0][:] = torch.nan

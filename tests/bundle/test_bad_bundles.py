@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust, bundle_adjust_model, bundle_covariance
@@ -42,7 +43,7 @@ def join(a: BundleProblem, b: BundleProblem) -> BundleProblem:
 
 def test_two_problems_in_one(problem: BundleProblem) -> None:
     """Each part finds what it finds alone, in a gauge of its own."""
-    other = random_bundle_problem(6, 90, 350, layout="path", generator=torch.Generator().manual_seed(5)).problem
+    other = random_bundle_problem(6, 90, 350, layout="path", generator=seeded(5)).problem
     both = join(problem, other)
     options = {"free": FREE, "tolerance": 1e-10, "max_iterations": 100}
     together = bundle_adjust_model(both, **options)

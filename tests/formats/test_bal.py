@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from chance import seeded
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -28,7 +29,7 @@ ONE = settings(deadline=None, max_examples=30, suppress_health_check=[HealthChec
 
 
 def make_problem(views: int, points: int, observations: int, seed: int, model: type = Radial) -> BundleProblem:
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     groups = max(views, 1)
 
     def draw(*shape: int) -> torch.Tensor:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from chance import numpy_seeded, seeded
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -18,8 +19,8 @@ QUICK = settings(deadline=None, max_examples=30, suppress_health_check=[HealthCh
 
 def encode(order: str = "<", views: int = 3, points: int = 4, seed: int = 0) -> tuple[bytes, dict[str, np.ndarray]]:  # type: ignore[type-arg]
     """The bytes of a problem in which image and track numbers are not in order, and what should be read."""
-    random = np.random.default_rng(seed)
-    g = torch.Generator().manual_seed(seed)
+    random = numpy_seeded(seed)
+    g = seeded(seed)
     truth = {
         "intrinsics": random.normal(size=8).astype("f4"),
         "R": random_rotation(views, generator=g, dtype=torch.float32).numpy().reshape(-1, 3, 3),

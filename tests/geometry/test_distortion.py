@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from chance import seeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -68,7 +69,7 @@ def test_unproject_undoes_project(name, dtype, generator):
 @given(st.sampled_from(NAMES[1:]), st.integers(0, 2**31), st.sampled_from([0.05, 0.3, 1.0]))
 def test_every_ray_of_the_domain_is_found_again(name, seed, spread):
     """Parameters without any physical sense, too: 0.99 of all rays up to 0.999 of the valid radius."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     cls = DISTORTION_MODELS[name]
     p = (2 * torch.rand(20, cls.num_parameters, generator=generator, dtype=torch.float64) - 1) * spread
     if name == "opencv":
@@ -285,7 +286,7 @@ def test_names_and_counts():
     st.sampled_from([1e-30, 1e-6, 1.0, 1e3, 1e6]),
 )
 def test_any_numbers_give_finite_numbers_and_gradients(name, dtype, seed, size, distance):
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     cls = DISTORTION_MODELS[name]
     p = (size * torch.randn(20, cls.num_parameters, generator=generator, dtype=torch.float64)).to(dtype).requires_grad_()
     u = (distance * torch.randn(20, 10, 2, generator=generator, dtype=torch.float64)).to(dtype).requires_grad_()

@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from chance import seeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -59,7 +60,7 @@ def test_normalize_sphere_of_zero_and_nan_is_zero_without_gradient():
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 2**31), st.floats(1e-4, 1e4), st.floats(-1e4, 1e4), st.sampled_from([2, 3]), st.integers(2, 20))
 def test_normalizing_similarity_centres_and_scales(seed, scale, offset, dimension, count):
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     x = torch.randn(3, count, dimension, generator=generator, dtype=torch.float64) * scale + offset
     T = normalizing_similarity(x)
     y = transform_points(T, x)

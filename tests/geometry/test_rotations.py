@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from chance import seeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,7 +46,7 @@ def axes(count, generator):
 @settings(deadline=None, max_examples=100)
 @given(st.floats(0, math.pi), st.integers(0, 2**31))
 def test_matrix_exponential_and_round_trip(angle, seed):
-    w = axes(8, torch.Generator().manual_seed(seed)) * angle
+    w = axes(8, seeded(seed)) * angle
     R = rotation_from_rotvec(w)
     torch.testing.assert_close(R, torch.linalg.matrix_exp(cross_matrix(w)), atol=1e-14, rtol=0)
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand(8, 3, 3), atol=4e-15, rtol=0)
@@ -122,9 +123,9 @@ def test_euler_angles_refuse_other_orders(order):
 
 
 def test_random_rotations_are_uniform_and_repeatable():
-    R = random_rotation(40000, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    R = random_rotation(40000, generator=seeded(1), dtype=torch.float64)
     torch.testing.assert_close(torch.linalg.det(R), torch.ones(40000, dtype=torch.float64))
-    assert (random_rotation(40000, generator=torch.Generator().manual_seed(1), dtype=torch.float64) == R).all()
+    assert (random_rotation(40000, generator=seeded(1), dtype=torch.float64) == R).all()
     assert R.mean(0).abs().max() < 0.012
     # Under the Haar measure the angle has density (1 - cos a) / pi: its mean is pi / 2 + 2 / pi.
     assert abs(rotation_angle(R).mean().item() - (math.pi / 2 + 2 / math.pi)) < 0.02

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import (
@@ -16,7 +17,7 @@ from torchsfm.geometry import (
 
 
 def points(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.randn(*shape, generator=seeded(seed), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3), (0,)])
@@ -38,7 +39,7 @@ def test_both_are_blind_to_affine_changes_and_follow_permutations() -> None:
     x, A, b = points(9, 2), points(2, 2, seed=1), points(2, seed=2)
     assert principal_angles(depth_space(x), depth_space(x @ A.mT + b)).max() < 1e-12
     assert principal_angles(affine_shape(x), affine_shape(x @ A.mT + b)).max() < 1e-12
-    order = torch.randperm(9, generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(9, generator=seeded())
     assert principal_angles(depth_space(x)[order], depth_space(x[order])).max() < 1e-12
     assert principal_angles(depth_space(x), depth_space(points(9, 2, seed=5))).max() > 0.1
 

@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from chance import seeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +19,7 @@ def make(*shape, generator, scale=1.0):
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 2**31), st.floats(1e-4, 1e4), st.integers(3, 12), st.booleans())
 def test_exact_points_give_the_similarity_back(seed, scale, count, planar):
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     truth = make(4, generator=generator, scale=scale)
     X = torch.randn(4, count, 3, generator=generator, dtype=torch.float64)
     if planar:

@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from chance import seeded, stream_seed
 from kornia import feature
 
 from torchsfm.images import Features, Photograph, load_detector, load_matcher
@@ -11,13 +12,13 @@ from torchsfm.images import Features, Photograph, load_detector, load_matcher
 
 @pytest.fixture(scope="module")
 def picture() -> torch.Tensor:
-    return torch.rand(3, 61, 75, generator=torch.Generator().manual_seed(0))
+    return torch.rand(3, 61, 75, generator=seeded())
 
 
 @pytest.fixture(scope="module")
 def disk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Path]:
     """The network with random weights, and a file of them as its authors publish theirs."""
-    torch.manual_seed(0)
+    torch.manual_seed(stream_seed())
     network = feature.DISK().eval()
     path = tmp_path_factory.mktemp("weights") / "disk.pth"
     torch.save({"extractor": network.state_dict()}, path)
@@ -42,7 +43,7 @@ def test_disk_gives_what_the_network_says(disk: tuple[Any, Path], picture: torch
 
 def test_shrunk_images_give_positions_in_the_image_given(disk: tuple[Any, Path]) -> None:
     # Enlarged threefold and shrunk again, the network sees about the same image; most of its points stay.
-    small = torch.nn.functional.avg_pool2d(torch.rand(1, 3, 96, 112, generator=torch.Generator().manual_seed(1)), 4, 1)[0]
+    small = torch.nn.functional.avg_pool2d(torch.rand(1, 3, 96, 112, generator=seeded(1)), 4, 1)[0]
     large = small.repeat_interleave(3, 1).repeat_interleave(3, 2)
     detector = load_detector("disk", disk[1])
     one, three = detector(small, 60), detector(large, 60, max_size=max(small.shape))
@@ -53,12 +54,11 @@ def test_shrunk_images_give_positions_in_the_image_given(disk: tuple[Any, Path])
 
 @pytest.mark.filterwarnings("ignore:CUDA is not available")  # kornia 0.8
 def test_dedode_has_its_first_pixel_at_zero(tmp_path: Path) -> None:
-    torch.manual_seed(0)
     network = feature.DeDoDe(descriptor_model="B", amp_dtype=torch.float32).eval()
     torch.save(network.detector.state_dict(), tmp_path / "detector.pth")
     torch.save(network.descriptor.state_dict(), tmp_path / "descriptor.pth")
     detector = load_detector("dedode-b", [tmp_path / "detector.pth", tmp_path / "descriptor.pth"])
-    image = torch.rand(3, 30, 45, generator=torch.Generator().manual_seed(1))
+    image = torch.rand(3, 30, 45, generator=seeded(1))
     features = detector(image, 10000)  # more than there are pixels: every pixel is a point
     assert len(features) == 30 * 45
     assert features.descriptors.shape == (30 * 45, 256)
@@ -69,7 +69,6 @@ def test_dedode_has_its_first_pixel_at_zero(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["disk", "sift"])
 def test_lightglue_gives_what_the_network_says(tmp_path: Path, name: str) -> None:
-    torch.manual_seed(0)
     settings = {"input_dim": 128, "add_scale_ori": name == "sift"}
     network = feature.LightGlue(features=None, filter_threshold=0.0, **settings).eval()
     state = network.state_dict()
@@ -94,7 +93,7 @@ def test_lightglue_gives_what_the_network_says(tmp_path: Path, name: str) -> Non
 
 
 def points(seed: int, n: int) -> Features:
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     x = torch.rand(n, 2, generator=generator) * 90
     scale, angle = torch.rand(n, generator=generator) * 5 + 1, torch.rand(n, generator=generator) * 6
     return Features(x, scale, angle, torch.ones(n), torch.nn.functional.normalize(torch.randn(n, 128, generator=generator)))

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -321,7 +322,7 @@ def test_save_image(tmp_path: Path) -> None:
         save_image(tmp_path / f"a{suffix}", values)
         expected = torch.tensor([[[0.0, 0.0, 0.2], [1.0, 1.0, 0.0]]])
         torch.testing.assert_close(read_image(tmp_path / f"a{suffix}", gray=True).pixels, expected)
-    color = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(1))
+    color = torch.rand(3, 5, 7, generator=seeded(1))
     save_image(tmp_path / "b.png", color)
     assert (read_image(tmp_path / "b.png").pixels - color).abs().max() < 0.51 / 255
     save_image(tmp_path / "b.ppm", values)

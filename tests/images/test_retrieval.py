@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.images import Features, describe_images, detect_features, list_images, read_image, retrieve_pairs
@@ -41,8 +42,8 @@ def test_pairs_are_sorted_unique_and_enough(generator: torch.Generator) -> None:
     assert bool((key.diff() > 0).all())
     assert int(torch.bincount(pairs.flatten(), minlength=24).min()) >= 3
     assert torch.equal(retrieve_pairs(features, 3, words=8), pairs)
-    seeded = [retrieve_pairs(features, 3, words=8, generator=torch.Generator().manual_seed(5)) for _ in range(2)]
-    assert torch.equal(*seeded)
+    twice = [retrieve_pairs(features, 3, words=8, generator=seeded(5)) for _ in range(2)]
+    assert torch.equal(*twice)
 
 
 def test_few_images_give_all_pairs(generator: torch.Generator) -> None:

@@ -5,13 +5,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from chance import numpy_seeded
 from torch import Tensor
 
 from torchsfm.images import Photograph, Tracks, detect_corners, read_image, track_points, track_sequence
 
 
 def texture(seed: int, size: int = 900) -> np.ndarray:
-    rng = np.random.default_rng(seed)
+    rng = numpy_seeded(seed)
     image = sum(cv2.GaussianBlur(rng.standard_normal((size, size)), (0, 0), s) * s for s in (2, 4, 8, 16))
     return ((image - image.min()) / np.ptp(image)).astype(np.float32)
 

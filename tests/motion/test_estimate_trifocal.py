@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from chance import seeded
 from multiview_scenes import F64, cameras, images, points
 from oxford import lines_of, read
 from torch import Tensor
@@ -78,8 +79,7 @@ def test_refined_estimate_is_better_than_the_algebraic_one(generator: torch.Gene
 
 def test_derivatives_covariance_and_degeneracy(generator: torch.Generator) -> None:
     x, _, _ = scene(1, 40, 0.1, generator, noise=0.3)
-    seed = lambda: torch.Generator().manual_seed(1)  # noqa: E731
-    found = estimate_trifocal(x.requires_grad_(), threshold=2.0, generator=seed(), covariance=True)
+    found = estimate_trifocal(x.requires_grad_(), threshold=2.0, generator=seeded(1), covariance=True)
     assert found.degeneracy == Degeneracy.NONE
     assert found.covariance is not None
     assert found.covariance.shape == (1, 36, 36)
@@ -88,14 +88,14 @@ def test_derivatives_covariance_and_degeneracy(generator: torch.Generator) -> No
     (grad,) = torch.autograd.grad((found.model * weight).sum(), x)
     d = torch.randn(x.shape, generator=generator, dtype=F64) * found.inliers[:, None, :, None]
     h = 1e-3
-    models = [estimate_trifocal(x.detach() + s * h * d, threshold=2.0, generator=seed()).model for s in (1, -1)]
+    models = [estimate_trifocal(x.detach() + s * h * d, threshold=2.0, generator=seeded(1)).model for s in (1, -1)]
     slope = ((models[0] - models[1]) * weight).sum() / (2 * h)
     torch.testing.assert_close((grad * d).sum(), slope, rtol=0.02, atol=1e-6)
     P = cameras(4, v=3, generator=generator)
     X = points(4, n=60, generator=generator)
     X[..., 2] = 0.4 * X[..., 0]
     flat = images(P, X) + 0.3 * torch.randn(4, 3, 60, 2, generator=generator, dtype=F64)
-    planar = estimate_trifocal(flat, threshold=2.0, generator=seed(), max_iterations=200)
+    planar = estimate_trifocal(flat, threshold=2.0, generator=seeded(1), max_iterations=200)
     assert (planar.degeneracy[planar.status == Status.OK] == Degeneracy.PLANAR).all()
     assert (planar.status == Status.OK).any()
 
@@ -122,14 +122,13 @@ def test_bad_problems_and_scale_of_the_threshold(generator: torch.Generator) -> 
     x[3] = torch.rand(3, 60, 2, generator=generator, dtype=F64) * 640
     mask = torch.ones(5, 60, dtype=torch.bool)
     mask[4, 5:] = False
-    seed = lambda: torch.Generator().manual_seed(1)  # noqa: E731
-    found = estimate_trifocal(x, threshold=3.0, mask=mask, generator=seed(), max_iterations=500)
+    found = estimate_trifocal(x, threshold=3.0, mask=mask, generator=seeded(1), max_iterations=500)
     wanted = [Status.OK, Status.NOT_FINITE, Status.DEGENERATE, Status.NO_CONSENSUS, Status.TOO_FEW]
     assert found.status.tolist() == wanted
     assert torch.isfinite(found.model).all()
-    large = estimate_trifocal(1000 * x, threshold=3000.0, mask=mask, generator=seed(), max_iterations=500)
+    large = estimate_trifocal(1000 * x, threshold=3000.0, mask=mask, generator=seeded(1), max_iterations=500)
     assert torch.equal(large.inliers, found.inliers)
-    single = estimate_trifocal(x[:1].float(), threshold=3.0, generator=seed())
+    single = estimate_trifocal(x[:1].float(), threshold=3.0, generator=seeded(1))
     assert single.model.dtype == torch.float32
 
 

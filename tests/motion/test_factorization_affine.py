@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -15,7 +16,7 @@ def scene(
     model: str, batch: int, views: int, n: int, *, noise: float = 0.0, seed: int = 0
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Images, points, rotations and scales."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     kind = {"generator": g, "dtype": torch.float64}
     X = torch.randn(batch, n, 3, **kind)
     X = X - X.mean(1, keepdim=True)
@@ -65,7 +66,7 @@ def test_exact_points_are_found_exactly(model: str, views: int, n: int) -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_missing_data(model: str) -> None:
     x, X, _, _ = scene(model, 10, 10, 40)
-    visible = torch.rand(10, 10, 40, generator=torch.Generator().manual_seed(3)) < 0.5
+    visible = torch.rand(10, 10, 40, generator=seeded(3)) < 0.5
     found = factorize_affine(torch.where(visible[..., None], x, torch.nan), model=model)
     assert (found.status == Status.OK).all()
     used = visible & found.used_point[:, None]
@@ -97,14 +98,14 @@ def test_weights_and_order() -> None:
     kept = [i for i in range(20) if i != 3]
     a, b = factorize_affine(x, weights=w), factorize_affine(x[:, :, kept])
     torch.testing.assert_close(a.error[:, :, kept], b.error, rtol=0, atol=1e-7)
-    order = torch.randperm(6, generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(6, generator=seeded())
     torch.testing.assert_close(factorize_affine(x[:, order]).error, factorize_affine(x).error[:, order], rtol=0, atol=1e-7)
 
 
 def test_data_that_do_not_determine_the_answer_say_so() -> None:
     x, _, _, _ = scene("orthographic", 6, 5, 20, noise=1e-3)
     visible = torch.ones(6, 5, 20, dtype=torch.bool)
-    x[0] = (x[0, :1] @ torch.randn(5, 2, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)) + 1  # a plane
+    x[0] = (x[0, :1] @ torch.randn(5, 2, 2, generator=seeded(), dtype=torch.float64)) + 1  # a plane
     x[1] = x[1, :1]  # no motion
     x[2, :, ::2] = torch.nan  # ten points are enough
     visible[3, 2:] = False

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -15,7 +16,7 @@ from torchsfm.motion import Factorization, factorize_points
 
 def scene(batch: int, views: int, n: int, *, noise: float = 0.0, missing: float = 0.0, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Images 1000 px wide of points in a cube, from cameras anywhere around it."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     kind = {"generator": g, "dtype": torch.float64}
     unit = torch.nn.functional.normalize
     X = torch.rand(batch, n, 3, **kind) * 2 - 1
@@ -68,7 +69,7 @@ def test_missing_data_are_left_out() -> None:
 
 def test_a_homography_of_one_image_changes_nothing_but_its_camera() -> None:
     x, _ = scene(4, 5, 20, noise=0.5)
-    g = torch.Generator().manual_seed(1)
+    g = seeded(1)
     H = torch.randn(4, 3, 3, generator=g, dtype=torch.float64) * torch.tensor([[1, 1, 500], [1, 1, 500], [5e-4, 5e-4, 1]])
     warped = x.clone()
     warped[:, 2] = from_homogeneous(to_homogeneous(x[:, 2]) @ H.mT)[0]
@@ -83,7 +84,7 @@ def test_a_homography_of_one_image_changes_nothing_but_its_camera() -> None:
 @pytest.mark.parametrize("views", [3, 6])
 def test_homographies_of_all_images_that_move_points_through_infinity(views: int) -> None:
     x, _ = scene(20, views, 30)
-    g = torch.Generator().manual_seed(1)
+    g = seeded(1)
     H = torch.randn(20, views, 3, 3, generator=g, dtype=torch.float64)
     h = to_homogeneous((x - 500) / 300) @ H.mT
     # Some of the points lie beyond the image's new line at infinity.
@@ -93,7 +94,7 @@ def test_homographies_of_all_images_that_move_points_through_infinity(views: int
 
 def test_order_of_views_and_points_means_nothing() -> None:
     x, visible = scene(3, 6, 30, noise=1.0, missing=0.2)
-    g = torch.Generator().manual_seed(2)
+    g = seeded(2)
     views, points = torch.randperm(6, generator=g), torch.randperm(30, generator=g)
     first = factorize_points(x, visible=visible)
     second = factorize_points(x[:, views][:, :, points], visible=visible[:, views][:, :, points])
@@ -130,7 +131,7 @@ def test_noise_leaves_noise_and_a_start_for_the_bundle(missing: float) -> None:
 
 def test_wrong_tracks_do_not_spoil_it() -> None:
     x, visible = scene(10, 8, 80, noise=1.0, missing=0.2, seed=6)
-    g = torch.Generator().manual_seed(7)
+    g = seeded(7)
     wrong = torch.rand(10, 1, 80, generator=g) < 0.2
     x = torch.where(wrong[..., None], torch.rand(x.shape, generator=g, dtype=torch.float64) * 1000, x)
     plain, robust = factorize_points(x, visible=visible), factorize_points(x, visible=visible, robust=True)
@@ -173,7 +174,7 @@ def test_each_problem_of_a_batch_stands_alone() -> None:
 def test_data_that_do_not_determine_the_answer_say_so() -> None:
     x, visible = scene(7, 4, 20, noise=0.1)
     x = x.clone()
-    g = torch.Generator().manual_seed(0)
+    g = seeded()
     # A planar scene: homographies of one image.
     H = torch.randn(4, 3, 3, generator=g, dtype=torch.float64) * 0.1 + torch.eye(3, dtype=torch.float64)
     x[0] = from_homogeneous(to_homogeneous((x[0, :1] - 500) / 500) @ H.mT)[0] * 500 + 500
@@ -201,7 +202,7 @@ def test_derivative_of_the_reprojections() -> None:
     """On exact data: against the change of the whole answer."""
     x, visible = scene(1, 4, 10, missing=0.1, seed=2)
     x, visible = x[0], visible[0]
-    g = torch.Generator().manual_seed(0)
+    g = seeded()
     direction = torch.randn(x.shape, generator=g, dtype=torch.float64)
     leaf = x.clone().requires_grad_()
     again = reprojected(factorize_points(leaf, visible=visible))

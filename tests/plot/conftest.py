@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from chance import seeded
 
 from torchsfm.geometry import Camera, Radial
 from torchsfm.geometry.cameras import intrinsics
@@ -24,7 +25,7 @@ def backend() -> Iterator[None]:
 @pytest.fixture
 def model() -> Reconstruction:
     """Five images of 200 points, the last but one not registered, with half a pixel of noise."""
-    g = torch.Generator().manual_seed(0)
+    g = seeded()
     X = random_points(200, generator=g)
     poses = orbit_poses(5, radius=4.0, height=(0.5, 2.0))
     K = intrinsics(torch.tensor([500.0], dtype=torch.float64), torch.tensor([[320.0, 240.0]], dtype=torch.float64))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Pose
@@ -100,7 +101,7 @@ def test_epipolar_lines_pass_through_their_points() -> None:
     K = torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]], dtype=dtype)
     relative = poses[1] @ poses[0].inverse()
     F = fundamental_from_pose(relative.R, relative.t, K, K)
-    X = torch.randn(6, 3, dtype=dtype, generator=torch.Generator().manual_seed(0)) * 0.4
+    X = torch.randn(6, 3, dtype=dtype, generator=seeded()) * 0.4
     x = poses.transform(X) @ K.mT
     x1, x2 = x[..., :2] / x[..., 2:]
     first, second = plot_epipolar_lines(F, x1, x2, torch.rand(80, 100), torch.rand(3, 80, 100))
@@ -135,7 +136,7 @@ def test_lines_are_clipped_to_the_image() -> None:
 
 
 def test_points_in_space_leave_out_the_wild_ones() -> None:
-    X = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(0))
+    X = torch.randn(2, 50, 3, generator=seeded())
     X[0, 0], X[1, 3, 0] = 1e6, torch.nan
     ax = plot_points_3d(X, color=torch.rand(2, 50, 3), share=0.95)
     draw(ax)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from chance import numpy_seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Similarity, random_rotation, rotation_from_rotvec
@@ -120,7 +121,7 @@ def test_rmse_is_in_the_unit_of_the_truth(generator: torch.Generator) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_auc_is_that_of_superglue(seed: int) -> None:
-    generator = np.random.default_rng(seed)
+    generator = numpy_seeded(seed)
     errors = generator.exponential(2.0, 40)
     errors[generator.random(40) < 0.2] = np.inf
     thresholds = [0.5, 1.0, 2.0, 5.0, 10.0]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from chance import seeded
 from test_reconstruct_tracks import SIZE, Scene, make_scene, run
 
 from torchsfm.geometry import Pose
@@ -14,7 +15,7 @@ from torchsfm.simulation import orbit_poses
 
 def wandering_poses(v: int, seed: int) -> Pose:
     """On an arc, at different heights and distances, looking past the scene's middle."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     poses = orbit_poses(v, radius=5.0, sweep=1.6)
     turn = 0.06 * torch.randn(v, 3, generator=g, dtype=torch.float64)
     shift = 0.4 * torch.randn(v, 3, generator=g, dtype=torch.float64)
@@ -39,7 +40,7 @@ def test_metric_model_from_tracks_alone(seed: int) -> None:
 
 
 def test_pure_translation_is_refused() -> None:
-    g = torch.Generator().manual_seed(3)
+    g = seeded(3)
     centre = 0.8 * torch.randn(8, 3, generator=g, dtype=torch.float64) + torch.tensor([0.0, 0.0, -5.0])
     scene = make_scene(Pose(torch.eye(3, dtype=torch.float64).expand(8, 3, 3).clone(), -centre), points=120)
     result = run(scene, method="projective")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
@@ -34,7 +35,7 @@ def make_scene(
     seed: int = 0,
     kind: str = "ball",
 ) -> Scene:
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     poses = orbit_poses(8, radius=5.0, sweep=1.6) if poses is None else poses
     X = random_points(points, kind=kind, size=1.6, generator=g)
     v = len(poses.R)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, NoDistortion, Pose, intrinsics
@@ -25,7 +26,7 @@ VIEWS = 5
 
 def make(*, noise: float = 0.0, wrong: float = 0.0, points: int = 60, seed: int = 0) -> tuple[Mapping, Tensor, Tensor]:
     """A mapping with true cameras and no points, the true points, and the true point of each image point."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     X = random_points(points, generator=g)
     poses = orbit_poses(VIEWS, radius=5.0, sweep=1.2)
     K = intrinsics(torch.tensor(1000.0, dtype=torch.float64), torch.tensor([499.5, 399.5], dtype=torch.float64))
@@ -118,7 +119,7 @@ def test_completion_never_gives_a_point_two_observations_in_one_image() -> None:
     mapping, _, _ = make(noise=0.3, points=150)
     # Every image point is matched with a random one of the next image as well.
     graph = mapping.graph
-    g = torch.Generator().manual_seed(1)
+    g = seeded(1)
     extra = torch.randint(len(graph.x), (3000, 2), generator=g)
     match = torch.cat([graph.match, extra])
     owner = torch.cat([graph.match_pair, torch.zeros(3000, dtype=torch.long)])

@@ -1,6 +1,7 @@
 """Tracks: connected matches, one point per image."""
 
 import torch
+from chance import seeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,7 +30,7 @@ def test_no_matches() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(2, 7), st.integers(2, 40), st.integers(0, 80))
 def test_laws(seed: int, images: int, points: int, matches: int) -> None:
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     view = torch.randint(images, (points,), generator=g)
     match = torch.randint(points, (matches, 2), generator=g)
     match = match[view[match[:, 0]] != view[match[:, 1]]]

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from chance import seeded
 
 from torchsfm._types import Status
 from torchsfm.resection import camera_dlt
@@ -15,7 +16,7 @@ def make_problem(make_scene):
         x = (Y @ K.T)[..., :2] / Y[..., 2:]
         t = P[..., 3] - (P[..., :3] @ torch.full((3,), origin, dtype=torch.float64))
         P = K @ torch.cat((P[..., :3], t[..., None]), -1)
-        generator = torch.Generator().manual_seed(1)
+        generator = seeded(1)
         return x + noise * torch.randn(x.shape, generator=generator, dtype=torch.float64), X + origin, P
 
     return make
@@ -97,7 +98,7 @@ def test_coplanar_points_are_reported(make_problem, noise, dtype):
     _, X, P = make_problem(30, n=25)
     X[..., 2] = 0.3 * X[..., 0] - 0.2 * X[..., 1] + 5
     x = project(P, X)
-    generator = torch.Generator().manual_seed(2)
+    generator = seeded(2)
     x = x + noise * torch.randn(x.shape, generator=generator, dtype=torch.float64)
     found = camera_dlt(x.to(dtype), X.to(dtype))
     assert (found.status == Status.DEGENERATE).all()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 
 from torchsfm._types import Status
 from torchsfm.geometry import Camera, Pose, krt_from_camera, random_rotation, rotation_angle
@@ -16,10 +17,6 @@ DOORS = {
     "projective": estimate_camera_projective,
 }
 every_door = pytest.mark.parametrize("door", DOORS.values(), ids=DOORS)
-
-
-def seed(value=0):
-    return torch.Generator().manual_seed(value)
 
 
 @pytest.fixture
@@ -59,7 +56,7 @@ def gap(P, Q, X):
 @pytest.mark.parametrize(("inliers", "n"), [(0.9, 100), (0.5, 300)])
 def test_cameras_are_right(images, door, inliers, n):
     x, X, wrong, P = images(16, n, inliers)
-    found = door(x, X, threshold=3.0, generator=seed())
+    found = door(x, X, threshold=3.0, generator=seeded())
     assert (found.status == Status.OK).all()
     assert (gap(found.model, P, X) < 1.5).all()
     # Eleven parameters at most, each of which takes its share of the noise.
@@ -72,7 +69,7 @@ def test_cameras_are_right(images, door, inliers, n):
 
 def test_the_focal_length_meets_the_bound(images):
     x, X, wrong, P = images(60, 120, 0.6)
-    found = estimate_camera_focal(x, X, C, threshold=4.0, generator=seed(), covariance=True)
+    found = estimate_camera_focal(x, X, C, threshold=4.0, generator=seeded(), covariance=True)
     K, R, _ = krt_from_camera(found.model)
     assert torch.allclose(K[:, 0, 0], K[:, 1, 1])
     assert torch.allclose(K[:, :2, 2], C.expand(60, 2))
@@ -89,8 +86,8 @@ def test_the_focal_length_meets_the_bound(images):
 @every_door
 def test_units_of_image_and_world_do_not_matter(images, door):
     x, X, _, P = images(6, 200, 0.6)
-    plain = door(x, X, threshold=3.0, generator=seed())
-    moved = door(x, X * 1e4 + 3e6, threshold=3.0, generator=seed())
+    plain = door(x, X, threshold=3.0, generator=seeded())
+    moved = door(x, X * 1e4 + 3e6, threshold=3.0, generator=seeded())
     assert (plain.inliers == moved.inliers).double().mean() > 0.998
     assert (gap(moved.model, P, X * 1e4 + 3e6) > 0).all()
     assert torch.allclose(project(moved.model, X * 1e4 + 3e6), project(plain.model, X), atol=0.05)
@@ -100,26 +97,26 @@ def test_units_of_image_and_world_do_not_matter(images, door):
 def test_ragged_extremes_in_one_batch(images, door):
     x, X, _, P = images(7, 600, 0.6)
     mask = torch.arange(600) < torch.tensor([0, 3, 50, 600, 600, 600, 600])[:, None]
-    x[4] = torch.rand(600, 2, generator=seed(), dtype=F64) * 1000
+    x[4] = torch.rand(600, 2, generator=seeded(), dtype=F64) * 1000
     x[5], X[5] = x[5, :1], X[5, :1]
     x[6, ::2] = torch.nan
-    found = door(x, X, threshold=3.0, mask=mask, generator=seed(), max_iterations=2000)
+    found = door(x, X, threshold=3.0, mask=mask, generator=seeded(), max_iterations=2000)
     wanted = [Status.TOO_FEW, Status.TOO_FEW, Status.OK, Status.OK, Status.NO_CONSENSUS, Status.DEGENERATE, Status.OK]
     assert found.status.tolist() == wanted
     assert found.model.isfinite().all()
     assert (gap(found.model, P, X)[[2, 3, 6]] < 3).all()
-    alone = door(x[3], X[3], threshold=3.0, generator=seed(), max_iterations=2000)
+    alone = door(x[3], X[3], threshold=3.0, generator=seeded(), max_iterations=2000)
     assert torch.equal(alone.inliers, found.inliers[3])
 
 
 def test_planes(images):
     x, X, _, P = images(12, 200, 0.7, noise=0.3, thickness=0.0)
-    found = estimate_camera_focal(x, X, C, threshold=2.0, generator=seed())
+    found = estimate_camera_focal(x, X, C, threshold=2.0, generator=seeded())
     assert (found.degeneracy == Degeneracy.PLANAR).all()
     tilted = P[:, 2, 2].abs() < 0.8
     K, K0 = krt_from_camera(found.model)[0], krt_from_camera(P)[0]
     assert ((K[:, 0, 0] / K0[:, 0, 0]).log().abs()[tilted] < 0.05).all()
-    blind = estimate_camera_projective(x, X, threshold=2.0, generator=seed())
+    blind = estimate_camera_projective(x, X, threshold=2.0, generator=seeded())
     assert ((blind.status != Status.OK) | (blind.degeneracy == Degeneracy.PLANAR)).all()
 
 
@@ -127,7 +124,7 @@ def test_planes(images):
 def test_derivatives(images, door):
     x, X, wrong, _ = images(2, 60, 0.8)
     x.requires_grad_()
-    found = door(x, X, threshold=3.0, generator=seed())
+    found = door(x, X, threshold=3.0, generator=seeded())
     (g,) = torch.autograd.grad(found.model[..., 0, :].sum(), x)
     assert g.isfinite().all()
     assert (g[~wrong] != 0).double().mean() > 0.9
@@ -136,15 +133,15 @@ def test_derivatives(images, door):
 
 def test_a_real_image_of_unknown_focal_length(pose6dscene):
     x, X, K, truth = pose6dscene
-    found = estimate_camera_focal(x, X, K[:2, 2], threshold=4.0, generator=seed())
+    found = estimate_camera_focal(x, X, K[:2, 2], threshold=4.0, generator=seeded())
     assert found.status == Status.OK
     assert found.inliers.sum() >= 90
     matrix, R, _ = krt_from_camera(found.model)
     assert (matrix[0, 0] / K[0, 0]).log().abs() < 0.05
     assert torch.rad2deg(rotation_angle(R @ truth[:, :3].T)) < 2
-    wrong = torch.rand(len(x), generator=seed()) < 0.5
-    spoiled = torch.where(wrong[:, None], torch.rand(len(x), 2, generator=seed(1), dtype=F64) * 480, x)
-    again = estimate_camera_focal(spoiled, X, K[:2, 2], threshold=4.0, generator=seed())
+    wrong = torch.rand(len(x), generator=seeded()) < 0.5
+    spoiled = torch.where(wrong[:, None], torch.rand(len(x), 2, generator=seeded(1), dtype=F64) * 480, x)
+    again = estimate_camera_focal(spoiled, X, K[:2, 2], threshold=4.0, generator=seeded())
     assert again.status == Status.OK
     assert (krt_from_camera(again.model)[0][0, 0] / K[0, 0]).log().abs() < 0.1
 
@@ -174,7 +171,7 @@ def test_every_camera_of_a_list(sequence, generator, threshold, calibrated):
     if threshold is not None:
         wrong = (torch.rand(visible.shape, generator=generator) < 0.3) & visible
         x = torch.where(wrong[..., None], 800 * torch.rand(x.shape, generator=generator, dtype=F64), x)
-    found = resect_cameras(x, X, K if calibrated else None, threshold=threshold, visible=visible, generator=seed())
+    found = resect_cameras(x, X, K if calibrated else None, threshold=threshold, visible=visible, generator=seeded())
     assert found.model.shape == (9, 3, 4)
     assert (found.status[:7] == Status.OK).all()
     assert found.status[7:].tolist() == [Status.TOO_FEW] * 2 or (calibrated and threshold is not None)
@@ -222,7 +219,7 @@ def test_oxford_sequences(oxford, folder):
     stored = torch.where(visible, (project(P, X.expand(len(P), -1, -1)) - x).square().sum(-1), 0).sum(-1)
     stored = (stored / visible.sum(-1)).sqrt()
     for threshold in (None, 3.0):
-        found = resect_cameras(x, X, threshold=threshold, visible=visible, generator=seed())
+        found = resect_cameras(x, X, threshold=threshold, visible=visible, generator=seeded())
         assert (found.status == Status.OK).all()
         # The robust optimum is that of another cost.
         assert (found.error <= stored * (1 + 1e-6 if threshold is None else 1.03)).all()
@@ -237,8 +234,8 @@ def test_a_staircase_with_many_wrong_matches(data, number, angle, distance):
     centre = -scene["R_gt"].T @ scene["t_gt"]
     x, X, K = scene["p2ds"], scene["p3ds"], scene["K"]
     for threshold in (3.0, 6.0):
-        known = estimate_camera(x, X, K, threshold=threshold, generator=seed())
-        matrix, R, t = krt_from_camera(estimate_camera_focal(x, X, K[:2, 2], threshold=threshold, generator=seed()).model)
+        known = estimate_camera(x, X, K, threshold=threshold, generator=seeded())
+        matrix, R, t = krt_from_camera(estimate_camera_focal(x, X, K[:2, 2], threshold=threshold, generator=seeded()).model)
         assert (matrix[0, 0] / K[0, 0]).log().abs() < 0.07
         for turn, shift in ((known.model[:, :3], known.model[:, 3]), (R, t)):
             assert torch.rad2deg(rotation_angle(turn @ scene["R_gt"].T)) < angle

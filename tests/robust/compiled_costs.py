@@ -1,4 +1,4 @@
-"""Run by test_compiled.py: costs of models, compiled and as they are, for the estimators named on the command line."""
+"""Run by test_compiled.py with a seed and names of estimators: costs of models, compiled and as they are."""
 
 import importlib
 import pkgutil
@@ -17,10 +17,10 @@ from torchsfm._types import tensor_map
 from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac
 from torchsfm.robust.scoring import _costs, losses
 
-wanted = sys.argv[1:]
+seed, wanted = int(sys.argv[1]), sys.argv[2:]
 rooms = [importlib.import_module(f"torchsfm.{room.name}") for room in pkgutil.iter_modules(torchsfm.__path__) if room.ispkg]
 kinds = {kind.model_name: kind for room in rooms for kind in getattr(room, "ESTIMATORS", ())}
-generator = torch.Generator().manual_seed(0)
+generator = torch.Generator().manual_seed(seed)
 for name in wanted or kinds:
     scores = (Msac(), InlierCount(), Magsac(), LeastMedian()) if wanted else (Msac(),)
     for score in scores:

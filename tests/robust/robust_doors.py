@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import random_rotation, rotation_from_rotvec, rotvec_from_rotation
@@ -70,7 +71,7 @@ class Door:
         return self.scene(p, n, generator).noisy(noise, wrong, self.images, generator)
 
     def __call__(self, scene: Scene, threshold: Any = 2.0, unit: float = 1.0, **options: Any) -> Any:
-        options = {"generator": torch.Generator().manual_seed(1), **options}
+        options = {"generator": seeded(1), **options}
         return self.call(scene, unit, threshold=threshold, **options)
 
     def difference(self, models: Tensor, others: Tensor) -> Tensor:

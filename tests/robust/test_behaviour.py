@@ -93,7 +93,7 @@ torch.set_num_threads(1)
 g = torch.Generator().manual_seed(0)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 x = torch.rand(256, 5000, 2, generator=g, dtype=torch.float64) * 1000
-y = x * torch.tensor([1.1, 0.9]) + 5 * torch.randn(256, 5000, 1)
+y = x * torch.tensor([1.1, 0.9]) + 5 * torch.randn(256, 5000, 1, generator=g)
 y = torch.where(torch.rand(256, 5000, 1, generator=g) < 0.6, y, x.flip(1))
 estimate_fundamental(x, y, threshold=1.0, generator=g, max_iterations=1000)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -23,10 +24,6 @@ def pixels(X: Tensor) -> Tensor:
 
 def rays(x: Tensor) -> Tensor:
     return torch.cat(((x - CENTRE) / FOCAL, torch.ones_like(x[..., :1])), -1)
-
-
-def seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
 
 
 def pairs(
@@ -68,7 +65,7 @@ def transfer_error(H: Tensor, R: Tensor, t: Tensor, normal: Tensor) -> Tensor:
 
 def test_fundamental_is_right(generator: torch.Generator) -> None:
     x1, x2, wrong, R, t, _ = pairs(32, 300, 0.6, generator)
-    result = estimate_fundamental(x1, x2, threshold=1.5, generator=seed())
+    result = estimate_fundamental(x1, x2, threshold=1.5, generator=seeded())
     F = result.model
     assert (result.status == Status.OK).all()
     torch.testing.assert_close(F.flatten(-2).norm(dim=-1), torch.ones(32, dtype=torch.float64))
@@ -84,7 +81,7 @@ def test_fundamental_is_right(generator: torch.Generator) -> None:
 def test_essential_is_right(generator: torch.Generator) -> None:
     x1, x2, wrong, R, t, _ = pairs(24, 300, 0.5, generator)
     scale = torch.rand(24, 300, 1, generator=generator, dtype=torch.float64) + 0.5
-    result = estimate_essential(rays(x1) * scale, rays(x2), threshold=1.5 / FOCAL, generator=seed())
+    result = estimate_essential(rays(x1) * scale, rays(x2), threshold=1.5 / FOCAL, generator=seeded())
     assert (result.status == Status.OK).all()
     values = torch.linalg.svdvals(result.model)
     torch.testing.assert_close(values, torch.tensor([1.0, 1, 0], dtype=torch.float64).expand(24, 3), atol=1e-9, rtol=0)
@@ -99,7 +96,7 @@ def test_essential_is_right(generator: torch.Generator) -> None:
 
 def test_homography_is_right(generator: torch.Generator) -> None:
     x1, x2, wrong, R, t, normal = pairs(32, 200, 0.5, generator, plane=True)
-    result = estimate_homography(x1, x2, threshold=1.5, generator=seed())
+    result = estimate_homography(x1, x2, threshold=1.5, generator=seeded())
     assert (result.status == Status.OK).all()
     error = transfer_error(result.model, R, t, normal)
     assert error.median() < 2
@@ -118,16 +115,16 @@ def test_homography_refinement_reaches_the_bound(generator: torch.Generator) -> 
         H = HomographyEstimator().refine(H, y1, y2, weights=(~wrong).double())
     ideal = transfer_error(T.inverse() @ H @ T, R, t, normal)
     for threshold in (1.0, 2.5):
-        found = estimate_homography(x1, x2, threshold=threshold, generator=seed()).model
+        found = estimate_homography(x1, x2, threshold=threshold, generator=seeded()).model
         ratio = transfer_error(found, R, t, normal) / ideal
         assert ratio.log().mean().exp() < 1.1
 
 
 def test_essential_refinement_nears_the_bound(generator: torch.Generator) -> None:
     x1, x2, wrong, R, t, _ = pairs(100, 200, 0.8, generator)
-    best = estimate_essential(rays(x1), rays(x2), threshold=3 / FOCAL, mask=~wrong, generator=seed()).model
+    best = estimate_essential(rays(x1), rays(x2), threshold=3 / FOCAL, mask=~wrong, generator=seeded()).model
     ideal = pose_error(best, x1, x2, wrong, R, t)
-    found = estimate_essential(rays(x1), rays(x2), threshold=1.5 / FOCAL, generator=seed()).model
+    found = estimate_essential(rays(x1), rays(x2), threshold=1.5 / FOCAL, generator=seeded()).model
     ratio = pose_error(found, x1, x2, wrong, R, t).clamp(min=1e-4) / ideal.clamp(min=1e-4)
     assert ratio.log().mean().exp() < 1.25
 
@@ -147,9 +144,9 @@ DOORS: dict[str, Any] = {
 @pytest.mark.parametrize("door", ["fundamental", "homography"])
 def test_the_unit_does_not_matter(door: str, generator: torch.Generator) -> None:
     x1, x2, *_ = pairs(8, 200, 0.6, generator, plane=door == "homography")
-    plain = DOORS[door](x1, x2, generator=seed())
+    plain = DOORS[door](x1, x2, generator=seeded())
     for scale in (1000.0, 1e-3):
-        scaled = DOORS[door](x1 * scale, x2 * scale, scale, generator=seed())
+        scaled = DOORS[door](x1 * scale, x2 * scale, scale, generator=seeded())
         assert torch.equal(plain.inliers, scaled.inliers)
         S = torch.diag(torch.tensor([scale, scale, 1.0], dtype=torch.float64))
         back = S @ scaled.model @ S if door == "fundamental" else S.inverse() @ scaled.model @ S
@@ -163,9 +160,9 @@ def test_float32_and_thresholds_per_pair(door: str, generator: torch.Generator) 
     x1, x2, wrong, *_ = pairs(6, 200, 0.7, generator, plane=door == "homography")
     s = torch.linspace(0.7, 2, 6)
     result = (
-        estimate_essential(rays(x1).float(), rays(x2).float(), threshold=1.5 * s / FOCAL, generator=seed())
+        estimate_essential(rays(x1).float(), rays(x2).float(), threshold=1.5 * s / FOCAL, generator=seeded())
         if door == "essential"
-        else DOORS[door](x1.float(), x2.float(), s, generator=seed())
+        else DOORS[door](x1.float(), x2.float(), s, generator=seeded())
     )
     assert result.model.dtype == torch.float32
     assert (result.status == Status.OK).all()
@@ -187,7 +184,7 @@ def test_ragged_extremes_in_one_batch(door: str, generator: torch.Generator) -> 
     # What lies outside the mask must not matter, not even where it is no number.
     x1 = torch.where(mask[..., None], x1, torch.nan)
     before = x1.clone(), x2.clone(), mask.clone()
-    result = DOORS[door](x1, x2, mask=mask, generator=seed(), max_iterations=4000)
+    result = DOORS[door](x1, x2, mask=mask, generator=seeded(), max_iterations=4000)
     assert torch.equal(x1.nan_to_num(), before[0].nan_to_num())
     assert torch.equal(x2.nan_to_num(), before[1].nan_to_num())
     assert torch.equal(mask, before[2])
@@ -203,7 +200,7 @@ def test_ragged_extremes_in_one_batch(door: str, generator: torch.Generator) -> 
     assert not result.inliers[8, 1::3].any()
     for i in range(9):
         n = int(count[i])
-        alone = DOORS[door](x1[i, :n], x2[i, :n], generator=seed(), max_iterations=4000)
+        alone = DOORS[door](x1[i, :n], x2[i, :n], generator=seeded(), max_iterations=4000)
         assert alone.status == result.status[i]
         assert torch.equal(alone.inliers, result.inliers[i, :n])
         torch.testing.assert_close(alone.model, result.model[i], rtol=1e-9, atol=1e-12)
@@ -211,8 +208,8 @@ def test_ragged_extremes_in_one_batch(door: str, generator: torch.Generator) -> 
 
 def test_points_of_a_plane_leave_fundamental_no_better_than_homography(generator: torch.Generator) -> None:
     x1, x2, *_ = pairs(6, 300, 0.7, generator, plane=True)
-    F = estimate_fundamental(x1, x2, threshold=1.5, generator=seed())
-    H = estimate_homography(x1, x2, threshold=1.5, generator=seed())
+    F = estimate_fundamental(x1, x2, threshold=1.5, generator=seeded())
+    H = estimate_homography(x1, x2, threshold=1.5, generator=seeded())
     assert (H.inliers.sum(-1) > 0.85 * F.inliers.sum(-1)).all()
     assert torch.isfinite(F.model).all()
 
@@ -221,8 +218,8 @@ def test_scores_are_accepted_everywhere(generator: torch.Generator) -> None:
     x1, x2, wrong, *_ = pairs(4, 400, 0.25, generator)
     trust = (~wrong).double() + 0.3 * torch.randn(4, 400, generator=generator)
     for door in ("fundamental", "essential"):
-        blind = DOORS[door](x1, x2, generator=seed(), max_iterations=128)
-        guided = DOORS[door](x1, x2, generator=seed(), max_iterations=128, scores=trust)
+        blind = DOORS[door](x1, x2, generator=seeded(), max_iterations=128)
+        guided = DOORS[door](x1, x2, generator=seeded(), max_iterations=128, scores=trust)
         assert guided.inliers.sum() > blind.inliers.sum()
 
 
@@ -262,7 +259,7 @@ def true_points(path: Path) -> tuple[Tensor, Tensor]:
 def test_real_fundamental_pairs(name: str, bound: float, data: Path) -> None:
     folder = data / "two_view" / "fundamental_matrix"
     x1, x2, _ = labelled(folder / f"{name}_pts.txt")
-    result = estimate_fundamental(x1, x2, threshold=1.0, generator=seed())
+    result = estimate_fundamental(x1, x2, threshold=1.0, generator=seeded())
     assert result.status == Status.OK
     assert sampson_distance(result.model, *true_points(folder / f"{name}_vpts.mat")).square().mean().sqrt() < bound
 
@@ -273,7 +270,7 @@ def test_real_fundamental_pairs(name: str, bound: float, data: Path) -> None:
 def test_real_homography_pairs(name: str, bound: float, data: Path) -> None:
     folder = data / "two_view" / "homography"
     x1, x2, _ = labelled(folder / f"{name}_pts.txt")
-    result = estimate_homography(x1, x2, threshold=2.0, generator=seed())
+    result = estimate_homography(x1, x2, threshold=2.0, generator=seeded())
     assert result.status == Status.OK
     distance = HomographyEstimator().residual(result.model, *true_points(folder / f"{name}_vpts.mat"))
     assert distance.square().mean().sqrt() < bound
@@ -285,7 +282,7 @@ def test_real_essential_pair(data: Path) -> None:
     rows = torch.from_numpy(np.loadtxt(folder / "fountain_pts.txt", skiprows=1))
     one = torch.ones_like(rows[:, :1])
     d1, d2 = (torch.cat((x, one), -1) @ C.inverse().mT for x, C in ((rows[:, :2], K1), (rows[:, 2:4], K2)))
-    result = estimate_essential(d1, d2, threshold=2 / K1[0, 0], generator=seed())
+    result = estimate_essential(d1, d2, threshold=2 / K1[0, 0], generator=seeded())
     assert result.status == Status.OK
     assert result.inliers.double().mean() > 0.5
     pose = pose_from_essential(result.model, d1, d2, result.inliers.double())
@@ -317,7 +314,7 @@ def test_no_worse_than_poselib(model: str, generator: torch.Generator) -> None:
             M = essential_from_pose(torch.tensor(pose.R), torch.tensor(pose.t)).numpy()
         theirs.append(torch.from_numpy(np.asarray(M)))
     errors = []
-    for M in (DOORS[model](x1, x2, generator=seed()).model, torch.stack(theirs)):
+    for M in (DOORS[model](x1, x2, generator=seeded()).model, torch.stack(theirs)):
         if model == "homography":
             errors.append(transfer_error(M, R, t, normal))
         else:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from chance import seeded
 from scenes import make_scene
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
@@ -94,29 +95,28 @@ def test_one_structure_is_what_ransac_finds(generator: torch.Generator) -> None:
 def test_alone_and_in_a_batch_and_with_masks(generator: torch.Generator) -> None:
     x1, x2, _, _ = planes(3, generator)
     mask = torch.rand(3, x1.shape[1], generator=generator) < 0.9
-    seed = lambda: torch.Generator().manual_seed(7)  # noqa: E731
     options = {"threshold": 4e-3, "hypotheses": 800, "kept": 200}
-    together = find_structures(HomographyEstimator(), x1, x2, mask=mask, generator=seed(), **options)
+    together = find_structures(HomographyEstimator(), x1, x2, mask=mask, generator=seeded(7), **options)
     assert (together.label[~mask] == -1).all()
     for i in range(3):
         alone = find_structures(
-            HomographyEstimator(), x1[i][mask[i]], x2[i][mask[i]], generator=seed(), **options
+            HomographyEstimator(), x1[i][mask[i]], x2[i][mask[i]], generator=seeded(7), **options
         )  # fmt: skip
         assert torch.equal(alone.label, together.label[i][mask[i]])
         assert torch.equal(alone.model, together.model[i])
-    again = find_structures(HomographyEstimator(), x1[None], x2[None], mask=mask, generator=seed(), **options)
+    again = find_structures(HomographyEstimator(), x1[None], x2[None], mask=mask, generator=seeded(7), **options)
     assert again.label.shape == (1, 3, x1.shape[1])
     assert torch.equal(again.label[0], together.label)
 
 
 def test_coordinates_may_be_of_any_scale(generator: torch.Generator) -> None:
     x1, x2, _, _ = planes(1, generator)
-    a = estimate_homographies(x1, x2, threshold=4e-3, generator=torch.Generator().manual_seed(0))
+    a = estimate_homographies(x1, x2, threshold=4e-3, generator=seeded())
     b = estimate_homographies(
-        1024 * x1, 1024 * x2, threshold=4.096, generator=torch.Generator().manual_seed(0)
+        1024 * x1, 1024 * x2, threshold=4.096, generator=seeded()
     )  # fmt: skip
     assert torch.equal(a.label, b.label)
-    single = estimate_homographies(x1.float(), x2.float(), threshold=4e-3, generator=torch.Generator().manual_seed(0))
+    single = estimate_homographies(x1.float(), x2.float(), threshold=4e-3, generator=seeded())
     assert single.model.dtype == torch.float32
 
 
@@ -171,7 +171,7 @@ def test_adelaide(kind: str, limit: float, data: Path) -> None:
         x[i, : len(points)] = points
     mask = torch.isfinite(x).all(-1)
     estimate, threshold = (estimate_fundamentals, 4.0) if kind == "F" else (estimate_homographies, 2.0)
-    found = estimate(x[..., :2], x[..., 3:5], threshold=threshold, mask=mask, generator=torch.Generator().manual_seed(0))
+    found = estimate(x[..., :2], x[..., 3:5], threshold=threshold, mask=mask, generator=seeded())
     errors = []
     for i, name in enumerate(names):
         truth = torch.from_numpy(archive[name + "_label"].ravel().astype(int)) - 1

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Solutions, Status
@@ -92,8 +93,8 @@ def test_lines_are_found(inliers: float, generator: torch.Generator) -> None:
 def test_fields_and_thresholds_belong_to_their_problem(generator: torch.Generator) -> None:
     x, truth, _ = lines(6, 300, 0.6, generator)
     scale = torch.tensor([1.0, 10.0, 100.0, 1.0, 10.0, 100.0], dtype=torch.float64)
-    plain = ransac(unit(6), x, threshold=0.3, generator=torch.Generator().manual_seed(1))
-    scaled = ransac(LineEstimator(scale), x, threshold=0.3 * scale, generator=torch.Generator().manual_seed(1))
+    plain = ransac(unit(6), x, threshold=0.3, generator=seeded(1))
+    scaled = ransac(LineEstimator(scale), x, threshold=0.3 * scale, generator=seeded(1))
     assert torch.equal(plain.inliers, scaled.inliers)
     assert (line_error(scaled.model, truth) < 0.02).all()
 
@@ -121,14 +122,13 @@ def test_no_problem_feels_the_others(generator: torch.Generator) -> None:
     count = torch.tensor([700, 30, 64, 65, 128, 300, 512, 513, 9, 2, 3, 256])
     mask = torch.arange(700) < count[:, None]
     x[4, 3] = torch.nan
-    seed = lambda: torch.Generator().manual_seed(7)  # noqa: E731
-    together = ransac(unit(12), x, threshold=0.3, mask=mask, generator=seed())
+    together = ransac(unit(12), x, threshold=0.3, mask=mask, generator=seeded(7))
     order = torch.randperm(12, generator=generator)
-    shuffled = ransac(unit(12), x[order], threshold=0.3, mask=mask[order], generator=seed())
+    shuffled = ransac(unit(12), x[order], threshold=0.3, mask=mask[order], generator=seeded(7))
     assert torch.equal(shuffled.model.angle, together.model.angle[order])
     for i in range(12):
         n = int(count[i])
-        alone = ransac(unit(), x[i, :n], threshold=0.3, generator=seed())
+        alone = ransac(unit(), x[i, :n], threshold=0.3, generator=seeded(7))
         assert torch.equal(alone.model.angle, together.model.angle[i])
         assert torch.equal(alone.inliers, together.inliers[i, :n])
         assert torch.equal(alone.status, together.status[i])
@@ -159,8 +159,8 @@ def test_trusted_data_are_found_sooner(generator: torch.Generator) -> None:
     x, truth, wrong = lines(20, 3000, 0.02, generator)
     scores = torch.where(wrong, 0.0, 1.0).double() + 0.3 * torch.randn(20, 3000, generator=generator)
     options = {"threshold": 0.3, "max_iterations": 128}
-    blind = ransac(unit(20), x, generator=torch.Generator().manual_seed(0), **options)
-    guided = ransac(unit(20), x, generator=torch.Generator().manual_seed(0), scores=scores, **options)
+    blind = ransac(unit(20), x, generator=seeded(), **options)
+    guided = ransac(unit(20), x, generator=seeded(), scores=scores, **options)
     hits = lambda r: int((line_error(r.model, truth) < 0.05).sum())  # noqa: E731
     assert hits(guided) >= 18
     assert hits(blind) <= 10

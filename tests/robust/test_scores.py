@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -23,10 +24,6 @@ def pixels(X: Tensor) -> Tensor:
 
 def rays(x: Tensor) -> Tensor:
     return torch.cat(((x - CENTRE) / FOCAL, torch.ones_like(x[..., :1])), -1)
-
-
-def seed(value: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(value)
 
 
 def scene(
@@ -98,13 +95,13 @@ def test_magsac_is_the_marginal_over_the_noise(dof: int) -> None:
 def test_every_score_finds_the_pose(score: Score, generator: torch.Generator) -> None:
     x1, x2, wrong, R, t = scene(16, 200, 0.7, generator)
     threshold = 1.5 if score.needs_threshold else None
-    result = estimate_fundamental(x1, x2, threshold=threshold, score=score, generator=seed())
+    result = estimate_fundamental(x1, x2, threshold=threshold, score=score, generator=seeded())
     assert (result.status == Status.OK).all()
     error = pose_error(essential_from_fundamental(result.model, K, K), x1, x2, wrong, R, t)
     assert error.median() < 0.9
     assert ((result.inliers == ~wrong).double().mean(-1) > 0.93).all()
     turned = estimate_essential(
-        rays(x1), rays(x2), threshold=None if threshold is None else 1.5 / FOCAL, score=score, generator=seed()
+        rays(x1), rays(x2), threshold=None if threshold is None else 1.5 / FOCAL, score=score, generator=seeded()
     )
     assert pose_error(turned.model, x1, x2, wrong, R, t).median() < 0.5
 
@@ -112,11 +109,11 @@ def test_every_score_finds_the_pose(score: Score, generator: torch.Generator) ->
 def test_the_threshold_is_found_where_none_is_given(generator: torch.Generator) -> None:
     for noise in (0.2, 2.0):
         x1, x2, wrong, _, _ = scene(16, 300, 0.75, generator, plane=1.0, noise=noise)
-        result = estimate_homography(x1, x2, threshold=None, generator=seed())
+        result = estimate_homography(x1, x2, threshold=None, generator=seeded())
         # The quantile 0.99 of a distance in two dimensions is 3.03 standard deviations; outliers raise the median by a quarter.
         assert (result.threshold / (3.03 * noise)).median().log().abs() < 0.35
         assert ((result.inliers == ~wrong).double().mean(-1) > 0.95).all()
-        given = estimate_homography(x1, x2, threshold=2.5, generator=seed())
+        given = estimate_homography(x1, x2, threshold=2.5, generator=seeded())
         torch.testing.assert_close(given.threshold, torch.full_like(given.threshold, 2.5))
 
 
@@ -134,14 +131,14 @@ def test_a_threshold_that_is_wanted_must_be_given(generator: torch.Generator) ->
 def test_trusted_data_end_the_search_early(generator: torch.Generator) -> None:
     x1, x2, wrong, R, t = scene(6, 400, 0.4, generator)
     order = torch.rand(6, 400, generator=generator, dtype=torch.float64) + 0.8 * (~wrong)
-    plain = estimate_fundamental(x1, x2, threshold=1.5, generator=seed(), max_iterations=30_000)
-    guided = estimate_fundamental(x1, x2, threshold=1.5, scores=order, generator=seed(), max_iterations=30_000)
+    plain = estimate_fundamental(x1, x2, threshold=1.5, generator=seeded(), max_iterations=30_000)
+    guided = estimate_fundamental(x1, x2, threshold=1.5, scores=order, generator=seeded(), max_iterations=30_000)
     assert (guided.status == Status.OK).all()
     assert guided.iterations.double().mean() < 0.2 * plain.iterations.double().mean()
     errors = [pose_error(essential_from_fundamental(r.model, K, K), x1, x2, wrong, R, t) for r in (plain, guided)]
     assert errors[1].median() < 1.2 * errors[0].median() + 0.1
     # An order that means nothing costs time at most.
-    lost = estimate_fundamental(x1, x2, threshold=1.5, scores=-order, generator=seed(), max_iterations=30_000)
+    lost = estimate_fundamental(x1, x2, threshold=1.5, scores=-order, generator=seeded(), max_iterations=30_000)
     assert (lost.status == Status.OK).all()
 
 
@@ -149,20 +146,20 @@ def test_a_weight_counts_as_so_many_data(generator: torch.Generator) -> None:
     """Twice the weight is twice the datum, 0 is none, and likely data are drawn more often."""
     x1, x2, *_ = scene(4, 120, 0.7, generator, plane=1.0)
     kept = torch.rand(4, 120, generator=generator) < 0.8
-    masked = estimate_homography(x1, x2, threshold=1.5, mask=kept, generator=seed())
-    weighted = estimate_homography(x1, x2, threshold=1.5, weights=kept.double(), generator=seed())
+    masked = estimate_homography(x1, x2, threshold=1.5, mask=kept, generator=seeded())
+    weighted = estimate_homography(x1, x2, threshold=1.5, weights=kept.double(), generator=seeded())
     torch.testing.assert_close(masked.model, weighted.model, rtol=1e-5, atol=1e-8)
     twice = torch.ones(4, 120, dtype=torch.float64)
     twice[:, :40] = 2
     double = [torch.cat((x, x[:, :40]), 1) for x in (x1, x2)]
-    first = estimate_homography(x1, x2, threshold=1.5, weights=twice, generator=seed())
-    second = estimate_homography(*double, threshold=1.5, generator=seed())
+    first = estimate_homography(x1, x2, threshold=1.5, weights=twice, generator=seeded())
+    second = estimate_homography(*double, threshold=1.5, generator=seeded())
     torch.testing.assert_close(first.model, second.model, rtol=2e-2, atol=1e-5)
     torch.testing.assert_close(first.score, second.score, rtol=2e-2, atol=0.5)
     y1, y2, bad, _, _ = scene(4, 400, 0.35, generator)
     likely = torch.where(bad, 0.2, 1.0).double()
-    plain = estimate_fundamental(y1, y2, threshold=1.5, generator=seed(), max_iterations=30_000)
-    helped = estimate_fundamental(y1, y2, threshold=1.5, weights=likely, generator=seed(), max_iterations=30_000)
+    plain = estimate_fundamental(y1, y2, threshold=1.5, generator=seeded(), max_iterations=30_000)
+    helped = estimate_fundamental(y1, y2, threshold=1.5, weights=likely, generator=seeded(), max_iterations=30_000)
     assert (helped.status == Status.OK).all()
     assert helped.iterations.double().mean() < 0.1 * plain.iterations.double().mean()
 
@@ -174,7 +171,7 @@ def test_the_model_moves_with_the_weights(generator: torch.Generator) -> None:
     functional = torch.randn(3, 3, 3, generator=generator, dtype=torch.float64)
 
     def solve(w: Tensor) -> Tensor:
-        model = estimate_homography(x1, x2, threshold=2.0, weights=w, generator=seed()).model
+        model = estimate_homography(x1, x2, threshold=2.0, weights=w, generator=seeded()).model
         return (model * functional).sum((-2, -1))
 
     free = weights.clone().requires_grad_()
@@ -190,7 +187,7 @@ def test_the_model_moves_with_the_weights(generator: torch.Generator) -> None:
 def test_a_dominant_plane_does_not_win(generator: torch.Generator) -> None:
     """Nine in ten of the right matches in a plane: found through the others, and reported as good."""
     x1, x2, wrong, R, t = scene(24, 400, 0.8, generator, plane=0.9, noise=0.3)
-    result = estimate_fundamental(x1, x2, threshold=1.0, generator=seed())
+    result = estimate_fundamental(x1, x2, threshold=1.0, generator=seeded())
     error = pose_error(essential_from_fundamental(result.model, K, K), x1, x2, wrong, R, t)
     assert (error < 10).double().mean() > 0.9
     assert error.median() < 2

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import pytest
 import torch
+from chance import seeded
 from scenes import make_scene
 from torch import Tensor
 
@@ -72,7 +73,7 @@ def test_the_derivative_by_logits_is_that_of_the_expectation(hypotheses: int) ->
     for i in range(4):
         rise = exact_expectation(LOGITS + step[i], hypotheses) - exact_expectation(LOGITS - step[i], hypotheses)
         assert abs(float(rise) / 2e-5 - float(slope[i])) < 1e-8
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded()
     values, slopes = [], []
     for _ in range(SEEDS):
         selection = soft_ransac(Mean(), X, logits=logits, hypotheses=hypotheses, generator=generator, **OPTIONS)
@@ -101,9 +102,7 @@ def test_derivatives_by_the_data(kind: type, generator: torch.Generator) -> None
     scene = make_scene(kind, (2,), 20, generator, 1e-3)
 
     def expected(*data: Tensor) -> Tensor:
-        selection = soft_ransac(
-            scene.estimator, *data, threshold=5e-3, hypotheses=4, temperature=0.1, generator=torch.Generator().manual_seed(1)
-        )
+        selection = soft_ransac(scene.estimator, *data, threshold=5e-3, hypotheses=4, temperature=0.1, generator=seeded(1))
         return selection.expectation(scene.error(selection.model, scene.model[:, None, None]))
 
     data = [d.clone().requires_grad_() for d in scene.data]
@@ -119,14 +118,13 @@ def test_a_problem_is_the_same_alone_and_in_a_batch(generator: torch.Generator) 
     scene = make_scene(FundamentalEstimator, (3, 2), 40, generator, 1e-3)
     mask = torch.rand(3, 2, 40, generator=generator) < 0.8
     logits = torch.randn(3, 2, 40, generator=generator, dtype=F64)
-    seed = lambda: torch.Generator().manual_seed(5)  # noqa: E731
     options = {"threshold": 3e-3, "hypotheses": 8}
-    together = soft_ransac(scene.estimator, *scene.data, logits=logits, mask=mask, generator=seed(), **options)
+    together = soft_ransac(scene.estimator, *scene.data, logits=logits, mask=mask, generator=seeded(5), **options)
     assert together.model.shape == (3, 2, 8, 3, 3, 4)
     assert mask[..., None, :].expand(3, 2, 8, 40).gather(-1, together.sample).all()
     for i in range(3):
         own = [d[i, 1] for d in scene.data]
-        alone = soft_ransac(scene.estimator, *own, logits=logits[i, 1], mask=mask[i, 1], generator=seed(), **options)
+        alone = soft_ransac(scene.estimator, *own, logits=logits[i, 1], mask=mask[i, 1], generator=seeded(5), **options)
         assert torch.equal(alone.sample, together.sample[i, 1])
         assert torch.equal(alone.model, together.model[i, 1])
         torch.testing.assert_close(alone.probability, together.probability[i, 1])
@@ -154,15 +152,14 @@ def test_bad_problems_leave_neighbours_alone(generator: torch.Generator) -> None
     mask = torch.ones(6, 30, dtype=torch.bool)
     data = [d.clone() for d in scene.data]
     logits = torch.zeros(6, 30, dtype=F64)
-    seed = lambda: torch.Generator().manual_seed(2)  # noqa: E731
-    reference = soft_ransac(scene.estimator, *data, threshold=3e-3, logits=logits, hypotheses=4, generator=seed())
+    reference = soft_ransac(scene.estimator, *data, threshold=3e-3, logits=logits, hypotheses=4, generator=seeded(2))
     mask[1, 3:] = False
     data[0][2] = torch.nan
     data[0][3], data[1][3] = data[0][3, :1], data[1][3, :1]
     data[1][4, ::2] = torch.inf
     for t in (*data, logits):
         t.requires_grad_()
-    found = soft_ransac(scene.estimator, *data, threshold=3e-3, logits=logits, mask=mask, hypotheses=4, generator=seed())
+    found = soft_ransac(scene.estimator, *data, threshold=3e-3, logits=logits, mask=mask, hypotheses=4, generator=seeded(2))
     assert found.status.tolist() == [Status.OK, Status.TOO_FEW, Status.NOT_FINITE, Status.DEGENERATE, Status.OK, Status.OK]
     assert torch.equal(found.probability[[0, 5]], reference.probability[[0, 5]])
     assert (found.probability[1:4] == 0).all()

@@ -1,6 +1,7 @@
 """Thresholds that are tighter than the noise."""
 
 import torch
+from chance import seeded
 
 from torchsfm import estimate_homography
 
@@ -24,7 +25,7 @@ def test_noise_beyond_the_threshold_is_found(generator: torch.Generator) -> None
     x2[:, 250:] = torch.rand(24, 250, 2, **kind) * 1000
 
     def error(threshold: float) -> torch.Tensor:
-        found = estimate_homography(x1, x2, threshold=threshold, generator=torch.Generator().manual_seed(0))
+        found = estimate_homography(x1, x2, threshold=threshold, generator=seeded())
         return (transfer(found.model, exact) - transfer(H, exact)).norm(dim=-1).mean(-1)
 
     assert error(0.6).median() < 1.3 * error(2.5).median()

@@ -2,15 +2,12 @@
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.geometry import project_points, rotation_from_rotvec
 from torchsfm.triangulation import triangulate_points, triangulate_points_robust
-
-
-def seed() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
 
 
 def ring(v: int, n: int, wrong: float, generator: torch.Generator) -> tuple[Tensor, ...]:
@@ -29,7 +26,7 @@ def ring(v: int, n: int, wrong: float, generator: torch.Generator) -> tuple[Tens
 
 def test_wrong_observations_are_found(generator: torch.Generator) -> None:
     x, P, X, bad = ring(10, 300, 0.3, generator)
-    result = triangulate_points_robust(x, P, threshold=2.5, generator=seed())
+    result = triangulate_points_robust(x, P, threshold=2.5, generator=seeded())
     enough = (~bad).sum(0) >= 4
     assert (result.status[enough] == Status.OK).all()
     assert ((result.inliers == ~bad)[:, enough].double().mean()) > 0.98
@@ -41,7 +38,7 @@ def test_wrong_observations_are_found(generator: torch.Generator) -> None:
 
 def test_clean_tracks_are_those_of_least_squares(generator: torch.Generator) -> None:
     x, P, _, _ = ring(5, 50, 0.0, generator)
-    result = triangulate_points_robust(x, P, threshold=5.0, generator=seed())
+    result = triangulate_points_robust(x, P, threshold=5.0, generator=seeded())
     assert result.inliers.all()
     plain = triangulate_points(x, P)
     for name in ("model", "covariance", "parallax", "error"):
@@ -52,9 +49,9 @@ def test_clean_tracks_are_those_of_least_squares(generator: torch.Generator) -> 
 
 def test_scale_and_sign_of_cameras_do_not_matter(generator: torch.Generator) -> None:
     x, P, _, _ = ring(6, 40, 0.2, generator)
-    plain = triangulate_points_robust(x, P, threshold=2.5, generator=seed())
+    plain = triangulate_points_robust(x, P, threshold=2.5, generator=seeded())
     factor = torch.tensor([-2.0, 0.1, 5, -1, 1, 30], dtype=torch.float64)[:, None, None]
-    other = triangulate_points_robust(x, P * factor, threshold=2.5, generator=seed())
+    other = triangulate_points_robust(x, P * factor, threshold=2.5, generator=seeded())
     assert torch.equal(plain.inliers, other.inliers)
     torch.testing.assert_close(plain.model, other.model)
 
@@ -68,8 +65,8 @@ def test_ragged_tracks_with_cameras_of_their_own(generator: torch.Generator) -> 
     visible[2:, 2] = False
     visible[:2, 2] = True
     xs, Ps, seen = x.transpose(0, 1)[:, :, None], P.expand(12, 8, 3, 4), visible.mT[..., None]
-    packed = triangulate_points_robust(xs, Ps, threshold=2.5, visible=seen, generator=seed())
-    plain = triangulate_points_robust(x, P, threshold=2.5, visible=visible, generator=seed())
+    packed = triangulate_points_robust(xs, Ps, threshold=2.5, visible=seen, generator=seeded())
+    plain = triangulate_points_robust(x, P, threshold=2.5, visible=visible, generator=seeded())
     assert packed.inliers.shape == (12, 8, 1)
     assert torch.equal(packed.inliers[..., 0].mT, plain.inliers)
     assert torch.equal(packed.status[:, 0], plain.status)
@@ -77,7 +74,7 @@ def test_ragged_tracks_with_cameras_of_their_own(generator: torch.Generator) -> 
     assert plain.status[:2].tolist() == [Status.TOO_FEW] * 2
     assert not (plain.inliers & ~visible).any()
     for i in range(2, 12):
-        alone = triangulate_points_robust(x[:, i : i + 1], P, threshold=2.5, visible=visible[:, i : i + 1], generator=seed())
+        alone = triangulate_points_robust(x[:, i : i + 1], P, threshold=2.5, visible=visible[:, i : i + 1], generator=seeded())
         assert torch.equal(alone.inliers[:, 0], plain.inliers[:, i])
 
 
@@ -86,7 +83,7 @@ def test_bad_values_stay_where_they_are(generator: torch.Generator) -> None:
     x[:, 3] = torch.nan
     x[2, 5] = torch.inf
     x[1, 7, 0] = torch.nan
-    result = triangulate_points_robust(x, P, threshold=2.5, generator=seed())
+    result = triangulate_points_robust(x, P, threshold=2.5, generator=seeded())
     assert result.status[3] == Status.NOT_FINITE
     assert torch.isfinite(result.model).all()
     rest = torch.arange(20) != 3
@@ -97,13 +94,13 @@ def test_bad_values_stay_where_they_are(generator: torch.Generator) -> None:
 
 def test_one_camera_alone_is_degenerate(generator: torch.Generator) -> None:
     x, P, _, _ = ring(2, 10, 0.0, generator)
-    result = triangulate_points_robust(x[:1].expand(2, 10, 2), P[:1].expand(2, 3, 4), threshold=2.5, generator=seed())
+    result = triangulate_points_robust(x[:1].expand(2, 10, 2), P[:1].expand(2, 3, 4), threshold=2.5, generator=seeded())
     assert (result.status == Status.DEGENERATE).all()
 
 
 def test_nonsense_has_no_consensus(generator: torch.Generator) -> None:
     x, P, _, _ = ring(6, 60, 1.0, generator)
-    result = triangulate_points_robust(x, P, threshold=2.5, generator=seed())
+    result = triangulate_points_robust(x, P, threshold=2.5, generator=seeded())
     assert (result.status == Status.NO_CONSENSUS).double().mean() > 0.9
     lost = result.status != Status.OK
     for value in (result.covariance, result.parallax, result.error):

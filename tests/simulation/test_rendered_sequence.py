@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 from torch.nn import functional
 
@@ -18,22 +19,18 @@ from torchsfm.simulation.textured_scene import texture_surface
 WIDTH, HEIGHT, VIEWS = 160, 120, 4
 
 
-def seed(n: int) -> torch.Generator:
-    return torch.Generator().manual_seed(n)
-
-
 def vector(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
 def scene() -> TexturedScene:
-    return courtyard_scene(texel=0.02, generator=seed(1))
+    return courtyard_scene(texel=0.02, generator=seeded(1))
 
 
 @pytest.fixture(scope="module")
 def rendered(scene: TexturedScene) -> RenderedSequence:
-    return render_sequence(scene, views=VIEWS, width=WIDTH, height=HEIGHT, noise=0.0, points=1500, generator=seed(2))
+    return render_sequence(scene, views=VIEWS, width=WIDTH, height=HEIGHT, noise=0.0, points=1500, generator=seeded(2))
 
 
 def sample(image: Tensor, x: Tensor) -> Tensor:
@@ -100,13 +97,13 @@ def test_a_point_has_one_colour_in_all_views(rendered: RenderedSequence) -> None
 def plane_pair(camera: Camera, shift: Tensor, supersample: int = 3) -> tuple[Tensor, Tensor, Tensor]:
     """Two views of a wall: the first image, the second one read where the truth says, and where that is possible."""
     wall = Rectangle(vector(-4.0, 4.0, 0.0), vector(8.0, 0.0, 0.0), vector(0.0, -8.0, 0.0))
-    textured = texture_surface(wall, "plaster", texel=0.01, generator=seed(3))
+    textured = texture_surface(wall, "plaster", texel=0.01, generator=seeded(3))
     scene = TexturedScene((textured,), vector(0.3, 0.2, 1.0))
     up = vector(0.0, 1.0, 0.0)
     centres = torch.stack((vector(0.2, -0.1, 3.0), vector(0.2, -0.1, 3.0) + shift))
     poses = look_at(centres, vector(0.1, 0.05, 0.0), up)
     r = render_sequence(
-        scene, poses=poses, camera=camera, width=240, height=180, noise=0.0, supersample=supersample, generator=seed(4)
+        scene, poses=poses, camera=camera, width=240, height=180, noise=0.0, supersample=supersample, generator=seeded(4)
     )
     y, x = torch.meshgrid(torch.arange(180.0), torch.arange(240.0), indexing="ij")
     d, valid = camera.unproject(torch.stack((x, y), -1).reshape(-1, 2).double())
@@ -143,16 +140,16 @@ def test_a_wall_has_the_depth_of_a_plane() -> None:
         Rectangle(vector(-5.0, -5.0, 2.0), vector(10.0, 0.0, 0.0), vector(0.0, 10.0, 0.0)), "mosaic", texel=0.1
     )
     pose = Pose.identity(1, dtype=torch.float64)
-    r = render_sequence(TexturedScene((wall,), vector(0.0, 0.0, -1.0)), poses=pose, width=64, height=48, generator=seed(0))
+    r = render_sequence(TexturedScene((wall,), vector(0.0, 0.0, -1.0)), poses=pose, width=64, height=48, generator=seeded())
     assert torch.allclose(r.depth, torch.full_like(r.depth, 2.0), rtol=1e-6)
 
 
 def test_a_ball_has_its_depth_and_size() -> None:
-    ball = texture_surface(Sphere(vector(0.0, 0.0, 5.0), 1.0), "marble", texel=0.05, generator=seed(0))
+    ball = texture_surface(Sphere(vector(0.0, 0.0, 5.0), 1.0), "marble", texel=0.05, generator=seeded())
     camera = Camera(intrinsics(vector(100.0)[0], vector(40.0, 40.0)))
     r = render_sequence(
         TexturedScene((ball,), vector(0.0, 0.0, -1.0)), poses=Pose.identity(1, dtype=torch.float64), camera=camera,
-        width=81, height=81, generator=seed(0),
+        width=81, height=81, generator=seeded(),
     )  # fmt: skip
     assert float(r.depth[0, 40, 40]) == pytest.approx(4.0, abs=1e-5)
     # The silhouette is the cone of half angle asin(1/5).
@@ -165,8 +162,8 @@ def test_images_are_not_aliased(scene: TexturedScene) -> None:
     poses = orbit_poses(2, radius=5.2, height=(0.8, 2.0), sweep=0.5, start=-0.9, target=(0.0, 0.0, 0.7))
     small_K = intrinsics(vector(110.0)[0], vector(59.5, 44.5))
     large_K = intrinsics(vector(440.0)[0], vector(4 * 60 - 0.5, 4 * 45 - 0.5))
-    small = render_sequence(scene, poses=poses, camera=Camera(small_K), width=120, height=90, noise=0.0, generator=seed(0))
-    large = render_sequence(scene, poses=poses, camera=Camera(large_K), width=480, height=360, noise=0.0, generator=seed(0))
+    small = render_sequence(scene, poses=poses, camera=Camera(small_K), width=120, height=90, noise=0.0, generator=seeded())
+    large = render_sequence(scene, poses=poses, camera=Camera(large_K), width=480, height=360, noise=0.0, generator=seeded())
     average = functional.avg_pool2d(large.images, 4)
     error = (small.images - average).square().mean().sqrt()
     picked = (large.images[:, :, 1::4, 1::4] - average).square().mean().sqrt()
@@ -175,19 +172,19 @@ def test_images_are_not_aliased(scene: TexturedScene) -> None:
 
 
 def test_the_same_generator_gives_the_same_images(scene: TexturedScene) -> None:
-    first, again, other = (render_sequence(scene, views=2, width=80, height=60, generator=seed(s)) for s in (5, 5, 6))
+    first, again, other = (render_sequence(scene, views=2, width=80, height=60, generator=seeded(s)) for s in (5, 5, 6))
     for name in ("images", "depth", "X", "x", "color"):
         assert torch.equal(getattr(first, name), getattr(again, name))
     assert not torch.equal(first.images, other.images)
     assert torch.equal(first.depth, other.depth)
     assert not torch.equal(
-        courtyard_scene(texel=0.1, generator=seed(0)).objects[0].sheets[0][0], scene.objects[0].sheets[0][-1]
+        courtyard_scene(texel=0.1, generator=seeded()).objects[0].sheets[0][0], scene.objects[0].sheets[0][-1]
     )
 
 
 def test_noise_has_the_deviation_asked_for(scene: TexturedScene) -> None:
     clean, noisy = (
-        render_sequence(scene, views=1, width=80, height=60, noise=n, generator=seed(5)).images for n in (0.0, 0.05)
+        render_sequence(scene, views=1, width=80, height=60, noise=n, generator=seeded(5)).images for n in (0.0, 0.05)
     )
     bright = (clean > 0.35) & (clean < 0.65)
     assert float((noisy - clean)[bright].std()) == pytest.approx(0.05 * math.sqrt(0.75), rel=0.05)
@@ -196,7 +193,7 @@ def test_noise_has_the_deviation_asked_for(scene: TexturedScene) -> None:
 def test_pixels_no_ray_reaches_are_black(scene: TexturedScene) -> None:
     # With k1 = -0.5 the image of the valid rays ends at a radius of 0.54 f.
     camera = Camera(intrinsics(vector(60.0)[0], vector(39.5, 29.5)), Radial(vector(-0.5)[0], vector(0.0)[0]))
-    r = render_sequence(scene, views=1, camera=camera, width=80, height=60, noise=0.0, generator=seed(5))
+    r = render_sequence(scene, views=1, camera=camera, width=80, height=60, noise=0.0, generator=seeded(5))
     assert (r.images[0, :, 0, 0] == 0).all()
     assert int(r.surface[0, 0, 0]) == -1
     assert int(r.surface[0, 30, 40]) >= 0
@@ -205,7 +202,7 @@ def test_pixels_no_ray_reaches_are_black(scene: TexturedScene) -> None:
 
 def test_one_camera_for_each_view(scene: TexturedScene, rendered: RenderedSequence) -> None:
     each = render_sequence(
-        scene, poses=rendered.poses, camera=rendered.cameras, width=WIDTH, height=HEIGHT, noise=0.0, generator=seed(2)
+        scene, poses=rendered.poses, camera=rendered.cameras, width=WIDTH, height=HEIGHT, noise=0.0, generator=seeded(2)
     )
     assert torch.equal(each.images, rendered.images)
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry.cameras import Camera, intrinsics, project_points
@@ -14,12 +15,8 @@ from torchsfm.simulation import look_at, orbit_poses, random_intrinsics, random_
 SIZE = (1000, 750)
 
 
-def seed(n: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(n)
-
-
 def problem(*batch: int, views: int = 3, n: int = 200) -> tuple[Tensor, Pose, Camera]:
-    g = seed(1)
+    g = seeded(1)
     X = random_points(*batch, n, generator=g)
     poses = random_poses(*batch, views, generator=g)
     return X, poses, Camera(random_intrinsics(*batch, views, image_size=SIZE, generator=g))
@@ -28,7 +25,7 @@ def problem(*batch: int, views: int = 3, n: int = 200) -> tuple[Tensor, Pose, Ca
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3), (0,)])
 def test_exact_projections_in_any_batch(batch: tuple[int, ...]) -> None:
     X, poses, cameras = problem(*batch)
-    seen = simulate_images(X, poses, cameras, image_size=SIZE, generator=seed())
+    seen = simulate_images(X, poses, cameras, image_size=SIZE, generator=seeded())
     assert seen.x.shape == (*batch, 3, 200, 2)
     assert seen.visible.shape == seen.outlier.shape == seen.depth.shape == (*batch, 3, 200)
     expected = project_points(cameras.K @ poses.matrix(), X[..., None, :, :])
@@ -40,11 +37,11 @@ def test_exact_projections_in_any_batch(batch: tuple[int, ...]) -> None:
 
 def test_one_camera_and_one_cloud_serve_all() -> None:
     X, _, _ = problem()
-    poses = random_poses(4, 3, generator=seed(2))
+    poses = random_poses(4, 3, generator=seeded(2))
     camera = Camera(intrinsics(torch.tensor(800.0, dtype=torch.float64), torch.tensor([500.0, 375.0], dtype=torch.float64)))
-    seen = simulate_images(X, poses, camera, image_size=SIZE, generator=seed())
+    seen = simulate_images(X, poses, camera, image_size=SIZE, generator=seeded())
     assert seen.x.shape == (4, 3, 200, 2)
-    single = simulate_images(X, poses[1], camera, image_size=SIZE, generator=seed())
+    single = simulate_images(X, poses[1], camera, image_size=SIZE, generator=seeded())
     assert torch.equal(seen.x_true[1], single.x_true)
     assert torch.equal(seen.visible[1], single.visible)
 
@@ -52,7 +49,7 @@ def test_one_camera_and_one_cloud_serve_all() -> None:
 def test_field_of_view_and_depth_limits() -> None:
     X, poses, cameras = problem(n=3000)
     X = 3 * X
-    seen = simulate_images(X, poses, cameras, image_size=SIZE, depth_range=(2.0, 5.0), generator=seed())
+    seen = simulate_images(X, poses, cameras, image_size=SIZE, depth_range=(2.0, 5.0), generator=seeded())
     x, z = seen.x_true, seen.depth
     inside = (x[..., 0] >= -0.5) & (x[..., 0] < 999.5) & (x[..., 1] >= -0.5) & (x[..., 1] < 749.5)
     assert torch.equal(seen.visible, inside & (z > 2) & (z <= 5))
@@ -77,8 +74,8 @@ def test_points_beyond_the_fold_of_the_lens_are_not_seen() -> None:
 
 def test_noise_outliers_and_dropout_have_their_rates() -> None:
     X, poses, cameras = problem(20, n=1000)
-    everything = simulate_images(X, poses, cameras, image_size=SIZE, generator=seed()).visible
-    seen = simulate_images(X, poses, cameras, image_size=SIZE, noise=0.7, outliers=0.3, dropout=0.2, generator=seed())
+    everything = simulate_images(X, poses, cameras, image_size=SIZE, generator=seeded()).visible
+    seen = simulate_images(X, poses, cameras, image_size=SIZE, noise=0.7, outliers=0.3, dropout=0.2, generator=seeded())
     kept = seen.visible.sum() / everything.sum()
     assert float(kept) == pytest.approx(0.8, abs=0.01)
     assert not (seen.visible & ~everything).any()
@@ -96,7 +93,7 @@ def test_noise_outliers_and_dropout_have_their_rates() -> None:
 
 def test_outliers_without_an_image_size_stay_among_the_points() -> None:
     X, poses, cameras = problem(2)
-    seen = simulate_images(X, poses, cameras, outliers=1.0, generator=seed())
+    seen = simulate_images(X, poses, cameras, outliers=1.0, generator=seeded())
     assert seen.outlier.all()
     for i in range(2):
         for j in range(3):
@@ -106,10 +103,10 @@ def test_outliers_without_an_image_size_stay_among_the_points() -> None:
 
 def test_a_broken_problem_leaves_its_neighbours_alone() -> None:
     X, poses, cameras = problem(3)
-    good = simulate_images(X, poses, cameras, image_size=SIZE, noise=1.0, outliers=0.2, generator=seed())
+    good = simulate_images(X, poses, cameras, image_size=SIZE, noise=1.0, outliers=0.2, generator=seeded())
     broken = X.clone()
     broken[1, 5] = float("nan")
-    bad = simulate_images(broken, poses, cameras, image_size=SIZE, noise=1.0, outliers=0.2, generator=seed())
+    bad = simulate_images(broken, poses, cameras, image_size=SIZE, noise=1.0, outliers=0.2, generator=seeded())
     assert not bad.visible[1, :, 5].any()
     assert torch.isfinite(bad.x).all()
     assert torch.equal(bad.x[::2], good.x[::2])
@@ -120,7 +117,7 @@ def test_a_broken_problem_leaves_its_neighbours_alone() -> None:
 def test_derivatives_reach_the_points() -> None:
     X, poses, cameras = problem(n=4)
     X.requires_grad_()
-    simulate_images(X, poses, cameras, noise=1.0, generator=seed()).x.sum().backward()
+    simulate_images(X, poses, cameras, noise=1.0, generator=seeded()).x.sum().backward()
     assert X.grad is not None
     assert torch.isfinite(X.grad).all()
     assert (X.grad != 0).any()
@@ -128,7 +125,9 @@ def test_derivatives_reach_the_points() -> None:
 
 def test_the_same_generator_gives_the_same_answer() -> None:
     X, poses, cameras = problem()
-    first, again, other = (simulate_images(X, poses, cameras, noise=1.0, outliers=0.2, generator=seed(s)).x for s in (3, 3, 4))
+    first, again, other = (
+        simulate_images(X, poses, cameras, noise=1.0, outliers=0.2, generator=seeded(s)).x for s in (3, 3, 4)
+    )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -157,7 +156,7 @@ def test_wrong_arguments(unchecked: None) -> None:
 
 @pytest.mark.parametrize("kind", ["ball", "cube", "plane", "line", "gauss"])
 def test_random_points_fill_their_shape(kind: str) -> None:
-    X = random_points(4, 20000, kind=kind, size=2.0, generator=seed())
+    X = random_points(4, 20000, kind=kind, size=2.0, generator=seeded())
     assert X.shape == (4, 20000, 3)
     used = {"plane": 2, "line": 1}.get(kind, 3)
     assert (X[..., used:] == 0).all()
@@ -167,7 +166,7 @@ def test_random_points_fill_their_shape(kind: str) -> None:
 
 
 def test_look_at_puts_the_target_ahead_and_up_above() -> None:
-    g = seed()
+    g = seeded()
     centre, target = (torch.randn(50, 3, generator=g, dtype=torch.float64) for _ in range(2))
     pose = look_at(centre, target)
     assert torch.allclose(pose.centre, centre)
@@ -202,7 +201,7 @@ def test_orbit_stays_on_its_cylinder() -> None:
 
 
 def test_random_poses_face_the_origin_from_their_cap() -> None:
-    poses = random_poses(5, 400, distance=(4.0, 6.0), spread=0.5, wobble=0.0, generator=seed())
+    poses = random_poses(5, 400, distance=(4.0, 6.0), spread=0.5, wobble=0.0, generator=seeded())
     assert poses.shape == (5, 400)
     distance = poses.centre.norm(dim=-1)
     assert 4 <= float(distance.min()) < 4.1
@@ -215,7 +214,7 @@ def test_random_poses_face_the_origin_from_their_cap() -> None:
 
 
 def test_random_intrinsics_have_the_angle_of_view() -> None:
-    K = random_intrinsics(2000, image_size=SIZE, view_angle=(0.8, 1.0), wobble=0.02, generator=seed())
+    K = random_intrinsics(2000, image_size=SIZE, view_angle=(0.8, 1.0), wobble=0.02, generator=seeded())
     angle = 2 * torch.atan(500 / K[:, 0, 0])
     assert 0.8 <= float(angle.min()) < 0.81
     assert 0.99 < float(angle.max()) <= 1.0
