@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 TYPES = {
@@ -75,7 +76,7 @@ def write_ply(
     for name, records in elements:
         header.append(f"element {name} {len(records)}")
         header += [f"property {words[records.dtype[field].str]} {field}" for field in records.dtype.names or ()]
-    with Path(path).open("wb") as file:
+    with whole_file(path) as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
         for _, records in elements:
             file.write(records.tobytes())

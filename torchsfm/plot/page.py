@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchsfm.images import read_image, save_image
 from torchsfm.plot.framing import frame
+from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Report
 
@@ -74,7 +75,9 @@ def write_page(
     page = template.substitute(title=html.escape(title), data=text, script=script)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page, encoding="utf-8")
+    with whole_file(path) as file:
+        # A file name that is not UTF-8 has no characters of its own.
+        file.write(page.encode("utf-8", "backslashreplace"))
     return path
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, Similarity
-from torchsfm.reconstruction.stages import load_arrays
+from torchsfm.reconstruction.files import load_arrays, whole_file
 
 
 @dataclass(frozen=True)
@@ -140,11 +140,11 @@ class Reconstruction:
             "names": np.array(self.names, dtype=np.str_),
             "camera_model": np.array(model),
             "camera_K": self.cameras.K.detach().cpu().numpy(),
-            "camera_distortion": distortion.parameters().detach().cpu().numpy().reshape(count, -1),
+            "camera_distortion": distortion.parameters().detach().cpu().numpy().reshape(count, distortion.num_parameters),
             "pose_R": self.poses.R.detach().cpu().numpy(),
             "pose_t": self.poses.t.detach().cpu().numpy(),
         }
-        with Path(path).open("wb") as file:
+        with whole_file(path) as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
     @classmethod
@@ -152,22 +152,73 @@ class Reconstruction:
         """Read what `save` wrote.
 
         Raises:
-            ValueError: The file is not a saved reconstruction.
-            FileNotFoundError: There is no such file.
+            ValueError: The file is not a saved reconstruction, or a damaged one: arrays missing or of other shapes, indices out
+                of range, cameras that are not finite. One line that says which.
+            OSError: It cannot be read.
         """
         try:
             arrays = load_arrays(Path(path))
-            tensors = {
-                f.name: torch.from_numpy(arrays[f.name]) for f in fields(cls) if f.name not in ("names", "cameras", "poses")
-            }
-            K = torch.from_numpy(arrays["camera_K"])
-            parameters = torch.from_numpy(arrays["camera_distortion"])
-            distortion = DISTORTION_MODELS[str(arrays["camera_model"])].from_parameters(parameters)
-            return cls(
-                names=tuple(str(name) for name in arrays["names"]),
-                cameras=Camera(K, distortion),
-                poses=Pose(torch.from_numpy(arrays["pose_R"]), torch.from_numpy(arrays["pose_t"])),
-                **tensors,
-            )
-        except (KeyError, ValueError) as error:
-            raise ValueError(f"{path} is not a saved reconstruction ({error})") from error
+            _check(arrays)
+        except ValueError as error:
+            raise ValueError(f"{path} is not a saved reconstruction ({error})") from None
+        tensors = {name: torch.from_numpy(arrays[name]) for name in LAYOUT if name not in ("names", "camera_model")}
+        distortion = DISTORTION_MODELS[str(arrays["camera_model"])].from_parameters(tensors.pop("camera_distortion"))
+        return cls(
+            names=tuple(arrays["names"].tolist()),
+            cameras=Camera(tensors.pop("camera_K"), distortion),
+            poses=Pose(tensors.pop("pose_R"), tensors.pop("pose_t")),
+            **tensors,
+        )
+
+
+LAYOUT = {
+    "names": ("v", "text"),
+    "image_size": ("v 2", "integers"),
+    "camera_model": ("", "text"),
+    "camera_K": ("c 3 3", "numbers"),
+    "camera_distortion": ("c p", "numbers"),
+    "camera_index": ("v", "integers"),
+    "pose_R": ("v 3 3", "numbers"),
+    "pose_t": ("v 3", "numbers"),
+    "registered": ("v", "yes or no"),
+    "X": ("n 3", "numbers"),
+    "color": ("n 3", "numbers"),
+    "x": ("m 2", "numbers"),
+    "view": ("m", "integers"),
+    "point": ("m", "integers"),
+}
+"""The arrays of a saved model: shape, where a letter is the same number everywhere, and contents."""
+KINDS = {"text": "U", "integers": "i", "numbers": "f", "yes or no": "b"}
+
+
+def _check(arrays: dict[str, NDArray[Any]]) -> None:
+    """See that arrays make a model.
+
+    Raises:
+        ValueError: One is missing, has the wrong shape or type, is not finite where it must be, or points at what is not there.
+    """
+    sizes: dict[str, int] = {}
+    for name, (shape, kind) in LAYOUT.items():
+        if name not in arrays:
+            raise ValueError(f"it has no array '{name}'")
+        array = arrays[name]
+        words = shape.split()
+        pairs = zip(words, array.shape, strict=False)
+        wanted = [int(word) if word.isdigit() else sizes.setdefault(word, size) for word, size in pairs]
+        if array.ndim != len(words) or list(array.shape) != wanted:
+            raise ValueError(f"{name}: wanted shape ({shape}){f' with {sizes}' if sizes else ''}, got {array.shape}")
+        if array.dtype.kind != KINDS[kind]:
+            raise ValueError(f"{name}: wanted {kind}, got {array.dtype}")
+        if kind == "numbers" and name != "color" and array.size and array.dtype != arrays["camera_K"].dtype:
+            raise ValueError(f"{name}: wanted {arrays['camera_K'].dtype} as camera_K has, got {array.dtype}")
+    model = DISTORTION_MODELS.get(str(arrays["camera_model"]))
+    if model is None or model.num_parameters != sizes["p"]:
+        raise ValueError(f"camera_model: there is no {str(arrays['camera_model'])[:40]!r} with {sizes['p']} parameters")
+    for name, limit in (("camera_index", sizes["c"]), ("view", sizes["v"]), ("point", sizes["n"])):
+        bad = (arrays[name] < 0) | (arrays[name] >= limit)
+        if bad.any():
+            raise ValueError(f"{name}: there is no number {arrays[name][bad][0]} among {limit}")
+    for name in ("camera_K", "camera_distortion", "pose_R", "pose_t"):
+        rows = arrays[name][arrays["registered"]] if name.startswith("pose") else arrays[name]
+        if not np.isfinite(rows).all():
+            raise ValueError(f"{name}: not finite")

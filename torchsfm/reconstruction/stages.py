@@ -2,10 +2,7 @@
 
 import hashlib
 import json
-import os
 import time
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+
+from torchsfm.reconstruction.files import load_arrays, whole_file
 
 Arrays = dict[str, Tensor]
 
@@ -77,12 +75,9 @@ class Stages:
         if path is None:
             return
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Written beside and renamed, so that no half file is ever found under the name.
-        partial = path.with_suffix(".partial")
         content: dict[str, Any] = {key: value.numpy() for key, value in arrays.items()}
-        with partial.open("wb") as file:
+        with whole_file(path) as file:
             np.savez(file, allow_pickle=False, fingerprint=np.array(self.fingerprint), **content)
-        os.replace(partial, path)
 
 
 @contextmanager
@@ -97,21 +92,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(count)
-
-
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` file, none of them pickled.
-
-    Raises:
-        ValueError: The file is no such archive, or a damaged one.
-    """
-    # NumPy leaves the file open when the archive is damaged; opened here it is closed.
-    with path.open("rb") as stream:
-        try:
-            with np.load(stream, allow_pickle=False) as file:
-                return {key: file[key] for key in file.files}
-        except (zipfile.BadZipFile, EOFError, KeyError, AttributeError, zlib.error) as error:
-            raise ValueError(str(error) or type(error).__name__) from error
 
 
 def fingerprint(files: list[Path], options: dict[str, Any]) -> str:
