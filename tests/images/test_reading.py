@@ -11,7 +11,7 @@ from chance import seeded
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchsfm.images import Exif, ImageError, list_images, parse_exif, read_image, save_image, scale_image
+from torchsfm.images import Exif, ImageError, list_images, list_skipped, parse_exif, read_image, save_image, scale_image
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
 
 MAKE, MODEL, ORIENTATION, EXIF_OFFSET = 0x010F, 0x0110, 0x0112, 0x8769
@@ -348,3 +348,22 @@ def test_scale_image() -> None:
     assert scaled[1].tolist() == [[0, 0], [0, 0]]
     assert scale_image(images[0], low=2.0, high=4.0).tolist() == [[0, 0], [0.5, 1]]
     assert scale_image(images[:0]).shape == (0, 2, 2)
+
+
+def test_what_may_have_been_meant_is_listed(tmp_path: Path) -> None:
+    for name in ("b.HEIC", "a.jpg", "notes.txt", ".c.heic", "film.MP4", "raw.cr2", "old.gif"):
+        (tmp_path / name).write_bytes(b"x")
+    for name in ("more", "empty", "folder.jpg"):
+        (tmp_path / name).mkdir()
+    for name in ("more/d.jpg", "more/e.heic", "more/notes.txt", "folder.jpg/f.png"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere")
+    found = {path.name: reason for path, reason in list_skipped(tmp_path)}
+    assert list(found) == ["b.HEIC", "film.MP4", "folder.jpg", "gone.jpg", "more", "old.gif", "raw.cr2"]
+    assert "JPEG" in found["b.HEIC"]
+    assert "video" in found["film.MP4"]
+    assert "2 pictures" in found["more"]
+    assert found["gone.jpg"] == "not a file"
+    assert [path.name for path in list_images(tmp_path)] == ["a.jpg"]
+    with pytest.raises(ImageError, match="no such folder"):
+        list_skipped(tmp_path / "missing")

@@ -4,8 +4,9 @@ from torchsfm.images.corners import Corners, detect_corners
 from torchsfm.images.exif import Exif, parse_exif
 from torchsfm.images.features import Features, detect_features
 from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
+from torchsfm.images.listing import list_images, list_skipped
 from torchsfm.images.matching import match_descriptors, match_features
-from torchsfm.images.reading import ImageError, Photograph, list_images, read_image, save_image, scale_image
+from torchsfm.images.reading import ImageError, Photograph, read_image, save_image, scale_image
 from torchsfm.images.retrieval import describe_images, retrieve_pairs
 from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_sequence
 
@@ -23,6 +24,7 @@ __all__ = [
     "detect_corners",
     "detect_features",
     "list_images",
+    "list_skipped",
     "load_detector",
     "load_matcher",
     "match_descriptors",

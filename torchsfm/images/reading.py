@@ -1,7 +1,6 @@
 """Image files to tensors and back."""
 
 import os
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,6 @@ from torch import Tensor
 
 from torchsfm.images.exif import parse_exif
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
-
-SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".pbm", ".pnm", ".bmp", ".tif", ".tiff", ".webp")
-"""The file names that `list_images` takes for images."""
 
 _TURNS: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
     1: lambda a: a,
@@ -61,27 +57,6 @@ class Photograph:
     def height(self) -> int:
         """Rows of this image."""
         return int(self.pixels.shape[-2])
-
-
-def list_images(folder: str | os.PathLike[str]) -> list[Path]:
-    """The image files in a folder (not in its subfolders), in natural order: `view2.jpg` before `view10.jpg`.
-
-    Raises:
-        ImageError: There is no such folder, or it cannot be read.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ImageError(f"{folder}: no such folder" if not folder.exists() else f"{folder}: not a folder")
-    try:
-        found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
-    except OSError as error:
-        raise ImageError(f"{folder}: cannot be read ({error.strerror or error})") from None
-    return sorted((path for path in found if path.is_file()), key=_natural)
-
-
-def _natural(path: Path) -> tuple[list[tuple[int, int, str]], str]:
-    pieces = re.split(r"(\d+)", path.name.lower())
-    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in pieces if p], path.name
 
 
 def read_image(path: str | os.PathLike[str], *, gray: bool = False, max_size: int | None = None) -> Photograph:

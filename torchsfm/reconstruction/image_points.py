@@ -1,5 +1,7 @@
 """The image points of all photographs: read each file, detect features, keep what the later stages need."""
 
+import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,18 +22,30 @@ class ImagePoints:
     """The readable images, what their files say of the camera, and the features of each."""
 
     files: tuple[Path, ...]
+    names: tuple[str, ...]
     image_size: Int[Tensor, "v 2"]
     labels: tuple[str, ...]
     focal: tuple[float | None, ...]
     failures: dict[str, str]
-    """Why the other files could not be read."""
+    """Why the other files could not be read, by name."""
     features: tuple[Features, ...]
     color: tuple[Tensor, ...]
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """File names without folders."""
-        return tuple(path.name for path in self.files)
+
+def image_names(files: Sequence[Path]) -> list[str]:
+    """A name for each file, no two the same: without its folder, or where that is not enough from the common folder on.
+
+    Raises:
+        ReconstructionError: A file is given twice.
+    """
+    names = [path.name for path in files]
+    if len(set(names)) < len(names):
+        full = [os.path.abspath(path) for path in files]
+        if len(set(full)) < len(full):
+            twice = next(path for i, path in enumerate(full) if path in full[:i])
+            raise ReconstructionError(f"{twice}: given twice")
+        names = [os.path.relpath(path, os.path.commonpath(full)) for path in full]
+    return names
 
 
 def detect_all(files: list[Path], max_features: int, progress: Progress) -> Arrays:
@@ -67,7 +81,7 @@ def _pack(found: list[Found | str]) -> Arrays:
     """One table of features of all readable images, and a record per file."""
     good = [entry for entry in found if not isinstance(entry, str)]
     records = [entry if isinstance(entry, str) else _label(entry[0]) for entry in found]
-    text = "\0".join(records).encode()
+    text = "\0".join(records).encode("utf-8", "surrogateescape")
     return {
         "readable": torch.tensor([not isinstance(entry, str) for entry in found]),
         "records": torch.frombuffer(bytearray(text or b"\0"), dtype=torch.uint8),
@@ -86,15 +100,15 @@ def _label(photo: Photograph) -> str:
     return "|".join([photo.make, photo.model, focal]).replace("\0", "")
 
 
-def unpack(saved: Arrays, files: list[Path]) -> ImagePoints:
-    """What `detect_all` found.
+def unpack(saved: Arrays, files: Sequence[Path], names: Sequence[str]) -> ImagePoints:
+    """What `detect_all` found in files to be known under these names.
 
     Raises:
         ReconstructionError: Fewer than two files could be read.
     """
-    records = bytes(saved["records"].numpy()).decode().split("\0")
+    records = bytes(saved["records"].numpy()).decode("utf-8", "surrogateescape").split("\0")
     readable = saved["readable"].tolist()
-    failures = {path.name: record for path, record, ok in zip(files, records, readable, strict=True) if not ok}
+    failures = {name: record for name, record, ok in zip(names, records, readable, strict=True) if not ok}
     if sum(readable) < 2:
         worst = next(iter(failures.values()))
         raise ReconstructionError(f"{sum(readable)} of {len(files)} files can be read as images; first failure: {worst}")
@@ -102,6 +116,7 @@ def unpack(saved: Arrays, files: list[Path]) -> ImagePoints:
     x, descriptors, color = (torch.split(saved[key], counts) for key in ("x", "descriptors", "color"))
     return ImagePoints(
         files=tuple(path for path, ok in zip(files, readable, strict=True) if ok),
+        names=tuple(name for name, ok in zip(names, readable, strict=True) if ok),
         image_size=saved["size"],
         labels=tuple(record for record, ok in zip(records, readable, strict=True) if ok),
         focal=tuple(f or None for f in saved["focal"].tolist()),

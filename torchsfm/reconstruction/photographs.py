@@ -1,6 +1,7 @@
 """The main job: photographs in, cameras and points out."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -9,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
-from torchsfm.images import ImageError, list_images, match_features, retrieve_pairs
-from torchsfm.reconstruction.image_points import ImagePoints, detect_all, unpack
+from torchsfm.images import ImageError, list_images, list_skipped, match_features, retrieve_pairs
+from torchsfm.reconstruction.image_points import ImagePoints, detect_all, image_names, unpack
 from torchsfm.reconstruction.models import METHODS, build_models
-from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
+from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult, describe_skipped
 from torchsfm.reconstruction.sequence import add_corners, sequence_pairs, track_corners
 from torchsfm.reconstruction.stages import Arrays, Stages, fingerprint, one_thread
 from torchsfm.reconstruction.view_graph import ViewGraph, verify_pairs
@@ -79,21 +80,22 @@ def reconstruct(
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
     report = progress or (lambda stage, done, total: None)
-    files = _files(images)
+    files, skipped = _files(images)
+    names = image_names(files)
     model = camera or ("pinhole" if K is not None else "radial")
     # What is saved depends on these alone; cameras and models are made from it each time.
     options = {"sequence": sequence, "features": max_features, "neighbours": neighbours}
     stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
     generator = torch.Generator().manual_seed(seed)
-    points = unpack(stages.run("features", lambda: detect_all(files, max_features, report)), files)
+    points = unpack(stages.run("features", lambda: detect_all(files, max_features, report)), files, names)
     graph = _view_graph(points, stages, report, generator, sequence=sequence, neighbours=neighbours)
-    return build_models(
+    result = build_models(
         graph,
         None,
         labels=points.labels,
         exif_focal=points.focal,
         failures=points.failures,
-        order=[path.name for path in files],
+        order=names,
         camera=model,
         shared_camera=shared_camera,
         K=K,
@@ -103,20 +105,28 @@ def reconstruct(
         stages=stages,
         progress=report,
     )
+    return replace(result, report=replace(result.report, skipped=tuple(skipped)))
 
 
-def _files(images: str | Path | Sequence[str | Path]) -> list[Path]:
+def _files(images: str | Path | Sequence[str | Path]) -> tuple[list[Path], list[tuple[str, str]]]:
+    """The image files, and what was passed over in their folder, with the reason."""
+    skipped: list[tuple[str, str]] = []
     try:
-        files = list_images(images) if isinstance(images, str | Path) else [Path(path) for path in images]
+        if isinstance(images, str | Path):
+            files = list_images(images)
+            skipped = [(path.name, reason) for path, reason in list_skipped(images)]
+        else:
+            files = [Path(path) for path in images]
     except ImageError as error:
         raise ReconstructionError(str(error)) from None
     if not files:
-        raise ReconstructionError(f"{images}: no images in this folder")
+        others = "".join(f"; not read: {text}" for text in describe_skipped(skipped))
+        raise ReconstructionError(f"{images}: no images in this folder{others}")
     if len(files) == 1:
         raise ReconstructionError(f"{files[0]}: one image is not enough, two views are the least")
     if missing := [path for path in files if not path.is_file()]:
         raise ReconstructionError(f"{missing[0]}: no such file")
-    return files
+    return files, skipped
 
 
 def _view_graph(

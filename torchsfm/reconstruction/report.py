@@ -1,6 +1,6 @@
 """What happened to each image and each pair on the way to the models."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +16,14 @@ Progress = Callable[[str, int, int], None]
 
 class ReconstructionError(ValueError):
     """The input cannot be used; the message is one line for people."""
+
+
+def printable(text: str) -> str:
+    """Text in one line that every terminal and file can hold; what cannot be shown is spelt as in a Python string.
+
+    File names may hold line breaks, commands to the terminal, and bytes that are no characters.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,7 @@ class Report:
         focal_source: Where each camera's first focal length came from: "given", "exif", "autocalibration", "fundamental
             matrices" or "default".
         autocalibration: For each set of images that was autocalibrated what was assumed, found and determined, or why not.
+        skipped: Files and folders in the input folder that may hold photographs but were passed over, each with the reason.
     """
 
     images: tuple[ImageReport, ...]
@@ -61,6 +70,7 @@ class Report:
     seconds: dict[str, float]
     focal_source: tuple[str, ...] = ()
     autocalibration: tuple[str, ...] = ()
+    skipped: tuple[tuple[str, str], ...] = ()
 
     def summary(self) -> str:
         """A few lines for people."""
@@ -72,9 +82,22 @@ class Report:
         if self.focal_source:
             lines.append("focal length first from: " + ", ".join(sorted(set(self.focal_source))))
         lines += [f"autocalibration: {text}" for text in self.autocalibration]
-        lines += [f"not registered: {image.name} ({image.reason})" for image in self.images if image.model is None]
+        for image in self.images:
+            if image.model is None:
+                lines.append(printable(f"not registered: {image.name} ({image.reason})"))
+        lines += [f"not read: {text}" for text in describe_skipped(self.skipped)]
         lines.append("seconds: " + ", ".join(f"{stage} {time:.1f}" for stage, time in self.seconds.items()))
         return "\n".join(lines)
+
+
+def describe_skipped(skipped: Sequence[tuple[str, str]]) -> list[str]:
+    """One line for each reason: how many, the first names."""
+    lines = []
+    for reason in dict.fromkeys(reason for _, reason in skipped):
+        names = [name for name, why in skipped if why == reason]
+        listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        lines.append(printable(f"{listed} ({reason})"))
+    return lines
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,14 @@
 """The report of a reconstruction as plain data for programs, and as a page of text for people."""
 
+import html
+import re
 from typing import Any
 
 import torch
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import ImageReport, SfmResult
+from torchsfm.reconstruction.report import ImageReport, SfmResult, printable
 from torchsfm.reconstruction.view_graph import Verdict
 
 Record = dict[str, Any]
@@ -27,7 +29,7 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         **more: Further entries, such as the options of the run; `truth` is a dict that `report_markdown` shows as a table.
 
     Returns:
-        `models`, `images`, `pairs`, `seconds`, `focal_source` and the further entries.
+        `models`, `images`, `pairs`, `seconds`, `focal_source`, `autocalibration`, `skipped` and the further entries.
     """
     report = result.report
     observed: dict[str, tuple[int, float]] = {}
@@ -60,6 +62,7 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         "seconds": {stage: round(value, 3) for stage, value in report.seconds.items()},
         "focal_source": list(report.focal_source),
         "autocalibration": list(report.autocalibration),
+        "skipped": [{"name": name, "reason": reason} for name, reason in report.skipped],
         **more,
     }
 
@@ -69,7 +72,7 @@ def report_markdown(record: Record) -> str:
     lines = ["# Reconstruction", ""]
     lines += _models_text(record)
     if texts := record.get("autocalibration"):
-        lines += ["## Autocalibration", "", *(f"- {text}" for text in texts), ""]
+        lines += ["## Autocalibration", "", *(f"- {_escape(text)}" for text in texts), ""]
     if truth := record.get("truth"):
         lines += ["## Against the truth", "", *_table(["", ""], [[key, value] for key, value in truth.items()]), ""]
     lines += ["## Images", ""]
@@ -86,6 +89,8 @@ def report_markdown(record: Record) -> str:
         for image in record["images"]
     ]
     lines += _table(["image", "registered", "model", "features", "observations", "mean error, px", "reason"], rows)
+    if skipped := record.get("skipped"):
+        lines += ["", "Not read:", "", *_table(["name", "reason"], [[entry["name"], entry["reason"]] for entry in skipped])]
     related = [pair for pair in record["pairs"] if pair["verdict"] != "unrelated"]
     lines += ["", "## Pairs", ""]
     lines += [f"{len(record['pairs'])} pairs were compared, {len(record['pairs']) - len(related)} have too little in common."]
@@ -139,7 +144,7 @@ def _model_record(model: Reconstruction) -> Record:
 
 def _models_text(record: Record) -> list[str]:
     if not record["models"]:
-        return [f"Nothing could be reconstructed: {record.get('failure', 'see the images below')}.", ""]
+        return [f"Nothing could be reconstructed: {_escape(record.get('failure', 'see the images below'))}.", ""]
     lines: list[str] = []
     total = len(record["images"])
     for number, model in enumerate(record["models"]):
@@ -161,8 +166,17 @@ def _models_text(record: Record) -> list[str]:
     return lines
 
 
+MARKUP = re.compile(r"[\\`*~|$\[\]]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
+"""What markdown could take for more than a character; it does not so take underscores within words."""
+
+
+def _escape(value: object) -> str:
+    """Text that a markdown page shows as it is, in one line."""
+    return MARKUP.sub(r"\\\g<0>", html.escape(printable(str(value)), quote=False))
+
+
 def _table(header: list[str], rows: list[list[Any]]) -> list[str]:
     def line(cells: list[Any]) -> str:
-        return "| " + " | ".join(str(cell).replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+        return "| " + " | ".join(map(_escape, cells)) + " |"
 
     return [line(header), "|" + "---|" * len(header), *map(line, rows)]
