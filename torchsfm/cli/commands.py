@@ -1,6 +1,8 @@
 """The commands and their options."""
 
+import sys
 from enum import StrEnum
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -8,17 +10,20 @@ import torch
 import typer
 
 from torchsfm.cli.bundle import bundle
-from torchsfm.cli.inputs import prepare_folder, read_intrinsics, warn_about_intrinsics
+from torchsfm.cli.inputs import photograph_folder, read_intrinsics, warn_about_intrinsics
 from torchsfm.cli.job import Job, UserError, told
+from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.results import VERSION, compare, finish
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import printable
 from torchsfm.simulation import render_sequence
 
 app = typer.Typer(
     name="torchsfm",
     help="From photographs to calibrated cameras and 3D structure.",
-    epilog="Exit status: 0 all good, 1 nothing could be reconstructed, 2 wrong input or usage, 130 interrupted.",
+    epilog="Exit status: 0 all good, 1 nothing could be reconstructed, 2 wrong input or usage, or a file that cannot be read or"
+    " written (results of an earlier run then stay as they were), 130 interrupted.",
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -61,6 +66,10 @@ def options(
     ] = False,
 ) -> None:
     """From photographs to calibrated cameras and 3D structure."""
+    for stream in (sys.stdout, sys.stderr):
+        # Names of folders may hold what the terminal's encoding does not.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 @app.command()
@@ -99,8 +108,7 @@ def reconstruct(
     threads: Threads = None,
 ) -> None:
     """Turn photographs into calibrated cameras and coloured 3D points."""
-    with told(Job(out)) as job:
-        prepare_folder(out)
+    with told(Job(out)) as job, output_folder(out):
         K = None if intrinsics is None else read_intrinsics(intrinsics)
         source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
         result = job.run(
@@ -109,8 +117,7 @@ def reconstruct(
         )  # fmt: skip
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
-        folders = {path.parent for path in images} if isinstance(source, list) else {source}
-        finish(job, result, folders.pop() if len(folders) == 1 else None, {})
+        finish(job, result, photograph_folder(images), {})
 
 
 @app.command()
@@ -122,10 +129,9 @@ def demo(
     threads: Threads = None,
 ) -> None:
     """Photograph a synthetic scene, reconstruct it knowing nothing, and compare with the truth."""
-    with told(Job(out)) as job:
-        prepare_folder(out)
+    with told(Job(out)) as job, output_folder(out):
         folder = out / "images"
-        prepare_folder(folder)
+        folder.mkdir(exist_ok=True)
         job.set_threads(threads)
         generator = torch.Generator().manual_seed(seed)
         # One image at a time would show progress, but the rays are shared by all of them.
@@ -150,6 +156,9 @@ def info(
     with told(Job(folder)):
         if not folder.exists():
             raise UserError(f"{folder}: no such folder")
+        if unfinished(folder):
+            with output_folder(folder):
+                finish_replacing(folder)
         files = sorted(folder.glob("model*.npz"), key=lambda path: (len(path.name), path.name)) if folder.is_dir() else [folder]
         if not files:
             raise UserError(f"{folder}: holds no model (no model.npz)")
@@ -161,9 +170,10 @@ def info(
             typer.echo(f"{file}\n{model.summary()}\n")
             counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
             errors = model.view_errors().tolist()
-            width = max(len("image"), *(len(name) for name in model.names))
+            names = [printable(name) for name in model.names]
+            width = max(map(len, ("image", *names)))
             typer.echo(f"{'image':<{width}}  observations  mean error, px")
-            for name, registered, count, mean in zip(model.names, model.registered.tolist(), counts, errors, strict=True):
+            for name, registered, count, mean in zip(names, model.registered.tolist(), counts, errors, strict=True):
                 typer.echo(f"{name:<{width}}  " + (f"{count:>12}  {mean:>14.3f}" if registered else "not registered"))
             typer.echo("")
 

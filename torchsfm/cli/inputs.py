@@ -1,6 +1,6 @@
-"""What the user gives: a folder to write to, and a file with known intrinsics."""
+"""What the user gives: photographs, and a file with known intrinsics."""
 
-import tempfile
+import os
 from pathlib import Path
 
 import torch
@@ -12,14 +12,15 @@ from torchsfm.cli.job import UserError
 from torchsfm.reconstruction import Reconstruction
 
 
-def prepare_folder(folder: Path) -> None:
-    """Make the folder and see that it can be written, before any work is done for it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written ({error.strerror or error})") from None
+def photograph_folder(images: list[Path]) -> Path | None:
+    """The folder in which images lie under their names in the model; None where they do not lie together."""
+    if len(images) == 1 and not images[0].is_file():
+        return images[0]
+    if len({path.name for path in images}) < len(images):
+        # Then the names begin at the common folder.
+        return Path(os.path.commonpath([path.absolute() for path in images]))
+    folders = {path.parent for path in images}
+    return folders.pop() if len(folders) == 1 else None
 
 
 def read_intrinsics(path: Path) -> Float[Tensor, "3 3"]:

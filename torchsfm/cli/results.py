@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 import shlex
 import sys
 from collections.abc import Callable
@@ -16,14 +15,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.cli.job import NOTHING, Job
+from torchsfm.cli.output import replacing_results
 from torchsfm.formats import write_colmap, write_ply
 from torchsfm.geometry import Pose
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import Reconstruction, SfmResult
 from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_rmse
+from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 
-OWN_FILES = re.compile(r"page\.html|(model|points)(-\d+)?\.(npz|ply)")
 VERSION = metadata.version("torchsfm")
 
 
@@ -51,7 +51,7 @@ def compare(model: Reconstruction, poses_true: Pose, K_true: Float[Tensor, "v 3 
 
 
 def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, str]) -> None:
-    """Write everything there is to `job.out`, and say in a few lines what came out and where to look.
+    """Write everything there is to `job.out`, all or nothing, and say in a few lines what came out and where to look.
 
     Args:
         job: The run.
@@ -62,10 +62,11 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
     more: dict[str, Any] = {"version": VERSION, "command": shlex.join(sys.argv[1:])}
     if not result.models:
         more["failure"] = result.failure()
-    written = write_models(job, result, folder)
-    record = report_record(result, peak_memory_mb=peak_memory(), truth=truth, **more)
-    (job.out / "report.json").write_text(json.dumps(record, indent=1))
-    (job.out / "report.md").write_text(report_markdown(record))
+    with replacing_results(job.out) as out:
+        written = write_models(job, result, folder, out)
+        record = report_record(result, peak_memory_mb=peak_memory(), truth=truth, **more)
+        texts = {"report.json": json.dumps(record, indent=1), "report.md": report_markdown(record)}
+        write_whole_files({out / name: text.encode() for name, text in texts.items()})
     job.close()
     for i, model in enumerate(result.models):
         typer.echo(("" if len(result.models) == 1 else f"model {i}: ") + model.summary())
@@ -79,17 +80,13 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
         raise typer.Exit(NOTHING)
 
 
-def write_models(job: Job, result: SfmResult, folder: Path | None) -> list[tuple[str, str]]:
+def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path) -> list[tuple[str, str]]:
     """Write the page of all models, and each model in all formats whose packages are there; return what to look at."""
-    for path in list(job.out.iterdir()):
-        # What an earlier run wrote would pass for results of this one.
-        if OWN_FILES.fullmatch(path.name):
-            path.unlink()
     if not result.models:
         return []
     total = 1 + 3 * len(result.models)
     job.progress("write", 0, total)
-    write_page(result.models, job.out / "page.html", report=result.report, images=folder)
+    write_page(result.models, out / "page.html", report=result.report, images=folder)
     written = [("page.html", "open it in a browser and turn the model with the mouse")]
     formats: list[tuple[str, str, Callable[[Reconstruction, Path], Any], str]] = [
         ("model", ".npz", Reconstruction.save, "the model, for Reconstruction.load and torchsfm info"),
@@ -101,7 +98,7 @@ def write_models(job: Job, result: SfmResult, folder: Path | None) -> list[tuple
             job.progress("write", 1 + 3 * i + k, total)
             name = f"{stem}{suffix}" if i == 0 else f"{stem}-{i}{suffix}"
             try:
-                write(model, job.out / name)
+                write(model, out / name)
             except ImportError as error:
                 if i == 0:
                     written.append((name, f"not written: the package {error.name} is not installed"))
