@@ -27,7 +27,7 @@ ALLOWED: dict[str, set[str]] = {
         "triangulation", "resection", "motion", "autocalibration", "bundle",
     },
     "formats": {"geometry", "reconstruction"},
-    "plot": {"geometry", "tensors", "images", "reconstruction"},
+    "plot": {"linalg", "geometry", "tensors", "images", "reconstruction"},
 }  # fmt: skip
 FREE = {"__init__", "cli", "__main__"}
 LAZY = {"kornia", "cv2", "matplotlib", "pycolmap"}
@@ -38,6 +38,14 @@ OWNERS = {
     "matplotlib": {"plot"},
     "pycolmap": {"formats"},
 }
+
+HARMLESS = {
+    "vector_norm", "matrix_norm", "norm", "cross", "vecdot", "det", "solve_triangular", "lu_solve",
+    "cholesky_ex", "inv_ex", "lu_factor_ex", "solve_ex",
+}  # fmt: skip
+"""What of `torch.linalg` never raises over the values of its data, and treats each matrix by itself."""
+METHODS = {"svd", "qr", "pinverse", "lu", "cholesky", "eig", "lstsq"}
+"""Decompositions that are functions of `torch` and methods of tensors too."""
 
 
 def room_of(path: Path) -> str:
@@ -80,6 +88,35 @@ def test_slow_packages_stay_in_their_rooms(path: Path) -> None:
     top_level = ast.Module(body=[n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], type_ignores=[])
     eager = {name.split(".")[0] for name in imported_modules(top_level)} & LAZY
     assert not eager, f"import {sorted(eager)} inside the functions that use them"
+
+
+def linalg_names(tree: ast.AST) -> set[str]:
+    """What a module takes from `torch.linalg`, by whatever name."""
+    modules = {"torch"}
+    aliases = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            modules |= {alias.asname for alias in node.names if alias.name == "torch" and alias.asname}
+            assert not any(alias.name.startswith("torch.linalg") for alias in node.names), "write torch.linalg.name"
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module != "torch.linalg", "write torch.linalg.name"
+            assert node.module != "torch" or all(alias.name != "linalg" for alias in node.names), "write torch.linalg.name"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "linalg":
+            owner = node.value.value
+            if isinstance(owner, ast.Name) and owner.id in modules:
+                aliases.add(node.attr)
+    return aliases
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_decompositions_are_guarded(path: Path) -> None:
+    if room_of(path) == "linalg":
+        return
+    tree = ast.parse(path.read_text())
+    taken = linalg_names(tree) - HARMLESS
+    taken |= METHODS & {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    assert not taken, f"{sorted(taken)} may raise for the whole batch: take it from torchsfm.linalg"
 
 
 def test_the_table_has_no_cycle() -> None:

@@ -13,7 +13,7 @@ from torchsfm.autocalibration.intrinsics_model import Assumption
 from torchsfm.autocalibration.projective_input import PreparedCameras
 from torchsfm.autocalibration.upgrade_fit import UpgradeProblem, fit_information, fit_upgrade
 from torchsfm.autocalibration.upgrade_residual import metric_blocks
-from torchsfm.linalg import determinant_3x3
+from torchsfm.linalg import determinant_3x3, eigh
 
 STARTS, FINALISTS = 8, 3
 """Places of the grid that are refined with each view weighed by itself, and of those the ones refined with all of it."""
@@ -99,7 +99,7 @@ def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumptio
     birge = (chi2 / redundancy.clamp_min(1)).clamp_min(1)
     information = fit_information(problem, unknowns, p)
     on_unknowns = _schur(information, q)
-    values, vectors = torch.linalg.eigh(on_unknowns)
+    values, vectors, _ = eigh(on_unknowns)
     values = values.clamp_min(0)
     expected = torch.diag_embed(precision[:, 0].square())
     tiny = 1e-12 * torch.eye(q, dtype=values.dtype, device=values.device)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors, tensor_map
 from torchsfm.geometry import Camera, Distortion, Pose, Radial
-from torchsfm.linalg import cross, nearest_rotation, null_vector
+from torchsfm.linalg import cross, eigvalsh, nearest_rotation, null_vector
 from torchsfm.motion import homography_dlt
 from torchsfm.optim import levenberg_marquardt, rotation_exponential
 
@@ -230,7 +230,7 @@ def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
     w = seen.to(X.dtype)[..., None]
     mean = (X[..., None, :, :] * w).sum(-2, keepdim=True) / w.sum(-2, keepdim=True).clamp_min(1)
     D = (X[..., None, :, :] - mean) * w
-    values = torch.linalg.eigvalsh(D.mT @ D)
+    values, _ = eigvalsh(D.mT @ D)
     spans: Tensor = values[..., 0] > 1e-10 * values[..., 1].clamp_min(1e-300)
     return spans
 

@@ -131,7 +131,7 @@ def intrinsics_from_modulus(
     s = 1 / max(image_size)
     c = [(image_size[0] - 1) / 2, (image_size[1] - 1) / 2]
     T = H.new_tensor([[s, 0, -s * c[0]], [0, s, -s * c[1]], [0, 0, 1]])
-    pixels = torch.linalg.inv(T) @ H @ T
+    pixels = torch.linalg.solve_ex(T, H @ T).result
     turning = intrinsics_from_rotations(pixels[:, 1:], image_size=image_size, weights=ready.good[:, 1:], assume=assume)
     pairs = ready.good.sum(-1)
     status = torch.where(pairs * (pairs - 1) / 2 < 4, int(Status.TOO_FEW), turning.status).to(torch.int8)

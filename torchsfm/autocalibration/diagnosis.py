@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.geometry import rotvec_from_rotation
+from torchsfm.linalg import eigh
 
 SMALL_ANGLE = 0.03
 """Angle in radians below which a rotation, or its part off the common axis, counts as none."""
@@ -126,5 +127,5 @@ def diagnose_motion(
 def _axes(rows: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
     """Mean squares along the principal axes of rows, ascending, and the axes as columns."""
     moments = torch.nan_to_num(rows.mT @ rows / number[..., None], 0.0, 0.0, 0.0)
-    values, vectors = torch.linalg.eigh(moments)
+    values, vectors, _ = eigh(moments)
     return values, vectors

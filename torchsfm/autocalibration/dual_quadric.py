@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.autocalibration.projective_input import image_scaling
-from torchsfm.linalg import null_vector
+from torchsfm.linalg import eigh, null_vector, svdvals
 
 _PAIRS = tuple((i, j) for i in range(4) for j in range(i, 4))
 SIGMA = {"aspect": 0.1, "skew": 0.01, "principal_point": 0.05, "focal": 3.0}
@@ -112,13 +112,13 @@ def dual_quadric_linear(
         q, _ = null_vector(torch.nn.functional.pad(whole, (0, 0, 0, 10)))
         size = (corner * q[..., None, :]).sum(-1).abs()
         scale = size.clamp_min(1e-3 * size.amax(-1, keepdim=True)).clamp_min(1e-300)
-    values = torch.linalg.svdvals(torch.nn.functional.pad(torch.nan_to_num(whole), (0, 0, 0, 10)))
+    values, _ = svdvals(torch.nn.functional.pad(whole, (0, 0, 0, 10)))
     gap = values[..., -1] / values[..., -2].clamp_min(1e-300)
     i, j = torch.tensor(_PAIRS, device=P.device).unbind(-1)
     Q = q.new_zeros(*batch, 4, 4)
     Q[..., i, j] = q
     Q[..., j, i] = q
-    spectrum, axes = torch.linalg.eigh(Q)
+    spectrum, axes, _ = eigh(Q)
     flip = (spectrum[..., 0] + spectrum[..., -1] < 0)[..., None]
     spectrum = torch.where(flip, -spectrum.flip(-1), spectrum)
     axes = torch.where(flip[..., None], axes.flip(-1), axes)

@@ -16,6 +16,7 @@ from torchsfm._types import check_tensors, tensor_map
 from torchsfm.autocalibration.algebraic_fit import IntrinsicsEstimate, check_shared, fit_intrinsics, focal_starts, scaled
 from torchsfm.autocalibration.intrinsics_model import CONSTANT, Assumption
 from torchsfm.autocalibration.projective_input import image_scaling
+from torchsfm.linalg import svd
 
 
 def intrinsics_from_kruppa(
@@ -50,7 +51,7 @@ def intrinsics_from_kruppa(
     good = torch.isfinite(flat).flatten(-2).all(-1) & (flat != 0).flatten(-2).any(-1) & torch.isfinite(w) & (w > 0)
     size = flat.new_tensor(image_size).expand(len(flat), 2)
     safe = torch.where(good[..., None, None], flat, torch.eye(3, dtype=flat.dtype, device=flat.device))
-    U, s, Vh = torch.linalg.svd(scaled(safe, image_scaling(size), inverse_left=False))
+    U, s, Vh, _ = svd(scaled(safe, image_scaling(size), inverse_left=False))
     s = s / s[..., :1].clamp_min(1e-300)
     left = U[..., :2].mT
     right = s[..., :2, None] * Vh[..., :2, :]

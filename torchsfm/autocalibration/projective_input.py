@@ -9,6 +9,7 @@ from torch import Tensor
 from torchsfm.autocalibration.camera_information import camera_information, covariance_in_frame
 from torchsfm.autocalibration.orientation import orient_projective
 from torchsfm.geometry import camera_centre
+from torchsfm.linalg import svdvals
 
 MAX_COUPLED = 120
 """Beyond this many views the covariance between different cameras is left out: it grows with the square of their number."""
@@ -162,7 +163,8 @@ def _frame(P: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     left, info = torch.linalg.inv_ex(gram)
     regular = (info == 0) & torch.isfinite(left).flatten(1).all(-1)
     left = torch.where(regular[:, None, None], left, torch.eye(3, dtype=P.dtype, device=P.device))
-    regular = regular & (torch.linalg.cond(gram) < 1e20)
+    values, _ = svdvals(gram)
+    regular = regular & (values[:, 0] < 1e20 * values[:, -1])
     pseudo = first.mT @ left
     c = camera_centre(first, homogeneous=True)
     A, a = P @ pseudo[:, None], (P @ c[:, None, :, None])[..., 0]

@@ -11,6 +11,7 @@ from torchsfm._types import Status, check_tensors
 from torchsfm.bundle.blocks import check_index
 from torchsfm.bundle.projection import NEAREST
 from torchsfm.geometry import normalize_sphere
+from torchsfm.linalg import eigh, inverse, svdvals
 from torchsfm.optim import Block, Loss, Term, UnitSphere, sparse_levenberg_marquardt
 from torchsfm.optim.sparse_derivative import Hessian
 
@@ -99,7 +100,8 @@ def bundle_adjust_projective(
         image, scale = _image_frames(x.double(), view, P.shape[0])
         observed = X.detach().double()[torch.unique(point)]
         space = _space_frame(observed)
-    cameras = normalize_sphere((image @ P.double() @ torch.linalg.inv(space)).flatten(1))
+        (image_back, _), (space_back, _) = inverse(image), inverse(space)
+    cameras = normalize_sphere((image @ P.double() @ space_back).flatten(1))
     points = normalize_sphere(X.double() @ space.mT)
     # Vectors that are no cameras or points become NaN again, so that their observations are left out.
     cameras = torch.where(_is_vector(P.flatten(1)), cameras, torch.nan)
@@ -122,10 +124,10 @@ def bundle_adjust_projective(
     )
     used = result.used[0]
     distance = torch.linalg.vector_norm(result.residuals[0], dim=-1)
-    back = torch.linalg.inv(image) @ result.x["camera"].reshape(-1, 3, 4) @ space
+    back = image_back @ result.x["camera"].reshape(-1, 3, 4) @ space
     return ProjectiveBundleResult(
         _keep(P, back, (cameras != result.x["camera"]).any(-1), fixed_cameras),
-        _keep(X, result.x["point"] @ torch.linalg.inv(space).mT, (points != result.x["point"]).any(-1), fixed_points),
+        _keep(X, result.x["point"] @ space_back.mT, (points != result.x["point"]).any(-1), fixed_points),
         result.cost,
         result.initial_cost,
         torch.where(used, distance, torch.inf).to(X.dtype),
@@ -204,14 +206,15 @@ def _space_frame(X: Tensor) -> Tensor:
     for _ in range(20):
         moved = normalize_sphere(X @ H.mT)
         moment = 4 * (moved.mT @ moved) / max(len(X), 1)
-        values, vectors = torch.linalg.eigh(moment)
+        values, vectors, _ = eigh(moment)
         step = vectors @ torch.diag(values.clamp_min(1e-6).rsqrt()) @ vectors.mT
         H = step @ H
         H = H / torch.linalg.matrix_norm(H)
         if bool((moment - eye).abs().max() < 1e-2):
             break
     # Planes, lines and points of data would squeeze what they do not span without end.
-    return H if bool(torch.linalg.cond(H) < 1e12) else eye
+    values, _ = svdvals(H)
+    return H if bool(values[0] < 1e12 * values[-1]) else eye
 
 
 def _keep(before: Tensor, after: Tensor, moved: Tensor, fixed: Tensor | None) -> Tensor:

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm.linalg import eigh
+
 
 def line_and_plane_distances(
     X: Float[Tensor, "*batch n d"], present: Bool[Tensor, "*batch n"], steps: int = 4
@@ -29,7 +31,7 @@ def line_and_plane_distances(
             total = weights.sum(-1).clamp(min=1e-300)[..., None, None]
             centre = (weights[..., None, :] @ X) / total
             Y = X - centre
-            _, vectors = torch.linalg.eigh((Y * weights[..., None]).mT @ Y / total)
+            _, vectors, _ = eigh((Y * weights[..., None]).mT @ Y / total)
             # The axes across: eigenvalues ascend.
             across = Y @ vectors[..., : X.shape[-1] - axes]
             distance = (across * across).sum(-1).sqrt()

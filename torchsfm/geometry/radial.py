@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import broadcast_shapes
-from torchsfm.linalg import solve_cubic
+from torchsfm.linalg import eigvals, solve_cubic
 
 GUARDED = 3
 """Newton steps that narrow a bracket around the root; then the rest converges by itself on all but contrived functions."""
@@ -95,7 +95,8 @@ def first_fold(coefficients: Sequence[Tensor]) -> Tensor:
         else:
             companion = torch.diag_embed(c.new_ones(count - 1), offset=-1).expand(*c.shape, count).clone()
             companion[..., 0, :] = -c
-            values = torch.linalg.eigvals(companion)
+            values, ok = eigvals(companion)
+            finite = finite & ok
             # A double root comes out as a pair with an imaginary part of half the digits: there the slope touches zero.
             real = values.imag.abs() <= 1e-7 * values.real.abs()
             w = torch.where(real, values.real, 0.0).amax(-1)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import check_tensors
 from torchsfm.geometry.homogeneous import finite_or_zero, normalizing_similarity, to_homogeneous
+from torchsfm.linalg import eigh, qr, svdvals
 
 _ROUNDS = 200
 """Fixed-point steps for the balanced frame; a few dozen do for points that are not nearly on a line."""
@@ -53,7 +54,7 @@ def affine_shape(
     """
     check_tensors(x=(x, f"n>={x.shape[-1] + 1} d"), depths=(depths, "n"))
     with torch.no_grad():
-        basis: Tensor = torch.linalg.qr(_weighted(x, depths), mode="complete")[0]
+        basis, _, _ = qr(_weighted(x, depths), complete=True)
     return basis[..., x.shape[-1] + 1 :]
 
 
@@ -76,7 +77,7 @@ def normalize_shape(
     check_tensors(x=(x, f"n>={x.shape[-1] + 1} d"), depths=(depths, "n"))
     moved = normalizing_similarity(x.detach(), None if depths is None else depths.detach().abs())
     h = _weighted(x, depths) @ moved.mT
-    basis, R = torch.linalg.qr(h)
+    basis, R, _ = qr(h)
     eye = torch.eye(R.shape[-1], dtype=x.dtype, device=x.device)
     pivots = R.diagonal(dim1=-2, dim2=-1).detach().abs()
     spans = pivots > 64 * torch.finfo(x.dtype).eps * pivots.amax(-1, keepdim=True).clamp_min(torch.finfo(x.dtype).tiny)
@@ -102,10 +103,10 @@ def principal_angles(A: Float[Tensor, "*#batch n p"], B: Float[Tensor, "*#batch 
     check_tensors(A=(A, "n p"), B=(B, "n q"))
     if A.shape[-1] > B.shape[-1]:
         A, B = B, A
-    A, B = (torch.linalg.qr(finite_or_zero(M))[0] for M in (A, B))
+    A, B = (qr(finite_or_zero(M))[0] for M in (A, B))
     # cos: singular values of B'A, descending. sin: of what B leaves of A, descending.
-    cosine = torch.linalg.svdvals(B.mT @ A).flip(-1).clamp(max=1)
-    sine = torch.linalg.svdvals(A - B @ (B.mT @ A)).clamp(max=1)
+    cosine = svdvals(B.mT @ A)[0].flip(-1).clamp(max=1)
+    sine = svdvals(A - B @ (B.mT @ A))[0].clamp(max=1)
     return torch.where(sine < 0.5**0.5, torch.arcsin(sine), torch.arccos(cosine))
 
 
@@ -142,7 +143,7 @@ def balanced_frame(
         tolerance = 64 * torch.finfo(x.dtype).eps
         for _ in range(_ROUNDS):
             a = torch.nn.functional.normalize(h @ frame.mT, dim=-1)
-            values, vectors = torch.linalg.eigh((a * w[..., None]).mT @ a)
+            values, vectors, _ = eigh((a * w[..., None]).mT @ a)
             step = (vectors * values.clamp(min=1e-3).rsqrt()[..., None, :]) @ vectors.mT
             frame = torch.where(done[..., None, None], frame, step @ frame)
             frame = frame / torch.linalg.matrix_norm(frame)[..., None, None]

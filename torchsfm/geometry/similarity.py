@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry.poses import Pose
-from torchsfm.linalg import nearest_rotation
+from torchsfm.linalg import nearest_rotation, svdvals
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def similarity_from_points(
     scale = (R * covariance).sum((-2, -1)) / torch.where(spread, variance, 1.0)
     scale = torch.where(spread & (scale > 0), scale, 1.0)
     t = y_mean.squeeze(-2) - scale[..., None] * (R @ x_mean.mT).squeeze(-1)
-    singular = torch.linalg.svdvals(covariance.detach())
+    singular, _ = svdvals(covariance.detach())
     degenerate = ~(singular[..., 1] > 64 * torch.finfo(X.dtype).eps * singular[..., 0])
     status = torch.where(degenerate, int(Status.DEGENERATE), int(Status.OK))
     status = torch.where(used.squeeze(-1).sum(-1) < 3, int(Status.TOO_FEW), status).to(torch.int8)

@@ -1,7 +1,8 @@
-"""Numbers without geometry: null spaces, roots of polynomials, small systems, nearest matrices."""
+"""Numbers without geometry: decompositions that never raise, null spaces, roots of polynomials, nearest matrices."""
 
 from torchsfm.linalg.compilation import compile_kernels
-from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3, solve
+from torchsfm.linalg.decompositions import eigh, eigvals, eigvalsh, inverse, qr, solve, svd, svdvals, triangular_factor
+from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3
 from torchsfm.linalg.nullspace import null_vector, nullspace_rows, orthonormal_nullspace
 from torchsfm.linalg.polynomial import companion_roots, evaluate, solve_cubic, solve_quadratic
 from torchsfm.linalg.projections import nearest_psd, nearest_rank, nearest_rotation
@@ -14,16 +15,24 @@ __all__ = [
     "compile_kernels",
     "cross",
     "determinant_3x3",
+    "eigh",
+    "eigvals",
+    "eigvalsh",
     "evaluate",
+    "inverse",
     "nearest_psd",
     "nearest_rank",
     "nearest_rotation",
     "null_vector",
     "nullspace_rows",
     "orthonormal_nullspace",
+    "qr",
     "real_roots",
     "solve",
     "solve_cubic",
     "solve_quadratic",
     "solve_quartic",
+    "svd",
+    "svdvals",
+    "triangular_factor",
 ]

@@ -1,7 +1,7 @@
-"""Small linear systems: determinants, inverses and solutions that stay finite whatever comes in."""
+"""Small linear systems by formulas: determinants, adjugates, least squares."""
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg.rows import combine_rows
@@ -24,27 +24,6 @@ def adjugate_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not."""
     r0, r1, r2 = A.unbind(-2)
     return torch.stack((cross(r1, r2), cross(r2, r0), cross(r0, r1)), -1)
-
-
-def solve(
-    A: Float[Tensor, "*#batch n n"], b: Float[Tensor, "*#batch n k"]
-) -> tuple[Float[Tensor, "*batch n k"], Bool[Tensor, "*batch"]]:
-    """Solve `A x = b` for every element of the batch on its own.
-
-    Args:
-        A: Square matrices.
-        b: Right-hand sides as columns.
-
-    Returns:
-        The solutions, zero where there is none, and the mask of elements that have one: a matrix that LU finds singular, or
-        an input or result that is not finite, makes an element False and touches no other.
-    """
-    if b.ndim < A.ndim:
-        # One dimension less, and torch may take columns for a batch of vectors: a 4x4 matrix for four systems of four, say.
-        b = b.expand(*A.shape[:-2], *b.shape[-2:])
-    x, info = torch.linalg.solve_ex(A, b)
-    good = (info == 0) & torch.isfinite(x).all(-1).all(-1)
-    return torch.where(good[..., None, None], x, 0.0), good
 
 
 def least_squares_rows(J: Float[Tensor, "m k batch"], r: Float[Tensor, "m batch"]) -> Float[Tensor, "k batch"]:

@@ -4,13 +4,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.linalg.decompositions import eigh, qr, unit_scale
 from torchsfm.linalg.rows import combine_rows
 
 
 def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
     """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose."""
     m = A.shape[-2]
-    Q: Tensor = torch.linalg.qr(A.mT, mode="complete")[0]
+    Q, _, _ = qr(A.mT, complete=True)
     return Q[..., m:]
 
 
@@ -108,9 +109,11 @@ def null_vector(
     """
     finite = torch.isfinite(A).all(-1).all(-1)
     safe = torch.where(finite[..., None, None], A, 0).double()
+    # Squares of very large or small numbers would not exist.
+    safe = safe * unit_scale(safe)
     with torch.no_grad():
         base = safe.detach()
-        values, vectors = torch.linalg.eigh(base.mT @ base)
+        values, vectors, _ = eigh(base.mT @ base)
         v = vectors[..., :1]
         gaps = values[..., 1:] - values[..., :1]
         inverse = torch.where(gaps > 1e-14 * values[..., -1:], 1 / gaps, 0)[..., None]

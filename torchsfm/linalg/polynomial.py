@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.linalg.decompositions import eigvals
 from torchsfm.linalg.derivative import followed
 
 Roots = tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]
@@ -141,9 +142,9 @@ def companion_roots(c: Float[Tensor, "*batch m"]) -> Roots:
     companion = torch.zeros(*c.shape[:-1], degree, degree, dtype=c.dtype, device=c.device)
     companion[..., -1] = torch.where(good[..., None], monic, 0)
     companion[..., range(1, degree), range(degree - 1)] = 1
-    values = torch.linalg.eigvals(companion)
+    values, ok = eigvals(companion)
     x = values.real.contiguous()
-    real = good[..., None] & (values.imag.abs() <= 1e-3 * (1 + x.abs()))
+    real = (good & ok)[..., None] & (values.imag.abs() <= 1e-3 * (1 + x.abs()))
     slope = c[..., 1:] * torch.arange(1, degree + 1, dtype=c.dtype, device=c.device)
     p = evaluate(c, x)
     for _ in range(3):

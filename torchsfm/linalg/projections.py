@@ -10,12 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.linalg.decompositions import eigh, svd
 from torchsfm.linalg.derivative import followed
-
-
-def _finite_or_zero(A: Tensor) -> tuple[Tensor, Tensor]:
-    finite = torch.isfinite(A).all(-1).all(-1)[..., None, None]
-    return torch.where(finite, A, 0), finite
 
 
 def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
@@ -29,9 +25,8 @@ def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n 
         Rotations.
     """
     check_tensors(A=(A, "n n"))
-    safe, finite = _finite_or_zero(A)
     with torch.no_grad():
-        U, s, Vh = torch.linalg.svd(safe.detach())
+        U, s, Vh, ok = svd(A.detach())
         flip = torch.linalg.det(U @ Vh) < 0
         sign = torch.ones_like(s)
         sign[..., -1] = torch.where(flip, -1, 1)
@@ -39,11 +34,11 @@ def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n 
         R: Tensor = U @ Vh
         total = s[..., :, None] + s[..., None, :]
         weight = torch.where(total > 64 * torch.finfo(A.dtype).eps * s[..., :1, None], 1 / total, 0)
-    if followed(safe):
+    if followed(A):
         # In the bases of the singular vectors dR is skew.
-        change = U.mT @ (safe - safe.detach()) @ Vh.mT
+        change = U.mT @ _change(A, ok) @ Vh.mT
         R = R + U @ (weight * (change - change.mT)) @ Vh
-    return torch.where(finite, R, torch.eye(A.shape[-1], dtype=A.dtype, device=A.device))
+    return R
 
 
 def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*batch m n"]:
@@ -63,9 +58,8 @@ def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*b
     check_tensors(A=(A, "m n"))
     if not 1 <= rank <= min(A.shape[-2:]):
         raise ValueError(f"rank: wanted 1 to {min(A.shape[-2:])} for shape {tuple(A.shape)}, got {rank}")
-    safe, _ = _finite_or_zero(A)
     with torch.no_grad():
-        U, s, Vh = torch.linalg.svd(safe.detach(), full_matrices=True)
+        U, s, Vh, ok = svd(A.detach())
         U1, U2 = U[..., :rank], U[..., rank:]
         V1, V2 = Vh[..., :rank, :].mT, Vh[..., rank:, :].mT
         s1 = s[..., :rank]
@@ -75,9 +69,9 @@ def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*b
         tall = torch.nn.functional.pad(s2, (0, U2.shape[-1] - s2.shape[-1]))
         wide = torch.nn.functional.pad(s2, (0, V2.shape[-1] - s2.shape[-1]))
         floor = 64 * torch.finfo(A.dtype).eps * s[..., :1, None] ** 2
-    if not followed(safe):
+    if not followed(A):
         return B
-    change = safe - safe.detach()
+    change = _change(A, ok)
     c11, c12, c21 = U1.mT @ change @ V1, U1.mT @ change @ V2, U2.mT @ change @ V1
     # First-order change of the truncation in the bases of the singular vectors; c22 drops out.
     upper = _coupled(s1[..., :, None], wide[..., None, :], c12, _fit(c21.mT, c12.shape), floor)
@@ -108,18 +102,23 @@ def nearest_psd(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
         Symmetric matrices without negative eigenvalues (Higham 1988).
     """
     check_tensors(A=(A, "n n"))
-    safe, _ = _finite_or_zero(A)
     with torch.no_grad():
-        base = safe.detach()
-        values, V = torch.linalg.eigh(0.5 * (base + base.mT))
+        base = A.detach()
+        values, V, ok = eigh(0.5 * (base + base.mT))
         kept = values.clamp_min(0)
         B: Tensor = (V * kept[..., None, :]) @ V.mT
         gap = values[..., :, None] - values[..., None, :]
         positive = (values > 0).to(A.dtype)[..., :, None].expand_as(gap)
         same = gap.abs() <= 64 * torch.finfo(A.dtype).eps * values.abs().amax(-1)[..., None, None]
         slope = torch.where(same, positive, (kept[..., :, None] - kept[..., None, :]) / gap)
-    if followed(safe):
-        change = safe - safe.detach()
+    if followed(A):
+        change = _change(A, ok)
         B = B + V @ (slope * (V.mT @ (0.5 * (change + change.mT)) @ V)) @ V.mT
     symmetric: Tensor = 0.5 * (B + B.mT)
     return symmetric
+
+
+def _change(A: Tensor, ok: Tensor) -> Tensor:
+    """Zero, with the derivative of A where it could be decomposed."""
+    safe = torch.where(ok[..., None, None], A, 0)
+    return safe - safe.detach()

@@ -17,6 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.linalg import eigh, eigvalsh, qr
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -66,7 +68,7 @@ def rank_four(rays: Rays) -> Float[Tensor, "p v 3 4"]:
     """Cameras whose joint column space holds most of the rays: the start of everything."""
     p, v, _, n = rays.a.shape
     M = (rays.a * rays.w[:, :, None]).reshape(p, 3 * v, n)
-    basis = torch.linalg.eigh(M @ M.mT)[1][..., -4:]
+    basis = eigh(M @ M.mT)[1][..., -4:]
     P: Tensor = basis.reshape(p, v, 3, 4) * v**0.5
     return P
 
@@ -151,8 +153,7 @@ def information(rays: Rays, fit: Fit) -> Float[Tensor, "p k"]:
     The scale of each camera is held. Of each problem, fifteen are zero: a projective change of space costs nothing.
     """
     S = _reduced(_angles(rays, fit.P, fit.u), torch.zeros_like(fit.cost), points=True)[0]
-    values: Tensor = torch.linalg.eigvalsh(torch.where(torch.isfinite(S), S, 0))
-    return values
+    return eigvalsh(S)[0]
 
 
 def with_derivative(rays: Rays, fit: Fit) -> tuple[Tensor, Tensor]:
@@ -164,7 +165,7 @@ def with_derivative(rays: Rays, fit: Fit) -> tuple[Tensor, Tensor]:
         held = _angles(Rays(rays.a.detach(), rays.w.detach()), fit.P, fit.u)
     system = replace(held, slope=_angles(rays, fit.P, fit.u).slope)
     S, right, F, rest = _reduced(system, torch.zeros_like(fit.cost), points=True)
-    values, vectors = torch.linalg.eigh(S)
+    values, vectors, _ = eigh(S)
     free = values <= values[:, 14:15].clamp_min(0) + 1e-13 * values[:, -1:]
     inverse = torch.where(free, 0, 1 / torch.where(free, 1, values))
     step = -(vectors * inverse[:, None]) @ (vectors.mT @ right[..., None])
@@ -292,14 +293,15 @@ def _next(damping: Tensor, growth: Tensor, better: Tensor, gain: Tensor) -> tupl
 def _balanced(P: Tensor) -> Tensor:
     """The same column space with orthonormal columns, of a norm that does not depend on the number of views."""
     p, v = P.shape[:2]
-    Q: Tensor = torch.linalg.qr(P.reshape(p, 3 * v, 4))[0].reshape(p, v, 3, 4) * v**0.5
-    return Q
+    Q, _, _ = qr(P.reshape(p, 3 * v, 4))
+    balanced: Tensor = Q.reshape(p, v, 3, 4) * v**0.5
+    return balanced
 
 
 def _unit(P: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """The frame in which the cameras' joint columns are orthonormal; then each camera and point of norm 1."""
     p, v = P.shape[:2]
-    Q, R = torch.linalg.qr(P.reshape(p, 3 * v, 4))
+    Q, R, _ = qr(P.reshape(p, 3 * v, 4))
     P, u = Q.reshape(p, v, 3, 4), R @ u
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-100)
     return P, torch.nn.functional.normalize(u, dim=1)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.geometry.rotations import cross_matrix
+from torchsfm.linalg import svd, triangular_factor
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.motion.epipolar_fit import cofactors
@@ -125,7 +126,7 @@ def _solve(d1: Tensor, d2: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
         basis, pivot = nullspace_rows(A.permute(1, 2, 0))
         fine = fine & (pivot > _INDEPENDENT)
     else:
-        _, s, Vh = torch.linalg.svd(torch.linalg.qr(A)[1] if A.shape[-2] > 9 else A, full_matrices=True)
+        _, s, Vh, _ = svd(triangular_factor(A)[0] if A.shape[-2] > 9 else A)
         fine = fine & (s[..., 5] > _INDEPENDENT * s[..., 0])
         basis = Vh[..., 6:, :].permute(1, 2, 0)
     fine = fine & torch.isfinite(basis).all(0).all(0)

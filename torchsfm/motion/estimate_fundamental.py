@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
+from torchsfm.linalg import svd
 from torchsfm.motion.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, with_left_epipole
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.normalization import common_scale, largest_positive
@@ -95,7 +96,7 @@ class FundamentalEstimator:
         """F moved along a basis of the tangent space, then to determinant 0 up to fourth order, and to norm 1."""
         f = model[..., :3].detach().flatten(-2)
         normals = torch.stack((f, _cofactors(f)), -2)
-        basis = torch.linalg.svd(normals, full_matrices=True)[2][..., 2:, :]
+        basis = svd(normals)[2][..., 2:, :]
         f = model[..., :3].flatten(-2) + (step[..., None, :] @ basis)[..., 0, :]
         return with_left_epipole(matrices(_determinant_step(f), 3), model[..., 3])
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry.homogeneous import finite_or_zero
+from torchsfm.linalg import eigh, inverse, qr, solve, svd, svdvals
 from torchsfm.motion.bilinear_fit import Rays, core, fit_with_prior
 
 AffineModel = Literal["orthographic", "weak_perspective", "paraperspective"]
@@ -98,7 +99,7 @@ def factorize_affine(
         w = w * view[..., None] * point[:, None]
         M, t, X, steady = _affine(finite_or_zero(flat), w, max_iterations)
         A, metric = _metric(M, t, view, model)
-        M, X = M @ A[:, None], torch.linalg.solve(A, X.mT).mT
+        M, X = M @ A[:, None], solve(A, X.mT)[0].mT
         R, scale, unit = _rotations(M, t, model)
         # Orthographic scales are 1 by definition; else the mean scale is made 1.
         if model != "orthographic":
@@ -109,7 +110,7 @@ def factorize_affine(
         seen = w > 0
         sigma = ((w * error.square()).sum((-2, -1)) / (2 * seen.sum((-2, -1))).clamp(min=1)).sqrt()
         stacked = (M * view[..., None, None]).flatten(1, 2) @ (X * point[..., None]).mT
-        values = torch.linalg.svdvals(stacked)
+        values, _ = svdvals(stacked)
         values = torch.nn.functional.pad(values, (0, 3))[:, :3]
         rows, columns = 2 * view.sum(-1), point.sum(-1)
         chance = _CHANCE * sigma * (rows.double().sqrt() + columns.double().sqrt())
@@ -135,7 +136,7 @@ def _affine(x: Tensor, w: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor, T
     size = ((w[..., None] * y.square()).sum((-3, -2, -1)) / w.sum((-2, -1)).clamp_min(1e-300)).sqrt()
     size = torch.where(size > 0, size, 1)[:, None, None, None]
     y = y / size
-    U, s, _ = torch.linalg.svd(y.mT.reshape(p, 2 * v, n), full_matrices=False)
+    U, s, _, _ = svd(y.mT.reshape(p, 2 * v, n), full_matrices=False)
     M = torch.nn.functional.pad(U * s[:, None], (0, 3))[..., :3].reshape(p, v, 2, 3)
     P = torch.zeros(p, v, 3, 4, dtype=x.dtype, device=x.device)
     P[:, :, :2, :3] = M / torch.linalg.matrix_norm(M.flatten(1, 2))[:, None, None, None].clamp_min(1e-300) * v**0.5
@@ -146,11 +147,10 @@ def _affine(x: Tensor, w: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor, T
     # The frame in which the third rows are (0, 0, 0, stiff) and points end in 1.
     present = (w > 0).any(-1)[..., None]
     last = (P[:, :, 2] * present).sum(1) / present.sum(1).clamp(min=1) / _STIFF
-    frame = torch.linalg.qr(torch.cat((last[..., None], torch.eye(4, dtype=x.dtype, device=x.device).expand(p, 4, 4)), -1))[0]
+    frame, _, _ = qr(torch.cat((last[..., None], torch.eye(4, dtype=x.dtype, device=x.device).expand(p, 4, 4)), -1))
     G = torch.cat((frame[..., 1:].mT, last[:, None]), -2)
-    back, info = torch.linalg.inv_ex(G)
-    fine = (info == 0) & torch.isfinite(back).all(-1).all(-1)
-    P, u = P @ torch.where(fine[:, None, None], back, 0)[:, None], G @ u
+    back, _ = inverse(G)
+    P, u = P @ back[:, None], G @ u
     X = (u[:, :3] / torch.where(u[:, 3:].abs() > 1e-6, u[:, 3:], 1)).mT
     seen = (w > 0).any(1).double()
     centroid = (X * seen[..., None]).sum(1) / seen.sum(-1, keepdim=True).clamp(min=1)
@@ -175,15 +175,13 @@ def _metric(M: Tensor, t: Tensor, view: Tensor, model: AffineModel) -> tuple[Ten
         right = right * view.repeat(1, 3)
         size = rows.square().sum((-2, -1)).clamp_min(1e-300).sqrt()[:, None, None]
         normal = (rows / size).mT @ (rows / size)
-        q, info = torch.linalg.solve_ex(normal, (rows / size).mT @ right[..., None])
+        q, fine = solve(normal, (rows / size).mT @ right[..., None])
         q = q[..., 0] / size[..., 0]
-        fine = (info == 0) & torch.isfinite(q).all(-1)
-        q = torch.where(fine[..., None], q, 0)
     else:
         a, b = (t[..., :1], t[..., 1:]) if model == "paraperspective" else (0 * t[..., :1], 0 * t[..., :1])
         mm, nn = form(m, m) / (1 + a * a), form(n, n) / (1 + b * b)
         rows = torch.cat(((mm - nn) * weight, (form(m, n) - a * b * (mm + nn) / 2) * weight), -2)
-        values, vectors = torch.linalg.eigh(torch.where(torch.isfinite(rows.mT @ rows), rows.mT @ rows, 0))
+        values, vectors, _ = eigh(rows.mT @ rows)
         q = vectors[..., 0]
         fine = values[..., 1] > 1e-12 * values[..., -1]
     i, j = torch.triu_indices(3, 3, device=M.device)
@@ -192,7 +190,7 @@ def _metric(M: Tensor, t: Tensor, view: Tensor, model: AffineModel) -> tuple[Ten
     Q[..., j, i] = q
     if model != "orthographic":
         Q = Q * torch.where(Q.diagonal(dim1=-2, dim2=-1).sum(-1) < 0, -1.0, 1.0)[..., None, None]
-    values, vectors = torch.linalg.eigh(Q)
+    values, vectors, _ = eigh(Q)
     fine = fine & (values[..., 0] > 1e-8 * values[..., -1].clamp_min(1e-300))
     A = vectors * torch.where(fine[..., None], values.clamp_min(0), 1).sqrt()[..., None, :] @ vectors.mT
     return torch.where(fine[..., None, None], A, torch.eye(3, dtype=A.dtype, device=A.device)), fine
@@ -212,7 +210,7 @@ def _rotations(M: Tensor, t: Tensor, model: AffineModel) -> tuple[Tensor, Tensor
         one, zero = torch.ones_like(a), torch.zeros_like(a)
         basis = torch.stack((one, zero, -a, zero, one, -b, a, b, one), -1).reshape(*a.shape, 3, 3)
         rows = torch.stack((m / s, n / s, third / s / s), -2)
-        m, n, _ = torch.linalg.solve(basis, rows).unbind(-2)
+        m, n, _ = solve(basis, rows)[0].unbind(-2)
     # The nearest rotation of (m, n): the frame halfway between their sum and difference.
     unit = torch.nn.functional.normalize
     p, q = unit(m, dim=-1), unit(n, dim=-1)

@@ -22,6 +22,7 @@ from torchsfm._types import Status, check_tensors
 from torchsfm.geometry import to_homogeneous
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.shape import balanced_frame
+from torchsfm.linalg import solve
 from torchsfm.motion.bilinear_fit import (
     Fit,
     Rays,
@@ -146,7 +147,7 @@ def _factorize(x: Tensor, w: Tensor, robust: bool, steps: int) -> tuple[Tensor, 
     if wants_derivative(x, w):
         P, u = with_derivative(_rays(x, w * counts * trust, frame), fit)
     # Back to the coordinates that came, each camera and point of norm 1, depths positive as often as can be.
-    P = torch.linalg.solve(frame, P)
+    P, _ = solve(frame, P)
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-300)
     side, turn = _signs((P.detach() @ u.detach()[:, None])[:, :, 2] * counts)
     P = P * (side * view)[..., None, None]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
-from torchsfm.linalg import null_vector
+from torchsfm.linalg import eigvalsh, null_vector
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.sample_rows import in_chunks, rows_of
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -114,7 +114,7 @@ def _fit(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor
     y = y / torch.where(size > 0, size, 1)
     A = torch.where(keep, torch.where(keep, share, 1).sqrt(), 0)[..., None] * y
     # The plane through the points is determined where only one direction is without extent.
-    values = torch.linalg.eigvalsh((A.mT @ A).detach())
+    values, _ = eigvalsh((A.mT @ A).detach())
     valid = fine & (values[..., 1] > _FLAT * values[..., 3]) & (values[..., 3] > 0)
     blank = torch.eye(4, dtype=A.dtype, device=A.device)[:3]
     padded = torch.nn.functional.pad(blank, (0, 0, 0, A.shape[-2] - 3))

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, Status, check_tensors
-from torchsfm.linalg import cross, determinant_3x3, solve
+from torchsfm.linalg import cross, determinant_3x3, solve, svd
 from torchsfm.motion.epipolar_fit import matrices
 from torchsfm.optim import attach_implicit, wants_derivative
 
@@ -112,7 +112,7 @@ def motions_from_homography(
 
 def _solve(H: Tensor) -> tuple[Tensor, Tensor]:
     """(R, t, n, s) as (*batch, 2, 16) and valid as (*batch, 2)."""
-    U, s, Vh = torch.linalg.svd(H)
+    U, s, Vh, _ = svd(H)
     middle = s[..., 1]
     regular = (s[..., 2] > _SINGULAR * middle) & (middle > _SINGULAR)
     scale = torch.where(determinant_3x3(H) < 0, -middle, middle)

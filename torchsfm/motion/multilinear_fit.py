@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.linalg import null_vector
+from torchsfm.linalg import null_vector, qr, svdvals, triangular_factor
 from torchsfm.optim import levenberg_marquardt
 
 _OPEN = 0.65
@@ -78,7 +78,7 @@ def free_directions(P: Float[Tensor, "*batch u 3 4"]) -> Float[Tensor, "*batch k
     """An orthonormal basis of the directions across those of `frame_directions`, without derivative."""
     with torch.no_grad():
         G = frame_directions(P.detach())
-        Q: Tensor = torch.linalg.qr(torch.where(torch.isfinite(G), G, 0), mode="complete")[0]
+        Q, _, _ = qr(G, complete=True)
     return Q[..., G.shape[-1] :]
 
 
@@ -156,7 +156,7 @@ def least_vector(A: Float[Tensor, "*batch m k"]) -> Float[Tensor, "*batch k"]:
         if A.shape[-2] < A.shape[-1]:
             return v
         # Inverse iteration with the triangular factor of A itself.
-        R = torch.linalg.qr(A, mode="r")[1]
+        R, _ = triangular_factor(A)
         pivots = R.diagonal(dim1=-2, dim2=-1)
         floor = torch.finfo(A.dtype).eps * pivots.abs().amax(-1, keepdim=True)
         small = pivots.abs() <= floor
@@ -193,9 +193,8 @@ def tensor_uncertainty(
         t = fit.tensor.detach()
         J = J @ free_directions(fit.P)
         J = J - t[..., None] * (t[..., None, :] @ J)
-        J = torch.where(torch.isfinite(J).flatten(-2).all(-1)[..., None, None], J, 0)
-        Q = torch.linalg.qr(J)[0]
-        values = torch.linalg.svdvals(torch.linalg.qr(A @ Q, mode="r")[1])
+        Q, _, _ = qr(J)
+        values, _ = svdvals(triangular_factor(A @ Q)[0])
         least, largest = values[..., -1], values[..., 0]
         noise = (2 * fit.cost / (number - J.shape[-1]).clamp(min=1)).sqrt()
         ratio = noise / torch.where(least > 0, least, 1)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg import eigvals
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.motion.epipolar_fit import matrices
@@ -235,9 +236,9 @@ def _eigenvalues(M: Float[Tensor, "3 9 9 batch"], M2: Tensor, basis: Tensor, fin
     C[:, 9:, :9] = basis[_LAST].permute(2, 0, 1)
     fine = fine & (info == 0) & torch.isfinite(A).all(-1).all(-1)
     C = torch.where(fine[:, None, None], C, torch.eye(15, dtype=A.dtype, device=A.device))
-    values = torch.linalg.eigvals(C)
+    values, ok = eigvals(C)
     size = values.abs()
-    real = (values.imag.abs() <= _REAL * size) & (values.imag >= 0) & (size > 0) & fine[:, None]
+    real = (values.imag.abs() <= _REAL * size) & (values.imag >= 0) & (size > 0) & (fine & ok)[:, None]
     w = _SHIFT + 1 / torch.where(real, values.real, 1)
     real = real & (w > _RANGE[1] ** -2) & (w < _RANGE[0] ** -2)
     item, column = real.nonzero().unbind(1)

@@ -78,8 +78,9 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
                 covariance[free[good]] = free_points[good]
         elif free.numel():
             place[free] = layout.first[name] + torch.arange(free.numel() * width, device=free.device).view(-1, width)
-            known[free] = True
-            covariance[free] = inverse.kept[place[free][:, :, None], place[free][:, None]]
+            kept = inverse.kept[place[free][:, :, None], place[free][:, None]]
+            known[free] = kept.isfinite().all(-1).all(-1)
+            covariance[free] = torch.where(known[free][:, None, None], kept, covariance[free])
         found[name], determined[name], columns[name] = covariance, known, place
     unknowns = layout.size - inverse.nullity + int(inverse.determined.sum()) * layout.point_size
     return SparseCovariance(found, determined, inverse.kept, columns, inverse.nullity, rows - unknowns, squares)

@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchsfm.linalg import qr
+
 
 def wants_derivative(*inputs: Tensor) -> bool:
     """Whether any of the tensors is followed by reverse- or forward-mode differentiation right now."""
@@ -145,7 +147,7 @@ def _pseudo_inverse(jacobian: Tensor) -> tuple[Tensor, Tensor]:
     row_scale = safe.abs().amax(-1, keepdim=True).clamp_min(tiny)
     scaled = safe / row_scale if rows == columns else safe
     column_scale = torch.linalg.vector_norm(scaled, dim=-2, keepdim=True).clamp_min(tiny)
-    q, r = torch.linalg.qr(scaled / column_scale)
+    q, r, _ = qr(scaled / column_scale)
     pivots = r.diagonal(dim1=-2, dim2=-1).abs()
     floor = 64 * columns * torch.finfo(jacobian.dtype).eps
     regular = finite & (pivots.amin(-1) > floor)

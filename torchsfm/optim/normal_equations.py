@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsfm.linalg import eigh
 from torchsfm.optim.conjugate_gradients import Clusters, solve_reduced
 from torchsfm.optim.coupling_groups import GroupCoupling
 from torchsfm.optim.coupling_pairs import PairCoupling
@@ -98,11 +99,12 @@ class NormalEquations:
                 assert not isinstance(self.coupling, RowCoupling), "asked for without conjugate gradients"
                 self.coupling.reduce(S, L, torch.zeros_like(pivots))
         scale = floor(self.diagonal).rsqrt()
-        values, vectors = torch.linalg.eigh(scale[:, None] * S[:size, :size] * scale)
+        values, vectors, ok = eigh(scale[:, None] * S[:size, :size] * scale)
         null = values <= NULL * values.amax(-1, keepdim=True) if size else values > 0
         inverse = torch.where(null, 0.0, 1 / torch.where(null, 1.0, values))
         vectors = scale[:, None] * vectors
-        return Inverse(self, L, (vectors * inverse) @ vectors.mT, int(null.sum()), determined)
+        kept = torch.where(ok, (vectors * inverse) @ vectors.mT, torch.inf)
+        return Inverse(self, L, kept, int(null.sum()), determined & ok)
 
     def point_gradient(self) -> Tensor:
         """`h`, (q, points)."""

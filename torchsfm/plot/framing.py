@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.linalg import eigh, eigvalsh
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 
@@ -37,8 +38,8 @@ def up_direction(reconstruction: Reconstruction) -> Float[Tensor, "3"]:
         return z_axis
     right, up, forward = rows[:, 0], -rows[:, 1], rows[:, 2]
     mean, view = up.mean(0), forward.mean(0)
-    values, vectors = torch.linalg.eigh(right.mT @ right / len(right))
-    steadiness = torch.linalg.eigvalsh(up.mT @ up / len(up))[2]
+    values, vectors, _ = eigh(right.mT @ right / len(right))
+    steadiness = eigvalsh(up.mT @ up / len(up))[0][2]
     if float(values[2]) > 0.9 and float(steadiness) < 0.7:
         aside: Tensor = vectors[:, 2] * -torch.sign(vectors[:, 2] @ view - 1e-12)
         return aside

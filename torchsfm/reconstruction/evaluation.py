@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import Pose, Similarity, similarity_from_points
-from torchsfm.linalg import nearest_rotation
+from torchsfm.linalg import nearest_rotation, svdvals
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 COLLINEAR = 1e-3
@@ -73,7 +73,7 @@ def align_poses(poses: Pose, poses_true: Pose, registered: Bool[Tensor, "*batch 
     scale = (spread_true * (spread @ R.mT)).sum((-2, -1)) / torch.where(variance > 0, variance, 1)
     scale = torch.where(scale > 0, scale, 1)
 
-    singular = torch.linalg.svdvals(spread_true)
+    singular, _ = svdvals(spread_true)
     width = singular[..., 1] if singular.shape[-1] > 1 else torch.zeros_like(singular[..., 0])
     by_points = (width > COLLINEAR * singular[..., 0]) & (weights.sum(-1) >= 3)
     R = torch.where(by_points[..., None, None], umeyama.R, R)

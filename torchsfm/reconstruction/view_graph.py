@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.linalg import svdvals
 from torchsfm.motion import estimate_fundamental, estimate_homography
 
 MIN_INLIERS = 15
@@ -86,7 +87,7 @@ class ViewGraph:
         tried[..., :2, :2] *= scales[..., None, None]
         K1, K2 = tried[:, self.pairs[:, 0]], tried[:, self.pairs[:, 1]]
         turn = torch.linalg.solve_ex(K2, self.H @ K1).result
-        s = torch.linalg.svdvals(turn)
+        s, _ = svdvals(turn)
         spread = (s[..., 0] / s[..., 2].clamp(min=1e-12) - 1).amin(0)
         verdict = torch.where(flat, int(Verdict.PLANAR), int(Verdict.GENERAL))
         verdict = torch.where(flat & (spread < 0.05), int(Verdict.ROTATION), verdict)

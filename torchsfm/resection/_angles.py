@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.geometry import rotation_from_rotvec
+from torchsfm.linalg import eigvalsh
 from torchsfm.optim import attach_optimum
 
 PIECE = 4096
@@ -147,10 +148,10 @@ def moved(R: Tensor, t: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
 def determined(data: Rays, N: Tensor) -> Tensor:
     """Whether rays differ and normal matrices (b, k, 6, 6) have full rank."""
     scale = N.diagonal(dim1=-2, dim2=-1).clamp_min(1e-280).rsqrt()
-    smallest: Tensor = torch.linalg.eigvalsh(N * scale[..., :, None] * scale[..., None, :])[..., 0]
+    smallest = eigvalsh(N * scale[..., :, None] * scale[..., None, :])[0][..., 0]
     eye = torch.eye(3, dtype=N.dtype, device=N.device)
     total = data.w.sum(-1)[:, None, None]
-    spread = torch.linalg.eigvalsh(total * eye - (data.u * data.w[:, None]) @ data.u.mT)[:, :1]
+    spread = eigvalsh(total * eye - (data.u * data.w[:, None]) @ data.u.mT)[0][:, :1]
     full: Tensor = (smallest > 1e-13) & (spread > 1e-14 * total[..., 0])
     return full
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.geometry import Camera, Distortion, NoDistortion, Pose
+from torchsfm.linalg import eigh
 from torchsfm.optim import Loss, attach_optimum, loss_slope, wants_derivative
 
 State = tuple[Pose, Tensor]
@@ -226,7 +227,7 @@ def inverse(N: Tensor) -> tuple[Tensor, Tensor]:
     eye = torch.eye(N.shape[-1], dtype=N.dtype, device=N.device)
     root = torch.where(positive[..., None], diagonal, 1.0).rsqrt()
     scaled = torch.where(positive[..., None, None], N * root[..., :, None] * root[..., None, :], eye)
-    values, vectors = torch.linalg.eigh(scaled)
+    values, vectors, _ = eigh(scaled)
     determined = positive & (values[..., 0] > 1e-13)
     inverse = (vectors / torch.where(determined[..., None], values, 1.0)[..., None, :]) @ vectors.mT
     return inverse * root[..., :, None] * root[..., None, :], determined

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry import normalizing_similarity
-from torchsfm.linalg import cross
+from torchsfm.linalg import cross, eigh
 
 FLAT = 1e-6
 """Singular value, over the largest, at which a second null vector is taken for exact (a plane, in float32 coordinates)."""
@@ -159,7 +159,7 @@ def _line_rows(line: Tensor, feet: Tensor, directions: Tensor, w: Tensor) -> Ten
 def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
     """The unit vector with the smallest |A p|, with its derivative, and the singular values from the smallest up."""
     with torch.no_grad():
-        values, vectors = torch.linalg.eigh(A.mT @ A)
+        values, vectors, _ = eigh(A.mT @ A)
         p, others = vectors[..., :1], vectors[..., 1:]
         gaps = values[..., 1:] - values[..., :1]
         inverse = torch.where(gaps > 1e-15 * values[..., -1:], 1 / gaps, 0.0)[..., None]

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
+from torchsfm.linalg import qr
 from torchsfm.linalg.quadric_intersection import intersect_quadrics, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -21,7 +22,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 _DIFFERENCES = ((0.5**0.5, 1 / 6**0.5), (-(0.5**0.5), 1 / 6**0.5), (0.0, -2 / 6**0.5))
 """Orthonormal coordinates of three numbers whose sum is 0."""
 # A fixed rotation of the coordinates.
-_TURN = torch.linalg.qr(torch.tensor([[5.0, 1, -2, 3], [-1, 4, 3, 2], [2, -3, 5, 1], [3, 2, 1, -4]], dtype=torch.float64)).Q
+_TURN = qr(torch.tensor([[5.0, 1, -2, 3], [-1, 4, 3, 2], [2, -3, 5, 1], [3, 2, 1, -4]], dtype=torch.float64))[0]
 
 
 def equations(

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
+from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
 from torchsfm.resection._angles import Rays, attach, determined, gauss_newton, in_pieces, status_of
 
@@ -94,7 +95,7 @@ def _solve(data: Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _infinitesimal(data: Rays) -> tuple[Tensor, Tensor, Tensor]:
     """Both poses R (b, 2, 3, 3), t (b, 2, 3) in closed form, and where the points are in a plane but not in a line."""
     wX = data.X * data.w[:, None]
-    spread, axes = torch.linalg.eigh(wX @ data.X.mT)
+    spread, axes, _ = eigh(wX @ data.X.mT)
     flat = (spread[:, 0] <= 1e-6 * spread[:, 2]) & (spread[:, 1] > 1e-12 * spread[:, 2])
     # World axes with the plane's normal last, right-handed.
     basis = axes.flip(-1).clone()
@@ -153,7 +154,7 @@ def _homography(data: Rays, h: Tensor) -> Tensor:
             full[:, a, c, j, i] = moments[:, p]
     # Rows are (column of H, row of H).
     quadratic = full.permute(0, 3, 1, 4, 2).reshape(-1, 9, 9)
-    H: Tensor = torch.linalg.eigh(quadratic)[1][..., 0].reshape(-1, 3, 3).mT
+    H = eigh(quadratic)[1][..., 0].reshape(-1, 3, 3).mT
     votes = ((H @ h) * data.u * data.w[:, None]).sum((1, 2))
     return H * torch.where(votes < 0, -1.0, 1.0)[:, None, None]
 

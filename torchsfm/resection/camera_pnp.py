@@ -7,6 +7,7 @@ from jaxtyping import Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
+from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
 from torchsfm.resection._angles import Rays, attach, cost, determined, gauss_newton, in_pieces, status_of
 
@@ -86,7 +87,7 @@ def _solve(data: Rays) -> tuple[Tensor, Tensor, Tensor]:
 def _starts(data: Rays) -> tuple[Tensor, Tensor]:
     """The two best minima of the squared distances from the rays, as R (b, 2, 3, 3) and t (b, 2, 3)."""
     quadratic, shift = _forms(data)
-    vectors = torch.linalg.eigh(quadratic)[1][..., :_STARTS]
+    vectors = eigh(quadratic)[1][..., :_STARTS]
     R = _rotations(vectors.mT.reshape(-1, _STARTS, 3, 3).mT)
     value = _value(quadratic, R)
     damping = torch.full_like(value, 1e-3)
@@ -153,7 +154,7 @@ def _rotations(M: Tensor) -> Tensor:
         xz - zx, xy + yx, yy - xx - zz, yz + zy,
         yx - xy, xz + zx, yz + zy, zz - xx - yy,
     )  # fmt: skip
-    vectors = torch.linalg.eigh(torch.stack(rows, -1).reshape(*xx.shape, 4, 4))[1]
+    vectors = eigh(torch.stack(rows, -1).reshape(*xx.shape, 4, 4))[1]
     w, x, y, z = torch.cat((vectors[..., -1], vectors[..., 0]), -2).unbind(-1)
     entries = (
         w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y),

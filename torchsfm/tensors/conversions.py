@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
-from torchsfm.linalg import null_vector, solve
+from torchsfm.linalg import null_vector, solve, svdvals
 from torchsfm.tensors.bifocal import bifocal_tensors, cameras_from_fundamental, unit_rank_2
 from torchsfm.tensors.minors import cyclic_pairs, dual_matrix, split_last
 from torchsfm.tensors.quadrifocal import cameras_from_quadrifocal, quadrifocal_from_cameras
@@ -49,8 +49,8 @@ def cameras_from_fundamentals(
     A = torch.cat(blocks, -2)
     p, _ = null_vector(A)
     with torch.no_grad():
-        values = torch.linalg.svdvals(torch.where(finite[..., None, None], A.detach(), 0))
-        rank2 = torch.stack([torch.linalg.svdvals(unit_rank_2(F.detach()))[..., 1] for F in (F12, F13, F23)]).amin(0)
+        values, _ = svdvals(A.detach())
+        rank2 = torch.stack([svdvals(unit_rank_2(F.detach()))[0][..., 1] for F in (F12, F13, F23)]).amin(0)
         floor = 256 * torch.finfo(F12.dtype).eps
         determined = (values[..., -2] > floor * values[..., 0]) & (rank2 > floor)
     P = torch.stack((P1, P2, split_last(p, 3, 4)), -3)

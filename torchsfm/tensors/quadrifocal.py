@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
-from torchsfm.linalg import null_vector, solve
+from torchsfm.linalg import null_vector, solve, svdvals
 from torchsfm.tensors.canonical import canonical_frame
 from torchsfm.tensors.minors import LAPLACE_SIGNS, dual_matrix, split_last, wedge
 from torchsfm.tensors.trifocal import ProjectiveCameras, cameras_from_trifocal, unit_tensor
@@ -121,7 +121,7 @@ def cameras_from_quadrifocal(Q: Float[Tensor, "*batch 3 3 3 3"]) -> ProjectiveCa
         base = unit.detach()
         equations = _transfer_equations(base)
         t, _ = null_vector(equations)
-        values = torch.linalg.svdvals(equations)
+        values, _ = svdvals(equations)
         three = cameras_from_trifocal(split_last(t, 3, 3, 3))
         fourth, solved = _fourth_camera(base, three.P)
         P = canonical_frame(torch.cat((three.P[..., 1:, :, :], fourth[..., None, :, :]), -3))[..., 1:, :, :]

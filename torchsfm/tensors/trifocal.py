@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry.homogeneous import normalize_sphere
 from torchsfm.geometry.rotations import cross_matrix
-from torchsfm.linalg import adjugate_3x3, null_vector, solve
+from torchsfm.linalg import adjugate_3x3, eigh, eigvalsh, null_vector, solve, svdvals
 from torchsfm.tensors.minors import LAPLACE_SIGNS, cyclic_pairs, split_last, wedge
 
 
@@ -149,7 +149,7 @@ def epipoles_of_slices(T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         left, right = form.flatten(-3, -2), form.mT.flatten(-3, -2)
         e2, _ = null_vector(left)
         # The second singular values, in units of |T|^2.
-        second = torch.linalg.svdvals(torch.stack((left, right)))[..., 1]
+        second = svdvals(torch.stack((left, right)))[0][..., 1]
         determined = (second > 64 * torch.finfo(T.dtype).eps).all(0)
         e2, e3 = _climb(base, e2)
         for _ in range(8):
@@ -161,13 +161,13 @@ def epipoles_of_slices(T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _climb(T: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
     """The best of four starts for e2, after steps that only go up: each epipole is an eigenvector, the other being fixed."""
-    others = torch.linalg.eigh((T @ T.mT).sum(-3))[1].mT
+    others = eigh((T @ T.mT).sum(-3))[1].mT
     e2 = torch.cat((start[..., None, :], others), -2)
     T = T[..., None, :, :, :]
     gain = e3 = e2
     for _ in range(6):
-        e3 = torch.linalg.eigh(_across(T, e2))[1][..., -1]
-        gain, vectors = torch.linalg.eigh(_across(T.mT, e3))
+        e3 = eigh(_across(T, e2))[1][..., -1]
+        gain, vectors, _ = eigh(_across(T.mT, e3))
         e2 = vectors[..., -1]
     height = gain[..., -1] + (T @ e3[..., None, :, None]).square().sum((-3, -2, -1))
     # The first start is the true one if there is no noise.
@@ -198,7 +198,7 @@ def _newton(T: Tensor, e2: Tensor, e3: Tensor, shifted: bool = False) -> tuple[T
     H = torch.cat((torch.cat((H22, H23), -1), torch.cat((H23.mT, H33), -1)), -2)
     g = torch.cat((U.mT @ g2[..., None], V.mT @ g3[..., None]), -2)
     if shifted:
-        values = torch.linalg.eigvalsh(H)
+        values, _ = eigvalsh(H)
         slope = 0.1 * values.abs().amax(-1)
         wrong = values[..., -1] > -1e-3 * slope
         H = H - torch.where(wrong, values[..., -1] + slope, 0)[..., None, None] * torch.eye(4, dtype=H.dtype, device=H.device)

@@ -1,0 +1,146 @@
+"""Decompositions that never raise: the one way to LAPACK for matrices that come from data.
+
+A matrix that is not finite, or on which the iteration does not end, makes torch raise for its whole batch. Here every function
+returns `ok` last, which is False for such an element; it then has zeros for values and solutions, axes for vectors, and its
+neighbours have the very numbers that they have without it. Derivatives are those of `torch.linalg`, zero where `ok` is False
+(of `solve` and `inverse` not finite there).
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Complex, Float
+from torch import Tensor
+
+_GaveUp: type[RuntimeError] = torch.linalg.LinAlgError  # type: ignore[attr-defined]
+_ROOM = 2.0**20
+"""How far below the largest number entries have to stay: sums of products with unit vectors must not overflow."""
+
+
+def eigh(
+    A: Float[Tensor, "*batch n n"],
+) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
+    """Eigenvalues, ascending, and eigenvectors, as columns, of symmetric matrices; the lower triangle counts."""
+    safe, sound = _sound(A)
+    values, vectors = _attempt(torch.linalg.eigh, safe)
+    ok = sound & torch.isfinite(values).all(-1)
+    return torch.where(ok[..., None], values, 0.0), _or_axes(vectors, ok), ok
+
+
+def eigvalsh(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
+    """Eigenvalues, ascending, of symmetric matrices; the lower triangle counts."""
+    safe, sound = _sound(A)
+    (values,) = _attempt(lambda a: (torch.linalg.eigvalsh(a),), safe)
+    ok = sound & torch.isfinite(values).all(-1)
+    return torch.where(ok[..., None], values, 0.0), ok
+
+
+def eigvals(A: Float[Tensor, "*batch n n"]) -> tuple[Complex[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
+    """Eigenvalues, in no order, of square matrices."""
+    safe, sound = _sound(A)
+    (values,) = _attempt(lambda a: (torch.linalg.eigvals(a),), safe)
+    ok = sound & torch.isfinite(values).all(-1)
+    return torch.where(ok[..., None], values, 0.0), ok
+
+
+def svd(
+    A: Float[Tensor, "*batch m n"], *, full_matrices: bool = True
+) -> tuple[Float[Tensor, "*batch m p"], Float[Tensor, "*batch k"], Float[Tensor, "*batch q n"], Bool[Tensor, "*batch"]]:
+    """`U`, the k = min(m, n) singular values, descending, and `V'`; all of the axes or the first k of them."""
+    safe, sound = _sound(A)
+    U, s, Vh = _attempt(lambda a: torch.linalg.svd(a, full_matrices=full_matrices), safe)
+    ok = sound & torch.isfinite(s).all(-1)
+    return _or_axes(U, ok), torch.where(ok[..., None], s, 0.0), _or_axes(Vh, ok), ok
+
+
+def svdvals(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch k"], Bool[Tensor, "*batch"]]:
+    """The k = min(m, n) singular values, descending."""
+    safe, sound = _sound(A)
+    (s,) = _attempt(lambda a: (torch.linalg.svdvals(a),), safe)
+    ok = sound & torch.isfinite(s).all(-1)
+    return torch.where(ok[..., None], s, 0.0), ok
+
+
+def qr(
+    A: Float[Tensor, "*batch m n"], *, complete: bool = False
+) -> tuple[Float[Tensor, "*batch m p"], Float[Tensor, "*batch p n"], Bool[Tensor, "*batch"]]:
+    """`Q`, all m columns or the first min(m, n), and the upper triangle `R`; `ok` says nothing of the rank."""
+    safe, sound = _sound(A)
+    Q, R = torch.linalg.qr(safe, mode="complete" if complete else "reduced")
+    return _or_axes(Q, sound), torch.where(sound[..., None, None], R, 0.0), sound
+
+
+def triangular_factor(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch k n"], Bool[Tensor, "*batch"]]:
+    """The upper triangle `R` of the QR decomposition alone, k = min(m, n)."""
+    safe, sound = _sound(A)
+    R = torch.linalg.qr(safe, mode="r")[1]
+    return torch.where(sound[..., None, None], R, 0.0), sound
+
+
+def solve(
+    A: Float[Tensor, "*#batch n n"], b: Float[Tensor, "*#batch n k"]
+) -> tuple[Float[Tensor, "*batch n k"], Bool[Tensor, "*batch"]]:
+    """Solve `A x = b`; `ok` is False where LU finds A singular, or A, b or x is not finite.
+
+    Args:
+        A: Square matrices.
+        b: Right-hand sides as columns.
+    """
+    if b.ndim < A.ndim:
+        # One dimension less, and torch may take columns for a batch of vectors: a 4x4 matrix for four systems of four, say.
+        b = b.expand(*A.shape[:-2], *b.shape[-2:])
+    x, info = torch.linalg.solve_ex(A, b)
+    ok = _is_sound(A) & (info == 0) & torch.isfinite(x).all(-1).all(-1)
+    return torch.where(ok[..., None, None], x, 0.0), ok
+
+
+def inverse(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
+    """The inverse; `ok` is False where LU finds the matrix singular, or it or its inverse is not finite."""
+    B, info = torch.linalg.inv_ex(A)
+    ok = _is_sound(A) & (info == 0) & torch.isfinite(B).all(-1).all(-1)
+    return torch.where(ok[..., None, None], B, 0.0), ok
+
+
+def unit_scale(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch 1 1"]:
+    """A power of two by which the largest number of a finite matrix, unless it is 0, comes to between 1/2 and 1."""
+    largest = A.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(A.dtype).tiny)
+    return torch.frexp(largest).mantissa / largest
+
+
+def _sound(A: Tensor) -> tuple[Tensor, Tensor]:
+    """The matrices, those with numbers that cannot be worked with replaced by axes, and which were not."""
+    sound = _is_sound(A)
+    return _or_axes(A, sound), sound
+
+
+def _is_sound(A: Tensor) -> Tensor:
+    return (A.detach().abs() < torch.finfo(A.dtype).max / _ROOM).all(-1).all(-1)
+
+
+def _or_axes(A: Tensor, ok: Tensor) -> Tensor:
+    return torch.where(ok[..., None, None], A, torch.eye(*A.shape[-2:], dtype=A.dtype, device=A.device))
+
+
+def _attempt(decompose: Callable[[Tensor], tuple[Tensor, ...]], A: Tensor) -> tuple[Tensor, ...]:
+    """The decomposition; NaN for matrices on which LAPACK gives up, whose entries are of wildly different sizes."""
+    try:
+        return decompose(A)
+    except _GaveUp:
+        # torch tells of the first alone, and rarely enough: one by one. Then all others once more, as rounding depends on the
+        # place in memory.
+        pieces = [_alone(decompose, matrix) for matrix in A.reshape(-1, *A.shape[-2:])]
+        parts = tuple(torch.stack(part).reshape(*A.shape[:-2], *part[0].shape) for part in zip(*pieces, strict=True))
+        kept = ~torch.isnan(parts[0]).flatten(A.ndim - 2).any(-1)
+        try:
+            again = decompose(_or_axes(A, kept))
+        except _GaveUp:
+            return parts
+        return tuple(torch.where(kept.view(*kept.shape, *[1] * (p.ndim - kept.ndim)), p, torch.nan) for p in again)
+
+
+def _alone(decompose: Callable[[Tensor], tuple[Tensor, ...]], matrix: Tensor) -> tuple[Tensor, ...]:
+    try:
+        return decompose(matrix)
+    except _GaveUp:
+        axes = torch.eye(*matrix.shape, dtype=matrix.dtype, device=matrix.device)
+        return tuple(torch.full_like(part, torch.nan) for part in decompose(axes))
