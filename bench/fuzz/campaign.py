@@ -1,0 +1,223 @@
+"""Targets tried at random in several processes, with a limit on the time of each trial, and the table of what went wrong.
+
+A trial is made by its target's name and a seed alone, so that each failure can be seen again by itself.
+"""
+
+import argparse
+import importlib
+import multiprocessing
+import sys
+import time
+import traceback
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Trial(NamedTuple):
+    """What came of one trial."""
+
+    inputs: int
+    """How many bad inputs it was made of."""
+    broken: tuple[str, ...] = ()
+    """The promises that were not kept, each as `kind: what`."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that takes input."""
+
+    name: str
+    """With its room or format before it: `motion.fundamental_7pt`."""
+    attempt: Callable[[int], Trial]
+    """Make bad input from a seed, and say whether the promises hold. What it raises counts as broken."""
+
+
+@dataclass
+class Tally:
+    """What came of all trials of a target."""
+
+    trials: int = 0
+    inputs: int = 0
+    seconds: float = 0.0
+    slowest: float = 0.0
+    kinds: Counter[str] = field(default_factory=Counter)
+    examples: dict[str, tuple[int, str]] = field(default_factory=dict)
+    """Of each kind of failure the first seed, and the words."""
+
+    def add(self, seed: int, trial: Trial, seconds: float) -> None:
+        """Count one trial."""
+        self.trials += 1
+        self.inputs += trial.inputs
+        self.seconds += seconds
+        self.slowest = max(self.slowest, seconds)
+        for broken in trial.broken:
+            kind = broken.partition(":")[0]
+            self.kinds[kind] += 1
+            self.examples.setdefault(kind, (seed, broken))
+
+
+def attempt(target: Target, seed: int) -> Trial:
+    """One trial, in this process."""
+    try:
+        return target.attempt(seed)
+    except Exception as error:  # whatever it is, it was not promised
+        frame = next((f for f in reversed(traceback.extract_tb(error.__traceback__)) if "torchsfm" in f.filename), None)
+        place = f"{Path(frame.filename).name}:{frame.lineno}" if frame else "?"
+        text = " ".join(str(error).split())[:160]
+        return Trial(1, (f"raised {type(error).__name__} at {place}: {text}",))
+
+
+def targets_of(modules: Sequence[str]) -> dict[str, Target]:
+    """The targets that modules make with their `load()`, by name."""
+    return {target.name: target for module in modules for target in importlib.import_module(module).load()}
+
+
+def _work(modules: Sequence[str], names: list[str], first: int, step: int, pipe: Connection) -> None:
+    """Try one target after the other, the one with the least time so far first; tell before and after each trial."""
+    import torch
+
+    torch.set_num_threads(1)
+    targets = targets_of(modules)
+    spent = dict.fromkeys(names, 0.0)
+    seeds = dict.fromkeys(names, first)
+    while True:
+        name = min(spent, key=spent.__getitem__)
+        seed = seeds[name]
+        seeds[name] += step
+        pipe.send((name, seed, None, 0.0))
+        start = time.perf_counter()
+        trial = attempt(targets[name], seed)
+        seconds = time.perf_counter() - start
+        spent[name] += seconds
+        pipe.send((name, seed, trial, seconds))
+
+
+class _Worker:
+    """A process, and what it is at."""
+
+    def __init__(self, modules: Sequence[str], names: list[str], first: int, step: int) -> None:
+        self.pipe, other = multiprocessing.Pipe()
+        context: Any = multiprocessing.get_context("spawn")
+        self.process = context.Process(target=_work, args=(modules, names, first, step, other), daemon=True)
+        self.process.start()
+        other.close()
+        self.at: tuple[str, int] | None = None
+        self.since = time.perf_counter()
+
+    def stop(self) -> None:
+        """End the process, whatever it is at."""
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def run(
+    modules: Sequence[str],
+    names: list[str],
+    *,
+    workers: int,
+    seed: int,
+    inputs: int | None,
+    seconds: float | None,
+    limit: float,
+) -> dict[str, Tally]:
+    """Try the targets of these names until there were enough inputs or the time is over.
+
+    Args:
+        modules: Those with a `load() -> list[Target]`, which each process calls.
+        names: Which of them to try.
+        workers: The number of processes.
+        seed: The first seed of every target.
+        inputs: After how many bad inputs to stop.
+        seconds: After what time to stop.
+        limit: The seconds after which a trial counts as hanging; its process is killed, and another goes on.
+    """
+    tallies: dict[str, Tally] = defaultdict(Tally)
+    crew = [_Worker(modules, names, seed + i, workers) for i in range(workers)]
+    start, total, restarts = time.perf_counter(), 0, 0
+    try:
+        while (inputs is None or total < inputs) and (seconds is None or time.perf_counter() - start < seconds):
+            for ready in wait([worker.pipe for worker in crew], timeout=1.0):
+                worker = next(w for w in crew if w.pipe is ready)
+                try:
+                    name, at, trial, took = worker.pipe.recv()
+                except EOFError:
+                    continue
+                worker.since = time.perf_counter()
+                worker.at = (name, at) if trial is None else None
+                if trial is not None:
+                    tallies[name].add(at, trial, took)
+                    total += trial.inputs
+            for i, worker in enumerate(crew):
+                took = time.perf_counter() - worker.since
+                dead = not worker.process.is_alive() and not worker.pipe.poll()
+                if worker.at is not None and (dead or took > limit):
+                    name, at = worker.at
+                    what = f"crashed: exit code {worker.process.exitcode}" if dead else f"hung: more than {limit:.0f} s"
+                    tallies[name].add(at, Trial(1, (what,)), took)
+                    worker.stop()
+                    restarts += 1
+                    crew[i] = _Worker(modules, names, seed + i + 1_000_003 * restarts, workers)
+                elif dead:
+                    raise RuntimeError(f"a worker ended before its first trial, with exit code {worker.process.exitcode}")
+    finally:
+        for worker in crew:
+            worker.stop()
+    return tallies
+
+
+def report(tallies: dict[str, Tally]) -> str:
+    """The table of targets, and the failures with the seeds that show them."""
+    lines = [f"{'target':44} {'trials':>8} {'inputs':>9} {'ms each':>8} {'slowest s':>9} {'broken':>7}"]
+    for name, tally in sorted(tallies.items()):
+        each = 1e3 * tally.seconds / max(tally.trials, 1)
+        broken = sum(tally.kinds.values())
+        lines.append(f"{name:44} {tally.trials:8} {tally.inputs:9} {each:8.1f} {tally.slowest:9.2f} {broken or '':>7}")
+    total = Tally()
+    for tally in tallies.values():
+        total.trials += tally.trials
+        total.inputs += tally.inputs
+        total.kinds += tally.kinds
+    lines += ["", f"{total.trials} trials, {total.inputs} bad inputs, {sum(total.kinds.values())} promises broken"]
+    for name, tally in sorted(tallies.items()):
+        for kind, (seed, words) in sorted(tally.examples.items()):
+            lines.append(f"{name} --seed {seed} ({tally.kinds[kind]} times): {words}")
+    return "\n".join(lines)
+
+
+def main(modules: Sequence[str], description: str | None) -> None:
+    """The command line of a set of targets."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--inputs", type=int, help="stop after so many bad inputs")
+    parser.add_argument("--seconds", type=float, help="stop after this time")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--rooms", nargs="*", help="rooms or formats; all by default")
+    parser.add_argument("--limit", type=float, default=60.0, help="seconds after which a trial hangs")
+    parser.add_argument("--only", help="try one target once, with this seed, and say what breaks")
+    parser.add_argument("--list", action="store_true", help="names of the targets")
+    parser.add_argument("--out", type=Path, help="write the table here too")
+    options = parser.parse_args()
+    targets = targets_of(modules)
+    names = [name for name in targets if not options.rooms or name.partition(".")[0] in options.rooms]
+    if options.list:
+        print("\n".join(names))
+        return
+    if options.only:
+        if options.only not in targets:
+            parser.error(f"no target {options.only!r}")
+        print("\n".join(targets[options.only].attempt(options.seed).broken) or "nothing broken")
+        return
+    inputs = options.inputs if options.inputs or options.seconds else 100_000
+    tallies = run(
+        modules, names, workers=options.workers, seed=options.seed, inputs=inputs, seconds=options.seconds, limit=options.limit
+    )
+    text = report(tallies)
+    print(text)
+    if options.out:
+        options.out.write_text(text + "\n")
+    sys.exit(any(tally.kinds for tally in tallies.values()))

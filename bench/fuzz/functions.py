@@ -1,0 +1,226 @@
+"""What each public function wants that a scene does not know by the names of its arguments."""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torchsfm
+from bench.fuzz.scene import SIZE, Scene
+from torchsfm.geometry import Camera, Pose, Radial, camera_from_krt, project_points
+from torchsfm.images import Features
+from torchsfm.motion import FundamentalEstimator, HomographyEstimator
+from torchsfm.optim import Block, Cauchy, Term
+from torchsfm.simulation import random_bundle_problem
+
+
+@dataclass(frozen=True)
+class Function:
+    """How to call a function."""
+
+    given: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments as they are, or as functions of the scene."""
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    """Of named dimensions."""
+    planar: bool = False
+    """Whether the points of the scene are to lie in a plane."""
+    centred: bool = False
+    """Whether the principal point is 0."""
+    batched: bool = True
+    """Whether the function takes batches of problems."""
+    half: bool = True
+    """Whether single precision is tried too."""
+
+
+def _generator(_: Scene) -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def _poses(s: Scene) -> Pose:
+    _, R, t = s.parameters(4)
+    return Pose(R, t)
+
+
+def _lenses(s: Scene) -> Camera:
+    K, _, _ = s.parameters(4)
+    return Camera(K, Radial(s.rand(4, low=-0.1, high=0.1), s.rand(4, low=-0.02, high=0.02)))
+
+
+def _board(s: Scene) -> tuple[Tensor, Tensor]:
+    """Points of a plane in its own coordinates, and their images."""
+    K, R, t = s.parameters(4)
+    X = s.points(12)[..., :2]
+    space = torch.cat((X, torch.zeros_like(X[..., :1])), -1)
+    far = torch.tensor([0.0, 0.0, 7.0], dtype=torch.float64)
+    return X, project_points(camera_from_krt(K, R, t + far), space[..., None, :, :])
+
+
+def _features(s: Scene) -> list[Features]:
+    one = [s.rand(20, high=9.0) for _ in range(3)]
+    return [Features(s.rand(20, 2, high=100.0), *one, s.rand(20, 128)) for _ in range(3)]
+
+
+def _bundle(name: str) -> Callable[[Scene], Any]:
+    return lambda s: getattr(random_bundle_problem(4, 20, 60, generator=_generator(s)).problem, name)
+
+
+def _projective(s: Scene) -> Tensor:
+    problem = random_bundle_problem(4, 20, 60, generator=_generator(s)).problem
+    return camera_from_krt(problem.cameras.K[problem.camera_index], problem.poses.R, problem.poses.t)
+
+
+def _fit(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    return torch.stack((x[..., 0, None] * a - b, x[..., 1, None] * a.exp() - 1), -1)
+
+
+def _terms(s: Scene) -> list[Term]:
+    index = torch.arange(12) % 4, torch.arange(12) % 3
+    return [Term(lambda p, q, z: p - q - z, ("p", "q"), index, (s.randn(12, 1),), Cauchy(1.0))]
+
+
+def _blocks(s: Scene) -> dict[str, Block]:
+    fixed = torch.tensor([True, False, False, False])
+    return {"p": Block(s.randn(4, 1), fixed=fixed), "q": Block(s.randn(3, 1))}
+
+
+ROBUST = {"threshold": 2.0, "max_iterations": 64, "generator": _generator}
+RAYS = ROBUST | {"threshold": 0.003}
+SIZED = {"image_size": SIZE}
+CENTRED = {"c": lambda s: s.rand(2, low=-1.0, high=1.0)}
+ADJUSTED = {name: _bundle(name) for name in ("poses", "cameras", "X", "x", "view", "point", "camera_index")}
+PROJECTIVE = {
+    "P": lambda s: _projective(s),
+    "X": lambda s: torch.nn.functional.pad(_bundle("X")(s), (0, 1), value=1.0),
+} | {name: _bundle(name) for name in ("x", "view", "point")}  # fmt: skip
+BUNDLE_SIZES = {"m": 60, "n": 20, "v": 4, "f": 4, "g": 1, "k": 1}
+TWO_VIEWS = {"estimator": FundamentalEstimator(), "data": lambda s: tuple(s.images(2, 30).unbind(-3))}
+
+FUNCTIONS: dict[str, Function] = {
+    "autocalibration.autocalibrate_points": Function(SIZED, {"n": 20}),
+    "autocalibration.calibrate_planes": Function({"X": lambda s: _board(s)[0], "x": lambda s: _board(s)[1]}),
+    "autocalibration.constant_intrinsics": Function(SIZED),
+    "autocalibration.dual_quadric_linear": Function(SIZED),
+    "autocalibration.intrinsics_from_kruppa": Function(SIZED),
+    "autocalibration.intrinsics_from_modulus": Function(SIZED),
+    "autocalibration.intrinsics_from_plane": Function(SIZED, planar=True),
+    "autocalibration.intrinsics_from_rotations": Function(SIZED),
+    "bundle.bundle_adjust": Function(ADJUSTED | {"max_iterations": 10}, BUNDLE_SIZES, batched=False),
+    "bundle.bundle_adjust_projective": Function(PROJECTIVE | {"max_iterations": 10}, BUNDLE_SIZES, batched=False),
+    "bundle.bundle_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
+    "geometry.rotation_from_euler": Function({"axes": "xyz"}),
+    "geometry.random_rotation": Function({"shape": (2,), "generator": _generator}),
+    "images.describe_images": Function({"features": _features, "words": 4, "generator": _generator}, batched=False),
+    "images.detect_corners": Function({"image": lambda s: s.rand(1, 32, 40)}),
+    "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
+    "images.match_descriptors": Function({f"descriptors{i}": lambda s: s.rand(9, 16) for i in (1, 2)}, batched=False),
+    "images.match_features": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),
+    "images.retrieve_pairs": Function(
+        {"features": _features, "neighbours": 1, "words": 4, "generator": _generator}, batched=False
+    ),
+    "images.scale_image": Function({"image": lambda s: s.rand(32, 40)}),
+    "images.track_points": Function(
+        {"image1": lambda s: s.rand(1, 40, 40), "image2": lambda s: s.rand(1, 40, 40), "x1": lambda s: s.rand(6, 2, high=39.0)}
+    ),
+    "images.track_sequence": Function({"images": lambda s: list(s.rand(3, 1, 40, 40))}, batched=False),
+    "linalg.nearest_rank": Function({"rank": 2}),
+    "linalg.nullspace_rows": Function(batched=False),
+    "linalg.null_vector": Function({"A": lambda s: s.randn(6, 4)}),
+    "linalg.orthonormal_nullspace": Function({"A": lambda s: s.randn(3, 5)}),
+    "motion.estimate_essential": Function(RAYS, {"n": 30}),
+    "motion.estimate_fundamental": Function(ROBUST, {"n": 30}),
+    "motion.estimate_fundamentals": Function({"threshold": 2.0, "generator": _generator, "slots": 2}, {"n": 30}),
+    "motion.estimate_homographies": Function({"threshold": 2.0, "generator": _generator, "slots": 2}, {"n": 30}, planar=True),
+    "motion.estimate_homography": Function(ROBUST, {"n": 30}, planar=True),
+    "motion.estimate_trifocal": Function(ROBUST, {"n": 30}),
+    "motion.estimate_upright": Function(RAYS, {"n": 30}),
+    "motion.factorize_affine": Function({"max_iterations": 20}),
+    "motion.factorize_points": Function({"max_iterations": 20}),
+    "motion.homography_4pt": Function(planar=True),
+    "motion.homography_dlt": Function(planar=True),
+    "motion.relative_6pt_focal": Function(centred=True),
+    "optim.attach_implicit": Function(
+        {"equations": lambda _: lambda y, a: y * y - a, "y": lambda s: s.rand(2).sqrt(), "inputs": lambda s: (s.rand(2),)}
+    ),
+    "optim.attach_optimum": Function(
+        {"objective": lambda _: lambda y, a: ((y - a) ** 2).sum(-1), "y": lambda s: s.rand(2), "inputs": lambda s: (s.rand(2),)}
+    ),
+    "optim.levenberg_marquardt": Function(
+        {"residual": lambda _: _fit, "x0": lambda s: s.randn(2), "data": lambda s: (s.randn(12), s.randn(12))}
+    ),
+    "optim.loss_slope": Function({"loss": Cauchy(1.0), "s": lambda s: s.rand(5)}),
+    "optim.sparse_covariance": Function({"blocks": _blocks, "terms": _terms}, batched=False),
+    "optim.sparse_levenberg_marquardt": Function({"blocks": _blocks, "terms": _terms}, batched=False),
+    "reconstruction.reconstruct_tracks": Function(
+        {
+            "x": lambda s: s.images(4, 60).flatten(0, 1), "view": torch.arange(240) // 60, "track": torch.arange(240) % 60,
+            "image_size": torch.tensor([SIZE] * 4),
+        },
+        {"n": 60},
+        batched=False,
+    ),
+    "resection.camera_gp3p": Function({"p": lambda s: s.points(3) - 5 * s.rays(0, 3) - 0.1, "d": lambda s: s.rays(0, 3)}),
+    "resection.camera_p4pf": Function(centred=True),
+    "resection.camera_p35pf": Function(centred=True),
+    "resection.camera_planar": Function(planar=True),
+    "resection.estimate_camera": Function(ROBUST, {"n": 20}),
+    "resection.estimate_camera_focal": Function(ROBUST, {"n": 20}),
+    "resection.estimate_camera_projective": Function(ROBUST, {"n": 20}),
+    "resection.refine_camera": Function(
+        {"pose": lambda s: _poses(s)[..., 0], "camera": lambda s: Camera(s.parameters(1)[0][..., 0, :, :])}
+    ),
+    "resection.resect_cameras": Function({"max_iterations": 64, "generator": _generator}, {"n": 20}),
+    "robust.find_structures": Function(
+        TWO_VIEWS | {"estimator": HomographyEstimator(), "threshold": 2.0, "generator": _generator, "slots": 2},
+        {"n": 30},
+        planar=True,
+    ),
+    "robust.ransac": Function(TWO_VIEWS | ROBUST, {"n": 30}),
+    "robust.soft_ransac": Function(TWO_VIEWS | {"threshold": 2.0, "generator": _generator}, {"n": 30}),
+    "simulation.look_at": Function(),
+    "simulation.orbit_poses": Function({"views": 3}),
+    "simulation.random_bundle_problem": Function(
+        {"num_cameras": 3, "num_points": 8, "num_observations": 16, "generator": _generator}
+    ),
+    "simulation.random_intrinsics": Function({"shape": (2,), "generator": _generator}),
+    "simulation.random_points": Function({"shape": (2,), "generator": _generator}),
+    "simulation.random_poses": Function({"shape": (2,), "generator": _generator}),
+    "simulation.simulate_images": Function({"poses": _poses, "cameras": _lenses, "generator": _generator}),
+    "tensors.reordered_trifocal": Function({"views": (1, 0, 2)}),
+    "triangulation.triangulate_points_robust": Function({"threshold": 2.0, "generator": _generator}),
+}  # fmt: skip
+"""The others are called with what the scene knows."""
+
+FILES = "reads or writes files, which `bench.fuzz.files` spoils"
+EXCEPTIONS: dict[str, str] = {
+    "bundle.bundle_adjust_model": "hands a model to bundle_adjust",
+    "cli.main": "a program; its options and files are tested in tests/test_cli.py",
+    **{f"formats.{name}": FILES for name in ("read_bal", "read_colmap", "read_libmv", "read_ply", "read_vgg")},
+    **{f"formats.{name}": FILES for name in ("write_bal", "write_colmap", "write_ply")},
+    **{f"images.{name}": FILES for name in ("list_images", "load_detector", "load_matcher", "read_image", "save_image")},
+    "images.parse_exif": FILES,
+    "linalg.compile_kernels": "a switch",
+    "optim.wants_derivative": "a question about tensors, not their values",
+    "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
+    "simulation.courtyard_scene": "takes no data, and seconds",
+    "simulation.render_sequence": "takes no data, and seconds",
+    **{f"plot.plot_{name}": "draws" for name in (
+        "cameras", "epipolar_lines", "matches", "points_2d", "points_3d", "residuals", "tracks")},
+    **{f"plot.{name}": "draws" for name in ("show_image", "show_scaled", "up_direction", "write_page")},
+}  # fmt: skip
+"""Public functions that are not tried, and why."""
+
+
+def public_functions() -> dict[str, Callable[..., Any]]:
+    """All functions that rooms export, by room and name."""
+    found = {}
+    for module in pkgutil.iter_modules(torchsfm.__path__):
+        if module.ispkg:
+            room = importlib.import_module(f"torchsfm.{module.name}")
+            names = (name for name in room.__all__ if inspect.isfunction(getattr(room, name)))
+            found |= {f"{module.name}.{name}": getattr(room, name) for name in names}
+    return found

@@ -1,0 +1,84 @@
+"""What every result promises, whatever was asked for."""
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchsfm import Solutions, Status
+
+MAY_BE_INFINITE = {
+    "deviation", "data_deviation", "intrinsics_deviation", "residuals", "error", "covariance", "cost", "initial_cost",
+    "threshold", "proximity",
+}  # fmt: skip
+"""Fields in which infinity means: not determined, not used, not found."""
+
+
+def tensors(value: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
+    """Every tensor in nested dataclasses, tuples, lists and dicts, with its place."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif is_dataclass(value) and not isinstance(value, type):
+        for f in fields(value):
+            yield from tensors(getattr(value, f.name), f"{name}.{f.name}")
+    elif isinstance(value, tuple | list):
+        names = getattr(value, "_fields", range(len(value)))
+        for part, item in zip(names, value, strict=True):
+            yield from tensors(item, f"{name}.{part}")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from tensors(item, f"{name}.{key}")
+
+
+def verdict(result: Any) -> Tensor | None:
+    """Which elements the result calls good: by `status`, by `valid`, or by a mask after one value; None if it does not say."""
+    status, valid = getattr(result, "status", None), getattr(result, "valid", None)
+    if isinstance(status, Tensor):
+        return status == int(Status.OK)
+    if isinstance(valid, Tensor):
+        return valid
+    if isinstance(result, tuple) and not hasattr(result, "_fields") and len(result) >= 2:
+        last = result[-1]
+        if isinstance(last, Tensor) and last.dtype == torch.bool:
+            return last
+    return None
+
+
+def not_finite(result: Any) -> Iterator[str]:
+    """Numbers that are none where the result calls itself good; in `Solutions` anywhere."""
+    good = verdict(result)
+    if good is None:
+        return
+    for name, value in tensors(result):
+        if not (value.is_floating_point() or value.is_complex()) or value.shape[: good.ndim] != good.shape:
+            continue
+        kept = value if isinstance(result, Solutions) else value[good]
+        infinite = name.rpartition(".")[2] in MAY_BE_INFINITE
+        if bool((kept.isnan() if infinite else ~kept.isfinite()).any()):
+            yield f"not finite: {name} of {type(result).__name__} where it is called good"
+
+
+def zero_models(result: Any) -> Iterator[str]:
+    """Models of zeros alone that are called good."""
+    good, model = verdict(result), getattr(result, "model", None)
+    if good is None or model is None:
+        return
+    for name, value in tensors(model, ".model"):
+        if value.is_floating_point() and value.ndim > good.ndim and value.shape[: good.ndim] == good.shape:
+            flat = value[good].flatten(1)
+            if bool((flat == 0).all(-1).any()):
+                yield f"zero model: {name} of {type(result).__name__} is called good"
+
+
+def changed(result: Any, reference: Any, kept: Tensor) -> Iterator[str]:
+    """Elements of the batch, those of a mask, that are not bit for bit what they are in a reference."""
+    for (name, value), (_, wanted) in zip(tensors(result), tensors(reference), strict=True):
+        if value.shape != wanted.shape:
+            yield f"neighbour changed: shape of {name or 'the value'}"
+        elif value.shape[: kept.ndim] == kept.shape:
+            a, b = value[kept], wanted[kept]
+            if not bool(((a == b) | ((a != a) & (b != b))).all()):
+                most = float((a.double() - b.double()).abs().nan_to_num(torch.inf).max()) if not a.is_complex() else 0.0
+                yield f"neighbour changed: {name or 'the value'} by {most:.1e}"
