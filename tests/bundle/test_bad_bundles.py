@@ -178,6 +178,47 @@ def test_points_seen_once_stay_on_their_rays(problem: BundleProblem) -> None:
     assert result.residuals[result.used][some.point[result.used] < 10].max() < 1e-3
 
 
+FAR = (1e10, -1e16, 1e40, -1e120, 1e200, 1e308, torch.inf, -torch.inf, torch.nan)
+
+
+def poisoned(problem: BundleProblem, kind: str, place: int, value: float) -> tuple[BundleProblem, torch.Tensor]:
+    """One number of a point, a pose, a camera or an observation replaced, and which observations that touches."""
+    X, t, K, x = problem.X.clone(), problem.poses.t.clone(), problem.cameras.K.clone(), problem.x.clone()
+    if kind == "point":
+        X[place % 120, place % 3] = value
+        touched = problem.point == place % 120
+    elif kind == "pose":
+        t[place % 8, place % 3] = value
+        touched = problem.view == place % 8
+    elif kind == "camera":
+        K[place % 8, 0, (0, 2)[place % 2]] = value
+        touched = problem.camera_index[problem.view] == place % 8
+    else:
+        x[place % 500, place % 2] = value
+        touched = torch.arange(500) == place % 500
+    new = change(problem, X=X, x=x, poses=Pose(problem.poses.R, t), cameras=Camera(K, problem.cameras.distortion))
+    return new, touched
+
+
+@pytest.mark.parametrize("kind", ["point", "pose", "camera", "observation"])
+def test_far_numbers_without_weight_change_nothing(problem: BundleProblem, kind: str, generator: torch.Generator) -> None:
+    """Whatever stands where nothing counts, the others end where they end without it, bit for bit."""
+    for value in FAR:
+        place = int(torch.randint(100_000, (), generator=generator))
+        bad, touched = poisoned(problem, kind, place, value)
+        weights = (~touched).double()
+        found = bundle_adjust_model(bad, free=FREE, weights=weights).result
+        wanted = bundle_adjust_model(problem, free=FREE, weights=weights).result
+        assert found.status == wanted.status == Status.OK
+        assert found.iterations == wanted.iterations > 2
+        assert found.cost == wanted.cost
+        assert torch.equal(found.residuals, wanted.residuals)
+        rest = torch.ones(120, dtype=torch.bool)
+        if kind == "point":
+            rest[place % 120] = False
+        assert torch.equal(found.X[rest], wanted.X[rest])
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_indices_and_names(problem: BundleProblem) -> None:
     args = [problem.poses, problem.cameras, problem.X, problem.x, problem.view, problem.point]

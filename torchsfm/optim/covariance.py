@@ -100,6 +100,6 @@ def _square_sum(term: Term, x: dict[str, Tensor]) -> float:
 
 
 def usable(term: Term, x: dict[str, Tensor]) -> Tensor:
-    """Which residuals are finite and have weight."""
-    finite = term_residual(term, x).isfinite().all(-1)
-    return finite if term.weights is None else finite & (term.weights > 0)
+    """Which residuals have weight and a finite share in the sum of squares."""
+    square = term_residual(term, x).square().sum(-1)
+    return square.isfinite() if term.weights is None else (square * term.weights).isfinite() & (term.weights > 0)

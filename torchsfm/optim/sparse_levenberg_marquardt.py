@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsfm._types import Status, check_tensors
 from torchsfm.optim.covariance import to_double, usable
 from torchsfm.optim.implicit import wants_derivative
-from torchsfm.optim.layout import lay_out
+from torchsfm.optim.layout import Layout, lay_out
 from torchsfm.optim.schur import Elimination, Solver, move
 from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
 from torchsfm.optim.terms import Block, Term, term_cost, term_residual
@@ -22,9 +22,10 @@ class SparseResult:
     """The minimum of a sparse least-squares problem.
 
     `x` holds every block, `residuals` every term's residuals (m, d) there, `used` (m) which of them count: a residual that is
-    not finite at the start is left out. `status` is `Status.OK` where a tolerance was met or no step lowers the cost any more,
-    `NOT_CONVERGED` where the iteration limit came first, `INTERRUPTED` where it was stopped from outside, `TOO_FEW` where
-    nothing is free or observed, `NOT_FINITE` where no residual is finite.
+    not finite at the start, or whose square is not, is left out. `status` is `Status.OK` where a tolerance was met or no step
+    lowers the cost any more, `NOT_CONVERGED` where the iteration limit came first, `INTERRUPTED` where it was stopped from
+    outside, `TOO_FEW` where nothing is free or observed, `NOT_FINITE` where no residual is finite, or where their sum or its
+    derivatives are not: then `x` is the best seen.
     """
 
     x: dict[str, Tensor]
@@ -62,7 +63,7 @@ def sparse_levenberg_marquardt(
         max_iterations: Most accepted or rejected steps.
         function_tolerance: End when an accepted step lowers the cost by less than this fraction.
         gradient_tolerance: End when no derivative of the cost is larger.
-        step_tolerance: End when the step is shorter than this fraction of the variables' norm.
+        step_tolerance: End when the step of every variable is shorter than this fraction of that variable's norm.
         initial_damping: Damping relative to the diagonal of the normal equations, at the start (1 / Ceres' radius).
         linear_solver: "dense" forms the reduced system of the retained variables and factors it; "pcg" solves it by
             preconditioned conjugate gradients without forming it, to a tenth of the decrease the model allows (inexact steps:
@@ -98,7 +99,8 @@ def sparse_levenberg_marquardt(
         if layout.pieces:
             engine = Elimination(double, layout, linear_solver)
             state.cost = state.initial = float(engine.cost(x))
-            status = _run(engine, state, constant, options)
+            finite = math.isfinite(state.cost + constant)
+            status = _run(engine, state, constant, options) if finite else Status.NOT_FINITE
         else:
             none = any(u.numel() for u in used) and not any(bool(u.any()) for u in used)
             status = Status.NOT_FINITE if none else Status.TOO_FEW
@@ -159,7 +161,7 @@ def _descend(engine: Elimination, state: _Descent, constant: float, options: _Op
         accepted = rounding or (trial_cost < cost and ratio > 1e-3)
         # A promise far below the tolerance ends it, kept or not: rounding decides whether such a step lowers the cost.
         done = solved and promise <= 1e-2 * options.function_tolerance * cost
-        done = done or (solved and _length(step) <= options.step_tolerance * (_length(state.x) + options.step_tolerance))
+        done = done or (solved and _is_short(step, state.x, engine.layout, options.step_tolerance))
         if accepted:
             done = done or (not rounding and cost - trial_cost <= options.function_tolerance * cost)
             state.x, state.cost = trial, trial_cost
@@ -172,7 +174,7 @@ def _descend(engine: Elimination, state: _Descent, constant: float, options: _Op
             return Status.OK if done else Status.INTERRUPTED
         # At the largest damping no step whatever lowers the cost.
         if done or damping > 1e16:
-            return Status.OK
+            return Status.OK if solved else Status.NOT_FINITE
         if accepted and iteration < options.max_iterations:
             system = engine.linearize(state.x)
     return Status.NOT_CONVERGED
@@ -203,5 +205,10 @@ def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | 
                 raise ValueError(f"terms[{k}].index: wanted numbers from 0 to {count - 1} for {name!r}, got {got}")
 
 
-def _length(x: dict[str, Tensor]) -> float:
-    return float(torch.stack([v.square().sum() for v in x.values()]).sum().sqrt()) if x else 0.0
+def _is_short(step: dict[str, Tensor], x: dict[str, Tensor], layout: Layout, tolerance: float) -> bool:
+    """Whether no variable moves by more than a fraction of its own norm: one that is far away says nothing of the others."""
+    norm = torch.linalg.vector_norm
+    return all(
+        bool((norm(delta, dim=1) <= tolerance * (norm(x[name][layout.free[name]], dim=1) + tolerance)).all())
+        for name, delta in step.items()
+    )
