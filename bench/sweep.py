@@ -139,7 +139,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1, help="the first seed")
     parser.add_argument("--every", action="store_true", help="every seed with every arithmetic")
     parser.add_argument("--workers", type=int, default=2, help="processes at a time")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="when to stop")
+    parser.add_argument("--seconds", type=float, default=10 * 24 * 3600.0, help="when to stop")
     parser.add_argument("--out", type=Path, help="where the report goes, rewritten as jobs end")
     arguments = sys.argv[1:]
     cut = arguments.index("--") if "--" in arguments else len(arguments)
