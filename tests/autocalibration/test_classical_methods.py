@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from projective_scenes import SIZE, projective_scene, stack
+from projective_scenes import MOTIONS, SIZE, projective_scene, stack
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -60,6 +60,39 @@ def test_dual_quadric_says_what_it_cannot(generator):
     assert dual_quadric_linear(still.P, image_size=SIZE, expected_focal=None).status == Status.DEGENERATE
     bad = torch.stack([still.P * torch.nan, still.P])
     assert dual_quadric_linear(bad, image_size=SIZE).status[0] == Status.NOT_FINITE
+
+
+@pytest.mark.parametrize("expected_focal", [None, 1.2])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.parametrize("motion", ["general", *MOTIONS])
+def test_dual_quadric_is_right_or_refused(generator, motion, noise, expected_focal):
+    scene = stack([projective_scene(generator, 7, motion=motion, noise=noise, offset=0.0) for _ in range(20)])
+    # With noise one of the twenty may lie outside its own deviation.
+    allowed = 0 if noise == 0 else 1
+    for dtype in (torch.float64, torch.float32):
+        found = dual_quadric_linear(scene.P.to(dtype), image_size=SIZE, expected_focal=expected_focal)
+        accepted = found.status == Status.OK
+        error = (found.K[..., 0, 0] / scene.K[..., 0, 0] - 1).abs().amax(-1)
+        assert (accepted & (error > 0.2)).sum() <= allowed
+        # Translations, and orbits about a point, leave focal lengths that may vary open.
+        if motion in ("translation", "orbital"):
+            assert accepted.sum() <= allowed
+            assert ((found.deviation > 0.15).any(-1) | accepted).all()
+        elif motion == "general":
+            assert (~accepted).sum() <= allowed
+            assert found.deviation[accepted].max() < (1e-3 if noise == 0 else 0.15)
+
+
+def test_dual_quadric_without_a_view_is_that_of_the_others(generator):
+    scene = projective_scene(generator, 7, noise=0.3, offset=0.0)
+    weights = torch.ones(7, dtype=torch.float64)
+    weights[3] = 0
+    rest = [0, 1, 2, 4, 5, 6]
+    found = dual_quadric_linear(scene.P, image_size=SIZE, weights=weights)
+    less = dual_quadric_linear(scene.P[rest], image_size=SIZE)
+    assert torch.allclose(found.deviation[rest], less.deviation, rtol=1e-6)
+    assert found.deviation[3] == 1
+    assert torch.allclose(found.K[rest], less.K, rtol=1e-6)
 
 
 @pytest.mark.parametrize("method", [constant_intrinsics, intrinsics_from_modulus])

@@ -3,6 +3,10 @@
 `w*_i = K_i K_i' ~ P_i Q P_i'`: every known zero or ratio in w* is one linear equation in the ten entries of Q (Triggs,
 "Autocalibration and the absolute quadric", CVPR 1997; Pollefeys, Koch & Van Gool, IJCV 1999). The unknown scale of each
 equation, w*_33, is put right by solving again. Q has rank 3 and is positive semidefinite; the nearest such quadric is taken.
+
+Whether the equations determine Q is asked of the equations themselves: without one view, or without one equation, they must
+still say the same (the jackknife of Quenouille and Tukey). That needs to know neither the noise of the cameras nor how it
+spreads over the equations, and two singular values that are nothing but rounding or noise do not pass for a gap.
 """
 
 from dataclasses import dataclass
@@ -12,6 +16,7 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
+from torchsfm.autocalibration.algebraic_fit import MAX_DEVIATION
 from torchsfm.autocalibration.projective_input import image_scaling
 from torchsfm.linalg import eigh, null_vector, svdvals
 
@@ -31,12 +36,18 @@ class DualQuadric:
     """Views whose conic is that of a real camera; others have K = I."""
     plane: Float[Tensor, "*batch 4"]
     """The plane at infinity, Q plane = 0."""
+    deviation: Float[Tensor, "*batch v"]
+    """Standard deviation of the logarithm of each view's focal length by the equations alone, from what they say when a view or
+    an equation is left out, and from how far the expected focal length moved it; at most 1, which stands also where a view has
+    no conic of a real camera."""
     gap: Float[Tensor, "*batch"]
-    """Ratio of the least to the second least singular value of the equations: near 1 where they leave Q open."""
+    """Ratio of the least to the second least singular value of the equations, both raised to their rounding: near 1 where they
+    leave Q open."""
     negative: Float[Tensor, "*batch"]
     """The third over the largest eigenvalue before positivity was enforced; negative where it had to be."""
     status: Int8[Tensor, "*batch"]
-    """OK; DEGENERATE: Q is left open, or is not that of real cameras; TOO_FEW equations; NOT_FINITE."""
+    """OK; DEGENERATE: the equations leave a focal length open, or Q is not that of real cameras; TOO_FEW equations;
+    NOT_FINITE."""
 
 
 def dual_quadric_linear(
@@ -61,7 +72,8 @@ def dual_quadric_linear(
         zero_skew: Use that pixels are rectangular.
         unit_aspect: Use that they are square.
         expected_focal: Focal length, over the longer side of the image, that is softly expected (within a factor of about 2, as
-            Pollefeys et al., IJCV 2004, do); None expects none.
+            Pollefeys et al., IJCV 2004, do), as far as the disagreement of the other equations lets it count; None expects
+            none. It has no part in deciding whether the focal lengths are determined.
         iterations: Number of solutions, each with the scales of the one before.
 
     Returns:
@@ -101,23 +113,28 @@ def dual_quadric_linear(
     rows = [(row(0, 2), SIGMA["principal_point"] / focal), (row(1, 2), SIGMA["principal_point"] / focal)]
     rows += [(row(0, 1), SIGMA["skew"])] if zero_skew else []
     rows += [(row(0, 0) - row(1, 1), SIGMA["aspect"])] if unit_aspect else []
-    known = len(rows)
-    if expected_focal is not None:
-        rows += [(row(0, 0) - corner, SIGMA["focal"]), (row(1, 1) - corner, SIGMA["focal"])]
     A = torch.stack([r / sigma for r, sigma in rows], -2)
+    prior = torch.stack((row(0, 0) - corner, row(1, 1) - corner), -2) / SIGMA["focal"]
+    known = len(rows)
+    count = good.sum(-1)
+    rounding = 64 * torch.finfo(P.dtype).eps
     scale = torch.ones_like(w)
     q = A.new_zeros(*batch, 10)
     for _ in range(max(iterations, 1)):
-        whole = (A * (w.sqrt() / scale)[..., None, None]).flatten(-3, -2)
-        q, _ = null_vector(torch.nn.functional.pad(whole, (0, 0, 0, 10)))
+        weight = (w.sqrt() / scale)[..., None, None]
+        equations = A * weight
+        values, _ = svdvals(torch.nn.functional.pad(equations.flatten(-3, -2), (0, 0, 0, 10)))
+        noise = torch.maximum(values[..., -1] / (count * known - 9).clamp_min(1).sqrt(), rounding * values[..., 0])
+        whole = equations
+        if expected_focal is not None:
+            whole = torch.cat((equations, noise[..., None, None, None] * prior * weight), -2)
+        q, _ = null_vector(torch.nn.functional.pad(whole.flatten(-3, -2), (0, 0, 0, 10)))
         size = (corner * q[..., None, :]).sum(-1).abs()
         scale = size.clamp_min(1e-3 * size.amax(-1, keepdim=True)).clamp_min(1e-300)
-    values, _ = svdvals(torch.nn.functional.pad(whole, (0, 0, 0, 10)))
-    gap = values[..., -1] / values[..., -2].clamp_min(1e-300)
-    i, j = torch.tensor(_PAIRS, device=P.device).unbind(-1)
-    Q = q.new_zeros(*batch, 4, 4)
-    Q[..., i, j] = q
-    Q[..., j, i] = q
+    floor = rounding * values[..., 0] + 1e-300
+    gap = (values[..., -1] + floor) / (values[..., -2] + floor)
+    deviation = _jackknife(equations, S, q, good)
+    Q = _symmetric(q)
     spectrum, axes, _ = eigh(Q)
     flip = (spectrum[..., 0] + spectrum[..., -1] < 0)[..., None]
     spectrum = torch.where(flip, -spectrum.flip(-1), spectrum)
@@ -134,9 +151,9 @@ def dual_quadric_linear(
     K = torch.linalg.inv_ex(T).inverse @ torch.where(valid[..., None, None], K, T @ eye[:, :3])
     K = torch.where(valid[..., None, None], K / K[..., 2:, 2:], eye[:, :3])
     status = torch.full(batch, int(Status.OK), dtype=torch.int8, device=P.device)
-    count = good.sum(-1)
+    open_ = ((deviation > MAX_DEVIATION) & good).any(-1)
     for condition, code in (
-        ((third < 1e-9) | (gap > 0.5) | ~(valid | ~good).all(-1), Status.DEGENERATE),
+        ((third < 1e-9) | open_ | ~(valid | ~good).all(-1), Status.DEGENERATE),
         (count * known < 9, Status.TOO_FEW),
         (count == 0, Status.NOT_FINITE),
     ):
@@ -144,8 +161,50 @@ def dual_quadric_linear(
     dtype = P.dtype
     unit = Q / Q.flatten(-2).norm(dim=-1)[..., None, None].clamp_min(1e-300)
     plane = plane / plane.norm(dim=-1, keepdim=True).clamp_min(1e-300)
-    numbers = (unit.to(dtype), K.to(dtype), valid, plane.to(dtype), gap.to(dtype), third.to(dtype))
+    numbers = (unit.to(dtype), K.to(dtype), valid, plane.to(dtype), deviation.to(dtype), gap.to(dtype), third.to(dtype))
     return DualQuadric(*numbers, status.to(torch.int8))
+
+
+def _symmetric(q: Tensor) -> Tensor:
+    i, j = torch.tensor(_PAIRS, device=q.device).unbind(-1)
+    Q = q.new_zeros(*q.shape[:-1], 4, 4)
+    Q[..., i, j] = q
+    Q[..., j, i] = q
+    return Q
+
+
+def _jackknife(equations: Tensor, S: Tensor, q: Tensor, good: Tensor) -> Tensor:
+    """Deviation (*batch, v) of the log focal lengths of q, the larger of what leaving out views and equations tells."""
+    known = equations.shape[-2]
+    outer = equations[..., :, None] * equations[..., None, :]
+    normal = outer.sum((-4, -3))
+    unit = normal.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp_min(1e-300)
+
+    def solved(N: Tensor) -> Tensor:
+        """Null vectors: squared equations are accurate enough for deviations that are not tiny."""
+        return eigh(N)[1][..., 0]
+
+    def focal(q: Tensor, cameras: Tensor) -> Tensor:
+        """Logarithms of focal lengths, infinite where the conic is that of no real camera."""
+        K, real = _upper_cholesky(cameras @ _symmetric(q)[..., None, :, :] @ cameras.mT)
+        return torch.where(real, (K[..., 0, 0] * K[..., 1, 1]).log() / 2, torch.inf)
+
+    def square(a: Tensor, b: Tensor) -> Tensor:
+        return (a - b).square().nan_to_num(1.0).clamp_max(1.0)
+
+    whole = focal(solved(normal / unit), S)
+    told = torch.zeros_like(whole)
+    number = good.sum(-1)
+    for left_out, each in ((outer.sum(-3), 1), (outer.flatten(-4, -3), known)):
+        rest = focal(solved((normal[..., None, :, :] - left_out) / unit[..., None, :, :]), S[..., None, :, :, :])
+        counted = good.repeat_interleave(each, -1)[..., None]
+        spread = (square(rest, whole[..., None, :]) * counted).sum(-2)
+        share = ((number * known - 9) / (number * known)).clamp(0, 1)[..., None]
+        # Fewer than nine equations say nothing.
+        enough = (number * known - known // each >= 9)[..., None]
+        told = torch.where(enough, torch.maximum(told, share * spread), told)
+    told = told + square(focal(q, S), whole)
+    return torch.where(good, told.sqrt().clamp_max(1.0), 1.0)
 
 
 def _upper_cholesky(C: Tensor) -> tuple[Tensor, Tensor]:
