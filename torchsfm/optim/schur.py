@@ -25,7 +25,8 @@ from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.normal_equations import NormalEquations
 from torchsfm.optim.runs import Runs, find_runs
 from torchsfm.optim.squares import Squares
-from torchsfm.optim.terms import Block, Term, Workspace, gather, lift_of, linearize, term_cost, term_residual
+from torchsfm.optim.terms import Block, Term, Workspace, gather, lift_of, linearize, residual_costs, term_cost, term_residual
+from torchsfm.optim.triangle import backward, diagonal, factor, floor, forward, place
 
 LARGEST = 9000
 """Columns of the largest reduced system formed without being asked: its square and factor take 1.3 GB."""
@@ -33,6 +34,8 @@ FLOP = 1.3e-11
 """Seconds per column cubed of a Cholesky factorisation, on a usual core."""
 PASS = 4e-6
 """Seconds per residual of a solution by conjugate gradients, of some 100 iterations."""
+SETTLING = 1e-6
+"""Damping of the steps of eliminated variables by themselves."""
 Solver = Literal["auto", "dense", "pcg"]
 """How the reduced system is solved: by a dense Cholesky factor, or by conjugate gradients without forming it."""
 
@@ -93,6 +96,49 @@ class Elimination:
 
     def linearize(self, x: dict[str, Tensor]) -> "NormalEquations":
         """The blocks of the normal equations at `x`; they are overwritten by the next call."""
+        lifts = self._lifts(x)
+        self.squares.clear()
+        self.V.zero_()
+        if self.coupling is not None:
+            self.coupling.clear()
+        for part in self.parts:
+            self._add(part, x, lifts, self.V)
+        squares = self.squares
+        return NormalEquations(
+            self.layout, self.coupling, squares, self.V, self.clusters, squares.diagonal(), squares.gradient()
+        )
+
+    def settle(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
+        """`x` with every eliminated variable one Gauss-Newton step of its own further where that lowers its cost.
+
+        A long step along a curved valley of the cost (focal length against depth) leaves it sideways; with the points brought
+        back to where the moved cameras want them it stays inside (embedded point iterations, Jeong et al. 2012).
+        """
+        q, layout = self.layout.point_size, self.layout
+        if layout.eliminated is None:
+            return x
+        V, lifts = self.work.get("settled", *self.V.shape).zero_(), self._lifts(x)
+        parts = [part for part in self.parts if part.point is not None]
+        for part in parts:
+            self._add(part, x, lifts, V, held=True)
+        L = factor(V, SETTLING * floor(diagonal(V, q)), q)
+        step = -backward(L, forward(L, V[[place(a, q, q) for a in range(q)]]))
+        moved = move(self.blocks, layout, x, {layout.eliminated: step.mT})
+        before, after = (self._point_costs(parts, y) for y in (x, moved))
+        better = torch.zeros(x[layout.eliminated].shape[0], dtype=torch.bool, device=V.device)
+        better[layout.free[layout.eliminated]] = after < before
+        return x | {layout.eliminated: torch.where(better, moved[layout.eliminated].mT, x[layout.eliminated].mT).mT}
+
+    def _point_costs(self, parts: list[_Part], x: dict[str, Tensor]) -> Tensor:
+        """The cost of each eliminated variable's residuals."""
+        total = self.V.new_zeros(self.layout.points)
+        for part in parts:
+            assert part.point is not None, "chosen so"
+            total.index_add_(0, part.point, residual_costs(part.term, term_residual(part.term, x, self.work)))
+        return total
+
+    def _lifts(self, x: dict[str, Tensor]) -> dict[str, Tensor | None]:
+        """Derivatives of the retractions that derivatives of terms are multiplied by."""
         needed = {
             name
             for part in self.parts
@@ -100,30 +146,22 @@ class Elimination:
             for name, w in zip(part.term.blocks, part.wanted, strict=True)
             if w
         }
-        lifts = {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
-        self.squares.clear()
-        self.V.zero_()
-        if self.coupling is not None:
-            self.coupling.clear()
-        for part in self.parts:
-            self._add(part, x, lifts)
-        squares = self.squares
-        return NormalEquations(
-            self.layout, self.coupling, squares, self.V, self.clusters, squares.diagonal(), squares.gradient()
-        )
+        return {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
 
-    def _add(self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None]) -> None:
-        """Add squares and products of a part's Jacobians to the system."""
-        q, c, d, m = self.layout.point_size, part.width, part.components, part.term.index[0].shape[0]
+    def _add(
+        self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None], V: Tensor, *, held: bool = False
+    ) -> None:
+        """Add squares and products of a part's Jacobians to the system, or with the retained variables held to V alone."""
+        q, c, d, m = self.layout.point_size, 0 if held else part.width, part.components, part.term.index[0].shape[0]
         # Both with the residual as one more column, which gives the gradients.
         J, P = self.work.get("J", d, c + 1, m), self.work.get("P", d, q + 1, m)
         out: list[Tensor | None] = []
         start = 0
         for name, wanted in zip(part.term.blocks, part.wanted, strict=True):
-            if not wanted:
-                out.append(None)
-            elif name == self.layout.eliminated:
+            if wanted and name == self.layout.eliminated:
                 out.append(P[:, :q].permute(2, 0, 1))
+            elif held or not wanted:
+                out.append(None)
             else:
                 end = start + self.blocks[name].tangent
                 out.append(J[:, start:end].permute(2, 0, 1))
@@ -139,7 +177,7 @@ class Elimination:
         if scale is not None:
             P[:, :q] *= scale
         P[:, q] = J[:, c]
-        squares = self.work.get("V", self.V.shape[0], m)
+        squares = self.work.get("V", V.shape[0], m)
         row = 0
         for a in range(q):
             rows = squares[row : row + q + 1 - a]
@@ -147,7 +185,7 @@ class Elimination:
             for k in range(1, d):
                 rows.addcmul_(P[k, a], P[k, a:])
             row += q + 1 - a
-        self.V.index_add_(1, part.point, squares)
+        V.index_add_(1, part.point, squares)
         if c and self.coupling is not None:
             self.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
 

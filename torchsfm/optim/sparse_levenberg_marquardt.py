@@ -16,6 +16,9 @@ from torchsfm.optim.schur import Elimination, Solver, move
 from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
 from torchsfm.optim.terms import Block, Term, term_cost, term_residual
 
+STRAIGHT = 0.75
+"""Steps that lower the cost by less than this part of what they promise left the linear model's reach."""
+
 
 @dataclass(frozen=True)
 class SparseResult:
@@ -155,6 +158,10 @@ def _descend(engine: Elimination, state: _Descent, constant: float, options: _Op
         solved, promise = bool(solvable), float(promised)
         trial = move(engine.blocks, engine.layout, state.x, step)
         trial_cost = float(engine.cost(trial)) if solved else math.inf
+        if math.isfinite(trial_cost) and cost - trial_cost < STRAIGHT * promise:
+            # The linear model reaches no farther than this, but with the eliminated variables settled it may.
+            trial = engine.settle(trial)
+            trial_cost = float(engine.cost(trial))
         ratio = (cost - trial_cost) / max(promise, 1e-300)
         # Below the rounding error of the cost a step is taken on its promise: it brings x, not the cost, to its end.
         rounding = solved and promise <= 1e-12 * cost and trial_cost - cost <= 1e-14 * cost

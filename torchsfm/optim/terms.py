@@ -114,6 +114,13 @@ def term_cost(term: Term, residual: Float[Tensor, "m d"]) -> Float[Tensor, ""]:
     return (rho.sum() if term.weights is None else rho @ term.weights) / 2
 
 
+def residual_costs(term: Term, residual: Float[Tensor, "m d"]) -> Float[Tensor, "m"]:
+    """`w rho(|r|^2) / 2` of each residual."""
+    square = residual.square().sum(-1)
+    rho = square if term.loss is None else term.loss(square)
+    return (rho if term.weights is None else rho * term.weights) / 2
+
+
 def linearize(
     term: Term, x: dict[str, Tensor], lifts: dict[str, Tensor | None], out: list[Tensor | None], work: Workspace
 ) -> tuple[Tensor, Tensor | None]:
