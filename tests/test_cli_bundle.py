@@ -87,8 +87,6 @@ def test_report_of_before_and_after(bal: Path, problem: BundleProblem) -> None:
 def test_every_format_out(bal: Path, tmp_path: Path) -> None:
     costs = {}
     for name in ("out.txt", "out.txt.bz2", "out.npz", "colmap"):
-        if name == "colmap":
-            pytest.importorskip("pycolmap")
         status, text, stderr = torchsfm("bundle", bal, "--out", tmp_path / name)
         assert status == 0, stderr
         assert f"written: {tmp_path / name}" in text
@@ -110,7 +108,6 @@ def test_every_format_in(problem: BundleProblem, bal: Path, tmp_path: Path) -> N
     new = Reconstruction.load(tmp_path / "new.npz")
     assert new.names == model.names
     assert torch.equal(new.color, model.color)
-    pytest.importorskip("pycolmap")
     write_colmap(model, tmp_path / "folder")
     status, text, _ = torchsfm("bundle", tmp_path / "folder")
     assert status == 0
@@ -177,7 +174,6 @@ def test_damaged_files(tmp_path: Path) -> None:
         status, _, stderr = torchsfm("bundle", tmp_path / name)
         assert status == 2
         assert_one_line(stderr, name, words)
-    pytest.importorskip("pycolmap")
     (tmp_path / "folder").mkdir()
     status, _, stderr = torchsfm("bundle", tmp_path / "folder")
     assert status == 2

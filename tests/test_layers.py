@@ -30,13 +30,12 @@ ALLOWED: dict[str, set[str]] = {
     "plot": {"linalg", "geometry", "tensors", "images", "reconstruction"},
 }  # fmt: skip
 FREE = {"__init__", "cli", "__main__"}
-LAZY = {"kornia", "cv2", "matplotlib", "pycolmap"}
+LAZY = {"kornia", "cv2", "matplotlib"}
 """Slow or optional packages, imported inside the functions that use them, and only in the rooms named below."""
 OWNERS = {
     "kornia": {"images"},
     "cv2": {"images"},
     "matplotlib": {"plot"},
-    "pycolmap": {"formats"},
 }
 
 HARMLESS = {

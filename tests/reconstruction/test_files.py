@@ -1,32 +1,19 @@
 """Files that are there whole or not at all, and archives from which nothing is taken on trust."""
 
 import io
-import resource
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from full_disk import full_disk
 from small_model import make
 
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.files import load_arrays, whole_file, write_whole_files
 from torchsfm.reconstruction.stages import Stages
-
-
-@contextmanager
-def full_disk(size: int) -> Iterator[None]:
-    """No file can be longer than this, as on a disk that fills up."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def saved(path: Path, **changes: np.ndarray) -> Path:

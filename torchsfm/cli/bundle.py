@@ -128,7 +128,7 @@ def read_model(path: Path) -> Model:
         if path.suffix == ".npz":
             return Reconstruction.load(path)
         return read_libmv(path) if path.suffix == ".bin" else read_bal(path)
-    except (ValueError, ImportError) as error:
+    except ValueError as error:
         raise UserError(" ".join(str(error).split())) from None
 
 
@@ -196,7 +196,7 @@ def write_model(model: Model, out: Path) -> None:
     """Write in the format that the name says.
 
     Raises:
-        UserError: The format cannot hold the model, or its package is not there.
+        UserError: The format cannot hold the model.
     """
     try:
         if is_bal(out):
@@ -207,7 +207,7 @@ def write_model(model: Model, out: Path) -> None:
             write_ply(as_reconstruction(model), out)
         else:
             write_colmap(as_reconstruction(model), out)
-    except (ValueError, ImportError) as error:
+    except ValueError as error:
         raise UserError(f"{out}: {' '.join(str(error).split())}") from None
 
 

@@ -81,7 +81,7 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
 
 
 def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path) -> list[tuple[str, str]]:
-    """Write the page of all models, and each model in all formats whose packages are there; return what to look at."""
+    """Write the page of all models, and each model in all formats that can hold it; return what to look at."""
     if not result.models:
         return []
     total = 1 + 3 * len(result.models)
@@ -99,9 +99,8 @@ def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path) ->
             name = f"{stem}{suffix}" if i == 0 else f"{stem}-{i}{suffix}"
             try:
                 write(model, out / name)
-            except ImportError as error:
-                if i == 0:
-                    written.append((name, f"not written: the package {error.name} is not installed"))
+            except ValueError as error:
+                written.append((name, f"not written: {error}"))
                 continue
             written.append((name, what if i == 0 else f"the same of model {i}"))
     job.progress("write", total, total)

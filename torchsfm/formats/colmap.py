@@ -1,27 +1,40 @@
-"""COLMAP models: the folder of binary files that COLMAP, and much that was built on it, reads and writes.
+"""COLMAP models: the folder of files that COLMAP, and much that was built on it, reads and writes.
 
-Reading and writing is done by pycolmap, an optional package. COLMAP puts the centre of the top-left pixel at (0.5, 0.5), this
-library at (0, 0); the half pixel is added and taken away here and nowhere else.
+COLMAP puts the centre of the top-left pixel at (0.5, 0.5), this library at (0, 0); the half pixel is added and taken away here
+and nowhere else.
 """
 
+import re
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchsfm.formats import colmap_binary, colmap_text
+from torchsfm.formats.colmap_model import (
+    NO_POINT,
+    STILL,
+    ColmapCamera,
+    ColmapFrame,
+    ColmapImage,
+    ColmapModel,
+    ColmapPoints,
+    check_model,
+    poses,
+)
 from torchsfm.geometry import (
     DISTORTION_MODELS,
     BrownConrady,
     Camera,
     KannalaBrandt,
     NoDistortion,
-    Pose,
     Radial,
     SimpleRadial,
     intrinsics,
     quaternion_wxyz_from_rotation,
 )
+from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 HALF_PIXEL = 0.5
@@ -44,15 +57,6 @@ MODELS: dict[str, tuple[str, int, tuple[str, ...]]] = {
 POLYNOMIALS = ("pinhole", "simple_radial", "radial", "opencv")
 
 
-def _import_pycolmap() -> Any:
-    try:
-        import pycolmap
-    except ImportError as error:
-        message = "COLMAP models need the package pycolmap, which is not installed: pip install 'torchsfm[colmap]'"
-        raise ImportError(message, name="pycolmap") from error
-    return pycolmap
-
-
 def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     """Write a model as COLMAP's binary files, with one trivial rig per camera and one frame per image.
 
@@ -63,18 +67,39 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
 
     Args:
         reconstruction: The model.
-        folder: Where to; made if it is not there. Files of an earlier model in it are overwritten.
+        folder: Where to; made if it is not there. Files of an earlier model in it are replaced, all of them or none.
 
     Raises:
-        ImportError: pycolmap is not installed.
         ValueError: A camera has skew, which no model of COLMAP has.
         OSError: The folder cannot be made or written.
     """
-    pycolmap = _import_pycolmap()
     folder = Path(folder)
     model = reconstruction.to("cpu", torch.float64)
-    colmap = pycolmap.Reconstruction()
-    camera_ids = _add_cameras(pycolmap, colmap, model)
+    keys = torch.cat([model.camera_index[:, None], model.image_size.to(model.camera_index.dtype)], -1)
+    used, index = torch.unique(keys, dim=0, return_inverse=True)
+    cameras = {
+        i: ColmapCamera(*_colmap_parameters(model.cameras[camera], camera, (width, height)))
+        for i, (camera, width, height) in enumerate(used.tolist(), start=1)
+    }
+    camera_ids = (index + 1).tolist()
+    images, points = _tables(model, camera_ids)
+    frames = {i: ColmapFrame(image.camera_id, image.cam_from_world, ((image.camera_id, i),)) for i, image in images.items()}
+    contents = colmap_binary.write_files(ColmapModel(cameras, images, points, {i: {i: STILL} for i in cameras}, frames))
+    lines = [
+        f"{i} {camera_id} {_one_line(name)}\n"
+        for i, (camera_id, name) in enumerate(zip(camera_ids, model.names, strict=True), start=1)
+        if i not in images
+    ]
+    if lines:
+        contents[UNREGISTERED] = "".join(lines).encode("utf-8", "surrogateescape")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole_files({folder / name: content for name, content in contents.items()})
+    if not lines:
+        (folder / UNREGISTERED).unlink(missing_ok=True)
+
+
+def _tables(model: Reconstruction, camera_ids: list[int]) -> tuple[dict[int, ColmapImage], ColmapPoints]:
+    """The registered images with their image points, and the 3D points with their tracks."""
     in_pose = model.registered[model.view]
     x, view, point = (model.x[in_pose] + HALF_PIXEL).numpy(), model.view[in_pose], model.point[in_pose]
     order = torch.argsort(view, stable=True)
@@ -82,42 +107,34 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     first = torch.cumsum(counts, 0) - counts
     slot = torch.empty_like(view)
     slot[order] = torch.arange(len(view)) - first[view[order]]
-    keypoints = torch.split(order, counts.tolist())
-    quaternions = quaternion_wxyz_from_rotation(model.poses.R).roll(-1, -1).numpy()
-    translations = model.poses.t.numpy()
-    for i in model.registered.nonzero()[:, 0].tolist():
-        camera_id = camera_ids[i]
-        image = pycolmap.Image(name=model.names[i], keypoints=x[keypoints[i].numpy()], camera_id=camera_id, image_id=i + 1)
-        frame = pycolmap.Frame(frame_id=i + 1, rig_id=camera_id)
-        frame.add_data_id(image.data_id)
-        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(quaternions[i]), translations[i])
-        colmap.add_frame(frame)
-        image.frame_id = i + 1
-        colmap.add_image(image)
-        colmap.register_frame(i + 1)
+    seen = torch.split(order, counts.tolist())
+    motions = torch.cat((quaternion_wxyz_from_rotation(model.poses.R), model.poses.t), -1).tolist()
+    images = {
+        i + 1: ColmapImage(
+            camera_ids[i], model.names[i], tuple(motions[i]), x[seen[i].numpy()], (point[seen[i]] + 1).numpy().astype(np.int64)
+        )
+        for i in model.registered.nonzero()[:, 0].tolist()
+    }
     by_point = torch.argsort(point, stable=True)
-    images = torch.split(view[by_point] + 1, torch.bincount(point, minlength=model.num_points).tolist())
-    slots = torch.split(slot[by_point], [len(part) for part in images])
-    color = (model.color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    for X, rgb, image_ids, indices in zip(model.X.numpy(), color, images, slots, strict=True):
-        track = pycolmap.Track()
-        for image_id, index in zip(image_ids.tolist(), indices.tolist(), strict=True):
-            track.add_element(image_id, index)
-        colmap.add_point3D(X, track, rgb)
-    colmap.update_point_3d_errors()
-    folder.mkdir(parents=True, exist_ok=True)
-    colmap.write_binary(folder)
-    lines = [f"{i + 1} {camera_ids[i]} {name}\n" for i, name in enumerate(model.names) if not model.registered[i]]
-    (folder / UNREGISTERED).unlink(missing_ok=True)
-    if lines:
-        (folder / UNREGISTERED).write_text("".join(lines), encoding="utf-8")
+    lengths = torch.bincount(point, minlength=model.num_points)
+    total = model.X.new_zeros(model.num_points).index_add(0, point, model.residuals()[in_pose])
+    points = ColmapPoints(
+        np.arange(1, model.num_points + 1),
+        model.X.numpy(),
+        (model.color.clamp(0, 1) * 255).round().to(torch.uint8).numpy(),
+        (total / lengths.clamp_min(1)).numpy(),
+        lengths.numpy(),
+        torch.stack((view[by_point] + 1, slot[by_point]), -1).numpy(),
+    )
+    return images, points
 
 
 def read_colmap(folder: str | Path) -> Reconstruction:
-    """Read a COLMAP model, binary or text.
+    """Read a COLMAP model, binary or, where there is none, text.
 
     Image points without a 3D point are left out. Images come in the order of COLMAP's numbers, points too. Cameras of different
-    models become the simplest of this library's models that holds them all.
+    models become the simplest of this library's models that holds them all. Poses are those of the images, with which rigs and
+    frames must agree where the model has them.
 
     Args:
         folder: Where the files lie.
@@ -127,75 +144,64 @@ def read_colmap(folder: str | Path) -> Reconstruction:
         leaves, are not.
 
     Raises:
-        ImportError: pycolmap is not installed.
         FileNotFoundError: There is no such folder.
         ValueError: The folder holds no COLMAP model, a damaged one, or one with cameras that have no equal here.
+        OSError: A file cannot be read.
     """
-    pycolmap = _import_pycolmap()
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is not a folder")
+    colmap = _read_files(folder)
     try:
-        colmap = pycolmap.Reconstruction(folder)
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise ValueError(f"{folder} does not hold a COLMAP model ({_last_line(error)})") from error
-    camera_ids = sorted(colmap.cameras.keys())
-    cameras = _cameras_from_colmap([colmap.cameras[i] for i in camera_ids])
+        check_model(colmap)
+        cameras = _cameras_from_colmap(colmap.cameras)
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from None
+    camera_ids = list(colmap.cameras)
     camera_of = {camera_id: i for i, camera_id in enumerate(camera_ids)}
-    images = {i: (image.camera_id, image.name) for i, image in colmap.images.items() if image.has_pose}
     listed = _read_unregistered(folder / UNREGISTERED, camera_of)
-    listed = {i: entry for i, entry in listed.items() if i not in images}
-    image_ids = sorted(images | listed)
-    entries = [(images | listed)[i] for i in image_ids]
-    sizes = [[colmap.cameras[i].width, colmap.cameras[i].height] for i, _ in entries]
-    Rt = torch.eye(3, 4, dtype=torch.float64).repeat(len(image_ids), 1, 1)
-    point_of = {point_id: k for k, point_id in enumerate(sorted(colmap.point3D_ids()))}
-    x: list[Any] = []
-    view: list[int] = []
-    point: list[int] = []
-    for i, image_id in enumerate(image_ids):
-        if image_id not in images:
-            continue
-        image = colmap.images[image_id]
-        Rt[i] = torch.from_numpy(image.cam_from_world().matrix())
-        for observed in image.points2D:
-            if observed.has_point3D():
-                x.append(observed.xy.tolist())
-                view.append(i)
-                point.append(point_of[observed.point3D_id])
-    points = [colmap.points3D[i] for i in point_of]
-    order = torch.argsort(torch.tensor(point, dtype=torch.long), stable=True)
+    entries = {i: (image.camera_id, image.name) for i, image in colmap.images.items()}
+    entries = dict(sorted((listed | entries).items()))
+    images = [colmap.images.get(i) for i in entries]
+    sizes = [[colmap.cameras[i].width, colmap.cameras[i].height] for i, _ in entries.values()]
+    by_number = np.argsort(colmap.points.point_id, kind="stable")
+    shown = [np.empty(0, np.int64), *(image.point_id for image in images if image)]
+    point_id = np.concatenate(shown)
+    view = np.repeat(np.arange(len(images)), [len(image.x) if image else 0 for image in images])
+    keep = point_id != NO_POINT
+    point = np.searchsorted(colmap.points.point_id[by_number], point_id[keep])
+    order = np.argsort(point, kind="stable")
+    x = np.concatenate([np.empty((0, 2)), *(image.x for image in images if image)])[keep][order]
     return Reconstruction(
-        names=tuple(name for _, name in entries),
+        names=tuple(name for _, name in entries.values()),
         image_size=torch.tensor(sizes, dtype=torch.long).reshape(-1, 2),
         cameras=cameras,
-        camera_index=torch.tensor([camera_of[i] for i, _ in entries], dtype=torch.long),
-        poses=Pose.from_matrix(Rt),
-        registered=torch.tensor([i in images for i in image_ids], dtype=torch.bool),
-        X=torch.tensor([p.xyz.tolist() for p in points], dtype=torch.float64).reshape(-1, 3),
-        color=torch.tensor([p.color.tolist() for p in points], dtype=torch.float64).reshape(-1, 3) / 255,
-        x=torch.tensor(x, dtype=torch.float64).reshape(-1, 2)[order] - HALF_PIXEL,
-        view=torch.tensor(view, dtype=torch.long)[order],
-        point=torch.tensor(point, dtype=torch.long)[order],
+        camera_index=torch.tensor([camera_of[i] for i, _ in entries.values()], dtype=torch.long),
+        poses=poses([image.cam_from_world if image else STILL for image in images]),
+        registered=torch.tensor([image is not None for image in images], dtype=torch.bool),
+        X=torch.from_numpy(colmap.points.X[by_number]),
+        color=torch.from_numpy(colmap.points.color[by_number]).double() / 255,
+        x=torch.from_numpy(x) - HALF_PIXEL,
+        view=torch.from_numpy(view[keep][order]),
+        point=torch.from_numpy(point[order]),
     )
 
 
-def _add_cameras(pycolmap: Any, colmap: Any, model: Reconstruction) -> list[int]:
-    """Add one camera and its rig for each camera and image size in use; return the camera number of each image."""
-    keys = torch.cat([model.camera_index[:, None], model.image_size.to(model.camera_index.dtype)], -1)
-    used, index = torch.unique(keys, dim=0, return_inverse=True)
-    for i, (camera_index, width, height) in enumerate(used.tolist(), start=1):
-        name, parameters = _colmap_parameters(model.cameras[camera_index], camera_index)
-        camera = pycolmap.Camera(camera_id=i, model=name, width=width, height=height, params=parameters)
-        colmap.add_camera(camera)
-        rig = pycolmap.Rig(rig_id=i)
-        rig.add_ref_sensor(camera.sensor_id)
-        colmap.add_rig(rig)
-    return [int(i) + 1 for i in index]
+def _read_files(folder: Path) -> ColmapModel:
+    """Read the tables, from binary files if all of them are there."""
+    for reader, ending in ((colmap_binary, "bin"), (colmap_text, "txt")):
+        paths = {name: folder / f"{name}.{ending}" for name in ("cameras", "images", "points3D", "rigs", "frames")}
+        if all(paths[name].is_file() for name in ("cameras", "images", "points3D")):
+            cameras = dict(sorted(reader.read_cameras(paths["cameras"]).items()))
+            images, points = reader.read_images(paths["images"]), reader.read_points(paths["points3D"])
+            rigs = reader.read_rigs(paths["rigs"]) if paths["rigs"].is_file() else {}
+            frames = reader.read_frames(paths["frames"]) if paths["frames"].is_file() else {}
+            return ColmapModel(cameras, images, points, rigs, frames)
+    raise ValueError(f"{folder} does not hold a COLMAP model (cameras, images and points3D, as .bin or .txt)")
 
 
-def _colmap_parameters(camera: Camera, index: int) -> tuple[str, list[float]]:
-    """Choose the COLMAP model that holds a camera exactly."""
+def _colmap_parameters(camera: Camera, index: int, size: tuple[int, int]) -> tuple[str, int, int, tuple[float, ...]]:
+    """Choose the COLMAP model that holds a camera exactly: its name, the size of the images, the parameters."""
     (fx, skew, cx), (_, fy, cy) = camera.K[0].tolist(), camera.K[1].tolist()
     if abs(skew) > 1e-9 * abs(fx):
         raise ValueError(f"camera {index} has skew {skew:.3g}, which no camera model of COLMAP has")
@@ -216,24 +222,24 @@ def _colmap_parameters(camera: Camera, index: int) -> tuple[str, list[float]]:
         case KannalaBrandt():
             name = "OPENCV_FISHEYE"
     focal = [fx] if MODELS[name][1] == 1 else [fx, fy]
-    return name, [*focal, cx + HALF_PIXEL, cy + HALF_PIXEL, *values]
+    return name, *size, (*focal, cx + HALF_PIXEL, cy + HALF_PIXEL, *values)
 
 
-def _cameras_from_colmap(cameras: list[Any]) -> Camera:
+def _cameras_from_colmap(cameras: dict[int, ColmapCamera]) -> Camera:
     """Join cameras into one batch, of the simplest distortion model that holds them all."""
     K, kinds, named = [], [], []
-    for camera in cameras:
-        model = camera.model.name
+    for camera_id, camera in cameras.items():
+        model = camera.model
         if model not in MODELS:
-            raise ValueError(f"camera {camera.camera_id} has COLMAP's model {model}, which has no equal here")
+            raise ValueError(f"camera {camera_id} has COLMAP's model {model}, which has no equal here")
         kind, focals, names = MODELS[model]
-        fx, fy, cx, cy, *rest = ([camera.params[0]] if focals == 1 else []) + list(camera.params)
-        values = dict(zip(names, (float(value) for value in rest), strict=True))
+        fx, fy, cx, cy, *rest = camera.parameters[: 2 - focals] + camera.parameters
+        values = dict(zip(names, rest, strict=True))
         if model == "FULL_OPENCV" and [values.pop(name) for name in ("k4", "k5", "k6")] != [0, 0, 0]:
-            raise ValueError(f"camera {camera.camera_id} is a FULL_OPENCV with k4, k5 or k6, which has no equal here")
+            raise ValueError(f"camera {camera_id} is a FULL_OPENCV with k4, k5 or k6, which has no equal here")
         f = torch.tensor(fx, dtype=torch.float64)
         c = torch.tensor([cx, cy], dtype=torch.float64) - HALF_PIXEL
-        K.append(intrinsics(f, c, aspect=fy / fx if fx else 1.0))
+        K.append(intrinsics(f, c, aspect=fy / fx))
         kinds.append(kind)
         named.append(values)
     if not K:
@@ -253,17 +259,24 @@ def _read_unregistered(path: Path, camera_of: dict[int, int]) -> dict[int, tuple
     images: dict[int, tuple[int, str]] = {}
     if not path.is_file():
         return images
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    lines = path.read_bytes().decode("utf-8", "surrogateescape").split("\n")
+    for number, line in enumerate(lines, start=1):
+        if not line:
+            continue
         try:
-            image_id, camera_id, name = line.split(" ", 2)
-            images[int(image_id)] = (int(camera_id), name)
+            image_id, camera_id, name = line.removesuffix("\r").split(" ", 2)
+            images[int(image_id)] = (int(camera_id), ESCAPED.sub(lambda found: ESCAPES[found[1]], name))
         except ValueError:
-            raise ValueError(f"{path}, line {number}: wanted 'IMAGE_ID CAMERA_ID NAME', got {line!r}") from None
+            raise ValueError(f"{path}, line {number}: wanted 'IMAGE_ID CAMERA_ID NAME', got {line[:100]!r}") from None
         if int(camera_id) not in camera_of:
             raise ValueError(f"{path}, line {number}: there is no camera {camera_id}")
     return images
 
 
-def _last_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[-1] if lines else type(error).__name__
+ESCAPES = {"n": "\n", "r": "\r", "\\": "\\"}
+ESCAPED = re.compile(r"\\([nr\\])")
+
+
+def _one_line(name: str) -> str:
+    """A name as `unregistered.txt` holds it."""
+    return name.replace("\\", r"\\").replace("\n", r"\n").replace("\r", r"\r")
