@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 from chance import seeded
-from typer.testing import CliRunner
+from command_line import assert_one_line, torchsfm
 
-from torchsfm.cli import app
 from torchsfm.cli.job import Job
 from torchsfm.formats import read_bal, read_colmap, read_ply, write_bal, write_colmap
 from torchsfm.geometry import BrownConrady, BundleProblem, Camera
@@ -17,22 +16,6 @@ from torchsfm.reconstruction import Reconstruction
 from torchsfm.simulation import random_bundle_problem
 
 F64 = torch.float64
-
-
-def torchsfm(*words: object) -> tuple[int, str, str]:
-    """Run the command in this process; exit status, stdout, stderr."""
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.stdout, result.stderr
-
-
-def assert_one_line(stderr: str, *words: str) -> None:
-    lines = [line for line in stderr.strip().splitlines() if not line.endswith("...")]
-    assert len(lines) == 1, stderr
-    assert lines[0].startswith("torchsfm: ")
-    for word in words:
-        assert word in lines[0]
 
 
 def table(text: str) -> dict[str, list[float]]:
