@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from chance import seeded
+from full_disk import full_disk
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -171,3 +172,36 @@ def test_cameras_that_bal_cannot_hold(tmp_path: Path) -> None:
             write_bal(wrong, tmp_path / "x.txt")
     with pytest.raises(ValueError, match="BrownConrady"):
         write_bal(make_problem(2, 3, 4, 1, BrownConrady), tmp_path / "x.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 1 1\n0 0 1 1\n" + "0 " * 8 + "nan " + "0 " * 3, "camera 0 is not finite"),
+        ("1 2 1\n0 0 1 1\n" + "0 " * 9 + "0 0 0 0 1e999 0", "point 1 is not finite"),
+    ],
+)
+def test_cameras_and_points_are_finite(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "bad.txt").write_text(text)
+    with pytest.raises(ValueError, match=rf"bad\.txt: {words}"):
+        read_bal(tmp_path / "bad.txt")
+
+
+@pytest.mark.parametrize("suffix", [".gz", ".bz2"])
+def test_an_archive_made_to_fill_the_memory(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"bomb.txt{suffix}"
+    path.write_bytes({".gz": gzip.compress, ".bz2": bz2.compress}[suffix](b"1 " * 2**24))
+    assert path.stat().st_size < 10**5
+    with pytest.raises(ValueError, match=r"bomb.*unpacks to more than"):
+        read_bal(path)
+
+
+@pytest.mark.parametrize("suffix", ["", ".gz", ".bz2"])
+def test_a_full_disk_leaves_the_problem_before(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.txt{suffix}"
+    write_bal(make_problem(3, 4, 8, 0), path)
+    before = path.read_bytes()
+    with full_disk(500), pytest.raises(OSError, match="File too large"):
+        write_bal(make_problem(30, 40, 80, 0), path)
+    assert path.read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 1

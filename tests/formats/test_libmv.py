@@ -92,6 +92,9 @@ def test_wrong_files(tmp_path: Path) -> None:
         (data + b"\0", "too long"),
         (bytes(twice), "image numbers occur twice"),
         (negative, "negative"),
+        (data[:2] + struct.pack("<f", float("nan")) + data[6:], "intrinsics are not finite"),
+        (data[:42] + struct.pack("<f", float("inf")) + data[46:], "camera 0 is not finite"),
+        (data[:42] + struct.pack("<f", 1e30) + data[46:], "its R no rotation"),
         (data[:1] + b"X" + data[2:], "not a libmv problem"),
         (b"", "not a libmv problem"),
     ):

@@ -8,9 +8,11 @@ image y points down: half a turn about the x axis, done here and nowhere else. N
 
 import bz2
 import gzip
+import os
 import zlib
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +30,7 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
+from torchsfm.reconstruction.files import FREE_BYTES, MAX_RATIO, whole_file
 
 OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
 
@@ -43,20 +46,12 @@ def read_bal(path: str | Path) -> BundleProblem:
         order of the file, float64. Image points are relative to the principal point.
 
     Raises:
-        ValueError: The file is not a BAL problem, or ends too early; one line that says where.
+        ValueError: The file is not a BAL problem, ends too early, has a camera or a point that is not finite, or was packed to
+            fill the memory; one line that says where. Image points that are not finite are kept: adjustment leaves them out.
         OSError: It cannot be read.
     """
     path = Path(path)
-    try:
-        with OPENERS.get(path.suffix, open)(path, "rb") as file:
-            words = file.read().split()
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise ValueError(f"{path}: damaged archive ({error})") from None
-    except OSError as error:
-        if error.errno is not None:
-            raise
-        # bz2 says so of a bad archive.
-        raise ValueError(f"{path}: damaged archive ({error})") from None
+    words = _unpack(path).split()
     try:
         numbers = np.array(words, dtype=np.float64)
     except ValueError as error:
@@ -69,6 +64,10 @@ def read_bal(path: str | Path) -> BundleProblem:
         kind = "truncated" if len(numbers) < wanted else "too long"
         what = f"{v} cameras, {n} points and {m} observations take {wanted} numbers"
         raise ValueError(f"{path}: {kind}: {what}, the file has {len(numbers)}")
+    for first, width, count, name in ((3 + 4 * m, 9, v, "camera"), (3 + 4 * m + 9 * v, 3, n, "point")):
+        finite = np.isfinite(numbers[first : first + width * count].reshape(count, width)).all(1)
+        if not finite.all():
+            raise ValueError(f"{path}: {name} {int(finite.argmin())} is not finite")
     observations = numbers[3 : 3 + 4 * m].reshape(m, 4)
     for column, limit, name in ((0, v, "cameras"), (1, n, "points")):
         index = observations[:, column]
@@ -123,12 +122,40 @@ def write_bal(problem: BundleProblem, path: str | Path) -> None:
     lens = torch.stack((K[:, 0, 0], k1, k2), -1)[index]
     rows = torch.cat((rotvec_from_rotation(flip[:, None] * R), flip * t, lens), 1)
     x = (problem.x.detach().double().cpu() - K[index, :2, 2][view]) * flip[:2]
-    with OPENERS.get(path.suffix, open)(path, "wt") as file:
-        file.write(f"{len(R)} {len(problem.X)} {len(x)}\n")
+    with whole_file(path) as whole, _packing(path.suffix, whole) as file:
+        file.write(f"{len(R)} {len(problem.X)} {len(x)}\n".encode())
         pairs = zip(view.tolist(), problem.point.tolist(), x.tolist(), strict=True)
-        file.writelines(f"{i} {j} {a!r} {b!r}\n" for i, j, (a, b) in pairs)
+        file.writelines(f"{i} {j} {a!r} {b!r}\n".encode() for i, j, (a, b) in pairs)
         for values in (rows, problem.X.detach().double().cpu()):
-            file.writelines(f"{number!r}\n" for number in _flat(values))
+            file.writelines(f"{number!r}\n".encode() for number in _flat(values))
+
+
+def _packing(suffix: str, file: BinaryIO) -> AbstractContextManager[BinaryIO]:
+    """A file that packs what is written to it, where the ending of the name asks for that."""
+    packed: AbstractContextManager[BinaryIO] = OPENERS[suffix](file, "wb") if suffix in OPENERS else nullcontext(file)
+    return packed
+
+
+def _unpack(path: Path) -> bytes:
+    """The text of a file, unpacked if its name says that it is packed.
+
+    Raises:
+        ValueError: The archive is damaged, or unpacks to more than any problem does.
+    """
+    with path.open("rb") as packed:
+        if path.suffix not in OPENERS:
+            return packed.read()
+        limit = max(FREE_BYTES, MAX_RATIO * os.fstat(packed.fileno()).st_size)
+        try:
+            with OPENERS[path.suffix](packed, "rb") as file:
+                text: bytes = file.read(limit + 1)
+        except (EOFError, zlib.error, OSError) as error:
+            if isinstance(error, OSError) and error.errno is not None:
+                raise
+            raise ValueError(f"{path}: damaged archive ({error})") from None
+    if len(text) > limit:
+        raise ValueError(f"{path}: not a BAL problem (it unpacks to more than {limit} bytes)")
+    return text
 
 
 def _flat(values: Tensor) -> list[float]:

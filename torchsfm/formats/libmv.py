@@ -29,7 +29,8 @@ def read_libmv(path: str | Path) -> BundleProblem:
         numbers are the file's, of single precision. Markers whose image has no camera or whose track has no point are left out.
 
     Raises:
-        ValueError: The file is not a libmv problem, or ends too early; one line that says where.
+        ValueError: The file is not a libmv problem, ends too early, or has a camera or point that is none; one line that says
+            where. Markers that are not finite are kept: adjustment leaves them out.
         OSError: It cannot be read.
     """
     path = Path(path)
@@ -53,10 +54,21 @@ def read_libmv(path: str | Path) -> BundleProblem:
     for name, numbers in (("image", cameras["image"]), ("track", points["track"])):
         if len(np.unique(numbers)) != len(numbers):
             raise ValueError(f"{path}: {name} numbers occur twice")
+    lens = first["intrinsics"]
+    if not np.isfinite(lens).all():
+        raise ValueError(f"{path}: the intrinsics are not finite")
+    # In double precision, where no product of two such numbers is too large.
+    R = cameras["R"].astype(np.float64)
+    sound = np.isfinite(R).all((1, 2)) & np.isfinite(cameras["t"]).all(1)
+    R = np.where(sound[:, None, None], R, 0)
+    sound &= (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < 1e-3).all((1, 2)) & (np.linalg.det(R) > 0)
+    for name, good in (("camera", sound), ("point", np.isfinite(points["X"]).all(1))):
+        if not good.all():
+            raise ValueError(f"{path}: {name} {int(good.argmin())} is not finite, or its R no rotation")
     view, has_view = _find(cameras["image"], markers["image"])
     point, has_point = _find(points["track"], markers["track"])
     keep = has_view & has_point
-    f, cx, cy, k1, k2, k3, p1, p2 = _tensor(first["intrinsics"]).unbind()
+    f, cx, cy, k1, k2, k3, p1, p2 = _tensor(lens).unbind()
     return BundleProblem(
         Pose(_tensor(cameras["R"]).mT.contiguous(), _tensor(cameras["t"])),
         Camera(

@@ -1,5 +1,6 @@
 """PLY: coloured points for MeshLab, CloudCompare, Blender, Open3D and many others."""
 
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -90,7 +91,8 @@ def read_ply(path: str | Path) -> PointCloud:
 
     Returns:
         The vertices, in float64 if the file has them so, else float32, and their colours if it has red, green and blue
-        (integers are divided by the largest number of their type). Other properties and elements are passed over.
+        (integers are divided by the largest number of their type). Other properties and elements are passed over. Points that
+        are not finite are kept, as programs write them for places where they measured nothing.
 
     Raises:
         ValueError: The file is not a PLY file, is damaged, or has no points.
@@ -160,14 +162,14 @@ def _read_records(file: BinaryIO, order: str, count: int, properties: Properties
         file.seek(here)
         return np.frombuffer(file.read(dtype.itemsize * count), dtype, count)
     dtype = np.dtype([(name, value) for name, value, _ in properties])
-    rows = []
+    # Through float64, which holds all of the types: values out of range must not wrap around.
+    values = array("d")
     for _ in range(count):
         words = file.readline().split()
         if len(words) != len(properties):
             raise ValueError("it ends within the points, or a line does not have one number per property")
-        rows.append(tuple(float(word) for word in words))
-    # Through float64, which holds all of the types: values out of range must not wrap around.
-    table = np.array(rows, dtype=np.float64).reshape(count, len(properties))
+        values.extend(map(float, words))
+    table = np.array(values, dtype=np.float64).reshape(count, len(properties))
     records = np.empty(count, dtype)
     for i, (name, value, _) in enumerate(properties):
         if value[0] in "iu" and not ((table[:, i] >= np.iinfo(value).min) & (table[:, i] <= np.iinfo(value).max)).all():
@@ -184,17 +186,25 @@ def _skip(file: BinaryIO, order: str, count: int, properties: Properties) -> Non
             if not file.readline():
                 raise ValueError("it ends before the points")
         return
+    place = file.tell()
+    end = file.seek(0, 2)
     if all(kind is None for _, _, kind in properties):
-        file.seek(count * sum(np.dtype(value).itemsize for _, value, _ in properties), 1)
-        return
+        place += count * sum(np.dtype(value).itemsize for _, value, _ in properties)
+        count = 0
     for _ in range(count):
         for _, value, kind in properties:
             number = 1
             if kind is not None:
-                number = int(np.frombuffer(file.read(np.dtype(kind).itemsize), ORDERS[order] + kind, 1)[0])
+                file.seek(min(place, end))
+                stored = np.dtype(ORDERS[order] + kind)
+                number = int(np.frombuffer(file.read(stored.itemsize), stored, 1)[0])
+                place += stored.itemsize
             if number < 0:
                 raise ValueError("a list has a negative length")
-            file.seek(number * np.dtype(value).itemsize, 1)
+            place += number * np.dtype(value).itemsize
+    if place > end:
+        raise ValueError("it ends before the points")
+    file.seek(place)
 
 
 def _cloud(records: npt.NDArray[Any]) -> PointCloud:

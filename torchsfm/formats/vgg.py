@@ -43,7 +43,7 @@ def read_vgg(folder: str | Path) -> VggScene:
         Points, lines and cameras, views in the order of their numbers.
 
     Raises:
-        ValueError: A file is missing or damaged; one line that says which.
+        ValueError: A file is missing or damaged, or holds a number that is not finite; one line that says which.
     """
     folder = Path(folder)
     corners = sorted((folder / "2D").glob("*.corners"))
@@ -85,22 +85,30 @@ def _numbers(path: Path, columns: int) -> Tensor:
         table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
     except (ValueError, UnicodeDecodeError, OSError) as error:
         raise ValueError(f"{path}: wanted {columns} numbers on every line ({error})") from None
+    if not np.isfinite(table).all():
+        raise ValueError(f"{path}: line {int(np.isfinite(table).all(1).argmin()) + 1} of numbers is not finite")
     return torch.from_numpy(table)
 
 
 def _matched(folder: Path, paths: list[Path], kind: str, columns: int) -> tuple[Tensor, Tensor]:
     """The features of all views in the order of the table of matches, and which of them there are."""
     table = _single(folder / "2D", f"nview-{kind}")
+    index = np.empty((0, len(paths)), np.int64)
     try:
         rows = [[-1 if word == "*" else int(word) for word in line.split()] for line in table.read_text().splitlines()]
-        index = torch.tensor([row for row in rows if row], dtype=torch.long).reshape(-1, len(paths)).T
-    except (ValueError, RuntimeError, UnicodeDecodeError) as error:
+        if any(rows):
+            index = np.array([row for row in rows if row], dtype=np.int64)
+        if index.shape[1:] != (len(paths),):
+            raise ValueError(f"got {index.shape[-1]}")
+    except (ValueError, OverflowError, OSError) as error:
         raise ValueError(f"{table}: wanted {len(paths)} numbers on every line ({error})") from None
+    if (index < -1).any():
+        raise ValueError(f"{table}: feature {index.min()} is none")
     columns_of = []
-    for path, numbers in zip(paths, index, strict=True):
+    for path, numbers in zip(paths, torch.from_numpy(index.T.copy()), strict=True):
         features = _numbers(path, columns)
         if len(numbers) and int(numbers.max()) >= len(features):
             raise ValueError(f"{table}: feature {int(numbers.max())} is not in {path.name}, which has {len(features)}")
         padded = torch.cat((features.new_zeros(1, columns), features))
         columns_of.append(padded[numbers.clamp_min(-1) + 1])
-    return torch.stack(columns_of), index >= 0
+    return torch.stack(columns_of), torch.from_numpy(index.T >= 0)
