@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from chance import seeded
-from command_line import assert_one_line, torchsfm
+from command_line import torchsfm
 
 from torchsfm.cli.job import Job
 from torchsfm.formats import read_bal, read_colmap, read_ply, write_bal, write_colmap
@@ -16,6 +16,14 @@ from torchsfm.reconstruction import Reconstruction
 from torchsfm.simulation import random_bundle_problem
 
 F64 = torch.float64
+
+
+def assert_one_line(stderr: str, *words: str) -> None:
+    lines = [line for line in stderr.strip().splitlines() if not line.endswith("...")]
+    assert len(lines) == 1, stderr
+    assert lines[0].startswith("torchsfm: ")
+    for word in words:
+        assert word in lines[0]
 
 
 def table(text: str) -> dict[str, list[float]]:
