@@ -109,6 +109,28 @@ def test_a_noisy_tensor_gives_the_cameras_of_the_nearest(generator: torch.Genera
         assert (distance(moved) >= best).all()
 
 
+def test_no_trifocal_tensor_is_nearer(generator: torch.Generator) -> None:
+    n, starts = 500, 16
+    noise = 10 ** (torch.rand(n, 1, 1, 1, generator=generator, dtype=F64) - 1.7)
+    P = torch.randn(n, 3, 3, 4, generator=generator, dtype=F64)
+    unit = lambda T: T / T.flatten(1).norm(dim=-1)[:, None, None, None]  # noqa: E731
+    T = unit(trifocal_from_cameras(*P.unbind(1)))
+    T = unit(T + noise * torch.randn(T.shape, generator=generator, dtype=F64) / 27**0.5)
+    # |T|^2 less its part across both epipoles, from many epipoles by alternation.
+    e2 = torch.nn.functional.normalize(torch.randn(n, starts, 3, generator=generator, dtype=F64), dim=-1)
+    for _ in range(20):
+        A = T[:, None] - e2[..., None, :, None] * (e2[..., None, None, :] @ T[:, None])
+        e3 = torch.linalg.eigh((A.mT @ A).sum(-3))[1][..., -1]
+        B = T[:, None] - (T[:, None] @ e3[..., None, :, None]) * e3[..., None, None, :]
+        values, vectors = torch.linalg.eigh((B @ B.mT).sum(-3))
+        e2 = vectors[..., -1]
+    nearest = values[..., :2].sum(-1).amin(-1).clamp_min(0).sqrt()
+    found = trifocal_from_cameras(*cameras_from_trifocal(T).P.unbind(1))
+    distance = (found - T).flatten(1).norm(dim=-1)
+    # Seven in ten thousand are not the nearest.
+    assert (distance > nearest + 1e-6).sum() <= 3
+
+
 def test_epipoles_and_fundamental_matrices(generator: torch.Generator) -> None:
     P = cameras(60, v=3, generator=generator, calibration=torch.eye(3, dtype=F64))
     T = trifocal_from_cameras(*P.unbind(1))

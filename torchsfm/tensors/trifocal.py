@@ -5,6 +5,7 @@ those of lines in the second and third. With cameras [I | 0], [a_1 a_2 a_3 | a_4
 `T[i] = a_i b_4' - a_4 b_i'`, and a point x1 on lines l2, l3 through its other images has `x1^i l2_j l3_k T_i^jk = 0`.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -68,7 +69,8 @@ def trifocal_epipoles(T: Float[Tensor, "*batch 3 3 3"]) -> tuple[Float[Tensor, "
     """The images of the first centre in the second and third view (HZ 15.1.2), as unit homogeneous points of either sign.
 
     The tensor nearest to T of the form a_i e3' - e2 b_i' has these epipoles (a_i and b_i being free): they maximise
-    sum_i |T_i' e2|^2 + |T_i e3|^2 - (e2' T_i e3)^2, found by Newton's method from the null vectors of the pencil of slices.
+    sum_i |T_i' e2|^2 + |T_i e3|^2 - (e2' T_i e3)^2, found by Newton's method from the null vectors of the pencil of slices and
+    from starts all over the sphere.
 
     Args:
         T: Trifocal tensors of any scale.
@@ -147,34 +149,47 @@ def epipoles_of_slices(T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         single = adjugate_3x3(base)
         form = adjugate_3x3(base[..., i, :, :] + base[..., j, :, :]) - single[..., i, :, :] - single[..., j, :, :]
         left, right = form.flatten(-3, -2), form.mT.flatten(-3, -2)
-        e2, _ = null_vector(left)
         # The second singular values, in units of |T|^2.
         second = svdvals(torch.stack((left, right)))[0][..., 1]
         determined = (second > 64 * torch.finfo(T.dtype).eps).all(0)
-        e2, e3 = _climb(base, e2)
-        for _ in range(8):
-            e2, e3 = _newton(base, e2, e3, shifted=True)
+        e2, e3 = _highest(base, null_vector(left)[0], null_vector(right)[0])
         e2, e3 = positive(e2), positive(e3)
     e2, e3 = _newton(T.double(), e2, e3)
     return e2.to(T.dtype), e3.to(T.dtype), determined
 
 
-def _climb(T: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """The best of four starts for e2, after steps that only go up: each epipole is an eigenvector, the other being fixed."""
-    others = eigh((T @ T.mT).sum(-3))[1].mT
-    e2 = torch.cat((start[..., None, :], others), -2)
-    T = T[..., None, :, :, :]
-    gain = e3 = e2
-    for _ in range(6):
-        e3 = eigh(_across(T, e2))[1][..., -1]
-        gain, vectors, _ = eigh(_across(T.mT, e3))
-        e2 = vectors[..., -1]
-    height = gain[..., -1] + (T @ e3[..., None, :, None]).square().sum((-3, -2, -1))
+def _highest(T: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
+    """The highest maximum that is found from e2, from e3 and from all over both half spheres.
+
+    Noise makes several maxima, the highest of them narrow at times. Each start takes the best other epipole, an eigenvector;
+    then the epipoles are multiplied in turn by the matrix whose eigenvector each is, which only goes up, and the best few are
+    refined.
+    """
+    slices = T[..., None, :, :, :]
+    everywhere = half_sphere(12, T).expand(*T.shape[:-3], 12, 3)
+    second, third = (torch.cat((e[..., None, :], everywhere), -2) for e in (e2, e3))
+    e2 = torch.cat((second, eigh(_across(slices.mT, third))[1][..., -1]), -2)
+    e3 = torch.cat((eigh(_across(slices, second))[1][..., -1], third), -2)
+    for _ in range(12):
+        e2 = normalize_sphere((_across(slices.mT, e3) @ e2[..., None])[..., 0])
+        e3 = normalize_sphere((_across(slices, e2) @ e3[..., None])[..., 0])
+
+    def height(e2: Tensor, e3: Tensor) -> Tensor:
+        left = (slices.mT @ e2[..., None, :, None]).square().sum((-3, -2, -1))
+        return left + (e3[..., None, :] @ _across(slices, e2) @ e3[..., None])[..., 0, 0]
+
+    def chosen(index: Tensor) -> tuple[Tensor, Tensor]:
+        index = index[..., None].expand(*index.shape, 3)
+        return e2.gather(-2, index), e3.gather(-2, index)
+
+    best = height(e2, e3).topk(3, -1).indices
+    e2, e3 = chosen(torch.cat((torch.zeros_like(best[..., :1]), best), -1))
+    for _ in range(8):
+        e2, e3 = _newton(slices, e2, e3, shifted=True)
     # The first start is the true one if there is no noise.
-    first = torch.arange(4, device=T.device) == 0
-    best = torch.where(first, height * (1 + 1e-9), height).argmax(-1)[..., None, None]
-    best = best.expand(*best.shape[:-1], 3)
-    return e2.gather(-2, best)[..., 0, :], e3.gather(-2, best)[..., 0, :]
+    advantage = 1 + 1e-9 * (torch.arange(4, device=T.device) == 0)
+    e2, e3 = chosen((advantage * height(e2, e3)).argmax(-1, keepdim=True))
+    return e2[..., 0, :], e3[..., 0, :]
 
 
 def _across(T: Tensor, e: Tensor) -> Tensor:
@@ -209,6 +224,14 @@ def _newton(T: Tensor, e2: Tensor, e3: Tensor, shifted: bool = False) -> tuple[T
     keep = (definite & good)[..., None, None] & (step.detach().abs().amax((-2, -1), keepdim=True) < 0.5)
     step = torch.where(keep, step, 0)
     return normalize_sphere(e2 + (U @ step[..., :2, :])[..., 0]), normalize_sphere(e3 + (V @ step[..., 2:, :])[..., 0])
+
+
+def half_sphere(n: int, like: Tensor) -> Float[Tensor, "n 3"]:
+    """Unit vectors evenly over half a sphere: a spiral that turns by the golden angle."""
+    k = torch.arange(n, dtype=like.dtype, device=like.device)
+    z, angle = 1 - (k + 0.5) / n, math.pi * (3 - 5**0.5) * k
+    r = (1 - z * z).sqrt()
+    return torch.stack((r * angle.cos(), r * angle.sin(), z), -1)
 
 
 def positive(e: Tensor) -> Tensor:
