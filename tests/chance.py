@@ -2,6 +2,11 @@
 
 import numpy as np
 import torch
+from scipy.stats import binom
+from torch import Tensor
+
+FALSE_ALARM = 1e-6
+"""How often a statistical test may fail where nothing is wrong. A run has some hundreds of them."""
 
 _run = 0
 
@@ -25,3 +30,17 @@ def seeded(stream: int = 0) -> torch.Generator:
 def numpy_seeded(stream: int = 0) -> np.random.Generator:
     """As `seeded`, of NumPy."""
     return np.random.default_rng(stream_seed(stream))
+
+
+def assert_share(right: Tensor, at_least: float) -> None:
+    """Fail where so few of these independent trials come out right that their rate is less than was asked for.
+
+    The number of right ones is binomial: it is refused where a rate of `at_least` gives as few with a probability below
+    `FALSE_ALARM`. So `at_least` is the rate itself, with nothing taken off for chance; the more trials, the sharper the test.
+    """
+    count, trials = int(right.sum()), right.numel()
+    assert trials > 0, "no trials"
+    chance = float(binom.cdf(count, trials, at_least))
+    assert chance > FALSE_ALARM, (
+        f"{count} of {trials} are right; a rate of {at_least:g} gives as few once in {1 / max(chance, 1e-300):.1g} runs"
+    )

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chance import assert_share
 from torch import Tensor
 from two_view_scenes import F64, two_views
 
@@ -120,17 +121,31 @@ def test_recall_on_random_scenes(case: Case, generator: torch.Generator) -> None
     sample, truth = case.sample("random", 2000, generator)
     solutions = case.solve(*sample)
     assert tensor(solutions.model).shape == (2000, case.slots, *case.shape)
-    assert (nearest(case, solutions, truth) < 1e-6).double().mean() >= 0.9995
+    assert_share(nearest(case, solutions, truth) < 1e-6, at_least=0.9999)
     single = case.solve(*(s.float() for s in sample))
     assert tensor(single.model).dtype == torch.float32
-    assert (nearest(case, single, truth) < case.tolerance32).double().mean() >= 0.95
+    assert_share(nearest(case, single, truth) < case.tolerance32, at_least=0.97)
 
 
 @pytest.mark.parametrize(("name", "family"), [(n, f) for n, c in CASES.items() for f in c.families])
 def test_recall_on_hard_families(name: str, family: str, generator: torch.Generator) -> None:
     case = CASES[name]
-    sample, truth = case.sample(family, 1000, generator)
-    assert (nearest(case, case.solve(*sample), truth) < 1e-6).double().mean() >= 0.995
+    sample, truth = case.sample(family, 4000, generator)
+    assert_share(nearest(case, case.solve(*sample), truth) < 1e-6, at_least=0.9995)
+
+
+def test_critical_motions_leave_no_focal_length(generator: torch.Generator) -> None:
+    """Parallel optical axes, and axes that meet at the same distance from both centres: a family, whatever rounding says."""
+    count, middle = 500, torch.tensor([0.0, 0, 6], dtype=F64)
+    X = 4 * torch.rand(count, 6, 3, dtype=F64, generator=generator) - 2 + middle
+    f = 400 * (1 + 3 * torch.rand(count, 1, 1, dtype=F64, generator=generator))
+    t = torch.randn(count, 1, 3, dtype=F64, generator=generator)
+    axis = torch.randn(count, 3, dtype=F64, generator=generator)
+    roll = rotation_from_rotvec(axis * torch.tensor([0.0, 0, 1], dtype=F64))
+    turn = rotation_from_rotvec(0.3 * axis * torch.tensor([1.0, 1, 0], dtype=F64))
+    for Y in (X + t, X + 0.1 * t, X @ roll.mT + t, (X - middle) @ turn.mT + middle, X @ turn.mT):
+        x1, x2 = (f * Z[..., :2] / Z[..., 2:] for Z in (X, Y))
+        assert not relative_6pt_focal(x1, x2).valid.any()
 
 
 def test_soundness(case: Case, generator: torch.Generator) -> None:

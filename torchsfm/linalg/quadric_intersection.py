@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.real_roots import real_root_list
 from torchsfm.linalg.rows import combine_rows, take_columns
 
@@ -84,10 +85,10 @@ def intersect_quadrics(A: Float[Tensor, "10 batch"], B: Float[Tensor, "10 batch"
         others, points = [item], [v]
         for k in range(_ATTEMPTS):
             turn, matrices = _rotation(k)
-            turned = [combine_rows(matrices[len(q)].to(q)[..., None], q) for q in forms]
+            turned = [combine_rows(matrices[len(q)].on(q.device, q.dtype)[..., None], q) for q in forms]
             again, u, _ = _attempt(*turned)
             others.append(index.index_select(0, again))
-            points.append(combine_rows(turn.to(u).T[..., None], u))
+            points.append(combine_rows(turn.on(u.device, u.dtype).T[..., None], u))
         item, order = torch.cat(others).sort(stable=True)
         v = take_columns(torch.cat(points, 1), order)
         keep = (~_repeated(item, v, torch.ones_like(item, dtype=torch.bool), len(CUBIC) * 2)).nonzero()[:, 0]
@@ -98,7 +99,7 @@ def intersect_quadrics(A: Float[Tensor, "10 batch"], B: Float[Tensor, "10 batch"
 def _attempt(A: Tensor, B: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Problems and unit vectors of common points, and which problems may have more of them."""
     degree = 8 if C.shape[0] == 10 else 12
-    nodes, to_coefficients = (t.to(A) for t in _circle(degree))
+    nodes, to_coefficients = (t.on(A.device, A.dtype) for t in _circle(degree))
     forms = []
     for i in range(0, max(A.shape[1], 1), _CHUNK):
         a, b, c = (q[:, i : i + _CHUNK] for q in (A, B, C))
@@ -255,23 +256,23 @@ def _turn(q: Tensor, turned: Tensor) -> Tensor:
 
 
 @cache
-def _circle(degree: int) -> tuple[Tensor, Tensor]:
+def _circle(degree: int) -> tuple[Constant, Constant]:
     """Points (z, w) on the half circle, and the matrix from values of a binary form there to coefficients of z^k w^(n-k)."""
     angle = math.pi * torch.arange(degree + 1, dtype=torch.float64) / (degree + 1)
     z, w = angle.sin(), angle.cos()
     k = torch.arange(degree + 1)
     monomials = z[:, None] ** k * w[:, None] ** (degree - k)
-    return torch.stack((z, w)), torch.linalg.inv(monomials)
+    return Constant(torch.stack((z, w))), Constant(torch.linalg.inv(monomials))
 
 
 @cache
-def _rotation(number: int) -> tuple[Tensor, dict[int, Tensor]]:
+def _rotation(number: int) -> tuple[Constant, dict[int, Constant]]:
     """One of a few fixed rotations of 4-space, and what it does to the coefficients of quadrics and cubics, as [from, to]."""
     generator = torch.Generator().manual_seed(number)
     turn = torch.linalg.qr(torch.randn(4, 4, generator=generator, dtype=torch.float64)).Q
     quadratic = torch.stack([product_of_forms(turn[i], turn[j]) for i, j in QUADRATIC])
     cubic = torch.stack([cubic_of_forms(product_of_forms(turn[i], turn[j]), turn[k]) for i, j, k in CUBIC])
-    return turn, {10: quadratic, 20: cubic}
+    return Constant(turn), {10: Constant(quadratic), 20: Constant(cubic)}
 
 
 def _determinant(m: list[Row]) -> Tensor:

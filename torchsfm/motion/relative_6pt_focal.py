@@ -30,18 +30,19 @@ _INDEPENDENT = 1e-12
 """Smallest pivot of the six normalised linear equations."""
 _SHIFT = -0.3
 """The 1 / f^2 around which eigenvalues are looked for, in units of the largest image coordinate."""
-_REAL = 2e-2
+_REAL = 6e-2
 """Largest share of the imaginary part in what may be a real eigenvalue; Newton's method decides."""
 _RANGE = (1e-3, 1e3)
 """Focal lengths that are meant, in units of the largest image coordinate."""
-_NEAR = 1e-8
-"""Distance from the essential matrices before a step after which there is nothing left to gain."""
+_NEAR = 1e-7
+"""Length of a step, in F of norm 1 and in log f, after which there is nothing left to gain."""
 _MORE = 8
 """Newton steps for the others."""
 _CONVERGED = 1e-7
 """Distance from the essential matrices before the last step, of what is a solution."""
-_ISOLATED = 1e-9
-"""Volume of the three conditions' gradients, below which the solution is one of a family (or a multiple root)."""
+_ISOLATED = 1e-11
+"""Slope of the conditions in the direction in which they change least, by log f and F of norm 1, below which the solution is
+one of a family: rounding leaves up to 4e-12 there, and 1e-10 is the least that was seen of single solutions."""
 _SAME = 1e-6
 """Solutions nearer than this, in F of norm 1 and in log f, are one."""
 _SLOTS = 15
@@ -74,8 +75,10 @@ class _Roots(NamedTuple):
     """1 / f."""
     error: Tensor
     """Distance from the essential matrices before the last Newton step."""
-    volume: Tensor
-    """Of the gradients of the three conditions there."""
+    step: Tensor
+    """Length of that step, in u and in log g."""
+    slope: Tensor
+    """Of the three conditions, in the direction in which they change least."""
 
 
 def equations(
@@ -144,14 +147,14 @@ def _solve(x1: Float[Tensor, "6 2 batch"], x2: Float[Tensor, "6 2 batch"]) -> tu
         u, g, *_ = _newton(_start(M, cubics, item, w), w.sqrt(), own)
         state = _newton(u, g, own)
         # The few that are not near yet.
-        rest = (~(state.error < _NEAR)).nonzero()[:, 0]
+        rest = (~(state.step < _NEAR)).nonzero()[:, 0]
         few, later = take_columns(own, rest), _Roots(*(v.index_select(-1, rest) for v in state))
         for _ in range(_MORE):
             later = _newton(later.u, later.g, few)
-        u, g, error, volume = (v.index_copy(-1, rest, new) for v, new in zip(state, later, strict=True))
+        u, g, error, _, slope = (v.index_copy(-1, rest, new) for v, new in zip(state, later, strict=True))
         E = combine_rows(_with_focal(own, g), u)
         f = 1 / g
-        keep = (error < _CONVERGED) & (volume > _ISOLATED) & torch.isfinite(E).all(0) & (f > _RANGE[0]) & (f < _RANGE[1])
+        keep = (error < _CONVERGED) & (slope > _ISOLATED) & torch.isfinite(E).all(0) & (f > _RANGE[0]) & (f < _RANGE[1])
         keep = keep & _first_of_its_kind(u, f, item, keep)
         chosen = keep.nonzero()[:, 0]
         item, E, f = item[chosen], E[:, chosen], f[chosen]
@@ -238,8 +241,10 @@ def _eigenvalues(M: Float[Tensor, "3 9 9 batch"], M2: Tensor, basis: Tensor, fin
     C = torch.where(fine[:, None, None], C, torch.eye(15, dtype=A.dtype, device=A.device))
     values, ok = eigvals(C)
     size = values.abs()
-    real = (values.imag.abs() <= _REAL * size) & (values.imag >= 0) & (size > 0) & (fine & ok)[:, None]
-    w = _SHIFT + 1 / torch.where(real, values.real, 1)
+    real = (values.imag.abs() <= _REAL * size) & (size > 0) & (fine & ok)[:, None]
+    offset = 1 / torch.where(real, values, 1)
+    # Rounding may make two neighbours a complex pair: one is looked for on either side.
+    w = _SHIFT + offset.real + offset.imag
     real = real & (w > _RANGE[1] ** -2) & (w < _RANGE[0] ** -2)
     item, column = real.nonzero().unbind(1)
     return item, w[item, column]
@@ -264,16 +269,16 @@ def _with_focal(basis: Float[Tensor, "3 9 roots"], g: Float[Tensor, " roots"]) -
 
 
 def _newton(u: Tensor, g: Tensor, basis: Tensor) -> _Roots:
-    """A Newton step on the three conditions of an essential matrix in (x, y, z) and g.
+    """A Newton step on the three conditions of an essential matrix in (x, y, z) and log g.
 
     Around E = U diag(1, 1, 0) V' the manifold's normal space is spanned by u3 v3', u1 v1' - u2 v2' and u1 v2' + u2 v1'. They
-    are linear in (x, y, z) and the change of g: four homogeneous unknowns.
+    are linear in (x, y, z) and the change of log g: four homogeneous unknowns.
     """
     scaled = _with_focal(basis, g)
     e = combine_rows(scaled, u)
     f = combine_rows(basis, u)
     zero = torch.zeros_like(g)
-    slope = torch.stack((zero, zero, f[2], zero, zero, f[5], f[6], f[7], 2 * g * f[8]))
+    slope = g * torch.stack((zero, zero, f[2], zero, zero, f[5], f[6], f[7], 2 * g * f[8]))
     size = combine_rows(e, e).rsqrt()
     columns = (torch.cat((scaled, slope[None])) * size).view(4, 3, 3, -1)
     p, q, r = _normal_products(e.view(3, 3, -1) * size, columns)
@@ -289,11 +294,20 @@ def _newton(u: Tensor, g: Tensor, basis: Tensor) -> _Roots:
     new = torch.stack((x, y, z))
     square = combine_rows(new, new)
     along = combine_rows(new, u)
-    ratio = change / along / g
+    ratio = change / along
     # Never so far that the sign of f changes.
     g = g * (1 + ratio.clamp(-0.6, 1.5))
     new = new * square.rsqrt() * torch.sign(along)
-    return _Roots(new, g, error, (square + change * change).sqrt())
+    step = torch.maximum(ratio.abs(), add_rows((new - u).abs().unbind(0)))
+    # The product of the three principal slopes is a volume; that of the greater two is about the largest area.
+    area = torch.stack([_area(a, b) for a, b in ((p, q), (q, r), (r, p))]).amax(0)
+    return _Roots(new, g, error, step, ((square + change * change) / area).sqrt())
+
+
+def _area(a: Tensor, b: Tensor) -> Tensor:
+    """The squared area between two vectors given by their coordinates; not less than rounding may make of 0."""
+    most = combine_rows(a, a) * combine_rows(b, b)
+    return torch.maximum(most - combine_rows(a, b) ** 2, 1e-15 * most)
 
 
 def _normal_products(e: Float[Tensor, "3 3 roots"], columns: Float[Tensor, "4 3 3 roots"]) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchsfm._types import broadcast_shapes
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
+from torchsfm.linalg.constants import Constant
 from torchsfm.robust import damped_solve
 from torchsfm.robust.local_optimisation import Weigh
 
@@ -55,14 +56,18 @@ def _generators() -> Tensor:
     return linear.reshape(12, 12, 7)
 
 
-_WHERE, _SIGN = _table()
-_GENERATORS = {size: _generators()[..., :size].reshape(12, -1) for size in (6, 7)}
-_CROSS = torch.zeros(3, 9, dtype=torch.float64)
-"""From w to [w]x."""
-for _axis in range(3):
-    _CROSS[_axis, 3 * ((_axis + 2) % 3) + (_axis + 1) % 3] = 1
-    _CROSS[_axis, 3 * ((_axis + 1) % 3) + (_axis + 2) % 3] = -1
-_ONE = torch.ones(1, 1, 1, dtype=torch.float64)
+def _cross() -> Tensor:
+    """From w to [w]x, 3 x 9."""
+    linear = torch.zeros(3, 3, 3, dtype=torch.float64)
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        linear[axis, last, after], linear[axis, after, last] = 1, -1
+    return linear.reshape(3, 9)
+
+
+_WHERE, _SIGN = (Constant(part) for part in _table())
+_GENERATORS = {size: Constant(_generators()[..., :size].reshape(12, -1)) for size in (6, 7)}
+_CROSS, _ONE = Constant(_cross()), Constant(torch.ones(1, 1, 1, dtype=torch.float64))
 
 
 class _Views:
@@ -133,7 +138,7 @@ def normal_equations(
     matrix = torch.bmm(torch.cat((c, first, both), 2).view(X.shape[0], 4 * k, n), products.mT)
     vector = torch.bmm(torch.cat((slope, last), 2).view(X.shape[0], 3 * k, n), points.mT)
     moments = torch.cat((matrix.view(X.shape[0] * k, 40), vector.view(X.shape[0] * k, 12)), 1).double()
-    entries = moments.index_select(1, _WHERE.to(X.device)).view(-1, 12, 13) * _SIGN.to(X.device)
+    entries = moments.index_select(1, _WHERE.on(X.device)).view(-1, 12, 13) * _SIGN.on(X.device)
     return entries, views.batch
 
 
@@ -146,7 +151,7 @@ def camera_step(
     """
     S, batch = normal_equations(P, x, X, weigh)
     flat = _flat(P.double(), batch, 3, 4).reshape(-1, 12)
-    B = torch.mm(flat, _GENERATORS[size].to(P.device)).view(-1, 12, size)
+    B = torch.mm(flat, _GENERATORS[size].on(P.device)).view(-1, 12, size)
     half = torch.bmm(B.mT, S)
     return damped_solve(torch.bmm(half[..., :12], B), half[..., 12:]), batch
 
@@ -159,9 +164,9 @@ def moved_pose(
     What a start in lower precision lacks to a rotation is mended.
     """
     pose, w = _flat(pose.double(), batch, 3, 4), step[:, :3]
-    W = torch.mm(w[..., 0], _CROSS.to(w.device)).view(-1, 3, 3)
+    W = torch.mm(w[..., 0], _CROSS.on(w.device)).view(-1, 3, 3)
     # (1 - W/2)^-1 (1 + W/2)
-    turn = torch.baddbmm(W, W, W, alpha=0.5) / torch.baddbmm(_ONE.to(w.device), w.mT, w, alpha=0.25)
+    turn = torch.baddbmm(W, W, W, alpha=0.5) / torch.baddbmm(_ONE.on(w.device), w.mT, w, alpha=0.25)
     moved = torch.baddbmm(pose, pose[..., :3], torch.cat((turn, step[:, 3:6]), -1))
     R = moved[..., :3]
     mended = torch.baddbmm(R, R, R.mT @ R, beta=1.5, alpha=-0.5)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg import qr
+from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.quadric_intersection import intersect_quadrics, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -22,7 +23,7 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 _DIFFERENCES = ((0.5**0.5, 1 / 6**0.5), (-(0.5**0.5), 1 / 6**0.5), (0.0, -2 / 6**0.5))
 """Orthonormal coordinates of three numbers whose sum is 0."""
 # A fixed rotation of the coordinates.
-_TURN = qr(torch.tensor([[5.0, 1, -2, 3], [-1, 4, 3, 2], [2, -3, 5, 1], [3, 2, 1, -4]], dtype=torch.float64))[0]
+_TURN = Constant(qr(torch.tensor([[5.0, 1, -2, 3], [-1, 4, 3, 2], [2, -3, 5, 1], [3, 2, 1, -4]], dtype=torch.float64))[0])
 
 
 def equations(
@@ -99,7 +100,7 @@ def _solve(eps: float, p: Tensor, d: Tensor, X: Tensor) -> tuple[Tensor, Tensor]
     unit = torch.where(good, torch.maximum(longest, apart).sqrt(), torch.nan)
     shift = (p - origin) / unit
     p, X = p / unit, X / unit
-    turn = _TURN.to(p)
+    turn = _TURN.on(p.device, p.dtype)
     mean = (depth / unit).clamp_min(1.0) / 3**0.5
     # The depths and 1 as linear forms of the four coordinates.
     depths = [turn[:, 0, None] * mean + (turn[:, 1] * a + turn[:, 2] * b)[:, None] for a, b in _DIFFERENCES]
