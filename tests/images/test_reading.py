@@ -1,3 +1,4 @@
+import os
 import struct
 import zlib
 from contextlib import suppress
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchsfm.images import Exif, ImageError, list_images, list_skipped, parse_exif, read_image, save_image, scale_image
+from torchsfm.images.headers import image_size
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
 
 MAKE, MODEL, ORIENTATION, EXIF_OFFSET = 0x010F, 0x0110, 0x0112, 0x8769
@@ -190,7 +192,7 @@ def test_focal_from_the_sensor_resolution(unit: int, millimetres: float) -> None
 
 
 def test_focal_follows_max_size(tmp_path: Path, picture: np.ndarray) -> None:
-    (tmp_path / "a.jpg").write_bytes(into_jpeg(encode(picture, ".jpg"), tiff_block({}, {FOCAL_35MM: 28})))
+    (tmp_path / "a.jpg").write_bytes(into_png(encode(picture, ".png"), tiff_block({}, {FOCAL_35MM: 28})))
     whole, small = read_image(tmp_path / "a.jpg"), read_image(tmp_path / "a.jpg", max_size=40)
     assert small.pixels.shape == (3, 24, 40)
     assert small.size == (80, 48)
@@ -259,7 +261,8 @@ def test_bad_files_say_why_in_one_line(tmp_path: Path, picture: np.ndarray, capf
         **{f"most{suffix}": (data[:-5], "cut short|damaged") for suffix, data in whole.items() if suffix != ".tif"},
         "header.png": (whole[".png"][:20], "cut short"),
         "middle.png": (whole[".png"][:60] + b"\0" * 40 + whole[".png"][100:], "damaged"),
-        "huge.pgm": (b"P5 999999999 999999999 255\n0", "cut short"),
+        "long.pgm": (b"P5 9999 9999 255\n0", "cut short"),
+        "huge.pgm": (b"P5 999999999 999999999 255\n0", "999999999 x 999999999 are more than"),
     }
     for name, (data, reason) in files.items():
         (tmp_path / name).write_bytes(data)
@@ -279,6 +282,7 @@ def test_forbidden_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "read_bytes", refuse)
+    (tmp_path / "a.png").touch()
     with pytest.raises(ImageError, match=r"cannot be read \(Permission denied"):
         read_image(tmp_path / "a.png")
     monkeypatch.setattr(Path, "iterdir", refuse)
@@ -367,3 +371,111 @@ def test_what_may_have_been_meant_is_listed(tmp_path: Path) -> None:
     assert [path.name for path in list_images(tmp_path)] == ["a.jpg"]
     with pytest.raises(ImageError, match="no such folder"):
         list_skipped(tmp_path / "missing")
+
+
+def sized(suffix: str, width: int, height: int) -> bytes:
+    """A small file whose header says that the image is of this size."""
+    data = bytearray(encode(np.zeros((8, 8, 3), np.uint8), suffix))
+    if suffix == ".png":
+        struct.pack_into(">II", data, 16, width, height)
+        struct.pack_into(">I", data, 29, zlib.crc32(data[12:29]))
+    elif suffix == ".jpg":
+        place = data.find(b"\xff\xc0")
+        struct.pack_into(">HH", data, place + 5, height, width)
+    elif suffix == ".bmp":
+        struct.pack_into("<ii", data, 18, width, -height)
+    elif suffix == ".tif":
+        count = struct.unpack_from("<H", data, struct.unpack_from("<I", data, 4)[0])[0]
+        for k in range(count):
+            place = struct.unpack_from("<I", data, 4)[0] + 2 + 12 * k
+            tag = struct.unpack_from("<H", data, place)[0]
+            if tag in (0x100, 0x101):
+                struct.pack_into("<HHII", data, place, tag, 4, 1, width if tag == 0x100 else height)
+    elif suffix == ".ppm":
+        data[:] = data.replace(b"8 8", f"{width} {height}".encode(), 1)
+    else:
+        # An extended WebP, whose canvas has the size.
+        chunk = b"VP8X" + struct.pack("<II", 10, 0) + (width - 1).to_bytes(3, "little") + (height - 1).to_bytes(3, "little")
+        data[4:] = struct.pack("<I", len(data) - 8 + len(chunk)) + b"WEBP" + chunk + data[12:]
+    return bytes(data)
+
+
+KINDS = [".png", ".jpg", ".bmp", ".tif", ".ppm", ".webp"]
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+def test_the_header_gives_the_size(suffix: str) -> None:
+    assert image_size(encode(np.zeros((7, 9, 3), np.uint8), suffix)) == (9, 7)
+    assert image_size(sized(suffix, 16000, 12001)) == (16000, 12001)
+    assert image_size(encode(np.zeros((7, 9), np.uint8), suffix.replace("ppm", "pgm"))) == (9, 7)
+
+
+def test_the_header_of_other_webp_and_bmp_files() -> None:
+    done, lossless = cv2.imencode(".webp", np.zeros((7, 9, 3), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert done
+    assert lossless.tobytes()[12:16] == b"VP8L"
+    assert image_size(lossless.tobytes()) == (9, 7)
+    old = b"BM" + struct.pack("<IHHI", 26 + 28, 0, 0, 26) + struct.pack("<IHHHH", 12, 9, 7, 1, 24)
+    assert image_size(old) == (9, 7)
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+def test_a_bomb_is_not_decoded(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / f"bomb{suffix}"
+    size = (16383, 16383) if suffix == ".webp" else (60000, 60000)
+    path.write_bytes(sized(suffix, *size))
+    monkeypatch.setattr(cv2, "imdecode", None)
+    with pytest.raises(ImageError, match=rf"bomb\{suffix}: {size[0]} x {size[1]} are more than the 1000000 pixels"):
+        read_image(path, max_pixels=10**6)
+    if suffix != ".webp":
+        with pytest.raises(ImageError, match="more than the"):
+            read_image(path)
+
+
+def test_the_limit_can_be_raised(tmp_path: Path, picture: np.ndarray) -> None:
+    (tmp_path / "a.png").write_bytes(encode(picture, ".png"))
+    with pytest.raises(ImageError, match="80 x 48 are more than the 3839 pixels"):
+        read_image(tmp_path / "a.png", max_pixels=3839)
+    assert read_image(tmp_path / "a.png", max_pixels=3840).size == (80, 48)
+    with pytest.raises(ValueError, match="max_pixels: wanted at least 1"):
+        read_image(tmp_path / "a.png", max_pixels=0)
+
+
+def test_a_file_too_long_for_its_pixels_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "a.jpg").open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(ImageError, match="bytes are more than"):
+        read_image(tmp_path / "a.jpg")
+
+
+def test_a_pipe_does_not_hold_anything_up(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.jpg")
+    with pytest.raises(ImageError, match="not a file"):
+        read_image(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize(("width", "height", "part"), [(1600, 1200, 4), (1604, 1204, 4), (1602, 1202, 2), (1601, 1201, 1)])
+def test_a_large_jpeg_is_decoded_in_part(
+    width: int, height: int, part: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The smaller image is the average of the larger one, without any shift."""
+    y, x = np.mgrid[:height, :width]
+    pattern = 127 + 60 * np.sin(x / 23) * np.cos(y / 31) + 60 * np.cos((x + 2 * y) / 57)
+    (tmp_path / "a.jpg").write_bytes(encode(np.repeat(pattern[:, :, None], 3, 2).round().astype(np.uint8), ".jpg"))
+    decoded: list[tuple[int, ...]] = []
+    real = cv2.imdecode
+
+    def imdecode(data: np.ndarray, flags: int) -> np.ndarray:
+        array = real(data, flags)
+        decoded.append(array.shape[:2])
+        return array
+
+    monkeypatch.setattr(cv2, "imdecode", imdecode)
+    small = read_image(tmp_path / "a.jpg", max_size=400)
+    assert decoded == [(height // part, width // part)]
+    assert small.size == (width, height)
+    expected = cv2.resize(pattern, (small.width, small.height), interpolation=cv2.INTER_AREA) / 255
+    for channel in small.pixels.numpy():
+        assert np.abs(channel - expected).max() < 4 / 255
+    assert read_image(tmp_path / "a.jpg").pixels.shape == (3, height, width)
+    assert read_image(tmp_path / "a.jpg", max_size=400, gray=True).pixels.shape == (1, small.height, small.width)

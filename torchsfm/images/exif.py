@@ -11,6 +11,10 @@ from dataclasses import dataclass
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8}
 _INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i"}
 _WANTED = {
+    0x0100: "image_width",
+    0x0101: "image_height",
+    0x0142: "tile_image_width",
+    0x0143: "tile_image_height",
     0x010F: "make",
     0x0110: "model",
     0x0112: "orientation",
@@ -70,7 +74,7 @@ class Exif:
 def parse_exif(data: bytes) -> Exif:
     """The Exif tags in the bytes of an image file (JPEG, PNG, TIFF, WebP); an empty `Exif` where there are none."""
     block = _find_block(data)
-    tags = _read_tags(block) if block is not None else {}
+    tags = read_tags(block) if block is not None else {}
 
     def number(name: str) -> float | None:
         value = tags.get(name)
@@ -139,7 +143,8 @@ def _find_in_chunks(data: bytes, position: int, wanted: bytes, order: str, *, le
     return None
 
 
-def _read_tags(block: bytes) -> dict[str, str | int | float]:
+def read_tags(block: bytes) -> dict[str, str | int | float]:
+    """The tags wanted here in a TIFF structure, by name."""
     order = {b"II": "<", b"MM": ">"}.get(block[:2])
     tags: dict[str, str | int | float] = {}
     if order is None or len(block) < 8:

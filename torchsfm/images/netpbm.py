@@ -4,6 +4,8 @@ Decoded here because OpenCV scales some of them by the largest value and others 
 """
 
 import re
+from array import array
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,12 @@ _VALUES = re.compile(rb"P([2356])" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})"
 def is_netpbm(data: bytes) -> bool:
     """Whether the bytes begin as a portable bit, grey or pixel map does."""
     return _BITMAP.match(data) is not None or _VALUES.match(data) is not None
+
+
+def netpbm_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height; None where this is no portable map."""
+    header = _BITMAP.match(data) or _VALUES.match(data)
+    return None if header is None else (int(header[2]), int(header[3]))
 
 
 def decode_netpbm(data: bytes) -> tuple[NDArray[Any], float]:
@@ -41,13 +49,14 @@ def decode_netpbm(data: bytes) -> tuple[NDArray[Any], float]:
             raise ValueError("the image is cut short")
         values = np.frombuffer(data, stored, count, header.end())
     else:
-        words = data[header.end() :].split()
-        if len(words) < count:
-            raise ValueError("the image is cut short")
+        # One word at a time: as a list they would take many times the memory of the image.
+        words = islice(re.finditer(rb"\S+", data[header.end() :]), count)
         try:
-            values = np.array([min(int(word), white) for word in words[:count]])
+            values = np.frombuffer(array("l", (min(int(word[0]), white) for word in words)), np.dtype("l"))
         except ValueError:
             raise ValueError("damaged: a pixel is not a number") from None
+        if len(values) < count:
+            raise ValueError("the image is cut short")
         if values.min() < 0:
             raise ValueError("damaged: a pixel is negative")
     values = np.minimum(values, white).astype(np.uint16 if white > 255 else np.uint8)

@@ -1,6 +1,7 @@
 """Image files to tensors and back."""
 
 import os
+import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsfm.images.exif import parse_exif
+from torchsfm.images.headers import guess_contents, image_size, is_complete
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
+
+MAX_PIXELS = 2**28
+"""More pixels than any camera takes; read all the same, they would fill several gigabytes."""
+BYTES_PER_PIXEL = 20
+FREE_BYTES = 2**26
+"""No image file needs more for each pixel, and for what it holds beside them."""
 
 _TURNS: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
     1: lambda a: a,
@@ -59,7 +67,9 @@ class Photograph:
         return int(self.pixels.shape[-2])
 
 
-def read_image(path: str | os.PathLike[str], *, gray: bool = False, max_size: int | None = None) -> Photograph:
+def read_image(
+    path: str | os.PathLike[str], *, gray: bool = False, max_size: int | None = None, max_pixels: int = MAX_PIXELS
+) -> Photograph:
     """Read one image file.
 
     JPEG, PNG, PGM and PPM (8 and 16 bits), TIFF, BMP and WebP. The orientation in the Exif tags is applied, so that the image
@@ -68,24 +78,30 @@ def read_image(path: str | os.PathLike[str], *, gray: bool = False, max_size: in
     Args:
         path: The file.
         gray: One channel (luma) instead of red, green and blue.
-        max_size: Scale the image down so that its longer side has at most this many pixels; `focal` is scaled with it.
+        max_size: Scale the image down so that its longer side has at most this many pixels; `focal` is scaled with it. A JPEG
+            of at least twice the size is not decoded in full where its sides allow it.
+        max_pixels: An image that has more pixels by its header is refused, as a small file can hold more than the memory does.
 
     Returns:
         The image with float32 pixels in [0, 1], upright.
 
     Raises:
-        ImageError: The file is missing, unreadable, empty, cut short, or no image.
-        ValueError: `max_size` is not positive.
+        ImageError: The file is missing, unreadable, empty, cut short, too large, or no image.
+        ValueError: `max_size` or `max_pixels` is not positive.
     """
-    if max_size is not None and max_size < 1:
-        raise ValueError(f"max_size: wanted at least 1, got {max_size}")
+    for name, value in (("max_size", max_size), ("max_pixels", max_pixels)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name}: wanted at least 1, got {value}")
     path = Path(path)
-    data = _read_bytes(path)
-    array, white = _decode(data, path, gray=gray)
+    data = _read_bytes(path, max_pixels)
+    stored = _stored_size(data, path, max_pixels)
+    # A part that divides both sides, so that every pixel of the smaller image is as many of the larger one.
+    parts = [part for part in (8, 4, 2) if max_size and max(stored) >= part * max_size and not any(n % part for n in stored)]
+    array, white = _decode(data, path, gray=gray, part=max(parts, default=1))
     exif = parse_exif(data)
-    focal = exif.focal(array.shape[1], array.shape[0])
+    focal = exif.focal(*stored)
     array = _TURNS[exif.orientation](array)
-    size = (array.shape[1], array.shape[0])
+    size = stored if exif.orientation < 5 else stored[::-1]
     if max_size is not None and max(size) > max_size:
         import cv2
 
@@ -162,10 +178,15 @@ def scale_image(image: Float[Tensor, "*batch h w"], *, low: float | None = None,
     return ((image - bottom) / torch.where(usable, spread, 1)).clamp(0, 1) * usable
 
 
-def _read_bytes(path: Path) -> bytes:
-    if path.is_dir():
-        raise ImageError(f"{path}: a folder, not an image")
+def _read_bytes(path: Path, max_pixels: int) -> bytes:
     try:
+        status = path.stat()
+        if stat.S_ISDIR(status.st_mode):
+            raise ImageError(f"{path}: a folder, not an image")
+        if not stat.S_ISREG(status.st_mode):  # a pipe, say, that nobody may ever write to
+            raise ImageError(f"{path}: not a file")
+        if status.st_size > BYTES_PER_PIXEL * max_pixels + FREE_BYTES:
+            raise ImageError(f"{path}: {status.st_size} bytes are more than {max_pixels} pixels take (max_pixels)")
         data = path.read_bytes()
     except FileNotFoundError:
         raise ImageError(f"{path}: no such file") from None
@@ -176,8 +197,26 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def _decode(data: bytes, path: Path, *, gray: bool) -> tuple[NDArray[Any], float]:
-    """Pixels (h, w) or (h, w, 3) in red, green, blue order as stored, and the value that stands for white."""
+def _stored_size(data: bytes, path: Path, max_pixels: int) -> tuple[int, int]:
+    """Width and height by the header, of a file that is an image as far as its header says."""
+    complete = True if is_netpbm(data) else is_complete(data)
+    if complete is None:
+        raise ImageError(f"{path}: not an image of a known kind ({guess_contents(data)})")
+    if not complete:
+        raise ImageError(f"{path}: the image is cut short")
+    size = image_size(data)
+    if size is None or min(size) < 1:
+        raise ImageError(f"{path}: damaged, the header names no size")
+    if size[0] * size[1] > max_pixels:
+        raise ImageError(f"{path}: {size[0]} x {size[1]} are more than the {max_pixels} pixels that are read (max_pixels)")
+    return size
+
+
+def _decode(data: bytes, path: Path, *, gray: bool, part: int) -> tuple[NDArray[Any], float]:
+    """Pixels (h, w) or (h, w, 3) in red, green, blue order as stored, and the value that stands for white.
+
+    A part of 2, 4 or 8 allows for an image that is smaller by that.
+    """
     import cv2
 
     if is_netpbm(data):
@@ -188,14 +227,11 @@ def _decode(data: bytes, path: Path, *, gray: bool) -> tuple[NDArray[Any], float
         if gray:
             return cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if values.ndim == 3 else values, white
         return values if values.ndim == 3 else np.repeat(values[:, :, None], 3, 2), white
-    complete = _is_complete(data)
-    if complete is None:
-        raise ImageError(f"{path}: not an image of a known kind ({_guess(data)})")
-    if not complete:
-        raise ImageError(f"{path}: the image is cut short")
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
+    flags = cv2.IMREAD_ANYDEPTH | (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
+    if part > 1 and data[:3] == b"\xff\xd8\xff":  # of other kinds the whole would be decoded all the same
+        flags = getattr(cv2, f"IMREAD_REDUCED_{'GRAYSCALE' if gray else 'COLOR'}_{part}")
     try:
-        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ImageError(f"{path}: cannot be decoded ({' '.join(str(error).split())[:200]})") from None
     if array is None or array.size == 0:
@@ -203,35 +239,3 @@ def _decode(data: bytes, path: Path, *, gray: bool) -> tuple[NDArray[Any], float
     if array.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path}: pixels of type {array.dtype}; 8 or 16 bit integers are wanted")
     return array if gray else array[:, :, ::-1], 255.0 if array.dtype == np.uint8 else 65535.0
-
-
-def _is_complete(data: bytes) -> bool | None:
-    """Whether the file holds all of its image; None where it is no image known here."""
-    if data[:3] == b"\xff\xd8\xff":
-        position = 2
-        while position + 4 <= len(data) and data[position] == 0xFF and data[position + 1] != 0xDA:
-            fill = data[position + 1] == 0xFF
-            position += 1 if fill else 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-        return data.find(b"\xff\xd9", position) >= 0  # inside the coded data 0xff is always followed by 0 or a restart mark
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
-        position = 8
-        while position + 12 <= len(data):
-            if data[position + 4 : position + 8] == b"IEND":
-                return True
-            position += 12 + int.from_bytes(data[position : position + 4], "big")
-        return False
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        return len(data) >= 8 + int.from_bytes(data[4:8], "little")
-    if data[:4] in (b"II*\0", b"MM\0*"):
-        return True
-    if data[:2] == b"BM":
-        return len(data) >= int.from_bytes(data[2:6], "little")
-    return None
-
-
-def _guess(data: bytes) -> str:
-    if data[4:8] == b"ftyp":
-        return "HEIC or AVIF: convert it to JPEG or PNG"
-    head = data[:512]
-    text = sum(byte in b"\t\n\r" or 32 <= byte < 127 for byte in head) > 0.95 * len(head)
-    return "it looks like text" if text else "unknown contents"
