@@ -6,10 +6,12 @@ from pathlib import Path
 from shutil import copy
 
 import pytest
+import torch
 from command_line import FOCAL, HEIGHT, WIDTH, assert_one_line, photograph, report, torchsfm
 from full_disk import full_disk
 
 from torchsfm.formats import read_colmap
+from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import printable
 
@@ -121,3 +123,17 @@ def test_a_model_that_colmap_cannot_hold_is_written_in_the_other_formats(courtya
     assert status == 0
     assert "colmap  not written: camera 0 has skew" in text
     assert (tmp_path / "out/model.npz").exists()
+
+
+def test_an_image_with_too_many_pixels_is_left_out_and_said(courtyard: Path, tmp_path: Path) -> None:
+    images = [courtyard / f"view{i}.png" for i in range(2)]
+    save_image(tmp_path / "large.png", torch.zeros(3, HEIGHT + 1, WIDTH))
+    words = ["reconstruct", *images, tmp_path / "large.png", "--max-pixels", WIDTH * HEIGHT]
+    assert torchsfm(*words, "--out", tmp_path / "out")[0] == 0
+    entry = report(tmp_path / "out")["large.png"]
+    assert not entry["registered"]
+    assert "400 x 301 are more than the 120000 pixels" in str(entry["reason"])
+    words[-1] -= 1
+    status, _, stderr = torchsfm(*words, "--out", tmp_path / "out")
+    assert status == 2
+    assert "0 of 3 files can be read" in stderr

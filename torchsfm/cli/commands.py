@@ -14,7 +14,7 @@ from torchsfm.cli.inputs import photograph_folder, read_intrinsics, warn_about_i
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.results import VERSION, compare, finish
-from torchsfm.images import save_image
+from torchsfm.images import MAX_PIXELS, save_image
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import printable
 from torchsfm.simulation import render_sequence
@@ -103,6 +103,7 @@ def reconstruct(
         typer.Option(help="From two images on, or all together without calibration and then autocalibration."),
     ] = Method.incremental,
     max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
+    max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,
     seed: Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where an earlier run into the same folder stopped.")] = False,
     threads: Threads = None,
@@ -113,11 +114,12 @@ def reconstruct(
         source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
         result = job.run(
             source, threads, sequence=sequence, camera=camera.value if camera else None, K=K, shared_camera=shared_camera,
-            free_principal_point=free_principal_point, method=method.value, max_features=max_features, seed=seed, resume=resume,
+            free_principal_point=free_principal_point, method=method.value, max_features=max_features, max_pixels=max_pixels, seed=seed,
+            resume=resume,
         )  # fmt: skip
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
-        finish(job, result, photograph_folder(images), {})
+        finish(job, result, photograph_folder(images), {}, max_pixels)
 
 
 @app.command()

@@ -18,6 +18,7 @@ from torchsfm.cli.job import NOTHING, Job
 from torchsfm.cli.output import replacing_results
 from torchsfm.formats import write_colmap, write_ply
 from torchsfm.geometry import Pose
+from torchsfm.images import MAX_PIXELS
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import Reconstruction, SfmResult
 from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_rmse
@@ -50,7 +51,7 @@ def compare(model: Reconstruction, poses_true: Pose, K_true: Float[Tensor, "v 3 
     return {key: value for key, value in words.items() if not math.isnan(rmse)}
 
 
-def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, str]) -> None:
+def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, str], max_pixels: int = MAX_PIXELS) -> None:
     """Write everything there is to `job.out`, all or nothing, and say in a few lines what came out and where to look.
 
     Args:
@@ -58,12 +59,13 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
         result: What it found.
         folder: Where the photographs lie, for the page; None where they do not lie together.
         truth: True errors, if known.
+        max_pixels: The most that a photograph on the page may have.
     """
     more: dict[str, Any] = {"version": VERSION, "command": shlex.join(sys.argv[1:])}
     if not result.models:
         more["failure"] = result.failure()
     with replacing_results(job.out) as out:
-        written = write_models(job, result, folder, out)
+        written = write_models(job, result, folder, out, max_pixels)
         record = report_record(result, peak_memory_mb=peak_memory(), truth=truth, **more)
         texts = {"report.json": json.dumps(record, indent=1), "report.md": report_markdown(record)}
         write_whole_files({out / name: text.encode() for name, text in texts.items()})
@@ -80,13 +82,13 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
         raise typer.Exit(NOTHING)
 
 
-def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path) -> list[tuple[str, str]]:
+def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path, max_pixels: int) -> list[tuple[str, str]]:
     """Write the page of all models, and each model in all formats that can hold it; return what to look at."""
     if not result.models:
         return []
     total = 1 + 3 * len(result.models)
     job.progress("write", 0, total)
-    write_page(result.models, out / "page.html", report=result.report, images=folder)
+    write_page(result.models, out / "page.html", report=result.report, images=folder, max_pixels=max_pixels)
     written = [("page.html", "open it in a browser and turn the model with the mouse")]
     formats: list[tuple[str, str, Callable[[Reconstruction, Path], Any], str]] = [
         ("model", ".npz", Reconstruction.save, "the model, for Reconstruction.load and torchsfm info"),

@@ -6,11 +6,12 @@ from torchsfm.images.features import Features, detect_features
 from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
 from torchsfm.images.listing import list_images, list_skipped
 from torchsfm.images.matching import match_descriptors, match_features
-from torchsfm.images.reading import ImageError, Photograph, read_image, save_image, scale_image
+from torchsfm.images.reading import MAX_PIXELS, ImageError, Photograph, read_image, save_image, scale_image
 from torchsfm.images.retrieval import describe_images, retrieve_pairs
 from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_sequence
 
 __all__ = [
+    "MAX_PIXELS",
     "Corners",
     "Exif",
     "Features",

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsfm.images import read_image, save_image
+from torchsfm.images import MAX_PIXELS, read_image, save_image
 from torchsfm.plot.framing import frame
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -31,6 +31,7 @@ def write_page(
     report: Report | None = None,
     images: str | Path | None = None,
     thumbnail: int = 320,
+    max_pixels: int = MAX_PIXELS,
 ) -> Path:
     """Write a self-contained interactive page of one model or of several.
 
@@ -46,6 +47,7 @@ def write_page(
         images: Folder with the photographs under their names. If given, small copies are put into the page, to be shown at
             the cameras; photographs that cannot be read are left out.
         thumbnail: Longer side of these copies in pixels.
+        max_pixels: Photographs that have more are left out too.
 
     Returns:
         The path written.
@@ -62,7 +64,7 @@ def write_page(
     photos: dict[str, str | None] = {}
     if images is not None:
         names = {name for model in models for name in model.names}
-        photos = {name: _thumbnail(Path(images) / name, thumbnail) for name in sorted(names)}
+        photos = {name: _thumbnail(Path(images) / name, thumbnail, max_pixels) for name in sorted(names)}
     content = {
         "title": title,
         "models": [_model(model, number, report, photos, len(models)) for number, model in enumerate(models)],
@@ -218,10 +220,10 @@ def _image(model: Reconstruction, i: int, R: Tensor, own: Tensor, residuals: Ten
     return entry
 
 
-def _thumbnail(path: Path, size: int) -> str | None:
+def _thumbnail(path: Path, size: int, max_pixels: int) -> str | None:
     """A small JPEG of a photograph as a data address; None where it cannot be read."""
     try:
-        pixels = read_image(path, max_size=size).pixels
+        pixels = read_image(path, max_size=size, max_pixels=max_pixels).pixels
     except (OSError, ValueError):
         return None
     with tempfile.TemporaryDirectory() as folder:

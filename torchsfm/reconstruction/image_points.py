@@ -15,6 +15,8 @@ from torchsfm.reconstruction.report import Progress, ReconstructionError
 from torchsfm.reconstruction.stages import Arrays
 
 Found = tuple[Photograph, Features, Tensor]
+DETECTION_SIZE = 2400
+"""Larger photographs are read and searched at this longer side; positions are those of the whole image."""
 
 
 @dataclass(frozen=True)
@@ -48,18 +50,21 @@ def image_names(files: Sequence[Path]) -> list[str]:
     return names
 
 
-def detect_all(files: list[Path], max_features: int, progress: Progress) -> Arrays:
+def detect_all(files: Sequence[Path], max_features: int, max_pixels: int, progress: Progress) -> Arrays:
     """Features of all files, as tensors to save; `unpack` reads them."""
 
     def work(path: Path) -> Found | str:
         try:
-            photo = read_image(path)
+            photo = read_image(path, max_size=DETECTION_SIZE, max_pixels=max_pixels)
         except ImageError as error:
             return str(error)
-        features = detect_features(photo, max_features)
+        features = detect_features(photo, max_features, max_size=DETECTION_SIZE)
         color = nearest_colors(photo.pixels, features.x)
-        # The pixels have served; only what the file says is kept.
-        return replace(photo, pixels=torch.zeros(1, 1, 1)), features, color
+        zoom = torch.tensor([photo.size[0] / photo.width, photo.size[1] / photo.height])
+        focal = None if photo.focal is None else photo.focal * max(photo.size) / max(photo.width, photo.height)
+        # The pixels have served; only what the file says of the whole image is kept.
+        whole = replace(photo, pixels=torch.zeros(1, 1, 1), focal=focal)
+        return whole, replace(features, x=(features.x + 0.5) * zoom - 0.5), color
 
     found: list[Found | str] = []
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:

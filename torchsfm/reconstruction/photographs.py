@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
-from torchsfm.images import ImageError, list_images, list_skipped, match_features, retrieve_pairs
+from torchsfm.images import MAX_PIXELS, ImageError, list_images, list_skipped, match_features, retrieve_pairs
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all, image_names, unpack
 from torchsfm.reconstruction.models import METHODS, build_models
 from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult, describe_skipped
@@ -32,6 +32,7 @@ def reconstruct(
     free_principal_point: bool = True,
     method: str = "incremental",
     max_features: int = 8192,
+    max_pixels: int = MAX_PIXELS,
     neighbours: int = 20,
     seed: int = 0,
     out: str | Path | None = None,
@@ -59,6 +60,7 @@ def reconstruct(
             without calibration, by factorisation of the longest tracks, and finds the camera by autocalibration. It refuses
             rather than guesses where the images do not determine the focal length (`report.autocalibration` says why).
         max_features: Features per image.
+        max_pixels: Larger images are left out, as a small file can hold more than the memory does.
         neighbours: Images each one is matched with when there are many.
         seed: The same seed gives the same model.
         out: Folder in which finished stages are saved.
@@ -84,11 +86,11 @@ def reconstruct(
     names = image_names(files)
     model = camera or ("pinhole" if K is not None else "radial")
     # What is saved depends on these alone; cameras and models are made from it each time.
-    options = {"sequence": sequence, "features": max_features, "neighbours": neighbours}
+    options = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
     stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
     generator = torch.Generator().manual_seed(seed)
-    points = unpack(stages.run("features", lambda: detect_all(files, max_features, report)), files, names)
-    graph = _view_graph(points, stages, report, generator, sequence=sequence, neighbours=neighbours)
+    points = unpack(stages.run("features", lambda: detect_all(files, max_features, max_pixels, report)), files, names)
+    graph = _view_graph(points, stages, report, generator, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels)
     result = build_models(
         graph,
         None,
@@ -137,6 +139,7 @@ def _view_graph(
     *,
     sequence: bool,
     neighbours: int,
+    max_pixels: int,
 ) -> ViewGraph:
     """Matches of all pairs worth comparing, verified."""
     features = points.features
@@ -160,7 +163,7 @@ def _view_graph(
     pairs, matches = matched["pairs"], list(torch.split(matched["match"], matched["count"].tolist()))
     x, color = [f.x for f in features], list(points.color)
     if sequence:
-        add_corners(x, color, pairs, matches, stages.run("track", lambda: track_corners(points, progress)))
+        add_corners(x, color, pairs, matches, stages.run("track", lambda: track_corners(points, max_pixels, progress)))
     with stages.timed("verify"), one_thread():
         progress("verify", 0, len(matches))
         graph = verify_pairs(

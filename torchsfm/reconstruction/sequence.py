@@ -30,7 +30,7 @@ def sequence_pairs(features: Sequence[Features]) -> Int[Tensor, "p 2"]:
     return pairs
 
 
-def track_corners(points: ImagePoints, progress: Progress) -> Arrays:
+def track_corners(points: ImagePoints, max_pixels: int, progress: Progress) -> Arrays:
     """Corners followed through all frames: tensors `frame`, `track`, `x`, `color`, sorted by frame.
 
     Raises:
@@ -39,18 +39,20 @@ def track_corners(points: ImagePoints, progress: Progress) -> Arrays:
     if len(torch.unique(points.image_size, dim=0)) > 1:
         raise ReconstructionError("the frames of a sequence must have one size")
     v = len(points.files)
-    tracks = track_sequence(_pixels(points.files), progress=lambda done: progress("track", done, v))
+    tracks = track_sequence(_pixels(points.files, max_pixels), progress=lambda done: progress("track", done, v))
     order = torch.argsort(tracks.frame, stable=True)
     frame, x = tracks.frame[order], tracks.x[order]
     counts = torch.bincount(frame, minlength=v).tolist()
-    colors = [nearest_colors(p, part) for p, part in zip(_pixels(points.files), torch.split(x, counts), strict=True)]
+    colors = [
+        nearest_colors(p, part) for p, part in zip(_pixels(points.files, max_pixels), torch.split(x, counts), strict=True)
+    ]
     return {"frame": frame, "track": tracks.track[order], "x": x, "color": torch.cat(colors)}
 
 
-def _pixels(files: Sequence[Path]) -> Iterator[Float[Tensor, "c h w"]]:
+def _pixels(files: Sequence[Path], max_pixels: int) -> Iterator[Float[Tensor, "c h w"]]:
     """One frame after the other, so that a long video need not fit into memory."""
     for path in files:
-        yield read_image(path).pixels
+        yield read_image(path, max_pixels=max_pixels).pixels
 
 
 def add_corners(

@@ -1,0 +1,33 @@
+"""The image points of photographs larger than detection needs."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from chance import seeded
+
+from torchsfm.images import detect_features, read_image, save_image
+from torchsfm.reconstruction import image_points
+from torchsfm.reconstruction.image_points import detect_all, unpack
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_positions_are_those_of_the_whole_image(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A photograph read at half the size has its points where those of the same photograph, searched at that size, are."""
+    monkeypatch.setattr(image_points, "DETECTION_SIZE", 400)
+    noise = torch.rand(1, 3, 75, 100, generator=seeded())
+    image = torch.nn.functional.interpolate(noise, size=(600, 800), mode="bicubic").clamp(0, 1)[0]
+    files = [tmp_path / f"{i}{suffix}" for i in range(2)]
+    for file in files:
+        save_image(file, image, quality=98)
+    points = unpack(detect_all(files, 500, 10**6, lambda *_: None), files, ["a", "b"])
+    assert points.image_size.tolist() == [[800, 600]] * 2
+    expected = detect_features(read_image(files[0]), 500, max_size=400).x
+    found = points.features[0].x
+    distance = torch.cdist(found, expected).min(1).values
+    assert len(found) > 100
+    assert float(distance.median()) < 0.3
+    near = torch.cdist(found, expected).argmin(1)[distance < 1]
+    assert float((found[distance < 1] - expected[near]).mean(0).abs().max()) < 0.1
+    assert float((distance < 1).double().mean()) > 0.9
+    assert float((points.color[0] - image[:, found[:, 1].long(), found[:, 0].long()].T).abs().mean()) < 0.1
