@@ -114,8 +114,8 @@ def reconstruct(
         source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
         result = job.run(
             source, threads, sequence=sequence, camera=camera.value if camera else None, K=K, shared_camera=shared_camera,
-            free_principal_point=free_principal_point, method=method.value, max_features=max_features, max_pixels=max_pixels, seed=seed,
-            resume=resume,
+            free_principal_point=free_principal_point, method=method.value, max_features=max_features, max_pixels=max_pixels,
+            seed=seed, resume=resume,
         )  # fmt: skip
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
