@@ -192,7 +192,7 @@ def report(tallies: dict[str, Tally]) -> str:
 def main(modules: Sequence[str], description: str | None) -> None:
     """The command line of a set of targets."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--inputs", type=int, help="stop after so many bad inputs")
+    parser.add_argument("--inputs", "--files", type=int, help="stop after so many bad inputs")
     parser.add_argument("--seconds", type=float, help="stop after this time")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)

@@ -5,6 +5,7 @@ frames (a rig at one time), from which the poses of the images follow. Each tabl
 https://colmap.github.io/format.html.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -187,6 +188,6 @@ def motion(values: list[float] | tuple[float, ...]) -> Motion:
     Raises:
         ValueError: One is not finite, or the quaternion is zero.
     """
-    if not np.isfinite(values).all() or not 1e-6 < float(np.linalg.norm(values[:4])) < 1e6:
+    if not all(map(math.isfinite, values)) or not 1e-6 < math.hypot(*values[:4]) < 1e6:
         raise ValueError("a pose that is none")
     return tuple(values)
