@@ -13,8 +13,9 @@ from torchsfm.geometry.cameras import Camera, intrinsics
 from torchsfm.geometry.distortion import KannalaBrandt, Radial
 from torchsfm.geometry.poses import Pose
 from torchsfm.simulation import RenderedSequence, TexturedScene, courtyard_scene, look_at, orbit_poses, render_sequence
+from torchsfm.simulation.rendering import default_camera
 from torchsfm.simulation.surfaces import Rectangle, Sphere
-from torchsfm.simulation.textured_scene import texture_surface
+from torchsfm.simulation.textured_scene import Textured, texture_surface
 
 WIDTH, HEIGHT, VIEWS = 160, 120, 4
 
@@ -220,3 +221,29 @@ def test_wrong_arguments(scene: TexturedScene, rendered: RenderedSequence) -> No
         render_sequence(scene, poses=rendered.poses[:2], camera=rendered.cameras)
     with pytest.raises(ValueError, match="styles: wanted at least one"):
         texture_surface(Sphere(vector(0.0, 0.0, 0.0), 1.0))
+
+
+def test_a_highlight_lies_where_the_sun_is_mirrored(generator: torch.Generator) -> None:
+    ball = Sphere(torch.zeros(3, dtype=torch.float64), 1.0)
+    grey = Textured(ball, tuple((torch.full((3, 8, 8), 0.3),) for _ in range(6)), 0.2)
+    poses = orbit_poses(5, radius=4.0)
+    camera = default_camera(160, 120)
+    for _ in range(3):
+        towards = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        for pose in (poses[i : i + 1] for i in range(5)):
+            # Somewhere on the camera's side.
+            sun = towards + 1.5 * torch.nn.functional.normalize(pose.centre[0], dim=0)
+            options = {"poses": pose, "camera": camera, "width": 160, "height": 120, "noise": 0.0, "points": 1}
+            plain, glossy = (
+                render_sequence(TexturedScene((grey,), sun, gloss=gloss, polish=200.0), **options).images[0].mean(0)
+                for gloss in (0.0, 0.6)
+            )
+            gain = glossy - plain
+            assert (gain >= 0).all()
+            y, x = divmod(int(gain.argmax()), 160)
+            d, _ = camera.unproject(torch.tensor([[x, y]], dtype=torch.float64))
+            e = (pose.R[0].mT @ d[0])[:, None]
+            s = ball.intersect(pose.centre[0][:, None], e)
+            normal = (pose.centre[0][:, None] + s * e)[:, 0]
+            middle = torch.nn.functional.normalize(sun, dim=0) - torch.nn.functional.normalize(e[:, 0], dim=0)
+            assert torch.nn.functional.cosine_similarity(normal, middle, dim=0) > math.cos(0.05)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry.rotations import random_rotation
-from torchsfm.simulation.surfaces import Box, Cylinder, Rectangle, Sphere, Surface
+from torchsfm.simulation.surfaces import Box, Cylinder, Ellipsoid, Rectangle, Sphere, Surface
 
 N = 2000
 
@@ -26,6 +26,8 @@ def surface(kind: str, generator: torch.Generator) -> Surface:
         return Box(vector(0.1, -0.2, 0.3), axes, vector(0.4, 0.7, 1.0))
     if kind == "sphere":
         return Sphere(vector(0.1, -0.2, 0.3), 0.8)
+    if kind == "ellipsoid":
+        return Ellipsoid(vector(0.1, -0.2, 0.3), axes, vector(0.5, 0.8, 1.1))
     return Cylinder(vector(0.1, -0.2, -0.5), axes, 0.6, 1.3)
 
 
@@ -47,12 +49,14 @@ def outside(thing: Surface, X: Tensor) -> Tensor:
         return p.amax(0)
     if isinstance(thing, Sphere):
         return (X - thing.centre[:, None]).norm(dim=0) - thing.radius
+    if isinstance(thing, Ellipsoid):
+        return (thing.axes @ (X - thing.centre[:, None]) / thing.radii[:, None]).norm(dim=0) - 1
     p = thing.axes @ (X - thing.base[:, None])
     side = (p[0].square() + p[1].square()).sqrt() - thing.radius
     return torch.maximum(side.abs(), (p[2] - thing.height / 2).abs() - thing.height / 2)
 
 
-KINDS = ("rectangle", "disc", "box", "sphere", "cylinder")
+KINDS = ("rectangle", "disc", "box", "sphere", "ellipsoid", "cylinder")
 
 
 @pytest.mark.parametrize("kind", KINDS)

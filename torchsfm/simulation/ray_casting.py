@@ -117,7 +117,13 @@ def shade(
         outside = -torch.sign(facing)
         light = scene.ambient * (0.8 + 0.2 * normal[2] * outside)
         light = light + (1 - scene.ambient) * 1.25 * ((sun @ normal) * outside).clamp_min(0) * sunny[chosen]
-        color.index_copy_(1, chosen, texture * light.to(torch.float32))
+        seen = texture * light.to(torch.float32)
+        if scene.gloss > 0:
+            mirrored = 2 * (sun @ normal) * normal - sun[:, None]
+            away = -_dot(mirrored, e) / _dot(e, e).sqrt()
+            lit_side = sunny[chosen] & ((sun @ normal) * outside > 0)
+            seen = seen + (scene.gloss * away.clamp_min(0) ** scene.polish * lit_side).to(torch.float32)
+        color.index_copy_(1, chosen, seen)
     return color.clamp(0, 1)
 
 

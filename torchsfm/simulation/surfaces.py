@@ -138,18 +138,64 @@ class Sphere:
     def chart(self, X: Float[Tensor, "3 n"]) -> Chart:
         """Texture coordinates at points on the surface."""
         p = (X - self.centre.to(X)[:, None]) / self.radius
-        axis = p.abs().argmax(0)
-        first, second = torch.where(axis == 0, 1, 0), torch.where(axis == 2, 1, 2)
-        main = p.gather(0, axis[None])[0]
-        rows = torch.eye(3, dtype=X.dtype, device=X.device)
+        sheet, uv, du, dv = _cube_chart(p)
+        return Chart(sheet, uv * self.radius, du, dv, p)
 
-        def along(index: Tensor) -> tuple[Tensor, Tensor]:
-            tangent = p.gather(0, index[None])[0] / main.abs()
-            gradient = (rows[:, index] - tangent * torch.sign(main) * rows[:, axis]) / (main.abs() * (1 + tangent.square()))
-            return (torch.atan(tangent) + math.pi / 4) * self.radius, gradient
 
-        (u, du), (v, dv) = along(first), along(second)
-        return Chart(2 * axis + (main > 0).long(), torch.stack((u, v)), du, dv, p)
+@dataclass(frozen=True)
+class Ellipsoid:
+    """An ellipsoid with its axes as the rows of a rotation and its radius along each: a sphere stretched, paint and all."""
+
+    centre: Float[Tensor, "3"]
+    axes: Float[Tensor, "3 3"]
+    radii: Float[Tensor, "3"]
+
+    def sheets(self) -> tuple[tuple[float, float], ...]:
+        """Width and height of each texture sheet, those of a sphere of the mean radius: -x, +x, -y, +y, -z, +z."""
+        return ((self._size() * math.pi / 2,) * 2,) * 6
+
+    def _size(self) -> float:
+        return float(self.radii.mean())
+
+    def ball(self) -> tuple[Float[Tensor, "3"], float]:
+        """Centre and radius of a ball around the surface."""
+        return self.centre, 1.001 * float(self.radii.max())
+
+    def _to_sphere(self) -> Tensor:
+        """The linear map that makes the ellipsoid a unit sphere."""
+        return self.axes / self.radii[:, None]
+
+    def intersect(self, origin: Float[Tensor, "3 #n"], d: Float[Tensor, "3 n"]) -> Float[Tensor, "n"]:
+        """The smallest s > 0 for which origin + s d lies on the surface, infinity where there is none."""
+        stretch = self._to_sphere().to(d)
+        o, e = stretch @ (origin - self.centre.to(d)[:, None]), stretch @ d
+        return _first_root(_dot(e, e), _dot(o, e), _dot(o, o) - 1)[0]
+
+    def chart(self, X: Float[Tensor, "3 n"]) -> Chart:
+        """Texture coordinates at points on the surface."""
+        stretch = self._to_sphere().to(X)
+        p = stretch @ (X - self.centre.to(X)[:, None])
+        sheet, uv, *gradients = _cube_chart(p)
+        normal = torch.nn.functional.normalize(stretch.T @ p, dim=0)
+        du, dv = (self._size() * (stretch.T @ g) for g in gradients)
+        du, dv = (g - normal * _dot(g, normal) for g in (du, dv))
+        return Chart(sheet, uv * self._size(), du, dv, normal)
+
+
+def _cube_chart(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Face of the cube, coordinates on it, and their gradients, of points on the unit sphere."""
+    axis = p.abs().argmax(0)
+    first, second = torch.where(axis == 0, 1, 0), torch.where(axis == 2, 1, 2)
+    main = p.gather(0, axis[None])[0]
+    rows = torch.eye(3, dtype=p.dtype, device=p.device)
+
+    def along(index: Tensor) -> tuple[Tensor, Tensor]:
+        tangent = p.gather(0, index[None])[0] / main.abs()
+        gradient = (rows[:, index] - tangent * torch.sign(main) * rows[:, axis]) / (main.abs() * (1 + tangent.square()))
+        return torch.atan(tangent) + math.pi / 4, gradient
+
+    (u, du), (v, dv) = along(first), along(second)
+    return 2 * axis + (main > 0).long(), torch.stack((u, v)), du, dv
 
 
 @dataclass(frozen=True)
@@ -192,7 +238,7 @@ class Cylinder:
         return Chart(zero.long(), uv, du, axes[2][:, None].expand_as(X), axes.T @ normal)
 
 
-Surface = Rectangle | Box | Sphere | Cylinder
+Surface = Rectangle | Box | Sphere | Ellipsoid | Cylinder
 
 
 def _first_root(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:

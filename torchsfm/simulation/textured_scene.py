@@ -29,6 +29,10 @@ class TexturedScene:
     """Direction to the sun; any length."""
     ambient: float = 0.5
     """Light that reaches every surface, as a share of the light on a surface facing the sun."""
+    gloss: float = 0.0
+    """Brightness of the sun's mirror image on the surfaces: a highlight that moves with the viewpoint (Phong 1975)."""
+    polish: float = 30.0
+    """How small highlights are: the exponent of the cosine of the angle from the mirror direction."""
 
 
 def texture_surface(surface: Surface, *styles: str, texel: float = 0.005, generator: torch.Generator | None = None) -> Textured:

@@ -280,6 +280,22 @@ def _poster(h: int, w: int, unit: float, generator: Generator) -> Tensor:
     return result
 
 
+def _curves(h: int, w: int, unit: float, generator: Generator) -> Tensor:
+    """Smooth glaze with a few painted curves, the level lines of a smooth function: nothing there has a corner."""
+    base, *inks = _pick(PAINT, 3, 0.2, generator)
+    field = fractal_noise(h, w, 0.6 * unit, gain=0.4, finest=0.25 * unit, generator=generator)
+    shade = fractal_noise(h, w, 1.5 * unit, gain=0.3, finest=0.7 * unit, generator=generator)
+    image: Tensor = (base[:, None, None] * (1 + 0.08 * shade)).expand(3, h, w)
+    # Distance to the level line in texels, so that lines are of one width.
+    slope = torch.stack(torch.gradient(field)).norm(dim=0).clamp_min(1e-6)
+    for ink, level in zip((*inks, *inks), (-0.7, 0.0, 0.5, 1.1), strict=True):
+        if float((ink - base).abs().sum()) < 0.5:
+            ink = (1 - base).clamp(0.05, 0.95)
+        cover = (0.012 * unit - (field - level).abs() / slope + 0.5).clamp(0, 1)
+        image = torch.lerp(image, ink[:, None, None].expand(3, h, w), cover)
+    return image
+
+
 def _posters(image: Tensor, unit: float, count: int, generator: Generator) -> Tensor:
     """Stick posters at random places on a sheet, as large as it allows."""
     _, h, w = image.shape
@@ -300,6 +316,7 @@ STYLES: dict[str, Callable[[int, int, float, Generator], Tensor]] = {
     "marble": _marble,
     "mosaic": _mosaic,
     "poster": _poster,
+    "curves": _curves,
 }
 """Painters by name: (height, width in texels, texels per unit of the scene, generator) -> (3, height, width)."""
 
