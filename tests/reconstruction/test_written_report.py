@@ -37,7 +37,7 @@ def shown(names: tuple[str, ...]) -> list[str]:
     images = page.split("## Images")[1].split("## Pairs")[0].strip().splitlines()[2:]
     assert len(images) == len(names)
     rows = [cells(line) for line in images]
-    assert {len(row) for row in rows} == {7}
+    assert {len(row) for row in rows} == {9}
     assert rows[3][-1] == printable(names[3]).strip()
     assert "<" not in page
     page.encode("utf-8")

@@ -488,6 +488,8 @@ function fillTable() {
     const c = model.images[i], row = document.createElement("tr"), name = document.createElement("td"), plain = document.createElement("bdi");
     row.dataset.index = i;
     plain.textContent = name.title = c.name;
+    if (c.standing) name.title += "\n" + c.standing;
+    if (c.doubtful) row.className = "doubtful";
     name.append(plain);
     row.append(name);
     if (c.pose) {

@@ -125,7 +125,7 @@ def _model(
     by_view = np.split(model.view.sort(stable=True).indices.numpy(), np.cumsum(counts)[:-1])
     entries = [
         _image(model, i, framing.R, own := torch.from_numpy(by_view[i]), residuals[own], photos.get(name))
-        | ({} if bool(model.registered[i]) else {"status": _status(name, number, report)})
+        | (_standing(name, report) if bool(model.registered[i]) else {"status": _status(name, number, report)})
         for i, name in enumerate(model.names)
     ]
     if report is not None and number == 0:
@@ -187,6 +187,17 @@ def _status(name: str, number: int, report: Report | None) -> str:
             if image.model != number:
                 return f"in model {image.model + 1}"
     return "not registered"
+
+
+def _standing(name: str, report: Report | None) -> dict[str, Any]:
+    """How well a registered image is placed, in words, and whether that is doubtful."""
+    image = next((image for image in report.images if image.name == name), None) if report is not None else None
+    if image is None:
+        return {}
+    known = math.isfinite(image.rotation_sigma) and math.isfinite(image.position_sigma)
+    text = f"rotation ± {image.rotation_sigma:.2g}°, place ± {100 * image.position_sigma:.2g} % of the distance to the points"
+    lines = ([text] if known else []) + ([f"doubtful: {image.doubt}"] if image.doubt else [])
+    return {"standing": "\n".join(lines), "doubtful": bool(image.doubt)}
 
 
 def _image(model: Reconstruction, i: int, R: Tensor, own: Tensor, residuals: Tensor, photo: str | None) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
+from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.projective import projective_start
@@ -82,7 +83,7 @@ def build_models(
         free += ("principal_point",) if free_principal_point and K is None else ()
         options = MappingOptions(free=free, expected=cameras, focal_sigma=focal_uncertainty(source), generator=generator)
         empty = Mapping.start(graph, track, cameras, camera_index)
-        models: list[Reconstruction] = []
+        found: list[tuple[Reconstruction, Standing]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
         taken = empty.registered
@@ -101,26 +102,29 @@ def build_models(
                     continue
                 source = tuple("autocalibration" for _ in start.focal_sigma)
                 metric = replace(options, expected=start.expected(), focal_sigma=start.focal_sigma)
-                mapped = extend_model(start.mapping, taken, metric, report)
+                mapped, known = extend_model(start.mapping, taken, metric, report), metric
             else:
                 grown = grow_model(replace(empty, registered=taken), options, report)
                 if grown is None:
                     break
-                mapped = grown
+                mapped, known = grown, options
             model, failed = mapped
-            if not models:
+            if not found:
                 reasons |= failed
             taken = taken | model.registered
-            models.append(model.reconstruction())
+            standing = examine(model, focal_free="focal" in free, focal_sigma=known.focal_sigma, threshold=options.reprojection)
+            found.append((model.reconstruction(), standing))
             if stages.folder is not None:
-                _save_model(models[-1], stages.folder, len(models) - 1)
-        models.sort(key=lambda model: (-model.num_registered, -model.num_points))
+                _save_model(found[-1][0], stages.folder, len(found) - 1)
+        found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", len(graph.names), len(graph.names))
     unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[camera_index]
     verdict = graph.verdicts(cameras.K[camera_index], unknown_focal)
     pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
-    images = _image_reports(graph, models, reasons, failures, order)
-    return SfmResult(tuple(models), Report(images, pairs, dict(stages.seconds), source, tuple(autocalibration)))
+    images = _image_reports(graph, found, reasons, failures, order)
+    return SfmResult(
+        tuple(model for model, _ in found), Report(images, pairs, dict(stages.seconds), source, tuple(autocalibration))
+    )
 
 
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
@@ -130,7 +134,7 @@ def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
 
 def _image_reports(
     graph: ViewGraph,
-    models: Sequence[Reconstruction],
+    found: Sequence[tuple[Reconstruction, Standing]],
     reasons: dict[int, str],
     failures: dict[str, str],
     order: Sequence[str],
@@ -145,13 +149,17 @@ def _image_reports(
             reports.append(ImageReport(name, None, failures[name]))
             continue
         i, position = position, position + 1
-        model = next((k for k, m in enumerate(models) if bool(m.registered[i])), None)
-        reason = ""
-        if model is None and features[i] < MIN_FEATURES:
+        model = next((k for k, (m, _) in enumerate(found) if bool(m.registered[i])), None)
+        if model is not None:
+            standing = found[model][1]
+            sigma = {"rotation_sigma": float(standing.rotation_sigma[i]), "position_sigma": float(standing.position_sigma[i])}
+            reports.append(ImageReport(name, model, "", features[i], doubt=standing.doubt[i], **sigma))
+            continue
+        if features[i] < MIN_FEATURES:
             reason = f"only {features[i]} features: nothing to match"
-        elif model is None and not linked[i]:
+        elif not linked[i]:
             reason = "has too little in common with every other image"
-        elif model is None:
+        else:
             reason = reasons.get(i, "sees too few of the reconstructed points")
         reports.append(ImageReport(name, model, reason, features[i]))
     return tuple(reports)

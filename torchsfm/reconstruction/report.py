@@ -1,5 +1,6 @@
 """What happened to each image and each pair on the way to the models."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -28,12 +29,25 @@ def printable(text: str) -> str:
 
 @dataclass(frozen=True)
 class ImageReport:
-    """One image: the number of its model (0 is the largest), or None and the reason."""
+    """What became of one image.
+
+    Attributes:
+        name: File name.
+        model: The number of its model (0 is the largest), or None.
+        reason: Why it is in none.
+        features: Number of features found in it.
+        doubt: Why its place in the model may be wrong; empty where nothing says so.
+        rotation_sigma: Standard deviation of its rotation, degrees; infinite where it is not known.
+        position_sigma: Standard deviation of its place over the median distance of the points that it sees.
+    """
 
     name: str
     model: int | None
     reason: str = ""
     features: int = 0
+    doubt: str = ""
+    rotation_sigma: float = math.inf
+    position_sigma: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -86,6 +100,7 @@ class Report:
             if image.model is None:
                 lines.append(printable(f"not registered: {image.name} ({image.reason})"))
         lines += [f"not read: {text}" for text in describe_skipped(self.skipped)]
+        lines += [printable(f"doubtful: {image.name} ({image.doubt})") for image in self.images if image.doubt]
         lines.append("seconds: " + ", ".join(f"{stage} {time:.1f}" for stage, time in self.seconds.items()))
         return "\n".join(lines)
 

@@ -1,6 +1,7 @@
 """The report of a reconstruction as plain data for programs, and as a page of text for people."""
 
 import html
+import math
 import re
 from typing import Any
 
@@ -42,6 +43,8 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         count, error = observed.get(image.name, (0, 0.0)) if image.model is not None else (0, 0.0)
         entry = {"name": image.name, "registered": image.model is not None, "model": image.model, "reason": image.reason}
         images.append(entry | {"features": image.features, "observations": count, "mean_error_px": error})
+        images[-1] |= {"doubt": image.doubt, "rotation_sigma_deg": _finite(image.rotation_sigma)}
+        images[-1] |= {"position_sigma": _finite(image.position_sigma)}
     names = [image.name for image in report.images if _readable(image)]
     table = report.pairs
     columns = (table.pairs, table.num_matches, table.fundamental_inliers, table.homography_inliers, table.verdict)
@@ -84,11 +87,13 @@ def report_markdown(record: Record) -> str:
             image["features"],
             image["observations"],
             f"{image['mean_error_px']:.3f}" if image["registered"] else "",
-            image["reason"],
+            *(_deviation(image, key, factor) for key, factor in (("rotation_sigma_deg", 1.0), ("position_sigma", 100.0))),
+            f"doubtful: {image['doubt']}" if image["doubt"] else image["reason"],
         ]
         for image in record["images"]
     ]
-    lines += _table(["image", "registered", "model", "features", "observations", "mean error, px", "reason"], rows)
+    header = ["image", "registered", "model", "features", "observations", "mean error, px"]
+    lines += _table([*header, "rotation ±, deg", "place ±, % of depth", "reason"], rows)
     if skipped := record.get("skipped"):
         lines += ["", "Not read:", "", *_table(["name", "reason"], [[entry["name"], entry["reason"]] for entry in skipped])]
     related = [pair for pair in record["pairs"] if pair["verdict"] != "unrelated"]
@@ -109,6 +114,17 @@ def report_markdown(record: Record) -> str:
     if memory := record.get("peak_memory_mb"):
         lines += [f"The process held {memory:.0f} MB at most."]
     return "\n".join(lines) + "\n"
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if math.isfinite(value) else None
+
+
+def _deviation(image: Record, key: str, factor: float) -> str:
+    if not image["registered"]:
+        return ""
+    return "unknown" if image[key] is None else f"{factor * image[key]:.3g}"
 
 
 def _readable(image: ImageReport) -> bool:

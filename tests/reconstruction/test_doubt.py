@@ -1,0 +1,200 @@
+"""What a finished model says of its own cameras, on scenes that are right, folded, or wrong in one camera."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Pose, intrinsics
+from torchsfm.geometry.distortion import Radial
+from torchsfm.geometry.rotations import random_rotation
+from torchsfm.reconstruction.consistency import pair_agreement
+from torchsfm.reconstruction.doubt import examine
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.simulation import look_at
+
+SIZE = (640, 480)
+
+
+def cameras_on_an_arc(v: int, sweep: float) -> Pose:
+    """Cameras around the origin, ten away, looking at it."""
+    angle = torch.linspace(0, sweep, v, dtype=torch.float64)
+    centre = torch.stack((10 * angle.sin(), -10 * angle.cos(), 0.5 * (3 * angle).sin()), -1)
+    return look_at(centre, torch.zeros(3, dtype=torch.float64))
+
+
+def mapping_of(poses: Pose, X: Tensor, sees: Tensor, generator: torch.Generator, noise: float = 0.5) -> Mapping:
+    """A model of the points that the views see inside their images, and every pair of views with its true matches."""
+    v, n = sees.shape
+    zero = torch.zeros(1, dtype=torch.float64)
+    middle = torch.tensor([[SIZE[0] / 2, SIZE[1] / 2]], dtype=torch.float64)
+    camera = Camera(intrinsics(torch.full((1,), 600.0, dtype=torch.float64), middle), Radial(zero, zero))
+    X_cam = poses.transform(X.expand(v, n, 3))
+    x = camera[torch.zeros(v, dtype=torch.long)].project(X_cam)
+    sees = sees & (x >= 1).all(-1) & (x < torch.tensor(SIZE) - 2).all(-1)
+    sees &= sees.sum(0) >= 2
+    view, point = sees.nonzero(as_tuple=True)
+    node = torch.full((v, n), -1)
+    node[view, point] = torch.arange(len(view))
+    pairs = torch.combinations(torch.arange(v))
+    both = sees[pairs].all(1)
+    match_pair, shared = both.nonzero(as_tuple=True)
+    match = torch.stack([node[pairs[match_pair, k], shared] for k in range(2)], 1)
+    kept, number = torch.unique(point, return_inverse=True)
+    count = both.sum(1)
+    eye = torch.eye(3, dtype=torch.float64).repeat(len(pairs), 1, 1)
+    graph = ViewGraph(
+        names=tuple(f"{i}.png" for i in range(v)),
+        image_size=torch.tensor([SIZE] * v),
+        x=x[view, point] + noise * torch.randn(len(view), 2, generator=generator, dtype=torch.float64),
+        view=view,
+        color=torch.zeros(len(view), 3, dtype=torch.float64),
+        pairs=pairs,
+        num_matches=count,
+        F=eye,
+        H=eye,
+        fundamental_inliers=count,
+        homography_inliers=torch.zeros_like(count),
+        match=match,
+        match_pair=match_pair,
+    )
+    start = Mapping.start(graph, number, camera, torch.zeros(v, dtype=torch.long))
+    return replace(start, poses=poses, registered=torch.ones(v, dtype=torch.bool), X=X[kept], point=number)
+
+
+def cloud(n: int, generator: torch.Generator, low: tuple[float, ...], high: tuple[float, ...]) -> Tensor:
+    a, b = (torch.tensor(side, dtype=torch.float64) for side in (low, high))
+    return a + (b - a) * torch.rand(n, 3, generator=generator, dtype=torch.float64)
+
+
+def scene(generator: torch.Generator, v: int = 8, n: int = 600, share: float = 0.6) -> Mapping:
+    """One cloud, each point seen in each view with one probability."""
+    X = cloud(n, generator, (-3, -2, -2.5), (3, 2, 2.5))
+    return mapping_of(cameras_on_an_arc(v, 0.8), X, torch.rand(v, n, generator=generator) < share, generator)
+
+
+def folded(generator: torch.Generator, v: int = 12) -> Mapping:
+    """Two places at which one thing stands, taken for one: every other camera sees the surroundings of the other place."""
+    thing, around = cloud(400, generator, (-3, -1, 0), (3, 1, 2.5)), cloud(500, generator, (-3, -1, -2.5), (3, 1, -0.8))
+    sees = torch.rand(v, 900, generator=generator) < 0.6
+    place = torch.arange(v) % 2
+    sees[:, 400:] &= place[:, None] == torch.arange(500) % 2
+    return mapping_of(cameras_on_an_arc(v, 0.6), torch.cat([thing, around]), sees, generator)
+
+
+def judged(mapping: Mapping) -> tuple[str, ...]:
+    return examine(mapping, focal_free=True, focal_sigma=torch.tensor([0.5]), threshold=4.0).doubt
+
+
+def test_a_right_model_is_not_doubted(generator: torch.Generator) -> None:
+    for _ in range(20):
+        mapping = scene(generator)
+        conflicts = missing_correspondences(mapping)
+        assert len(conflicts.pairs) > 0
+        assert not len(conflicts.refuted)
+        assert judged(mapping) == ("",) * 8
+
+
+def test_a_folded_model_is_doubted_whole(generator: torch.Generator) -> None:
+    for _ in range(10):
+        mapping = folded(generator)
+        refuted = missing_correspondences(mapping).refuted
+        assert len(refuted) > 1
+        # Only cameras at different places miss what the others see.
+        assert ((refuted[:, 0] + refuted[:, 1]) % 2 == 1).all()
+        assert all("look alike" in reason for reason in judged(mapping))
+
+
+def test_what_hides_points_explains_that_they_are_missing(generator: torch.Generator) -> None:
+    mapping = folded(generator)
+    # Something seen by all stands before the surroundings.
+    screen = cloud(400, generator, (-3, -4, -2.5), (3, -3.8, -0.3))
+    X = torch.cat([mapping.X, screen])
+    v = len(mapping.registered)
+    sees = torch.zeros(v, len(X), dtype=torch.bool)
+    sees[mapping.graph.view, mapping.point] = True
+    sees[:, len(mapping.X) :] = torch.rand(v, len(screen), generator=generator) < 0.6
+    assert not len(missing_correspondences(mapping_of(mapping.poses, X, sees, generator)).refuted)
+
+
+def test_matches_agree_with_right_poses_alone(generator: torch.Generator) -> None:
+    for _ in range(10):
+        mapping = scene(generator)
+        right = pair_agreement(mapping, threshold=4.0)
+        assert right.agreeing.sum() > 0.99 * right.matches.sum()
+        assert right.supports.all()
+        axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        delta = torch.zeros(8, 6, dtype=torch.float64)
+        delta[3, :3] = math.radians(20) * axis
+        wrong = pair_agreement(replace(mapping, poses=mapping.poses.retract(delta)), threshold=4.0)
+        own = (wrong.pairs == 3).any(1)
+        assert wrong.supports[~own].all()
+        assert not wrong.supports[own].any()
+        assert wrong.balance(8)[3] < 0
+        assert (wrong.balance(8)[torch.arange(8) != 3] > 0).all()
+
+
+def test_a_camera_that_its_pairs_contradict_is_doubted(generator: torch.Generator) -> None:
+    mapping = scene(generator)
+    delta = torch.zeros(8, 6, dtype=torch.float64)
+    delta[3, :3] = torch.tensor([0.2, 0.2, 0.2])
+    # It keeps the few points that fit a wrong pose, as a camera does that was registered by chance.
+    turned = replace(mapping, poses=mapping.poses.retract(delta))
+    error = turned.errors(turned.point, torch.arange(len(turned.point)))
+    point = torch.where((turned.graph.view == 3) & (error > 30), -1, turned.point)
+    doubt = judged(replace(turned, point=point))
+    assert "contradict" in doubt[3]
+
+
+def test_deviations_do_not_depend_on_the_frame(generator: torch.Generator) -> None:
+    mapping = scene(generator)
+    R = random_rotation(generator=generator, dtype=torch.float64)
+    shift = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
+    X = 7 * mapping.X @ R.mT + shift
+    R_cam = mapping.poses.R @ R.mT
+    moved = replace(mapping, X=X, poses=Pose(R_cam, 7 * mapping.poses.t - (R_cam @ shift)))
+    options = {"focal_free": False, "focal_sigma": torch.tensor([0.01]), "threshold": 4.0}
+    first, second = examine(mapping, **options), examine(moved, **options)
+    torch.testing.assert_close(first.rotation_sigma, second.rotation_sigma, rtol=1e-5, atol=0)
+    torch.testing.assert_close(first.position_sigma, second.position_sigma, rtol=0.05, atol=0)
+    assert (first.rotation_sigma > 0).all()
+
+
+def test_images_that_are_not_registered_have_no_standing(generator: torch.Generator) -> None:
+    mapping = scene(generator)
+    registered = torch.arange(8) != 5
+    point = torch.where(mapping.graph.view == 5, -1, mapping.point)
+    standing = examine(
+        replace(mapping, registered=registered, point=point).compacted(),
+        focal_free=True,
+        focal_sigma=torch.tensor([0.5]),
+        threshold=4.0,
+    )
+    assert standing.rotation_sigma[5] == torch.inf
+    assert standing.position_sigma[5] == torch.inf
+    assert standing.rotation_sigma[registered].isfinite().all()
+    assert standing.doubt == ("",) * 8
+
+
+@pytest.mark.parametrize("guessed", [True, False])
+def test_two_images_with_a_guessed_focal_length_are_doubted(guessed: bool, generator: torch.Generator) -> None:
+    mapping = scene(generator, v=2)
+    sigma = torch.tensor([0.5 if guessed else 0.01])
+    doubt = examine(mapping, focal_free=guessed, focal_sigma=sigma, threshold=4.0).doubt
+    assert all(("focal" in reason) == guessed for reason in doubt)
+
+
+def test_a_camera_of_few_points_is_less_well_known(generator: torch.Generator) -> None:
+    mapping = scene(generator, n=600)
+    # The last camera keeps four points of one corner: a rotation and a place are not known from them.
+    own = (mapping.graph.view == 7).nonzero()[:, 0]
+    point = mapping.point.clone()
+    point[own[4:]] = -1
+    standing = examine(
+        replace(mapping, point=point).compacted(), focal_free=True, focal_sigma=torch.tensor([0.5]), threshold=4.0
+    )
+    assert standing.rotation_sigma[7] > 3 * standing.rotation_sigma[:7].max()

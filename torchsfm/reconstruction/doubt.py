@@ -1,0 +1,103 @@
+"""How well each camera of a finished model is known, and where it may be wrong altogether."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm.bundle import bundle_covariance
+from torchsfm.optim import Cauchy
+from torchsfm.reconstruction.consistency import pair_agreement
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.missing import missing_correspondences
+
+WRONG_ANGLE = 5.0
+"""Degrees by which a camera may be turned or displaced before it counts as wrong; twice the deviation is not to reach it."""
+GUESSED_FOCAL = 0.2
+"""A focal length at least so uncertain, as a fraction, is a guess where the images do not determine it."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What a model knows of its cameras.
+
+    Attributes:
+        rotation_sigma: Standard deviation of each camera's rotation, degrees, in the gauge in which the cameras move least;
+            infinite where it is not determined, and of images that are not registered.
+        position_sigma: Standard deviation of each camera's place over the median depth of the points that it sees; likewise.
+        doubt: Why each camera may be wrong; empty where nothing says so, and of images that are not registered.
+    """
+
+    rotation_sigma: Float[Tensor, "v"]
+    position_sigma: Float[Tensor, "v"]
+    doubt: tuple[str, ...]
+
+
+def examine(mapping: Mapping, *, focal_free: bool, focal_sigma: Float[Tensor, "g"], threshold: float) -> Standing:
+    """Judge the cameras of a finished model by all that is known of its images.
+
+    Args:
+        mapping: The model.
+        focal_free: Whether focal lengths were estimated.
+        focal_sigma: How uncertain the cameras' focal lengths were at first, as a fraction.
+        threshold: Largest reprojection error of an observation, in pixels.
+    """
+    v = len(mapping.registered)
+    count = int(mapping.registered.sum())
+    rotation, position = pose_deviations(mapping, focal_free=focal_free and count >= 3)
+    agreement = pair_agreement(mapping, threshold=threshold)
+    one = torch.ones_like(agreement.matches)
+    supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
+    outvoted = agreement.balance(v) < 0
+    refuted = missing_correspondences(mapping).refuted.tolist()
+    guessed = focal_sigma[mapping.camera_index] >= GUESSED_FOCAL
+    degrees = torch.atan(position).rad2deg()
+
+    def doubt(i: int) -> str:
+        own = [pair for pair in refuted if i in pair]
+        # One such pair may have another reason; of several, one thing that occurs twice is the likeliest, and folds the whole.
+        if own or len(refuted) > 1:
+            first, second = (mapping.graph.names[k] for k in (own or refuted)[0])
+            return f"things that look alike may be taken for one: {first} and {second} miss what both should see"
+        if bool(outvoted[i]):
+            return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
+        if count >= 3 and int(supporting[i]) < 2:
+            return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
+        if count < 3 and bool(guessed[i]):
+            return "two images alone, with a guessed focal length"
+        if not 2 * rotation[i] < WRONG_ANGLE:
+            return f"its rotation is known to {rotation[i]:.1f} degrees only"
+        if not 2 * degrees[i] < WRONG_ANGLE:
+            return f"its place is known to {100 * position[i]:.1f} % of its distance from the points only"
+        return ""
+
+    return Standing(rotation, position, tuple(doubt(i) if mapping.registered[i] else "" for i in range(v)))
+
+
+def pose_deviations(mapping: Mapping, *, focal_free: bool) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"]]:
+    """Standard deviations of rotations (degrees) and of places (over the median depth), as in `Standing`."""
+    node = mapping.observations()
+    view, point = mapping.graph.view[node], mapping.point[node]
+    covariance = bundle_covariance(
+        mapping.poses,
+        mapping.cameras,
+        mapping.X,
+        mapping.graph.x[node],
+        view,
+        point,
+        camera_index=mapping.camera_index,
+        free=("focal",) if focal_free else (),
+        loss=Cauchy(1.0),
+    )
+    depth = mapping.project(point, view)[1]
+    seen = torch.bincount(view, minlength=len(mapping.registered))
+    # The depths of each image in ascending order, those of one image together: the middle one of each.
+    order = torch.argsort(depth, stable=True)
+    order = order[torch.argsort(view[order], stable=True)]
+    middle = (seen.cumsum(0) - seen + seen // 2).clamp(max=max(len(depth) - 1, 0))
+    median = depth[order][middle] if len(depth) else depth.new_ones(len(seen))
+    known = mapping.registered & (seen > 0)
+    variance = covariance.poses.diagonal(dim1=-2, dim2=-1)
+    rotation, position = variance[:, :3].sum(-1).sqrt().rad2deg(), variance[:, 3:].sum(-1).sqrt() / median
+    return torch.where(known, rotation, torch.inf), torch.where(known, position, torch.inf)
