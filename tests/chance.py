@@ -24,7 +24,7 @@ def stream_seed(stream: int = 0) -> int:
 
 def seeded(stream: int = 0) -> torch.Generator:
     """A stream of random numbers: the same for the same number within a run, independent of the others."""
-    return torch.Generator().manual_seed(stream_seed(stream))
+    return torch.Generator(torch.get_default_device()).manual_seed(stream_seed(stream))
 
 
 def numpy_seeded(stream: int = 0) -> np.random.Generator:

@@ -1,6 +1,8 @@
 """What all tests share: one thread, seeds by option, real data by environment variable, tolerances by dtype."""
 
+import importlib
 import os
+import pkgutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +23,7 @@ TOLERANCE = {torch.float64: 1e-8, torch.float32: 1e-3}
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--seed", type=int, default=0, help="other random numbers in every test")
+    parser.addoption("--device", default="cpu", help="where the data of every test lie: cuda, for one")
 
 
 @pytest.hookimpl(tryfirst=True)  # before hypothesis reads its own
@@ -30,8 +33,20 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.hypothesis_seed = config.option.seed
 
 
+def pytest_collection(session: pytest.Session) -> None:
+    import torchsfm  # not before the type checker is in place
+
+    device = session.config.option.device
+    if device != "cpu":
+        # What modules make when they are imported stays on the CPU, as where nobody sets a default.
+        for room in pkgutil.iter_modules(torchsfm.__path__):
+            importlib.import_module(f"torchsfm.{room.name}")
+        torch.set_default_device(device)
+
+
 def pytest_report_header(config: pytest.Config) -> str:
-    return f"seed {config.option.seed}, {torch.backends.cpu.get_cpu_capability()} arithmetic"
+    option = config.option
+    return f"seed {option.seed}, device {option.device}, {torch.backends.cpu.get_cpu_capability()} arithmetic"
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,119 @@
+"""Data elsewhere than on the CPU: every public function works there, and nothing is taken along unasked.
+
+Without an accelerator the device is a pretended one, which tells when tensors of two devices meet; `--device cuda` takes a real
+one.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from chance import seeded
+from elsewhere import CONSTANT, ELSEWHERE, TransferError, elsewhere, fetch, send
+from scenes import make_scene
+from test_contract import ESTIMATORS
+
+from bench.fuzz.calls import apply, good_arguments
+from bench.fuzz.functions import EXCEPTIONS, FUNCTIONS, Function, public_functions
+from bench.fuzz.promises import tensors
+from bench.fuzz.scene import Scene
+from torchsfm._types import tensor_map
+from torchsfm.robust import ransac, soft_ransac
+
+OPENCV = "OpenCV takes images and gives points on the CPU"
+ON_THE_CPU = EXCEPTIONS | {
+    **{f"images.{name}": OPENCV for name in ("detect_corners", "detect_features", "track_points", "track_sequence")},
+    "images.list_skipped": "reads a folder",
+    "images.retrieve_pairs": "pairs are numbers for the program, not data",
+    "linalg.companion_roots": "gives the roots in any order",
+    "reconstruction.reconstruct_tracks": "maps on the CPU",
+}
+"""Public functions that are not tried, and why."""
+CALLS = {name: call for name, call in public_functions().items() if name not in ON_THE_CPU}
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where the data are to lie."""
+
+    name: torch.device
+
+    @property
+    def pretended(self) -> bool:
+        return self.name == ELSEWHERE
+
+    def send(self, tree: Any) -> Any:
+        return tensor_map(send if self.pretended else lambda t: t.to(self.name), tree)
+
+    def compare(self, call: Callable[[Any], Any], arguments: Any) -> None:
+        """All results lie there; pretended, they are those of the CPU, but for rounding."""
+        here = call(arguments)
+        with elsewhere() if self.pretended else nullcontext():
+            there = call(self.send(arguments))
+        for (name, wanted), (_, found) in zip(tensors(here), tensors(there), strict=True):
+            assert found.device.type == self.name.type, name
+            assert found.shape == wanted.shape or not self.pretended, name
+            assert found.dtype == wanted.dtype, name
+            if self.pretended:
+                torch.testing.assert_close(fetch(found), wanted, rtol=1e-6, atol=1e-6, equal_nan=True)
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+    wanted = request.config.option.device
+    with torch.device("cpu"):  # what is made without `device=` is to be found out
+        yield Device(ELSEWHERE if wanted == "cpu" else torch.device(wanted))
+
+
+def agreeable(call: Callable[..., Any], how: Function) -> dict[str, Any]:
+    """Arguments that the function accepts; some that may be left out belong together, and chance separates them."""
+    for stream in range(20):
+        scene = Scene(seeded(stream), (2,) if how.batched else (), tuple(how.sizes.items()), how.planar, how.centred)
+        arguments = good_arguments(call, how, scene)
+        try:
+            apply(call, arguments)
+        except ValueError:
+            continue
+        return arguments
+    raise LookupError("no arguments that are accepted")
+
+
+@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.usefixtures("unchecked")
+def test_functions(name: str, device: Device) -> None:
+    how = FUNCTIONS.get(name, Function())
+    arguments = agreeable(CALLS[name], how)
+    if not any(True for _ in tensors(arguments)):
+        pytest.skip("takes no tensors")
+    device.compare(lambda given: apply(CALLS[name], given), arguments)
+
+
+@pytest.mark.parametrize("kind", ESTIMATORS, ids=lambda kind: kind.model_name)
+def test_estimators(kind: type, device: Device) -> None:
+    scene = make_scene(kind, (3,), 60, seeded(), 1e-3)
+    sample = tuple(d[:, : kind.sample_size] for d in scene.data)  # type: ignore[attr-defined]
+    options = {"threshold": 3e-3, "max_iterations": 200}
+    arguments = scene.estimator, scene.model, scene.data, sample
+    device.compare(lambda a: (a[0].minimal(*a[3]), a[0].degenerate(*a[3]), a[0].residual(a[1], *a[2])), arguments)
+    device.compare(lambda a: ransac(a[0], *a[2], generator=seeded(1), **options), arguments)
+    device.compare(lambda a: soft_ransac(a[0], *a[2], threshold=3e-3, hypotheses=8, generator=seeded(1)), arguments)
+
+
+def test_the_pretended_device_tells() -> None:
+    here = torch.ones(3, 3)
+    with elsewhere():
+        there = send(here)
+        for wrong in (
+            lambda: there + here,
+            lambda: there.index_select(0, torch.ones(CONSTANT + 1, dtype=torch.long)),
+            lambda: torch.cat((there, torch.zeros(1, 3))),
+            lambda: there[torch.ones(3, dtype=torch.bool)],
+            there.cpu,
+        ):
+            with pytest.raises(TransferError):
+                wrong()
+        assert torch.equal(fetch(there + 2 * torch.eye(3, device=there.device)[[0, 1, 2]]), here + 2 * torch.eye(3))
+        assert int(there.sum()) == 9
