@@ -178,6 +178,7 @@ def test_cameras_that_bal_cannot_hold(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("1 1 1\n0 0 1 1\n" + "0 " * 8 + "nan " + "0 " * 3, "camera 0 is not finite"),
+        ("1 1 1\n0 0 1 1\n1e300 1e300 " + "0 " * 10, "camera 0 is turned by an angle that is none"),
         ("1 2 1\n0 0 1 1\n" + "0 " * 9 + "0 0 0 0 1e999 0", "point 1 is not finite"),
     ],
 )

@@ -94,6 +94,7 @@ def test_wrong_files(tmp_path: Path) -> None:
         (negative, "negative"),
         (data[:2] + struct.pack("<f", float("nan")) + data[6:], "intrinsics are not finite"),
         (data[:42] + struct.pack("<f", float("inf")) + data[46:], "camera 0 is not finite"),
+        (data[:42] + b"\x01\0\x80\x7f" + data[46:], "camera 0 is not finite"),
         (data[:42] + struct.pack("<f", 1e30) + data[46:], "its R no rotation"),
         (data[:1] + b"X" + data[2:], "not a libmv problem"),
         (b"", "not a libmv problem"),
@@ -110,3 +111,12 @@ def test_real_problem(data: Path) -> None:
     assert (problem.poses.shape[0], problem.cameras.shape[0], len(problem.X), len(problem.x)) == (333, 1, 26, 5421)
     assert float(problem.residuals().square().mean().sqrt()) == pytest.approx(1.304, abs=5e-4)
     assert bool((problem.depths() > 0).all())
+
+
+def test_markers_that_are_not_finite_are_kept(tmp_path: Path) -> None:
+    """Also the NaN that makes noise when it is copied."""
+    data, _ = encode()
+    for number in (struct.pack("<f", float("inf")), b"\x01\0\x80\x7f"):
+        (tmp_path / "a.bin").write_bytes(data[:-40] + number + data[-36:])
+        problem = read_libmv(tmp_path / "a.bin")
+        assert int((~problem.x.isfinite()).sum()) == 1

@@ -77,11 +77,15 @@ def read_bal(path: str | Path) -> BundleProblem:
             raise ValueError(f"{path}: observation {first}: there is no number {index[first]:g} among {limit} {name}")
     rest = torch.tensor(numbers[3 + 4 * m :])
     camera, X = rest[: 9 * v].reshape(v, 9), rest[9 * v :].reshape(n, 3).clone()
+    R = rotation_from_rotvec(camera[:, :3])
+    turned = R.isfinite().flatten(1).all(1)
+    if not bool(turned.all()):
+        raise ValueError(f"{path}: camera {int(turned.int().argmin())} is turned by an angle that is none")
     flip = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
     seen = torch.tensor(observations)
     view, point = seen[:, 0].long(), seen[:, 1].long()
     return BundleProblem(
-        Pose(flip[:, None] * rotation_from_rotvec(camera[:, :3]), flip * camera[:, 3:6]),
+        Pose(flip[:, None] * R, flip * camera[:, 3:6]),
         Camera(intrinsics(camera[:, 6], camera.new_zeros(v, 2)), Radial(camera[:, 7].clone(), camera[:, 8].clone())),
         torch.arange(v),
         X,

@@ -108,7 +108,8 @@ def check_model(model: ColmapModel) -> None:
         ValueError: One points at an entry that is not there, or two say different things; one line that names them.
     """
     points = model.points
-    if (points.point_id < 0).any() or len(np.unique(points.point_id)) != len(points.point_id):
+    numbers = np.unique(points.point_id)
+    if (points.point_id < 0).any() or len(numbers) != len(points.point_id):
         raise ValueError("the number of a 3D point is negative or occurs twice")
     if not np.isfinite(points.X).all():
         raise ValueError(f"the 3D point {points.point_id[~np.isfinite(points.X).all(1)][0]} is not finite")
@@ -122,7 +123,8 @@ def check_model(model: ColmapModel) -> None:
             raise ValueError(f"image {image_id} is of camera {image.camera_id}, which is not there")
         if not 0 <= image_id < 2**32 or not np.isfinite(image.x).all():
             raise ValueError(f"image {image_id} has a number out of range, or an image point that is not finite")
-        unknown = (image.point_id != NO_POINT) & ~np.isin(image.point_id, model.points.point_id)
+        place = np.searchsorted(numbers, image.point_id).clip(max=max(len(numbers) - 1, 0))
+        unknown = (image.point_id != NO_POINT) & (numbers[place] != image.point_id if len(numbers) else True)
         if unknown.any():
             raise ValueError(f"image {image_id} shows the 3D point {image.point_id[unknown][0]}, which is not there")
     _check_tracks(model)

@@ -58,9 +58,8 @@ def read_libmv(path: str | Path) -> BundleProblem:
     if not np.isfinite(lens).all():
         raise ValueError(f"{path}: the intrinsics are not finite")
     # In double precision, where no product of two such numbers is too large.
-    R = cameras["R"].astype(np.float64)
-    sound = np.isfinite(R).all((1, 2)) & np.isfinite(cameras["t"]).all(1)
-    R = np.where(sound[:, None, None], R, 0)
+    sound = np.isfinite(cameras["R"]).all((1, 2)) & np.isfinite(cameras["t"]).all(1)
+    R = np.where(sound[:, None, None], cameras["R"], 0).astype(np.float64)
     sound &= (np.abs(R @ R.swapaxes(1, 2) - np.eye(3)) < 1e-3).all((1, 2)) & (np.linalg.det(R) > 0)
     for name, good in (("camera", sound), ("point", np.isfinite(points["X"]).all(1))):
         if not good.all():
@@ -106,4 +105,5 @@ def _find(numbers: npt.NDArray[Any], wanted: npt.NDArray[Any]) -> tuple[npt.NDAr
 
 
 def _tensor(values: npt.NDArray[Any]) -> Tensor:
-    return torch.from_numpy(values.astype(np.float64))
+    with np.errstate(invalid="ignore"):  # there are NaN that warn when they are copied
+        return torch.from_numpy(values.astype(np.float64))
