@@ -479,3 +479,8 @@ def test_a_large_jpeg_is_decoded_in_part(
         assert np.abs(channel - expected).max() < 4 / 255
     assert read_image(tmp_path / "a.jpg").pixels.shape == (3, height, width)
     assert read_image(tmp_path / "a.jpg", max_size=400, gray=True).pixels.shape == (1, small.height, small.width)
+
+
+def test_a_second_size_in_the_header_does_not_hide_the_first() -> None:
+    first = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in ((0x100, 60000), (0x101, 50000), (0x100, 8)))
+    assert image_size(b"II*\0\x08\0\0\0" + struct.pack("<H", 3) + first + bytes(4)) == (60000, 50000)

@@ -169,12 +169,14 @@ def _read_directory(block: bytes, order: str, offset: int, tags: dict[str, str |
         place = start + 8 if size <= 4 else struct.unpack_from(order + "I", block, start + 8)[0]
         if place + size > len(block):
             continue
+        value: str | int | float | None = None
         if kind == 2:
             raw = block[place : place + size].split(b"\0")[0]
-            tags[_WANTED[tag]] = "".join(c for c in raw.decode("utf-8", "replace") if c.isprintable()).strip()
+            value = "".join(c for c in raw.decode("utf-8", "replace") if c.isprintable()).strip()
         elif kind in (5, 10):
             above, below = struct.unpack_from(order + ("2I" if kind == 5 else "2i"), block, place)
-            if below:
-                tags[_WANTED[tag]] = above / below
+            value = above / below if below else None
         elif kind in _INTEGERS:
-            tags[_WANTED[tag]] = struct.unpack_from(order + _INTEGERS[kind], block, place)[0]
+            value = struct.unpack_from(order + _INTEGERS[kind], block, place)[0]
+        if value is not None:
+            tags.setdefault(_WANTED[tag], value)  # of a tag that is there twice decoders take the first

@@ -97,7 +97,10 @@ def read_image(
     stored = _stored_size(data, path, max_pixels)
     # A part that divides both sides, so that every pixel of the smaller image is as many of the larger one.
     parts = [part for part in (8, 4, 2) if max_size and max(stored) >= part * max_size and not any(n % part for n in stored)]
-    array, white = _decode(data, path, gray=gray, part=max(parts, default=1))
+    part = max(parts, default=1) if data[:3] == b"\xff\xd8\xff" else 1  # of other kinds the whole is decoded in any case
+    array, white = _decode(data, path, gray=gray, part=part)
+    if array.shape[:2] != (stored[1] // part, stored[0] // part):
+        raise ImageError(f"{path}: damaged, the header says {stored[0]} x {stored[1]}, not {array.shape[1]} x {array.shape[0]}")
     exif = parse_exif(data)
     focal = exif.focal(*stored)
     array = _TURNS[exif.orientation](array)
@@ -215,7 +218,7 @@ def _stored_size(data: bytes, path: Path, max_pixels: int) -> tuple[int, int]:
 def _decode(data: bytes, path: Path, *, gray: bool, part: int) -> tuple[NDArray[Any], float]:
     """Pixels (h, w) or (h, w, 3) in red, green, blue order as stored, and the value that stands for white.
 
-    A part of 2, 4 or 8 allows for an image that is smaller by that.
+    A JPEG comes smaller by `part`: 1, 2, 4 or 8.
     """
     import cv2
 
@@ -228,7 +231,7 @@ def _decode(data: bytes, path: Path, *, gray: bool, part: int) -> tuple[NDArray[
             return cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if values.ndim == 3 else values, white
         return values if values.ndim == 3 else np.repeat(values[:, :, None], 3, 2), white
     flags = cv2.IMREAD_ANYDEPTH | (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
-    if part > 1 and data[:3] == b"\xff\xd8\xff":  # of other kinds the whole would be decoded all the same
+    if part > 1:
         flags = getattr(cv2, f"IMREAD_REDUCED_{'GRAYSCALE' if gray else 'COLOR'}_{part}")
     try:
         array = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
