@@ -66,7 +66,7 @@ def load() -> list[Target]:
     """A target for each format."""
     formats = _formats()
     every = b"".join(data for kind in formats for data in kind.files.values())
-    return [Target(f"files.{kind.name}", lambda seed, kind=kind: _attempt(kind, every, seed)) for kind in formats]
+    return [Target(kind.name, lambda seed, kind=kind: _attempt(kind, every, seed)) for kind in formats]
 
 
 def _attempt(kind: Format, every: bytes, seed: int) -> Trial:
@@ -190,11 +190,11 @@ def _formats() -> list[Format]:
         formats.append(Format("libmv", {"a.bin": _libmv(problem)}, read_libmv))
         formats.append(Format("vgg", _vgg(), read_vgg))
         write_ply(model, folder / "a.ply")
-        formats.append(Format("ply binary", _files(folder, "a.ply"), read_ply))
-        formats += [Format(f"ply {kind}", {"a.ply": data}, read_ply) for kind, data in _ply().items()]
+        formats.append(Format("ply.binary", _files(folder, "a.ply"), read_ply))
+        formats += [Format(f"ply.{kind}", {"a.ply": data}, read_ply) for kind, data in _ply().items()]
         write_colmap(model, folder / "colmap")
-        formats.append(Format("colmap binary", _files(folder, "colmap"), read_colmap))
-        formats.append(Format("colmap text", _colmap_text(), read_colmap))
+        formats.append(Format("colmap.binary", _files(folder, "colmap"), read_colmap))
+        formats.append(Format("colmap.text", _colmap_text(), read_colmap))
         model.save(folder / "model.npz")
         formats.append(Format("model", _files(folder, "model.npz"), Reconstruction.load, _in_zip))
         np.savez(folder / "stage.npz", a=np.arange(5), b=np.array("text"))
@@ -207,9 +207,9 @@ def _formats() -> list[Format]:
         exif = b"\xff\xe1\x00\x48Exif\0\0II*\0\x08\0\0\0\x02\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0"
         exif += b"\x0f\x01\x02\0\x05\0\0\0\x26\0\0\0"
         jpeg = (folder / "a.jpg").read_bytes()
-        formats.append(Format("image exif", {"a.jpg": jpeg[:2] + exif + b"\0\0\0\0Acme\0" + bytes(23) + jpeg[2:]}, _photograph))
-        formats.append(Format("image plain", {"a.ppm": b"P3\n# words\n2 2\n255\n" + b"1 20 255 " * 4}, _photograph))
-        formats.append(Format("image bits", {"a.pbm": b"P1\n4 2\n1 0 1 0\n1111\n"}, _photograph))
+        formats.append(Format("image.exif", {"a.jpg": jpeg[:2] + exif + b"\0\0\0\0Acme\0" + bytes(23) + jpeg[2:]}, _photograph))
+        formats.append(Format("image.plain", {"a.ppm": b"P3\n# words\n2 2\n255\n" + b"1 20 255 " * 4}, _photograph))
+        formats.append(Format("image.bits", {"a.pbm": b"P1\n4 2\n1 0 1 0\n1111\n"}, _photograph))
     return formats
 
 
