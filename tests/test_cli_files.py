@@ -112,6 +112,7 @@ def test_a_full_disk_leaves_the_results_before(courtyard: Path, tmp_path: Path) 
         assert status == 2
         assert stderr.splitlines()[-1].startswith(f"torchsfm: {tmp_path}{os.sep}"), stderr
         assert stderr.splitlines()[-1].endswith("File too large")
+        assert f"{os.sep}." not in stderr.splitlines()[-1]
         after = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and "stages" not in path.parts}
         assert after == before
 

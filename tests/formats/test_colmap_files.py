@@ -161,6 +161,15 @@ def test_binary_is_preferred(binary: Path) -> None:
     assert read_colmap(binary).num_points == 2
 
 
+def test_models_from_before_there_were_rigs(binary: Path) -> None:
+    model = read_colmap(binary)
+    for name in ("rigs", "frames"):
+        (binary / f"{name}.bin").unlink()
+    again = read_colmap(binary)
+    assert again.poses.matrix().equal(model.poses.matrix())
+    assert again.names == model.names
+
+
 def same(model: Reconstruction, colmap) -> None:
     """The model is COLMAP's."""
     assert sorted(model.names) == sorted(image.name for image in colmap.images.values())

@@ -54,8 +54,10 @@ def replacing_results(folder: Path) -> Iterator[Path]:
     writing.mkdir()
     try:
         yield writing
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(writing, ignore_errors=True)
+        if isinstance(error, OSError) and error.filename:  # known to the user by the name it would have got
+            raise OSError(error.errno, error.strerror, str(error.filename).replace(str(writing), str(folder))) from None
         raise
     writing.rename(folder / WRITTEN)
     finish_replacing(folder)

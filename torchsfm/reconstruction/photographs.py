@@ -46,7 +46,8 @@ def reconstruct(
     poses, points, focal length and distortion. Images that have nothing in common form several models.
 
     Args:
-        images: A folder, or image files.
+        images: A folder, without its subfolders, or image files. What else in the folder may hold photographs is named in the
+            report with the reason why it was not read.
         sequence: The images are consecutive frames of a video: corners are tracked through it, and features are matched
             between frames that are near in time or look alike, instead of between all.
         camera: Distortion model: "pinhole", "simple_radial", "radial", "opencv" or "fisheye". By default "radial", or "pinhole"
