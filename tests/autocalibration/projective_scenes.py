@@ -20,6 +20,7 @@ class ProjectiveScene:
     K: Tensor
     R: Tensor
     centre: Tensor
+    distortion: Tensor
 
 
 def projective_scene(
@@ -34,10 +35,15 @@ def projective_scene(
     offset: float = 0.01,
     aspect: float = 1.0,
     skew: float = 0.0,
+    variation: float = 0.2,
+    around: float = 1.8,
+    distortion: float = 0.0,
 ) -> ProjectiveScene:
     """Cameras around a cube of points that fills the image; focal lengths 0.6 to 4 times the width unless given.
 
-    With noise the projective reconstruction is the one of least reprojection error.
+    With noise or distortion the projective reconstruction is the one of least reprojection error. `variation` is the standard
+    deviation of the logarithms of focal lengths that are `varying`, `around` the range of directions in radians, `distortion`
+    the standard deviation of the first radial coefficient.
     """
 
     def normal(*shape: int) -> Tensor:
@@ -48,13 +54,13 @@ def projective_scene(
 
     width, height = SIZE
     f = 0.6 * float(torch.tensor(4 / 0.6).log().mul(uniform(1)[0]).exp()) if focal is None else focal
-    each = f * (0.2 * normal(v)).exp() if varying else torch.full((v,), f, dtype=torch.float64)
+    each = f * (variation * normal(v)).exp() if varying else torch.full((v,), f, dtype=torch.float64)
     K = torch.zeros(v, 3, 3, dtype=torch.float64)
     K[:, 0, 0], K[:, 1, 1], K[:, 0, 1], K[:, 2, 2] = each * width, each * width * aspect, each * width * skew, 1
     K[:, :2, 2] = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64) + offset * width * normal(2)
     distance = 2.4 * f
     far = distance * (1 + 0.15 * normal(v)).clamp(0.75, 1.5)
-    angle, height_angle, tilt = 1.8 * (uniform(v) - 0.5), 0.8 * (uniform(v) - 0.5), 0.5 * normal(v)
+    angle, height_angle, tilt = around * (uniform(v) - 0.5), 0.8 * (uniform(v) - 0.5), 0.5 * normal(v)
     target = 0.25 * normal(v, 3)
     if motion in ("one axis", "planar"):
         height_angle, tilt = 0 * height_angle, 0 * tilt
@@ -82,14 +88,19 @@ def projective_scene(
     image = h[..., :2] / h[..., 2:]
     limit = torch.tensor([width, height], dtype=torch.float64)
     visible = (h[..., 2] > 0) & ((image > -0.2 * limit) & (image < 1.2 * limit)).all(-1)
+    k = torch.zeros((), dtype=torch.float64)
+    if distortion:
+        k = distortion * normal(1)[0]
+        offsets = (image - (limit - 1) / 2) / width
+        image = (limit - 1) / 2 + width * offsets * (1 + k * offsets.square().sum(-1, keepdim=True))
     image = image + noise * normal(v, n, 2)
     frame = torch.eye(4, dtype=torch.float64) + 0.3 * normal(4, 4)
     P, X = P @ frame, torch.linalg.solve(frame, X.mT).mT
-    if noise:
+    if noise or distortion:
         P, X = adjust(P, X, image, visible)
     P = P * (normal(v).exp() * normal(v).sign())[:, None, None]
     X = X * (normal(n).exp() * normal(n).sign())[:, None]
-    return ProjectiveScene(P, X, image, visible, K, R, centre)
+    return ProjectiveScene(P, X, image, visible, K, R, centre, k)
 
 
 def stack(scenes: list[ProjectiveScene]) -> ProjectiveScene:

@@ -99,6 +99,55 @@ def test_focal_lengths_that_differ_are_noticed(generator):
     assert (alone.chi2 > 5 * alone.redundancy).all()
 
 
+def test_three_views_through_a_lens_that_distorts_a_little(generator):
+    options = {"noise": 0.3, "around": 0.8, "offset": 0.005, "distortion": 0.05}
+    scene = stack([projective_scene(generator, 3, 80, **options) for _ in range(24)])
+    found = solve(scene)
+    accepted = found.status == Status.OK
+    assert (~accepted).sum() <= 4
+    # One focal length explains the images, though what is left of the distortion disturbs it.
+    assert (found.assumption == 0).sum() >= 21
+    assert not (accepted & (focal_error(found, scene) > 0.1)).any()
+    score = (found.K[..., 0, 0] / scene.K[..., 0, 0]).log()[accepted] / found.deviation[..., 0][accepted]
+    assert score.square().mean().sqrt() < 1.8
+    bend = (found.distortion - scene.distortion) / found.distortion_deviation
+    assert 0.4 < bend.square().mean().sqrt() < 1.8
+    # Taken for a lens without distortion the same images say something else, and are too sure of it.
+    plain = solve(scene, distortion_sigma=0.0)
+    wrong = (plain.K[..., 0, 0] / scene.K[..., 0, 0]).log() / plain.deviation[..., 0]
+    assert wrong.square().mean() > 1.5 * score.square().mean()
+
+
+def test_a_lens_that_distorts_much_more_than_expected_is_refused(generator):
+    scene = stack([projective_scene(generator, 4, 80, noise=0.3, distortion=0.1) for _ in range(12)])
+    far = scene.distortion.abs() > 0.08
+    assert far.any()
+    assert (solve(scene, distortion_sigma=0.005).status[far] != Status.OK).all()
+    straight = stack([projective_scene(generator, 4, 80, noise=0.3) for _ in range(4)])
+    assert (solve(straight, distortion_sigma=0.005).status == Status.OK).all()
+
+
+def test_deviations_hold_what_the_choice_leaves_open(generator):
+    options = {"noise": 1.0, "around": 0.8, "varying": True, "variation": 0.03}
+    scene = stack([projective_scene(generator, 3, 80, **options) for _ in range(24)])
+    found = solve(scene)
+    alone = [solve(scene, assume=assume) for assume in (Assumption(), VARYING)]
+    chosen = torch.where(found.assumption[:, None] == 0, alone[0].deviation[..., 0], alone[1].deviation[..., 0])
+    unsure = found.probability < 0.95
+    assert unsure.any()
+    apart = (alone[0].K[..., 0, 0] / alone[1].K[..., 0, 0]).log().abs()
+    told = found.deviation[..., 0]
+    assert (told >= 0.999 * (found.probability[:, None] * chosen.square()).sqrt()).all()
+    kept = unsure & (found.assumption == 0)
+    # As far apart as the deviation says, where the richer assumption is not held back by how little it is expected to vary.
+    known = kept & (alone[1].deviation[..., 0] < 0.05).all(-1)
+    assert known.any()
+    least = (1 - found.probability)[:, None].sqrt() * apart
+    assert (told > 0.5 * least)[known].all()
+    scores = (found.K[..., 0, 0] / scene.K[..., 0, 0]).log()[found.valid] / told[found.valid]
+    assert (scores.abs() < 3).double().mean() > 0.85
+
+
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_critical_motions_are_refused_or_reported(generator, motion):
     scene = stack([projective_scene(generator, 8, motion=motion, noise=1.0) for _ in range(5)])
@@ -191,5 +240,7 @@ def test_wrong_input(generator, unchecked):
         autocalibrate_points(scene.P, scene.X, image_size=torch.ones(3, 2, dtype=torch.float64))
     with pytest.raises(ValueError, match="no intrinsic parameter"):
         Assumption(free=("focal", "zoom"))
+    with pytest.raises(ValueError, match="distortion_sigma: wanted"):
+        autocalibrate_points(scene.P, scene.X, image_size=SIZE, distortion_sigma=-1.0)
     with pytest.raises(ValueError, match="at least one"):
         autocalibrate_points(scene.P, scene.X, image_size=SIZE, assume=())

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.autocalibration.evidence import expected_variation, log_evidence
 from torchsfm.autocalibration.focal_search import search_focal
 from torchsfm.autocalibration.intrinsics_model import Assumption
 from torchsfm.autocalibration.projective_input import PreparedCameras
@@ -47,8 +48,11 @@ class SolvedAssumption:
     plane: Tensor
     covariance: Tensor
     data_deviation: Tensor
+    likely: Tensor
+    """The parameters where what varies is expected to vary little, as far as the data leave it open, and their covariance."""
+    likely_covariance: Tensor
+    evidence: Tensor
     fit: AssumptionFit
-    unknowns: int
 
 
 def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumption, max_deviation: float) -> SolvedAssumption:
@@ -64,10 +68,10 @@ def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumptio
     spread = assumption.spread(v, ready.P)
     q = spread.shape[-1]
     present = ready.present.to(ready.P.dtype)
-    problem = UpgradeProblem(ready.P, ready.covariance, base, present, spread)
+    problem = UpgradeProblem(ready.straight, ready.covariance, base, present, spread)
     varying = "focal" in assumption.varying
     log_f, plane, _ = search_focal(
-        ready.P, ready.X, ready.visible.any(-2).to(ready.P.dtype), base, present, varying=varying, starts=STARTS
+        ready.straight, ready.X, ready.visible.any(-2).to(ready.P.dtype), base, present, varying=varying, starts=STARTS
     )
     is_focal = spread[:, 0].sum(0) > 0
     starts = log_f.new_zeros(*log_f.shape[:2], q)
@@ -103,6 +107,12 @@ def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumptio
     values = values.clamp_min(0)
     expected = torch.diag_embed(precision[:, 0].square())
     tiny = 1e-12 * torch.eye(q, dtype=values.dtype, device=values.device)
+    variation, log_density = expected_variation(assumption, precision[:, 0], present)
+    calmed = torch.linalg.inv_ex(on_unknowns / birge[:, None, None] + variation + tiny).inverse
+    likely = unknowns - (calmed @ (variation @ unknowns[..., None]))[..., 0]
+    surprise = (unknowns * (variation @ unknowns[..., None])[..., 0]).sum(-1)
+    whole = information / birge[:, None, None] + torch.nn.functional.pad(variation, (0, 3, 0, 3))
+    evidence = log_evidence(chi2, redundancy, whole, surprise, log_density, q + 3 - held.sum(-1))
     covariance = torch.linalg.inv_ex(on_unknowns / birge[:, None, None] + expected + tiny).inverse
     # The floor makes the deviation of what the data do not determine at all large and finite.
     by_data = (vectors.square() @ (birge[:, None] / values.clamp_min(1e-6))[..., None])[..., 0].sqrt()
@@ -134,8 +144,12 @@ def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumptio
     ):
         status = torch.where(condition, int(code), status)
     fit = AssumptionFit(assumption, status.to(torch.int8), chi2, redundancy, values.sqrt(), vectors)
-    parameters = base + torch.einsum("vmq,bq->bvm", spread, unknowns).clamp(-20, 20)
-    return SolvedAssumption(parameters, p, per_view, data_deviation, fit, q)
+
+    def of_views(u: Tensor) -> Tensor:
+        return base + torch.einsum("vmq,bq->bvm", spread, u).clamp(-20, 20)
+
+    likely_covariance = spread @ calmed[:, None] @ spread.mT
+    return SolvedAssumption(of_views(unknowns), p, per_view, data_deviation, of_views(likely), likely_covariance, evidence, fit)
 
 
 def _impossible(problem: UpgradeProblem, ready: PreparedCameras, unknowns: Tensor, p: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchsfm._types import Status, check_tensors, tensor_map
 from torchsfm.autocalibration.assumption_fit import FINALISTS, STARTS, AssumptionFit, solve_assumption
 from torchsfm.autocalibration.diagnosis import Motion, diagnose_motion
+from torchsfm.autocalibration.evidence import weigh_assumptions
 from torchsfm.autocalibration.intrinsics_model import (
     CONSTANT,
     VARYING_FOCAL,
@@ -23,6 +24,8 @@ from torchsfm.autocalibration.projective_input import MAX_COUPLED, prepare_camer
 
 _DOUBLES = 12_000_000
 """Entries of covariances held at once; bounds memory, changes no result."""
+_FAR = 3.0
+"""Distortion this many times what was expected is beyond what its linear treatment reaches."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +42,13 @@ class Autocalibration:
     """H with `P_given H ~ P`, `X_given ~ H X`."""
     status: Int8[Tensor, "*batch"]
     """OK; DEGENERATE: the data do not determine the focal lengths, or determine two; NO_CONSENSUS: no camera of the kind
-    assumed fits;
-    BEHIND: points would be behind cameras; TOO_FEW: fewer than two views with six points, or fewer constraints than unknowns;
+    assumed fits, or the images are distorted much more than was expected; BEHIND:
+    points would be behind cameras; TOO_FEW: fewer than two views with six points, or fewer constraints than unknowns;
     NOT_FINITE. Where it is not OK the numbers are the best found, and not to be relied on."""
     assumption: Int8[Tensor, "*batch"]
     """Which of `fits` was taken."""
+    probability: Float[Tensor, "*batch"]
+    """Of that assumption among those tried; what the others would have had is in the deviations."""
     fits: tuple[AssumptionFit, ...]
     deviation: Float[Tensor, "*batch v 5"]
     """Standard deviations of focal length (relative), aspect (relative), skew over focal length, and principal point in
@@ -57,6 +62,10 @@ class Autocalibration:
     chi2: Float[Tensor, "*batch"]
     """Weighted squared departure from metric cameras; about `redundancy` where the assumption holds."""
     redundancy: Float[Tensor, "*batch"]
+    distortion: Float[Tensor, "*batch"]
+    """First coefficient of radial distortion, of which the cameras were freed before they were judged; see
+    `distortion_sigma`."""
+    distortion_deviation: Float[Tensor, "*batch"]
     noise: Float[Tensor, "*batch"]
     """Standard deviation of the observations that was estimated or given, pixels."""
     in_front: Float[Tensor, "*batch"]
@@ -85,14 +94,15 @@ def autocalibrate_points(
     assume: Assumption | Sequence[Assumption] = (CONSTANT, VARYING_FOCAL),
     noise: float | None = None,
     max_deviation: float = 0.05,
+    distortion_sigma: float = 0.05,
 ) -> Autocalibration:
     """Upgrade projective cameras and points to metric ones.
 
     A grid of focal lengths, each with the plane at infinity it implies, is the start; then intrinsics and plane are adjusted
     so that all cameras are metric, weighed with the covariance that the observations give the cameras. That is what bundle
     adjustment over metric cameras finds, to first order, at a small part of its cost; metric bundle adjustment is still the
-    last step for those who want it. Of several assumptions the first is taken unless a later one fits better than its further
-    unknowns explain.
+    last step for those who want it. Of several assumptions the likeliest is taken, a later one only where its further unknowns
+    explain much more; the deviations tell also what the others would have had, as likely as they are.
 
     The answer is refused (`status`), not guessed, where the data do not determine the focal length: by their information, and
     by a second look at focal lengths 15 % off, which must fit worse. Critical motions are refused by that, and described in
@@ -111,6 +121,10 @@ def autocalibrate_points(
         assume: What is assumed of the intrinsics, or several such to be tried in that order.
         noise: Standard deviation of the observations per coordinate, in pixels.
         max_deviation: Largest standard deviation of the logarithm of a focal length that is accepted.
+        distortion_sigma: Standard deviation of the radial distortion that the images may have, before any was seen: of k in
+            `x_distorted = (1 + k |x|^2) x`, x relative to the middle of the image and over its longer side, the same k in all
+            views. It is estimated from the residuals, where x is given, and taken out of the cameras; 0 for images that have
+            none.
 
     Returns:
         Intrinsics, metric cameras and points, with covariance, diagnosis and status.
@@ -130,6 +144,8 @@ def autocalibrate_points(
     batch = check_tensors(
         P=(P, "v 3 4"), X=(X, "n 4"), x=(x, "v n 2"), image_size=(sizes, "w 2"), visible=(visible, "v n : bool"), K=(K, "k 3 3")
     )
+    if not distortion_sigma >= 0:
+        raise ValueError(f"distortion_sigma: wanted a number that is not negative, got {distortion_sigma}")
     if v < 2:
         raise ValueError(f"P: wanted at least 2 views, got {v}")
 
@@ -155,7 +171,9 @@ def autocalibrate_points(
             rest = part[4:]
             observed = rest.pop(0) if x is not None else None
             expected = rest.pop(0) if K is not None else None
-            pieces.append(_solve(part[0], part[1], observed, part[2], part[3], expected, options, noise, max_deviation))
+            pieces.append(
+                _solve(part[0], part[1], observed, part[2], part[3], expected, options, noise, max_deviation, distortion_sigma)
+            )
         whole = pieces[0] if len(pieces) == 1 else _concatenate(pieces)
 
     def restored(t: Tensor) -> Tensor:
@@ -193,26 +211,21 @@ def _solve(
     assume: tuple[Assumption, ...],
     noise: float | None,
     max_deviation: float,
+    distortion_sigma: float,
 ) -> Autocalibration:
     b, v = P.shape[:2]
     given_noise = None if noise is None else torch.full((b,), noise, dtype=P.dtype, device=P.device)
-    ready = prepare_cameras(P, X, x, visible, image_size, given_noise)
+    ready = prepare_cameras(P, X, x, visible, image_size, given_noise, distortion_sigma)
     rows = torch.arange(b, device=P.device)[:, None]
     base = P.new_zeros(b, v, 5)
     if K is not None:
         base = torch.nan_to_num(parameters_from_intrinsics(ready.image @ K[rows, ready.order]), 0.0, 0.0, 0.0)
         base[..., 0] = 0
     solved = [solve_assumption(ready, base, assumption, max_deviation) for assumption in assume]
-    taken = torch.zeros(b, dtype=torch.long, device=P.device)
-    best, unknowns = solved[0].fit.chi2, torch.full((b,), float(solved[0].unknowns), dtype=P.dtype, device=P.device)
-    for k, other in enumerate(solved[1:], 1):
-        # Noise is known only through the fit itself: the richer model sets the unit.
-        unit = (other.fit.chi2 / other.fit.redundancy.clamp_min(1)).clamp_min(1)
-        more = other.unknowns - unknowns
-        better = (best - other.fit.chi2 > unit * (3 * more.clamp_min(0) + 10)) & (other.fit.status != Status.TOO_FEW)
-        taken = torch.where(better, k, taken)
-        best = torch.where(better, other.fit.chi2, best)
-        unknowns = torch.where(better, float(other.unknowns), unknowns)
+    statuses = torch.stack([s.fit.status for s in solved])
+    possible = (statuses != Status.TOO_FEW) & (statuses != Status.NOT_FINITE) & (statuses != Status.BEHIND)
+    weight = weigh_assumptions(torch.stack([s.evidence for s in solved]), possible)
+    taken = weight.argmax(0)
 
     def pick(values: list[Tensor]) -> Tensor:
         return torch.stack(values)[taken, torch.arange(b, device=P.device)]
@@ -224,7 +237,18 @@ def _solve(
     metric = metric_cameras(ready, K_ready, plane)
     side = 1 / ready.image[..., 0, 0]
     unit = torch.stack((*[torch.ones_like(side)] * 3, side, side), -1)
-    covariance = pick([s.covariance for s in solved])[rows, inverse] * (unit[..., :, None] * unit[..., None, :])[rows, inverse]
+    # What the other assumptions would have elsewhere is uncertain too.
+    weight = torch.where(weight > 1e-6, weight, 0.0)[..., None, None, None]
+    own = (torch.arange(len(solved), device=P.device)[:, None] == taken)[..., None, None, None]
+    apart = torch.stack([s.likely for s in solved]) - parameters
+    others = torch.stack([s.likely_covariance for s in solved]) + apart[..., :, None] * apart[..., None, :]
+    spread = torch.where(own, torch.stack([s.covariance for s in solved]), torch.where(weight > 0, others, 0.0))
+    covariance = (weight * spread).sum(0)
+    focal = (covariance[..., 0, 0].clamp_min(0).sqrt() * ready.present).amax(-1)
+    status = torch.where((status == Status.OK) & (focal > max_deviation), int(Status.DEGENERATE), status)
+    bent = ready.distortion.abs() > _FAR * distortion_sigma
+    status = torch.where((status == Status.OK) & bent, int(Status.NO_CONSENSUS), status)
+    covariance = covariance[rows, inverse] * (unit[..., :, None] * unit[..., None, :])[rows, inverse]
     told = pick([s.data_deviation for s in solved])
     determined = (told <= max_deviation)[rows, inverse]
     K_pixels = _unscaled(ready.image) @ K_ready
@@ -243,13 +267,16 @@ def _solve(
         upgrade=metric.upgrade,
         status=status.to(torch.int8),
         assumption=taken.to(torch.int8),
+        probability=pick([*weight[..., 0, 0, 0]]),
         fits=tuple(s.fit for s in solved),
         deviation=covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt(),
         covariance=covariance,
         determined=determined,
         plane=plane_given,
-        chi2=best,
+        chi2=pick([s.fit.chi2 for s in solved]),
         redundancy=pick([s.fit.redundancy for s in solved]),
+        distortion=ready.distortion,
+        distortion_deviation=ready.distortion_deviation,
         noise=ready.noise,
         in_front=metric.in_front,
         motion=motion,

@@ -1,8 +1,12 @@
 """What the observations say of projective cameras: the information matrix with the points eliminated, and its covariance.
 
 The Gauss-Newton matrix of projective bundle adjustment, points eliminated by the Schur complement. It has a null space, the
-scale of every camera and the choice of frame, which is known in closed form.
+scale of every camera and the choice of frame, which is known in closed form. Eliminated with it are fields of displacements of
+the image points: the residuals, or what a distortion would do. How far the cameras follow them, and what of them is left, comes
+from the same matrix.
 """
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -12,20 +16,39 @@ _ENTRIES = 2_000_000
 """Entries of the matrix of couplings between cameras and points held at once; bounds memory, changes no result."""
 
 
+@dataclass(frozen=True)
+class CameraInformation:
+    """Normal equations of the entries of all cameras, for image noise of standard deviation 1, points eliminated or known."""
+
+    matrix: Float[Tensor, "b r r"] | Float[Tensor, "b v 12 12"]
+    right: Float[Tensor, "b r k"]
+    """Right-hand sides of k fields of displacements."""
+    left_over: Float[Tensor, "b k k"]
+    """Products of the fields that the points do not follow."""
+
+
 def camera_information(
-    P: Float[Tensor, "b v 3 4"], X: Float[Tensor, "b n 4"], weights: Float[Tensor, "b v n"], *, coupled: bool = True
-) -> Float[Tensor, "b r r"] | Float[Tensor, "b v 12 12"]:
-    """The information matrix of the entries of all cameras, for image noise of standard deviation 1.
+    P: Float[Tensor, "b v 3 4"],
+    X: Float[Tensor, "b n 4"],
+    weights: Float[Tensor, "b v n"],
+    fields: Float[Tensor, "b v n 2 k"],
+    *,
+    coupled: bool = True,
+) -> CameraInformation:
+    """The normal equations.
 
     Args:
         P: Cameras.
         X: Homogeneous points.
         weights: Of the observations, 0 where there is none.
+        fields: Displacements of the image points.
         coupled: With the points eliminated; else taken as known, which leaves one block per view.
     """
     b, v, n = weights.shape
     blocks = P.new_zeros(b, v, 12, 12)
     S = P.new_zeros(b, 12 * v, 12 * v) if coupled else blocks
+    right = P.new_zeros(b, 12 * v, fields.shape[-1])
+    left_over = P.new_zeros(b, fields.shape[-1], fields.shape[-1])
     step = max(1, _ENTRIES // max(1, 48 * b * v)) if n else 1
     for start in range(0, n, step):
         part = slice(start, start + step)
@@ -39,6 +62,9 @@ def camera_information(
         # Derivative of each image point with respect to its camera's twelve entries, rows first.
         J = (D[..., None] * Y[:, None, :, None, None, :]).flatten(-2)
         blocks += torch.einsum("bvnri,bvnrj->bvij", J, J)
+        field = fields[:, :, part] * w.sqrt()[..., None, None]
+        right += torch.einsum("bvnri,bvnrk->bvik", J, field).flatten(1, 2)
+        left_over += torch.einsum("bvnri,bvnrj->bij", field, field)
         if not coupled:
             continue
         DP = D @ P[:, :, None]
@@ -55,10 +81,14 @@ def camera_information(
         Z = torch.linalg.solve_triangular(L[:, :, None], W.mT, upper=False)
         Z = Z.permute(0, 2, 4, 1, 3).reshape(b, 12 * v, 4 * Y.shape[1])
         S -= Z @ Z.mT
+        followed = torch.einsum("bvnri,bvnrk->bnik", DP, field) * good
+        followed = torch.linalg.solve_triangular(L, followed, upper=False).flatten(1, 2)
+        right -= Z @ followed
+        left_over -= followed.mT @ followed
     if coupled:
         diagonal = S.view(b, v, 12, v, 12).diagonal(dim1=1, dim2=3)
         diagonal += blocks.permute(0, 2, 3, 1)
-    return S
+    return CameraInformation(S, right, left_over)
 
 
 def covariance_in_frame(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.autocalibration.camera_information import camera_information, covariance_in_frame
+from torchsfm.autocalibration.camera_information import CameraInformation, camera_information, covariance_in_frame
 from torchsfm.autocalibration.orientation import orient_projective
 from torchsfm.geometry import camera_centre
 from torchsfm.linalg import svdvals
@@ -34,7 +34,13 @@ class PreparedCameras:
     order: Int[Tensor, "b v"]
     visible: Bool[Tensor, "b v n"]
     present: Bool[Tensor, "b v"]
+    straight: Float[Tensor, "b v 3 4"]
+    """P as it would be without the distortion."""
     covariance: Tensor
+    """Of `straight`, of all views together or of each by itself."""
+    distortion: Float[Tensor, "b"]
+    """k of `x_distorted = (1 + k |x|^2) x`, the same for all views, in the image coordinates above."""
+    distortion_deviation: Float[Tensor, "b"]
     noise: Float[Tensor, "b"]
     """Standard deviation per image coordinate, pixels."""
     consistent: Float[Tensor, "b"]
@@ -122,16 +128,22 @@ def prepare_cameras(
     visible: Bool[Tensor, "b v n"],
     image_size: Float[Tensor, "b v 2"],
     noise: Float[Tensor, "b"] | None,
+    distortion_sigma: float,
 ) -> PreparedCameras:
     """Bring cameras and points to the canonical frame, and weigh them by their covariance.
+
+    A little radial distortion bends projective cameras by more than their noise, mostly without trace in their own residuals,
+    and a focal length with them. It is one more unknown here, linearised: the residuals tell it, the cameras are freed of it,
+    and what stays unknown of it is in their covariance.
 
     Args:
         P: Cameras in pixels.
         X: Homogeneous points.
-        x: Observations in pixels, of which only the noise is estimated.
+        x: Observations in pixels, which tell noise and distortion.
         visible: Which points each view sees.
         image_size: Width and height.
         noise: Standard deviation of the observations per coordinate, in pixels; from x if None, else 1.
+        distortion_sigma: Standard deviation of the distortion before any image was seen; 0 for none.
     """
     if x is not None:
         visible = visible & torch.isfinite(x).all(-1)
@@ -143,13 +155,68 @@ def prepare_cameras(
     sigma = torch.where(torch.isfinite(sigma), sigma, 1.0).clamp_min(NOISE_FLOOR)
     precision = (1 / (sigma[:, None] * c.image[..., 0, 0])).square()
     weights = c.visible.to(P.dtype) * torch.where(c.present, precision, 0.0)[..., None]
-    if v <= MAX_COUPLED:
-        S = camera_information(c.P, c.X, weights)
-        covariance: Tensor = covariance_in_frame(c.P, S, torch.zeros(b, dtype=torch.long, device=P.device))
+    fields = _fields(c, x)
+    coupled = v <= MAX_COUPLED
+    information = camera_information(c.P, c.X, weights, fields, coupled=coupled)
+    if coupled:
+        covariance: Tensor = covariance_in_frame(c.P, information.matrix, torch.zeros(b, dtype=torch.long, device=P.device))
     else:
-        covariance = _separate(c.P, camera_information(c.P, c.X, weights, coupled=False))
+        covariance = _separate(c.P, information.matrix)
     covariance = torch.where(torch.isfinite(covariance), covariance, 0.0)
-    return PreparedCameras(c.P, c.X, c.frame, c.image, c.order, c.visible, c.present, covariance, sigma, c.consistent, c.finite)
+    # Noise that is given, or already the least, does not shrink when distortion takes its part of the residuals.
+    least = (NOISE_FLOOR / sigma).square() if x is not None and noise is None else torch.ones_like(sigma)
+    bend, k, deviation, share = _distortion(information, covariance, distortion_sigma, least, x is not None)
+    sigma = sigma * share.sqrt()
+    covariance = covariance * share.reshape(-1, *[1] * (covariance.ndim - 1))
+    spread = bend * deviation[:, None, None]
+    if coupled:
+        covariance = covariance + spread[..., None, None] * spread[:, None, None]
+    else:
+        covariance = covariance + spread[..., None] * spread[..., None, :]
+    straight = c.P - (k[:, None, None] * bend).reshape(c.P.shape)
+    return PreparedCameras(
+        c.P, c.X, c.frame, c.image, c.order, c.visible, c.present, straight, covariance, k, deviation, sigma, c.consistent,
+        c.finite,
+    )  # fmt: skip
+
+
+def _fields(c: CanonicalCameras, x: Tensor | None) -> Tensor:
+    """Where unit distortion would move the image points, and their residuals (b, v, n, 2, 2), zero where nothing is seen."""
+    h = torch.einsum("bvij,bnj->bvni", c.P, c.X)
+    seen = c.visible & (h[..., 2] != 0)
+    y = h[..., :2] / torch.where(seen, h[..., 2], 1.0)[..., None]
+    bent = y * y.square().sum(-1, keepdim=True)
+    residual = torch.zeros_like(y)
+    if x is not None:
+        rows = torch.arange(len(x), device=x.device)[:, None]
+        T = c.image
+        residual = torch.nan_to_num(x[rows, c.order]) * T[:, :, None, [0, 1], [0, 1]] + T[:, :, None, :2, 2] - y
+    fields = torch.stack((bent, residual), -1)
+    return torch.where(seen[..., None, None] & torch.isfinite(fields), fields, 0.0)
+
+
+def _distortion(
+    information: CameraInformation, covariance: Tensor, prior: float, least_share: Tensor, told: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """How unit distortion bends the cameras (b, v, 12), the distortion, its deviation, and what share of the variance stays."""
+    b, v = covariance.shape[:2]
+    right = information.right
+    if covariance.ndim == 5:
+        follow = covariance.reshape(b, 12 * v, 12 * v) @ right
+    else:
+        follow = (covariance @ right.reshape(b, v, 12, -1)).flatten(1, 2)
+    bend = follow[..., 0].reshape(b, v, 12)
+    share = torch.ones_like(least_share)
+    if prior == 0 or not told:
+        return bend, 0 * share, prior * share, share
+    left_over = information.left_over - right.mT @ follow
+    own, common = left_over[:, 0, 0].clamp_min(0), left_over[:, 0, 1]
+    explained = common.square() / (own * information.left_over[:, 1, 1]).clamp_min(1e-300)
+    share = torch.maximum(1 - explained, least_share)
+    precision = own / share + prior**-2
+    k = common / share / precision
+    # What the linear term leaves is of the size of its square.
+    return bend, k, (1 / precision + k**4).sqrt(), share
 
 
 def _frame(P: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
