@@ -12,8 +12,11 @@ from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation
 from torchsfm.reconstruction.consistency import pair_agreement
 from torchsfm.reconstruction.doubt import examine
+from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at
 
@@ -87,7 +90,7 @@ def folded(generator: torch.Generator, v: int = 12) -> Mapping:
 
 
 def judged(mapping: Mapping) -> tuple[str, ...]:
-    return examine(mapping, focal_free=True, focal_sigma=torch.tensor([0.5]), threshold=4.0).doubt
+    return examine(mapping, free=("focal",), focal_sigma=torch.tensor([0.5]), threshold=4.0).doubt
 
 
 def test_a_right_model_is_not_doubted(generator: torch.Generator) -> None:
@@ -157,7 +160,7 @@ def test_deviations_do_not_depend_on_the_frame(generator: torch.Generator) -> No
     X = 7 * mapping.X @ R.mT + shift
     R_cam = mapping.poses.R @ R.mT
     moved = replace(mapping, X=X, poses=Pose(R_cam, 7 * mapping.poses.t - (R_cam @ shift)))
-    options = {"focal_free": False, "focal_sigma": torch.tensor([0.01]), "threshold": 4.0}
+    options = {"free": (), "focal_sigma": torch.tensor([0.01]), "threshold": 4.0}
     first, second = examine(mapping, **options), examine(moved, **options)
     torch.testing.assert_close(first.rotation_sigma, second.rotation_sigma, rtol=1e-5, atol=0)
     torch.testing.assert_close(first.position_sigma, second.position_sigma, rtol=0.05, atol=0)
@@ -170,7 +173,7 @@ def test_images_that_are_not_registered_have_no_standing(generator: torch.Genera
     point = torch.where(mapping.graph.view == 5, -1, mapping.point)
     standing = examine(
         replace(mapping, registered=registered, point=point).compacted(),
-        focal_free=True,
+        free=("focal",),
         focal_sigma=torch.tensor([0.5]),
         threshold=4.0,
     )
@@ -184,7 +187,7 @@ def test_images_that_are_not_registered_have_no_standing(generator: torch.Genera
 def test_two_images_with_a_guessed_focal_length_are_doubted(guessed: bool, generator: torch.Generator) -> None:
     mapping = scene(generator, v=2)
     sigma = torch.tensor([0.5 if guessed else 0.01])
-    doubt = examine(mapping, focal_free=guessed, focal_sigma=sigma, threshold=4.0).doubt
+    doubt = examine(mapping, free=("focal",) if guessed else (), focal_sigma=sigma, threshold=4.0).doubt
     assert all(("focal" in reason) == guessed for reason in doubt)
 
 
@@ -195,6 +198,53 @@ def test_a_camera_of_few_points_is_less_well_known(generator: torch.Generator) -
     point = mapping.point.clone()
     point[own[4:]] = -1
     standing = examine(
-        replace(mapping, point=point).compacted(), focal_free=True, focal_sigma=torch.tensor([0.5]), threshold=4.0
+        replace(mapping, point=point).compacted(), free=("focal",), focal_sigma=torch.tensor([0.5]), threshold=4.0
     )
     assert standing.rotation_sigma[7] > 3 * standing.rotation_sigma[:7].max()
+
+
+def options(mapping: Mapping) -> MappingOptions:
+    sigma = torch.full((1,), 0.05, dtype=torch.float64)
+    return MappingOptions(free=("focal",), expected=mapping.cameras, focal_sigma=sigma)
+
+
+def misplaced(mapping: Mapping, images: list[int], generator: torch.Generator) -> Mapping:
+    """The images turned and moved, left with those of their observations that fit by chance."""
+    delta = torch.zeros(len(mapping.registered), 6, dtype=torch.float64)
+    delta[images] = 0.3 * torch.randn(6, generator=generator, dtype=torch.float64)
+    turned = replace(mapping, poses=mapping.poses.retract(delta))
+    error = turned.errors(turned.point, torch.arange(len(turned.point)))
+    moved = torch.isin(turned.graph.view, torch.tensor(images))
+    return replace(turned, point=torch.where(moved & (error > 10), -1, turned.point)).compacted()
+
+
+def test_a_contradicted_camera_is_put_right(generator: torch.Generator) -> None:
+    for _ in range(3):
+        mapping = scene(generator)
+        wrong = misplaced(mapping, [3], generator)
+        settled, parted = settle(wrong, torch.zeros(8, dtype=torch.bool), options(mapping), lambda n, v: None)
+        assert settled.registered.all()
+        assert not parted
+        errors = pose_errors(settled.poses, mapping.poses)
+        assert errors.image_rotation.max() < 0.5
+        assert not any(judged(settled))
+
+
+def test_a_model_of_two_halves_is_parted(generator: torch.Generator) -> None:
+    mapping = scene(generator, v=10)
+    a, b = mapping.graph.match.unbind(1)
+    pairs = mapping.graph.pairs
+    across = (pairs < 4).sum(1) == 1
+    # Matches between the halves that no poses explain: each says that the points lie elsewhere.
+    shuffled = b.clone()
+    wrong = across[mapping.graph.match_pair]
+    for q in across.nonzero()[:, 0].tolist():
+        own = (mapping.graph.match_pair == q).nonzero()[:, 0]
+        shuffled[own] = b[own[torch.randperm(len(own), generator=generator)]]
+    graph = replace(mapping.graph, match=torch.stack([a, shuffled], 1))
+    assert wrong.any()
+    settled, parted = settle(
+        replace(mapping, graph=graph), torch.zeros(10, dtype=torch.bool), options(mapping), lambda n, v: None
+    )
+    assert settled.registered.tolist() == [False] * 4 + [True] * 6
+    assert sorted(parted) == [0, 1, 2, 3]

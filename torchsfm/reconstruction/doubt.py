@@ -1,5 +1,6 @@
 """How well each camera of a finished model is known, and where it may be wrong altogether."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -34,18 +35,18 @@ class Standing:
     doubt: tuple[str, ...]
 
 
-def examine(mapping: Mapping, *, focal_free: bool, focal_sigma: Float[Tensor, "g"], threshold: float) -> Standing:
+def examine(mapping: Mapping, *, free: Sequence[str], focal_sigma: Float[Tensor, "g"], threshold: float) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
     Args:
         mapping: The model.
-        focal_free: Whether focal lengths were estimated.
+        free: Intrinsic parameters that were estimated from three images or more.
         focal_sigma: How uncertain the cameras' focal lengths were at first, as a fraction.
         threshold: Largest reprojection error of an observation, in pixels.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
-    rotation, position = pose_deviations(mapping, focal_free=focal_free and count >= 3)
+    rotation, position = pose_deviations(mapping, free=free if count >= 3 else ())
     agreement = pair_agreement(mapping, threshold=threshold)
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
@@ -59,7 +60,7 @@ def examine(mapping: Mapping, *, focal_free: bool, focal_sigma: Float[Tensor, "g
         # One such pair may have another reason; of several, one thing that occurs twice is the likeliest, and folds the whole.
         if own or len(refuted) > 1:
             first, second = (mapping.graph.names[k] for k in (own or refuted)[0])
-            return f"things that look alike may be taken for one: {first} and {second} miss what both should see"
+            return f"things that look alike may be taken for one: {first} and {second} each miss what the other sees"
         if bool(outvoted[i]):
             return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
         if count >= 3 and int(supporting[i]) < 2:
@@ -75,7 +76,7 @@ def examine(mapping: Mapping, *, focal_free: bool, focal_sigma: Float[Tensor, "g
     return Standing(rotation, position, tuple(doubt(i) if mapping.registered[i] else "" for i in range(v)))
 
 
-def pose_deviations(mapping: Mapping, *, focal_free: bool) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"]]:
+def pose_deviations(mapping: Mapping, *, free: Sequence[str]) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"]]:
     """Standard deviations of rotations (degrees) and of places (over the median depth), as in `Standing`."""
     node = mapping.observations()
     view, point = mapping.graph.view[node], mapping.point[node]
@@ -87,7 +88,7 @@ def pose_deviations(mapping: Mapping, *, focal_free: bool) -> tuple[Float[Tensor
         view,
         point,
         camera_index=mapping.camera_index,
-        free=("focal",) if focal_free else (),
+        free=free,
         loss=Cauchy(1.0),
     )
     depth = mapping.project(point, view)[1]

@@ -17,6 +17,7 @@ from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.projective import projective_start
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
+from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
@@ -109,10 +110,12 @@ def build_models(
                     break
                 mapped, known = grown, options
             model, failed = mapped
+            model, parted = settle(model, taken, known, report)
+            failed |= parted
             if not found:
                 reasons |= failed
             taken = taken | model.registered
-            standing = examine(model, focal_free="focal" in free, focal_sigma=known.focal_sigma, threshold=options.reprojection)
+            standing = examine(model, free=free, focal_sigma=known.focal_sigma, threshold=options.reprojection)
             found.append((model.reconstruction(), standing))
             if stages.folder is not None:
                 _save_model(found[-1][0], stages.folder, len(found) - 1)
