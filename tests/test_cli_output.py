@@ -121,15 +121,15 @@ def test_two_runs_exclude_each_other_and_a_killed_one_does_not_block(folder: Pat
         "with output_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == "held\n"
-        for _ in range(2):
-            with (
-                pytest.raises(UserError, match=rf"another run is writing to it \(process {other.pid}\)"),
-                output_folder(folder),
-            ):
-                raise AssertionError("both hold it")
-        other.kill()
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == "held\n"
+            message = rf"another run is writing to it \(process {other.pid}\)"
+            for _ in range(2):
+                with pytest.raises(UserError, match=message), output_folder(folder):
+                    raise AssertionError("both hold it")
+        finally:
+            other.kill()
     with output_folder(folder):
         assert (folder / output.LOCK).read_text() == f"{os.getpid()}\n"
     with output_folder(folder):
