@@ -1,9 +1,14 @@
 """The words every room shares: solutions, statuses, shape checks, and a map over tensors in a dataclass."""
 
+import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import IntEnum
-from typing import Any, Generic, TypeVar
+from functools import cache
+from numbers import Integral, Real
+from types import UnionType
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool
@@ -82,8 +87,9 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
     """Check shapes, dtypes and devices of named arguments, and return their common batch shape.
 
     Each argument comes as `(tensor, spec)`. The spec describes the trailing dimensions: a number is exact, a name is the same
-    number wherever it stands, `name>=k` sets a minimum. A spec may end in `: bool` or `: int`; otherwise the tensor must be
-    floating point, and all floating-point tensors must share one dtype. `None` stands for an option not given.
+    number wherever it stands, `name>=k` sets a minimum. A spec may end in `: bool` or `: int`; otherwise the tensor must be of
+    single or double precision, and all such tensors must share one dtype: half precision holds neither pixels nor products of
+    them. A spec that begins with `?` is that of an option, which may be None.
 
     Args:
         **arguments: The tensors under the names the caller knows them by.
@@ -99,11 +105,11 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
     first: tuple[str, Tensor] | None = None
     floating: tuple[str, Tensor] | None = None
     for name, (tensor, spec) in arguments.items():
-        if tensor is None:
+        if tensor is None and spec.startswith("?"):
             continue
-        shape_spec, _, kind = (part.strip() for part in spec.partition(":"))
+        shape_spec, _, kind = (part.strip() for part in spec.removeprefix("?").partition(":"))
         if not isinstance(tensor, Tensor):
-            raise ValueError(f"{name}: wanted a torch.Tensor of shape (*batch, {shape_spec}), got {type(tensor).__name__}")
+            raise ValueError(f"{name}: wanted a torch.Tensor of shape {_words(shape_spec)}, got {type(tensor).__name__}")
         _check_kind(name, tensor, kind)
         if kind == "":
             if floating is not None and tensor.dtype != floating[1].dtype:
@@ -113,18 +119,17 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
             raise ValueError(f"{name}: wanted device {first[1].device} as {first[0]} has, got {tensor.device}")
         first = first or (name, tensor)
         tokens = shape_spec.split()
-        wanted = f"(*batch, {', '.join(tokens)})" if tokens else "(*batch)"
         if tensor.ndim < len(tokens):
-            raise ValueError(f"{name}: wanted shape {wanted}, got {tuple(tensor.shape)}")
+            raise ValueError(f"{name}: wanted shape {_words(shape_spec)}, got {tuple(tensor.shape)}")
         trailing = tensor.shape[tensor.ndim - len(tokens) :]
         for token, size in zip(tokens, trailing, strict=True):
             label, _, minimum = token.partition(">=")
             if token.isdigit():
                 if size != int(token):
-                    raise ValueError(f"{name}: wanted shape {wanted}, got {tuple(tensor.shape)}")
+                    raise ValueError(f"{name}: wanted shape {_words(shape_spec)}, got {tuple(tensor.shape)}")
                 continue
             if minimum and size < int(minimum):
-                raise ValueError(f"{name}: wanted {label} >= {minimum} in shape {wanted}, got {tuple(tensor.shape)}")
+                raise ValueError(f"{name}: wanted {label} >= {minimum} in {_words(shape_spec)}, got {tuple(tensor.shape)}")
             if label in sizes and sizes[label][0] != size:
                 known, owner = sizes[label]
                 raise ValueError(f"{name}: wanted {label} = {known} as {owner} has, got shape {tuple(tensor.shape)}")
@@ -137,12 +142,69 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
         raise ValueError(f"batch dimensions do not broadcast: {listing}") from None
 
 
+def check_options(**arguments: tuple[object, str | tuple[object, ...] | type | UnionType]) -> None:
+    """Check options, which are no tensors: numbers, choices and objects.
+
+    Each argument comes as `(value, wanted)`: a tuple of the values there are, a type, or the range of a finite number as in
+    `int >= 1`, `float > 0`, `0 <= float <= 1`. A range that begins with `?` is that of an option which may be None.
+
+    Args:
+        **arguments: The options under the names the caller knows them by.
+
+    Raises:
+        ValueError: An option is not what is wanted.
+    """
+    for name, (value, wanted) in arguments.items():
+        if isinstance(wanted, str):
+            good, words = _range(wanted).holds(value), wanted
+        elif isinstance(wanted, tuple):
+            good, words = isinstance(value, str | int) and value in wanted, f"one of {', '.join(map(repr, wanted))}"
+        else:
+            good, words = isinstance(value, wanted), getattr(wanted, "__name__", str(wanted))
+        if not good:
+            raise ValueError(f"{name}: wanted {words}, got {value!r}")
+
+
+class _Range(NamedTuple):
+    """What numbers an option may be."""
+
+    kind: type
+    optional: bool
+    bounds: tuple[tuple[Callable[[Any, float], bool], float], ...]
+
+    def holds(self, value: object) -> bool:
+        """Whether a value is one of them."""
+        if not isinstance(value, self.kind) or isinstance(value, bool) or not math.isfinite(value):  # type: ignore[arg-type]
+            return value is None and self.optional
+        return all(compare(value, bound) for compare, bound in self.bounds)
+
+
+@cache
+def _range(words: str) -> _Range:
+    """The range of `0 < float <= 1`, say; a `?` in front allows None."""
+    tokens = words.removeprefix("?").split()
+    i = next(i for i, token in enumerate(tokens) if token in _NUMBERS)
+    below = [(_COMPARE[tokens[k + 1].replace("<", ">")], float(tokens[k])) for k in range(0, i, 2)]
+    above = [(_COMPARE[tokens[k]], float(tokens[k + 1])) for k in range(i + 1, len(tokens), 2)]
+    return _Range(_NUMBERS[tokens[i]], words.startswith("?"), (*below, *above))
+
+
+_NUMBERS: dict[str, type] = {"int": Integral, "float": Real}
+_COMPARE: dict[str, Callable[[Any, Any], bool]] = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
+}  # fmt: skip
+
+
+def _words(shape_spec: str) -> str:
+    return f"({', '.join(['*batch', *shape_spec.split()])})"
+
+
 def _check_kind(name: str, tensor: Tensor, kind: str) -> None:
     if kind == "bool":
         good = tensor.dtype == torch.bool
     elif kind == "int":
         good = not (tensor.dtype.is_floating_point or tensor.dtype.is_complex or tensor.dtype == torch.bool)
     else:
-        good, kind = tensor.dtype.is_floating_point, "floating point"
+        good, kind = tensor.dtype in (torch.float32, torch.float64), "float32 or float64"
     if not good:
         raise ValueError(f"{name}: wanted a {kind} tensor, got {tensor.dtype}")

@@ -23,6 +23,9 @@ from torchsfm._types import tensor_map
 BATCH = (4,)
 OPTIONAL = 0.3
 """How often an optional argument is given."""
+JUDGED_BY_TORCH = {"device", "dtype", "generator", "shape", "progress"}
+"""Options of which torch itself, or Python, says what is wrong with them."""
+ELSEWHERE = "on another device"
 
 Arguments = dict[str, Any]
 Call = Callable[..., Any]
@@ -131,12 +134,14 @@ def _wrong_arguments(call: Call, how: Function, seed: int) -> Trial:
     batch: tuple[int, ...] = ((), (2,), (0,))[int(torch.randint(3, (), generator=generator))]
     arguments = good_arguments(call, how, _scene(how, generator, batch))
     parameters = inspect.signature(call).parameters
-    names = [n for n, p in parameters.items() if p.kind is not p.VAR_KEYWORD and not callable(arguments.get(n, p.default))]
+    names = [n for n, p in parameters.items() if p.kind is not p.VAR_KEYWORD and n not in JUDGED_BY_TORCH]
+    names = [n for n in names if not callable(arguments.get(n, parameters[n].default))]
     if not names:
         return Trial(0)
     name = names[int(torch.randint(len(names), (), generator=generator))]
     value = arguments.get(name, parameters[name].default)
-    wrong = list(_wrong_values(value, generator))
+    alone = sum(isinstance(a, Tensor) for a in arguments.values()) < 2
+    wrong = [w for w in _wrong_values(value, generator) if not (alone and w[0] == ELSEWHERE)]
     if not wrong:
         return Trial(0)
     what, wrong_value = wrong[int(torch.randint(len(wrong), (), generator=generator))]
@@ -166,7 +171,7 @@ def _wrong_values(value: Any, generator: torch.Generator) -> Iterator[tuple[str,
         yield "a string", "tensor"
         for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.int64, torch.bool, torch.complex128):
             yield str(dtype), value.to(dtype)
-        yield "on another device", value.to("meta")
+        yield ELSEWHERE, value.to("meta")
         if value.ndim:
             yield "a longer last dimension", torch.cat((value, value[..., :1]), -1)
             yield "a shorter last dimension", value[..., :-1]

@@ -142,7 +142,12 @@ def autocalibrate_points(
     if K is not None and K.shape[-3] not in (1, v):
         raise ValueError(f"K: wanted 1 or {v} views, got shape {tuple(K.shape)}")
     batch = check_tensors(
-        P=(P, "v 3 4"), X=(X, "n 4"), x=(x, "v n 2"), image_size=(sizes, "w 2"), visible=(visible, "v n : bool"), K=(K, "k 3 3")
+        P=(P, "v 3 4"),
+        X=(X, "n 4"),
+        x=(x, "?v n 2"),
+        image_size=(sizes, "w 2"),
+        visible=(visible, "?v n : bool"),
+        K=(K, "?k 3 3"),
     )
     if not distortion_sigma >= 0:
         raise ValueError(f"distortion_sigma: wanted a number that is not negative, got {distortion_sigma}")

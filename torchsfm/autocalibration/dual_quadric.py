@@ -82,7 +82,7 @@ def dual_quadric_linear(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
     """
-    batch = check_tensors(P=(P, "v>=2 3 4"), weights=(weights, "v"))
+    batch = check_tensors(P=(P, "v>=2 3 4"), weights=(weights, "?v"))
     v = P.shape[-3]
     full = P.detach().double().expand(*batch, v, 3, 4)
     w = full.new_ones(*batch, v) if weights is None else weights.detach().double().expand(*batch, v)

@@ -85,7 +85,9 @@ def focal_from_fundamentals(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the search range is empty.
     """
-    batch = check_tensors(F=(F, "p 3 3"), c1=(c1, "p 2"), c2=(c2, "p 2"), weights=(weights, "p"), image_size=(image_size, "2"))
+    batch = check_tensors(
+        F=(F, "p 3 3"), c1=(c1, "p 2"), c2=(c2, "p 2"), weights=(weights, "?p"), image_size=(image_size, "?2")
+    )
     if focal_range is not None and not 0 < focal_range[0] < focal_range[1]:
         raise ValueError(f"focal_range: wanted 0 < smallest < largest, got {focal_range}")
     if num_candidates < 8:

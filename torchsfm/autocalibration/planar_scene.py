@@ -45,7 +45,7 @@ def intrinsics_from_plane(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the assumption lets intrinsics vary.
     """
-    batch = check_tensors(H=(H, "m>=1 3 3"), weights=(weights, "m"))
+    batch = check_tensors(H=(H, "m>=1 3 3"), weights=(weights, "?m"))
     kind = Assumption(free=("focal",)) if assume is None else assume
     check_shared(kind)
     m = H.shape[-3]

@@ -39,7 +39,7 @@ def intrinsics_from_rotations(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the assumption lets intrinsics vary.
     """
-    batch = check_tensors(H=(H, "m>=1 3 3"), weights=(weights, "m"))
+    batch = check_tensors(H=(H, "m>=1 3 3"), weights=(weights, "?m"))
     check_shared(assume)
     m = H.shape[-3]
     flat = H.detach().double().expand(*batch, m, 3, 3).reshape(-1, m, 3, 3)

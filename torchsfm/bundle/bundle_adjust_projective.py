@@ -89,9 +89,9 @@ def bundle_adjust_projective(
         x=(x, "m 2"),
         view=(view, "m: int"),
         point=(point, "m: int"),
-        fixed_cameras=(fixed_cameras, "v: bool"),
-        fixed_points=(fixed_points, "n: bool"),
-        weights=(weights, "m"),
+        fixed_cameras=(fixed_cameras, "?v: bool"),
+        fixed_points=(fixed_points, "?n: bool"),
+        weights=(weights, "?m"),
     )
     if batch:
         raise ValueError(f"wanted one problem without batch dimensions, got batch {tuple(batch)}")

@@ -76,7 +76,7 @@ def normalizing_similarity(
         The transformation T, homogeneous, with `T (x, 1) = (x', 1)`. Where the points coincide, only the centroid is moved;
         where none is present, T is the identity.
     """
-    check_tensors(x=(x, "n d"), weights=(weights, "n"))
+    check_tensors(x=(x, "n d>=1"), weights=(weights, "?n"))
     dimension = x.shape[-1]
     present = torch.isfinite(x).all(-1)
     w = present.to(x.dtype) if weights is None else torch.where(present & torch.isfinite(weights), weights.clamp(min=0), 0.0)
@@ -108,7 +108,10 @@ def transform_points(H: Float[Tensor, "*#batch h h"], x: Float[Tensor, "*#batch 
         The transformed points, finite always: a point sent to infinity is returned very far away, in its own direction
         (about 1 / machine epsilon), and a point with NaN or inf as the image of the origin.
     """
-    check_tensors(x=(x, "n d"), H=(H, f"{x.shape[-1] + 1} {x.shape[-1] + 1}"))
+    check_tensors(H=(H, "h h"), x=(x, "n d"))
+    if H.shape[-1] != x.shape[-1] + 1:
+        got = f"{tuple(H.shape)} and {tuple(x.shape)}"
+        raise ValueError(f"H, x: wanted shapes (*batch, d + 1, d + 1) and (*batch, n, d), got {got}")
     y = finite_or_zero(x) @ H[..., :-1, :-1].mT + H[..., None, :-1, -1]
     w = (finite_or_zero(x) * H[..., -1:, :-1]).sum(-1) + H[..., -1:, -1]
     return divide_safely(y, w)

@@ -70,7 +70,7 @@ def track_points(
     Raises:
         ValueError: A shape or an option is wrong.
     """
-    check_tensors(x1=(x1, "n 2"), guess=(guess, "n 2"))
+    check_tensors(x1=(x1, "n 2"), guess=(guess, "?n 2"))
     start = x1 if guess is None else guess
     batch = check_tensors(
         image1=(image1, "c h w"), image2=(image2, "c h w"), x1=(x1.to(image1), "n 2"), guess=(start.to(image1), "n 2")

@@ -83,7 +83,7 @@ def factorize_affine(
     Raises:
         ValueError: Wrong shape, dtype, device or option.
     """
-    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "v n: bool"), weights=(weights, "v n"))
+    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
     if model not in ("orthographic", "weak_perspective", "paraperspective"):
         raise ValueError(f'model: wanted "orthographic", "weak_perspective" or "paraperspective", got {model!r}')
     v, n = x.shape[-3:-1]

@@ -108,7 +108,7 @@ def factorize_points(
     Raises:
         ValueError: Wrong shape, dtype, device or option.
     """
-    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "v n: bool"), weights=(weights, "v n"))
+    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
     if max_iterations < 1:
         raise ValueError(f"max_iterations: wanted a positive number, got {max_iterations}")
     v, n = x.shape[-3:-1]

@@ -50,7 +50,7 @@ def fundamental_affine_4pt(
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 4.
     """
-    batch = check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "n"))
+    batch = check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     if x1.shape[-2] == 4 and weights is None:
         with torch.no_grad():
             rows, good = in_chunks(_solve, _CHUNK, *rows_of(batch, x1, x2))

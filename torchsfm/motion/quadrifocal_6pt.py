@@ -64,7 +64,7 @@ def quadrifocal_6pt(
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 6.
     """
-    batch = check_tensors(x=(x, "4 n>=6 2"), weights=(weights, "n"))
+    batch = check_tensors(x=(x, "4 n>=6 2"), weights=(weights, "?n"))
     n = x.shape[-2]
     views = normalized_views(x.expand(*batch, 4, n, 2), x.new_zeros(*batch, 4, 0, 3), weights, None)
     A = _equations(views)

@@ -75,7 +75,7 @@ def trifocal_7pt(
         ValueError: Wrong shape, dtype or device, or too few points and lines.
     """
     batch = check_tensors(
-        x=(x, "3 n 2"), l=(l, "3 m 3"), ends=(ends, "m 2 2"), weights=(weights, "n"), line_weights=(line_weights, "m")
+        x=(x, "3 n 2"), l=(l, "?3 m 3"), ends=(ends, "?m 2 2"), weights=(weights, "?n"), line_weights=(line_weights, "?m")
     )
     if l is None and (ends is not None or line_weights is not None):
         raise ValueError("l: wanted the lines to which ends or line_weights belong, got None")

@@ -57,17 +57,17 @@ def camera_dlt(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit; only one of `l` and `L` is given; or fewer than 11 equations in all.
     """
-    if (l is None) != (L is None):
-        raise ValueError("l, L: wanted both or neither")
-    n = x.shape[-2] if x.ndim > 1 else 0
-    per_coordinate = weights is not None and weights.ndim > 1 and weights.shape[-1] == 2 and n != 2
+    if (l is None) != (L is None) or (l is None and line_weights is not None):
+        raise ValueError("l, L: wanted both or neither, and line_weights only with them")
+    n = x.shape[-2] if isinstance(x, Tensor) and x.ndim > 1 else 0
+    per_coordinate = isinstance(weights, Tensor) and weights.ndim > 1 and weights.shape[-1] == 2 and n != 2
     batch = check_tensors(
         x=(x, "n 2"),
         X=(X, "n 3"),
-        l=(l, "k 3"),
-        L=(L, "k 6"),
-        weights=(weights, "n 2" if per_coordinate else "n"),
-        line_weights=(line_weights, "k"),
+        l=(l, "?k 3"),
+        L=(L, "?k 6"),
+        weights=(weights, "?n 2" if per_coordinate else "?n"),
+        line_weights=(line_weights, "?k"),
     )
     k = 0 if l is None else l.shape[-2]
     if 2 * (n + k) < 11:

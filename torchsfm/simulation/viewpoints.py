@@ -29,7 +29,7 @@ def look_at(
     """
     if up is None:
         up = centre.new_tensor([0.0, 0.0, 1.0])
-    check_tensors(centre=(centre, "3"), target=(target, "3"), up=(up, "3"))
+    check_tensors(centre=(centre, "3"), target=(target, "3"), up=(up, "?3"))
     shape = broadcast_shapes(centre.shape, target.shape, up.shape)
     centre, target, up = centre.expand(shape), target.expand(shape), up.expand(shape)
     z_axis, x_axis = centre.new_tensor([0.0, 0.0, 1.0]), centre.new_tensor([1.0, 0.0, 0.0])

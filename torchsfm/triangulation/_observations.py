@@ -71,7 +71,7 @@ def row_dot(row: tuple[Tensor, ...], X: Tensor | tuple[Tensor, ...]) -> Tensor:
 
 def check(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> tuple[torch.Size, int]:
     """The batch shape and the number of points."""
-    batch = check_tensors(x=(x, "v n 2"), P=(P, "v 3 4"), visible=(visible, "v n: bool"), weights=(weights, "v n"))
+    batch = check_tensors(x=(x, "v n 2"), P=(P, "v 3 4"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
     return batch, x.shape[-2]
 
 
