@@ -7,8 +7,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import IntEnum
 from functools import cache
 from numbers import Integral, Real
-from types import UnionType
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import torch
 from jaxtyping import Bool
@@ -100,6 +99,28 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
     Raises:
         ValueError: An argument has the wrong type, number of dimensions, size, dtype or device, or batches do not broadcast.
     """
+    batches = _batches(arguments)
+    try:
+        return broadcast_shapes(*batches.values())
+    except ValueError:
+        listing = ", ".join(f"{name} {tuple(shape)}" for name, shape in batches.items())
+        raise ValueError(f"batch dimensions do not broadcast: {listing}") from None
+
+
+def check_one_problem(**arguments: tuple[Tensor | None, str]) -> None:
+    """Check arguments as `check_tensors` does, which may not have batch dimensions.
+
+    Raises:
+        ValueError: An argument has the wrong type, number of dimensions, size, dtype or device.
+    """
+    for name, shape in _batches(arguments).items():
+        if shape:
+            wanted = _words(arguments[name][1].removeprefix("?").partition(":")[0]).replace("*batch, ", "")
+            raise ValueError(f"{name}: wanted shape {wanted} of one problem, got batch dimensions {tuple(shape)}")
+
+
+def _batches(arguments: dict[str, tuple[Tensor | None, str]]) -> dict[str, torch.Size]:
+    """The batch dimensions of checked arguments."""
     sizes: dict[str, tuple[int, str]] = {}
     batches: dict[str, torch.Size] = {}
     first: tuple[str, Tensor] | None = None
@@ -135,18 +156,15 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
                 raise ValueError(f"{name}: wanted {label} = {known} as {owner} has, got shape {tuple(tensor.shape)}")
             sizes.setdefault(label, (size, name))
         batches[name] = tensor.shape[: tensor.ndim - len(tokens)]
-    try:
-        return broadcast_shapes(*batches.values())
-    except ValueError:
-        listing = ", ".join(f"{name} {tuple(shape)}" for name, shape in batches.items())
-        raise ValueError(f"batch dimensions do not broadcast: {listing}") from None
+    return batches
 
 
-def check_options(**arguments: tuple[object, str | tuple[object, ...] | type | UnionType]) -> None:
+def check_options(**arguments: tuple[object, Any]) -> None:
     """Check options, which are no tensors: numbers, choices and objects.
 
     Each argument comes as `(value, wanted)`: a tuple of the values there are, a type, or the range of a finite number as in
-    `int >= 1`, `float > 0`, `0 <= float <= 1`. A range that begins with `?` is that of an option which may be None.
+    `int >= 1`, `float > 0`, `0 <= float <= 1`. `2 float > 0` stands for a tuple of two; a range that begins with `?` is that
+    of an option which may be None.
 
     Args:
         **arguments: The options under the names the caller knows them by.
@@ -169,13 +187,21 @@ class _Range(NamedTuple):
     """What numbers an option may be."""
 
     kind: type
+    length: int
     optional: bool
     bounds: tuple[tuple[Callable[[Any, float], bool], float], ...]
 
     def holds(self, value: object) -> bool:
-        """Whether a value is one of them."""
-        if not isinstance(value, self.kind) or isinstance(value, bool) or not math.isfinite(value):  # type: ignore[arg-type]
-            return value is None and self.optional
+        """Whether a value is one of them, or a tuple of as many as are wanted."""
+        if value is None:
+            return self.optional
+        if not self.length:
+            return self._holds(value)
+        return isinstance(value, Sequence) and len(value) == self.length and all(self._holds(v) for v in value)
+
+    def _holds(self, value: Any) -> bool:
+        if not isinstance(value, self.kind) or isinstance(value, bool) or not math.isfinite(cast(float, value)):
+            return False
         return all(compare(value, bound) for compare, bound in self.bounds)
 
 
@@ -183,10 +209,11 @@ class _Range(NamedTuple):
 def _range(words: str) -> _Range:
     """The range of `0 < float <= 1`, say; a `?` in front allows None."""
     tokens = words.removeprefix("?").split()
+    length = int(tokens.pop(0)) if tokens[1:] and tokens[1] in _NUMBERS else 0
     i = next(i for i, token in enumerate(tokens) if token in _NUMBERS)
     below = [(_COMPARE[tokens[k + 1].replace("<", ">")], float(tokens[k])) for k in range(0, i, 2)]
     above = [(_COMPARE[tokens[k]], float(tokens[k + 1])) for k in range(i + 1, len(tokens), 2)]
-    return _Range(_NUMBERS[tokens[i]], words.startswith("?"), (*below, *above))
+    return _Range(_NUMBERS[tokens[i]], length, words.startswith("?"), (*below, *above))
 
 
 _NUMBERS: dict[str, type] = {"int": Integral, "float": Real}

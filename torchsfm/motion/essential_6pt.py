@@ -89,11 +89,8 @@ def essential_6pt(
     batch = shape[:-1]
     with torch.no_grad():
         rays = [d.detach().double().expand(*shape, 3).reshape(-1, shape[-1], 3) for d in (d1, d2)]
-        w = (
-            torch.ones_like(rays[0][..., 0])
-            if weights is None
-            else weights.detach().double().expand(shape).reshape(-1, shape[-1])
-        )
+        w = rays[0].new_ones(shape) if weights is None else weights.detach().double().expand(shape)
+        w = w.reshape(-1, shape[-1])
         starts = range(0, max(len(w), 1), _CHUNK)
         parts = [_solve(*(v[i : i + _CHUNK] for v in (*rays, w))) for i in starts]
         E, valid = (torch.cat(p) for p in zip(*parts, strict=True))

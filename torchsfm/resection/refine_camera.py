@@ -1,6 +1,6 @@
 """The pose, and on request the inside, of cameras whose reprojection error is smallest."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -84,11 +84,14 @@ def refine_camera(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or `free` names what the camera does not have.
     """
+    check_options(
+        pose=(pose, Pose), camera=(camera, Camera), free=(free, Sequence), loss=(loss, Callable | None),
+        max_iterations=(max_iterations, "int >= 0"),
+    )  # fmt: skip
     names = (*INSIDE, *camera.distortion.parameter_names)
     unknown = [name for name in free if name not in names]
     if unknown or len(set(free)) != len(free):
         raise ValueError(f"free: wanted distinct names out of {names}, got {tuple(free)}")
-    check_options(pose=(pose, Pose), camera=(camera, Camera), max_iterations=(max_iterations, "int >= 0"))
     kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
     batch = check_tensors(x=(x, "n 2"), X=(X, "n 3"), R=(pose.R, "3 3"), K=(camera.K, "3 3"), weights=(weights, kind))
     x, X = x.expand(*batch, *x.shape[-2:]), X.expand(*batch, *X.shape[-2:])

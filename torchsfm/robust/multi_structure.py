@@ -94,6 +94,7 @@ def find_structures(
     """
     if not data:
         raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
+    check_options(estimator=(estimator, Estimator))
     m = estimator.sample_size
     smallest = m + 4 if smallest is None else smallest
     check_options(

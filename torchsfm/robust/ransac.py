@@ -115,11 +115,13 @@ def ransac(
     if not data:
         raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
     check_options(
+        estimator=(estimator, Estimator),
         confidence=(confidence, "0 < float < 1"),
         min_iterations=(min_iterations, "int >= 0"),
         max_iterations=(max_iterations, "int >= 1"),
         score=(score, Score | None),
         covariance=(covariance, bool),
+        scoring_dtype=(scoring_dtype, torch.dtype | None),
     )
     if covariance and not has_manifold(estimator):
         raise ValueError(f"covariance: {type(estimator).__name__} does not say how its models move (`retract`)")

@@ -145,7 +145,10 @@ def soft_ransac(
     if not data:
         raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
     check_options(
-        temperature=(temperature, "float > 0"), sharpness=(sharpness, "float > 0"), hypotheses=(hypotheses, "int >= 1")
+        estimator=(estimator, Estimator),
+        temperature=(temperature, "float > 0"),
+        sharpness=(sharpness, "float > 0"),
+        hypotheses=(hypotheses, "int >= 1"),
     )
     known = {f"data[{i}]": (d, f"n d{i}") for i, d in enumerate(data)}
     limit = threshold if isinstance(threshold, Tensor) else None
