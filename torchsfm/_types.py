@@ -174,9 +174,9 @@ def check_options(**arguments: tuple[object, Any]) -> None:
     """
     for name, (value, wanted) in arguments.items():
         if isinstance(wanted, str):
-            good, words = _range(wanted).holds(value), wanted
+            good, words = _range(wanted).holds(value), wanted.replace("?", "None or ")
         elif isinstance(wanted, tuple):
-            good, words = isinstance(value, str | int) and value in wanted, f"one of {', '.join(map(repr, wanted))}"
+            good, words = any(type(value) is type(w) and value == w for w in wanted), f"one of {', '.join(map(repr, wanted))}"
         else:
             good, words = isinstance(value, wanted), getattr(wanted, "__name__", str(wanted))
         if not good:

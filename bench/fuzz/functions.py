@@ -16,6 +16,7 @@ from torchsfm.geometry import Camera, Pose, Radial, camera_from_krt, project_poi
 from torchsfm.images import Features
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
 from torchsfm.optim import Block, Cauchy, Term
+from torchsfm.reconstruction import ReconstructionError
 from torchsfm.simulation import random_bundle_problem
 
 
@@ -33,6 +34,10 @@ class Function:
     """Whether the principal point is 0."""
     batched: bool = True
     """Whether the function takes batches of problems."""
+    together: tuple[tuple[str, ...], ...] = ()
+    """Optional arguments that come together or not at all."""
+    raises: tuple[type[Exception], ...] = ()
+    """What it says of data that are good for nothing."""
     half: bool = True
     """Whether single precision is tried too."""
 
@@ -143,6 +148,7 @@ FUNCTIONS: dict[str, Function] = {
     "motion.homography_4pt": Function(planar=True),
     "motion.homography_dlt": Function(planar=True),
     "motion.relative_6pt_focal": Function(centred=True),
+    "motion.trifocal_7pt": Function(together=(("l", "ends", "line_weights"),)),
     "optim.attach_implicit": Function(
         {"equations": lambda _: lambda y, a: y * y - a, "y": lambda s: s.rand(2).sqrt(), "inputs": lambda s: (s.rand(2),)}
     ),
@@ -162,7 +168,9 @@ FUNCTIONS: dict[str, Function] = {
         },
         {"n": 60},
         batched=False,
+        raises=(ReconstructionError,),
     ),
+    "resection.camera_dlt": Function(together=(("l", "L", "line_weights"),)),
     "resection.camera_gp3p": Function({"p": lambda s: s.points(3) - 5 * s.rays(0, 3) - 0.1, "d": lambda s: s.rays(0, 3)}),
     "resection.camera_p4pf": Function(centred=True),
     "resection.camera_p35pf": Function(centred=True),

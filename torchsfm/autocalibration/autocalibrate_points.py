@@ -132,13 +132,14 @@ def autocalibrate_points(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or nothing is assumed.
     """
-    options = [assume] if isinstance(assume, Assumption) else assume
+    options = (assume,) if isinstance(assume, Assumption) else assume
     check_options(
         assume=(options, Sequence), noise=(noise, "?float > 0"), max_deviation=(max_deviation, "float > 0"),
         distortion_sigma=(distortion_sigma, "float >= 0"),
     )  # fmt: skip
     if not options or not all(isinstance(option, Assumption) for option in options):
         raise ValueError(f"assume: wanted one Assumption or several, got {assume!r}")
+    options = tuple(options)
     given = image_size if isinstance(image_size, Tensor) else None
     if given is None:
         check_options(image_size=(image_size, "2 float > 0"))
@@ -180,7 +181,18 @@ def autocalibrate_points(
             observed = rest.pop(0) if x is not None else None
             expected = rest.pop(0) if K is not None else None
             pieces.append(
-                _solve(part[0], part[1], observed, part[2], part[3], expected, tuple(options), noise, max_deviation, distortion_sigma)
+                _solve(
+                    part[0],
+                    part[1],
+                    observed,
+                    part[2],
+                    part[3],
+                    expected,
+                    tuple(options),
+                    noise,
+                    max_deviation,
+                    distortion_sigma,
+                )
             )
         whole = pieces[0] if len(pieces) == 1 else _concatenate(pieces)
 

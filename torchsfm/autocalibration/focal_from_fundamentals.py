@@ -14,7 +14,7 @@ from jaxtyping import Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.linalg import cross
+from torchsfm.linalg import cross, usable
 from torchsfm.optim import attach_optimum
 
 WIDE = (0.15, 12.0)
@@ -95,7 +95,7 @@ def focal_from_fundamentals(
     F64, a, b = (t.double().expand(*batch, p, *t.shape[-k:]) for t, k in ((F, 2), (c1, 1), (c2, 1)))
     w = torch.ones(*batch, p, dtype=torch.float64, device=F.device) if weights is None else weights.double().expand(*batch, p)
     wanted = ~(w <= 0)
-    finite = torch.isfinite(F64).all(-1).all(-1) & torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1) & torch.isfinite(w)
+    finite = usable(F64).all(-1).all(-1) & usable(a).all(-1) & usable(b).all(-1) & usable(w)
     finite = finite & (F64.abs() > 0).any(-1).any(-1)
     used = wanted & finite
     w = torch.where(used, w, 0.0)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.linalg import unit_scale
 
 
 def to_homogeneous(x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d+1"]:
@@ -82,15 +83,18 @@ def normalizing_similarity(
     w = present.to(x.dtype) if weights is None else torch.where(present & torch.isfinite(weights), weights.clamp(min=0), 0.0)
     w = w[..., None]
     x = torch.where(w > 0, x, 0.0)
-    total = w.sum(-2)
-    safe_total = torch.where(total > 0, total, 1.0)
-    centroid = (w * x).sum(-2) / safe_total
-    variance = (w * (x - centroid[..., None, :]).square()).sum((-2, -1))[..., None] / safe_total
+    # A power of two, so that squares of very large and very small coordinates exist.
+    unit = unit_scale(x)
+    x, unit = x * unit, unit[..., 0]
+    total = w.sum(-2, keepdim=True)
+    w = w / torch.where(total > 0, total, 1.0)
+    centroid = (w * x).sum(-2)
+    variance = (w * (x - centroid[..., None, :]).square()).sum((-2, -1))[..., None]
     # Below this, what is left of the spread is rounding error of the centroid.
     floor = 16 * torch.finfo(x.dtype).eps * centroid.detach().abs().amax(-1, keepdim=True)
     spread = variance.detach() > floor.square()
-    scale = torch.where(spread, math.sqrt(dimension) / torch.where(spread, variance, 1.0).sqrt(), 1.0)
-    linear = scale[..., None] * torch.eye(dimension, dtype=x.dtype, device=x.device)
+    scale = torch.where(spread, math.sqrt(dimension) / torch.where(spread, variance, 1.0).sqrt(), 1 / unit)
+    linear = (scale * unit)[..., None] * torch.eye(dimension, dtype=x.dtype, device=x.device)
     top = torch.cat([linear, -(scale * centroid)[..., None]], -1)
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., -1] = 1

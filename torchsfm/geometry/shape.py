@@ -145,8 +145,9 @@ def balanced_frame(
             a = torch.nn.functional.normalize(h @ frame.mT, dim=-1)
             values, vectors, _ = eigh((a * w[..., None]).mT @ a)
             step = (vectors * values.clamp(min=1e-3).rsqrt()[..., None, :]) @ vectors.mT
-            frame = torch.where(done[..., None, None], frame, step @ frame)
-            frame = frame / torch.linalg.matrix_norm(frame)[..., None, None]
+            moved = step @ frame
+            moved = moved / torch.linalg.matrix_norm(moved)[..., None, None]
+            frame = torch.where(done[..., None, None], frame, moved)
             done = done | ((values - 1).abs().amax(-1) < tolerance)
             if bool(done.all()):
                 break

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry import normalizing_similarity
-from torchsfm.linalg import cross, eigh
+from torchsfm.linalg import cross, eigh, unit_scale, usable
 
 FLAT = 1e-6
 """Singular value, over the largest, at which a second null vector is taken for exact (a plane, in float32 coordinates)."""
@@ -114,7 +114,7 @@ def camera_dlt(
 def _clean(batch: torch.Size, a: Tensor, b: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """In float64 and full batch shape, absent rows zero; and which elements have rows with weight that are not finite."""
     a, b, w = (t.double().expand(*batch, *t.shape[-2:]) for t in (a, b, w.expand(*w.shape[:-2], a.shape[-2], w.shape[-1])))
-    good = torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1) & torch.isfinite(w).all(-1) & (w >= 0).all(-1)
+    good = usable(a).all(-1) & usable(b).all(-1) & usable(w).all(-1) & (w >= 0).all(-1)
     wanted = (w != 0).any(-1)
     use = (wanted & good)[..., None]
     return torch.where(use, a, 0.0), torch.where(use, b, 0.0), torch.where(use, w, 0.0), (wanted & ~good).any(-1)
@@ -174,6 +174,7 @@ def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
 
 def _scaled(P: Tensor, X: Tensor, w: Tensor) -> Tensor:
     """|third row of the left part| = 1 (|P| = 1 for affine cameras), and most points at positive third coordinates."""
+    P = P * unit_scale(P)
     third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
     whole = torch.linalg.vector_norm(P, dim=(-2, -1), keepdim=True)
     size = torch.where(third.detach() > 1e-12 * whole.detach(), third, torch.where(whole.detach() > 0, whole, 1.0))
