@@ -134,6 +134,7 @@ FUNCTIONS: dict[str, Function] = {
     "images.track_sequence": Function({"images": lambda s: list(s.rand(3, 1, 40, 40))}, batched=False),
     "linalg.nearest_rank": Function({"rank": 2}),
     "linalg.nullspace_rows": Function(batched=False),
+    "linalg.usable": Function({"x": lambda s: s.randn(5)}),
     "linalg.null_vector": Function({"A": lambda s: s.randn(6, 4)}),
     "linalg.orthonormal_nullspace": Function({"A": lambda s: s.randn(3, 5)}),
     "motion.estimate_essential": Function(RAYS, {"n": 30}),
