@@ -5,6 +5,7 @@ from torchsfm.bundle.bundle_adjust_model import AdjustedModel, BundleModel, bund
 from torchsfm.bundle.bundle_adjust_projective import ProjectiveBundleResult, bundle_adjust_projective
 from torchsfm.bundle.bundle_covariance import BundleCovariance, bundle_covariance
 from torchsfm.bundle.gauge import Gauge
+from torchsfm.bundle.intrinsics_covariance import intrinsics_covariance
 from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior
 from torchsfm.bundle.rig import Rig
 
@@ -24,4 +25,5 @@ __all__ = [
     "bundle_adjust_model",
     "bundle_adjust_projective",
     "bundle_covariance",
+    "intrinsics_covariance",
 ]

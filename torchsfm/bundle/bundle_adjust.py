@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_options
+from torchsfm._types import Status
 from torchsfm.bundle.blocks import Bundle, cheapest_elimination, moved_cameras, moved_poses
 from torchsfm.bundle.gauge import Gauge, restore_gauge
 from torchsfm.bundle.intrinsics import intrinsics_prior
@@ -60,7 +60,7 @@ def bundle_adjust(
     fixed_sensors: Bool[Tensor, "k"] | None = None,
     weights: Float[Tensor, "m"] | None = None,
     loss: Loss | None = None,
-    intrinsics_sigma: Mapping[str, float] | None = None,
+    intrinsics_sigma: Mapping[str, float | Tensor] | None = None,
     intrinsics_mean: Camera | None = None,
     priors: Sequence[Prior] = (),
     gauge: Gauge = "free",
@@ -100,7 +100,8 @@ def bundle_adjust(
         weights: Weight of each observation's squared distance; 0 leaves it out.
         loss: Robust loss of the squared distance (see `torchsfm.optim`), squares if not given.
         intrinsics_sigma: Standard deviations of Gaussian priors on free intrinsics, by the names in `free`, as a fraction of
-            the mean for "focal" and absolute otherwise. An observation's distance counts in units of 1 pixel.
+            the mean for "focal" and absolute otherwise, for all cameras or (g,) for each. An observation's distance counts in
+            units of 1 pixel.
         intrinsics_mean: Where the priors are centred; the cameras given if not given.
         priors: What is known of poses and points: `CentrePrior`, `PosePrior`, `PointPrior`.
         gauge: "free"; or "first", which moves the adjusted world so that the first pose is what it was and the pose farthest
@@ -123,10 +124,9 @@ def bundle_adjust(
         poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras,
         fixed_intrinsics, fixed_sensors, weights, loss, priors,
     )  # fmt: skip
-    check_options(gauge=(gauge, ("free", "first")), intrinsics_sigma=(intrinsics_sigma, Mapping | None))
-    held = priors or any(isinstance(mask, Tensor) and bool(mask.any()) for mask in (fixed_poses, fixed_points))
-    if gauge == "first" and held:
-        raise ValueError("gauge: wanted 'free' where something is fixed or known beforehand, got 'first'")
+    held = priors or any(mask is not None and bool(mask.any()) for mask in (fixed_poses, fixed_points))
+    if gauge not in ("free", "first") or (gauge == "first" and held):
+        raise ValueError(f"gauge: wanted 'free', or 'first' where nothing is fixed or known beforehand, got {gauge!r}")
     blocks, terms = bundle.problem()
     if intrinsics_sigma:
         terms.append(intrinsics_prior(intrinsics_sigma, cameras if intrinsics_mean is None else intrinsics_mean))

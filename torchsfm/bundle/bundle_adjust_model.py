@@ -64,7 +64,7 @@ class BundleOptions(TypedDict, total=False):
     fixed_sensors: Tensor | None
     weights: Tensor | None
     loss: Loss | None
-    intrinsics_sigma: Mapping[str, float] | None
+    intrinsics_sigma: Mapping[str, float | Tensor] | None
     intrinsics_mean: Camera | None
     priors: Sequence[Prior]
     gauge: Gauge

@@ -92,14 +92,15 @@ class Switched:
         return x + step.index_add(-1, index, switched)
 
 
-def intrinsics_prior(sigma: Mapping[str, float], mean: Camera) -> Term:
-    """Gaussian priors on intrinsics by the names users know; "focal" is relative."""
+def intrinsics_prior(sigma: Mapping[str, float | Tensor], mean: Camera) -> Term:
+    """Gaussian priors on intrinsics by the names users know, one width for all cameras or one for each; "focal" is relative."""
     rows, model = camera_rows(mean), type(mean.distortion)
     columns, scales = [], []
     for name, value in sigma.items():
         for column in free_columns((name,), model):
             columns.append(column)
-            scales.append(rows[:, column].abs() * value if name == "focal" else torch.full_like(rows[:, column], value))
+            unit = rows[:, column].abs() if name == "focal" else torch.ones_like(rows[:, column])
+            scales.append(unit * value)
     picked = torch.tensor(columns, device=rows.device)
     return Term(
         lambda camera, mean, scale: (camera[:, picked] - mean) / scale,

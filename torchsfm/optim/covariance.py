@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import check_options
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.loss import loss_slope
 from torchsfm.optim.schur import Elimination
@@ -51,7 +50,6 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
     Returns:
         The covariances, float64.
     """
-    check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple), eliminate=(eliminate, (None, *blocks)))
     with torch.no_grad():
         double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
         x = {name: b.x for name, b in double.items()}
@@ -86,6 +84,35 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
         found[name], determined[name], columns[name] = covariance, known, place
     unknowns = layout.size - inverse.nullity + int(inverse.determined.sum()) * layout.point_size
     return SparseCovariance(found, determined, inverse.kept, columns, inverse.nullity, rows - unknowns, squares)
+
+
+def marginal_covariance(
+    blocks: Mapping[str, Block], terms: Sequence[Term], name: str, *, eliminate: str | None = None
+) -> Float[Tensor, "n k k"]:
+    """The covariance of each variable of one block alone, which costs no more than a step.
+
+    The block must not be the one eliminated, and nothing in it may be part of the gauge. Zero where a variable is fixed, or
+    held in a coordinate; residuals in units of their standard deviation, as in `sparse_covariance`.
+    """
+    with torch.no_grad():
+        double = {key: replace(b, x=b.x.detach().double().mT.contiguous().mT) for key, b in blocks.items()}
+        x = {key: b.x for key, b in double.items()}
+        counted = [to_double(t) for t in terms]
+        counted = [t.select(usable(t, x).nonzero()[:, 0]) for t in counted]
+        layout = lay_out(double, counted, eliminate)
+        width, free = double[name].tangent, layout.free[name]
+        out = double[name].x.new_zeros((double[name].x.shape[0], width, width))
+        if not free.numel() or not width:
+            return out
+        columns = layout.first[name] + torch.arange(free.numel() * width, device=free.device)
+        information = Elimination(double, layout, "dense").linearize(x).information(columns)
+        held = information.diagonal() <= 0
+        information.diagonal()[held] = 1.0
+        joint = torch.cholesky_inverse(torch.linalg.cholesky_ex(information)[0])
+        joint.diagonal()[held] = 0.0
+        places = torch.arange(free.numel() * width, device=free.device).view(-1, width)
+        out[free] = joint[places[:, :, None], places[:, None]]
+    return out
 
 
 def to_double(term: Term) -> Term:

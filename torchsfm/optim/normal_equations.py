@@ -106,6 +106,27 @@ class NormalEquations:
         kept = torch.where(ok, (vectors * inverse) @ vectors.mT, torch.inf)
         return Inverse(self, L, kept, int(null.sum()), determined & ok)
 
+    def information(self, columns: Tensor) -> Tensor:
+        """What the problem says of some retained variables: the system left when all other variables are eliminated.
+
+        A free gauge among the others is held by a damping too weak to count.
+        """
+        size, q = self.layout.size, self.layout.point_size
+        S = self.squares.dense()
+        if q and self.coupling is not None:
+            assert not isinstance(self.coupling, RowCoupling), "asked for without conjugate gradients"
+            pivots = diagonal(self.V, q)
+            self.coupling.reduce(S, factor(self.V, NULL * floor(pivots), q), torch.zeros_like(pivots))
+        S = S[:size, :size]
+        S = S.tril() + S.tril(-1).mT
+        others = torch.ones(size, dtype=torch.bool, device=S.device)
+        others[columns] = False
+        A = S[others][:, others]
+        A.diagonal().add_(NULL * floor(self.diagonal[others]))
+        half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(A)[0], S[others][:, columns], upper=False)
+        left: Tensor = S[columns][:, columns] - half.mT @ half
+        return left
+
     def point_gradient(self) -> Tensor:
         """`h`, (q, points)."""
         q = self.layout.point_size

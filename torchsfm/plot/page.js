@@ -359,7 +359,7 @@ function showTip(x, y) {
     const c = model.images[hovered];
     const name = document.createElement("b");
     name.textContent = c.name;
-    tip.append(name, `\n${c.points.toLocaleString("en")} points, mean error ${px(c.mean)}\nfocal length ${c.focal.toFixed(1)} px`);
+    tip.append(name, `\n${c.points.toLocaleString("en")} points, mean error ${px(c.mean)}\nfocal length ${c.focal.toFixed(1)} ${c.focalDeviation ? `± ${c.focalDeviation} ` : ""}px`, ...(c.doubts ?? []).map(text => `\n${text}`));
     if (c.photo) { const image = new Image(); image.src = c.photo; tip.append(image); }
   } else if (pointed >= 0) {
     const views = Array.from(model.views.subarray(model.first[pointed], model.first[pointed + 1])), names = views.slice(0, 8).map(i => model.images[i].name);

@@ -16,8 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.images import MAX_PIXELS, read_image, save_image
 from torchsfm.plot.framing import frame
+from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Report
@@ -109,6 +111,7 @@ def _model(
     sound = [getattr(model.poses, name).flatten(1).isfinite().all(-1) for name in ("R", "t")]
     K_sound = model.cameras.K.flatten(1).isfinite().all(-1)[model.camera_index]
     model = replace(model, registered=model.registered & sound[0] & sound[1] & K_sound)
+    found = report.calibrations[number] if report is not None and number < len(report.calibrations) else None
     framing = frame(model)
     residuals, errors = model.residuals().nan_to_num(), model.point_errors().nan_to_num()
     tracks = model.track_lengths()
@@ -124,7 +127,7 @@ def _model(
     counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
     by_view = np.split(model.view.sort(stable=True).indices.numpy(), np.cumsum(counts)[:-1])
     entries = [
-        _image(model, i, framing.R, own := torch.from_numpy(by_view[i]), residuals[own], photos.get(name))
+        _image(model, i, framing.R, own := torch.from_numpy(by_view[i]), residuals[own], photos.get(name), found)
         | (_standing(name, report) if bool(model.registered[i]) else {"status": _status(name, number, report)})
         for i, name in enumerate(model.names)
     ]
@@ -140,6 +143,8 @@ def _model(
         track = model.num_observations / max(model.num_points, 1)
         summary.append(f"{model.num_observations:,} observations, mean track {track:.1f}")
         summary.append(f"residuals: mean {float(residuals.mean()):.3g}, median {_quantile(residuals, 0.5):.3g} px")
+    if found is not None and found.status != Status.OK:
+        summary.append(f"the last adjustment did not converge in {found.iterations} steps")
     return {
         "label": f"{number + 1} of {count}: {model.num_registered} images",
         "summary": "\n".join(summary),
@@ -200,7 +205,9 @@ def _standing(name: str, report: Report | None) -> dict[str, Any]:
     return {"standing": "\n".join(lines), "doubtful": bool(image.doubt)}
 
 
-def _image(model: Reconstruction, i: int, R: Tensor, own: Tensor, residuals: Tensor, photo: str | None) -> dict[str, Any]:
+def _image(
+    model: Reconstruction, i: int, R: Tensor, own: Tensor, residuals: Tensor, photo: str | None, found: Calibration | None
+) -> dict[str, Any]:
     """One row of the table, and the camera if there is one; `own` are the image's observations."""
     entry: dict[str, Any] = {
         "name": model.names[i],
@@ -226,6 +233,11 @@ def _image(model: Reconstruction, i: int, R: Tensor, own: Tensor, residuals: Ten
     entry["corners"] = [_numbers(row) for row in rays]
     entry["depth"] = float(f"{_quantile(depth[depth > 0], 0.5) or 1.0:.6g}")
     entry["focal"] = float(f"{float(camera.K[0, 0]):.6g}")
+    if found is not None:
+        index = int(model.camera_index[i])
+        sigma = float(found.deviation[index, 0])
+        entry["focalDeviation"] = float(f"{sigma:.3g}") if math.isfinite(sigma) else 0
+        entry["doubts"] = found.camera_doubts(index)
     if photo is not None:
         entry["photo"] = photo
     return entry

@@ -1,6 +1,8 @@
 """Bundle adjustment of a growing model, of all of it or of the neighbourhood of new images."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -8,43 +10,44 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
-from torchsfm.geometry import Camera
 from torchsfm.optim import Cauchy
-from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.calibration import (
+    CameraPrior,
+    Free,
+    as_expected,
+    cameras_free,
+    choose_free,
+    folded_cameras,
+    measure_noise,
+)
+from torchsfm.reconstruction.mapping import Adjustment, Mapping
 
 NEIGHBOURS = 8
 """Images that move along with new ones in a local adjustment."""
 
-PRINCIPAL_POINT_SIGMA = 0.01
-"""How far principal points lie from the middle of the image, as a fraction of its longer side."""
-RADIAL_SIGMA = 0.3
-TANGENTIAL_SIGMA = 0.01
-"""How large the distortion parameters of lenses are."""
+LOSS = Cauchy(1.0)
+"""The loss of reprojection errors in pixels."""
 
 
 def adjust(
     mapping: Mapping,
     *,
-    free: tuple[str, ...],
-    expected: Camera | None = None,
-    focal_sigma: float = 0.5,
+    free: Free | None = None,
+    prior: CameraPrior | None = None,
     moving: Bool[Tensor, "v"] | None = None,
     max_iterations: int = 30,
     tolerance: float = 1e-5,
-    loss_scale: float = 1.0,
 ) -> Mapping:
     """Minimise the robust reprojection error.
 
     Args:
         mapping: The model so far.
-        free: Intrinsic parameters to adjust, by the names `bundle_adjust` knows. Held in a local adjustment.
-        expected: What to expect of the cameras before any image point was seen: free parameters have Gaussian priors around
-            it, wide enough to matter only where the images say little.
-        focal_sigma: Standard deviation of the expected focal length, as a fraction.
+        free: Numbers of the cameras to adjust; none when None. Held in a local adjustment.
+        prior: What to expect of the cameras before any image point was seen: wide enough to matter only where the images say
+            little. Needed where something is free.
         moving: Images whose poses move; the points they see move with them, everything else is held. All images when None.
         max_iterations: Limit on the steps of the optimiser.
         tolerance: Relative decrease of the cost at which it stops.
-        loss_scale: Scale of the Cauchy loss in pixels.
     """
     node = mapping.observations()
     view, point = mapping.graph.view[node], mapping.point[node]
@@ -54,8 +57,7 @@ def adjust(
         touched[point[moving[view]]] = True
         keep = touched[point]
         node, view, point = node[keep], view[keep], point[keep]
-        fixed_poses, fixed_points, free = ~moving, ~touched, ()
-    sigma = _prior_sigma(mapping, free, focal_sigma) if free and expected is not None else None
+        fixed_poses, fixed_points, free = ~moving, ~touched, None
     result = bundle_adjust(
         mapping.poses,
         mapping.cameras,
@@ -64,35 +66,47 @@ def adjust(
         view,
         point,
         camera_index=mapping.camera_index,
-        free=free,
         fixed_poses=fixed_poses,
         fixed_points=fixed_points,
-        loss=Cauchy(loss_scale),
-        intrinsics_sigma=sigma,
-        intrinsics_mean=expected,
+        loss=LOSS,
         max_iterations=max_iterations,
         tolerance=tolerance,
+        **_about_cameras(mapping, free, prior),
     )
     if result.status == Status.INTERRUPTED:
         # There is more to do than this: let the interrupt through.
         raise KeyboardInterrupt
-    return replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X)
+    adjustment = mapping.adjustment if moving is not None else Adjustment(result.status, result.iterations, free or {})
+    return replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X, adjustment=adjustment)
 
 
-def _prior_sigma(mapping: Mapping, free: tuple[str, ...], focal_sigma: float) -> dict[str, float]:
-    """Standard deviations of the priors in the unit of the observations' noise, which the cost takes to be one pixel."""
-    node = mapping.observations()
-    x, _ = mapping.project(mapping.point[node], mapping.graph.view[node])
-    # The median of a Rayleigh distribution is 1.18 sigma.
-    noise = max(float((x - mapping.graph.x[node]).norm(dim=-1).median()) / 1.18, 0.05)
-    side = float(mapping.graph.image_size[mapping.registered].max())
-    sigma = {
-        "focal": focal_sigma,
-        "principal_point": PRINCIPAL_POINT_SIGMA * side,
-        "p1": TANGENTIAL_SIGMA,
-        "p2": TANGENTIAL_SIGMA,
-    }
-    return {name: sigma.get(name, RADIAL_SIGMA) / noise for name in free}
+def adjust_all(mapping: Mapping, names: Sequence[str], prior: CameraPrior, *, lone: bool = False, **limits: Any) -> Mapping:
+    """Adjust everything, and of the cameras what the images determine; the rest is held where it was expected.
+
+    A lens that comes out folded over was none: it is held as expected, too.
+
+    Args:
+        mapping: The model so far.
+        names: Numbers of the cameras that may be estimated.
+        prior: What is expected of the cameras.
+        lone: Whether cameras that took a single photograph count as those of many; see `choose_free`.
+        **limits: When to stop; see `adjust`.
+    """
+    free = choose_free(mapping, names, prior, loss=LOSS, lone=lone)
+    adjusted = adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
+    folded = folded_cameras(adjusted)
+    if not bool(folded.any()):
+        return adjusted
+    free |= {name: free[name] & ~folded for name in mapping.cameras.distortion.parameter_names if name in free}
+    return adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
+
+
+def _about_cameras(mapping: Mapping, free: Free | None, prior: CameraPrior | None) -> dict[str, Any]:
+    """What is free in the cameras and expected of it, in the words of `bundle_adjust`."""
+    if not free or prior is None:
+        return {"free": ()}
+    noise = measure_noise(mapping, LOSS)
+    return cameras_free(free) | {"intrinsics_sigma": prior.in_units_of(noise, free), "intrinsics_mean": prior.mean}
 
 
 def neighbourhood(mapping: Mapping, new: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:

@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import Camera
-from torchsfm.reconstruction.adjust import adjust, neighbourhood
+from torchsfm.reconstruction.adjust import adjust, adjust_all, neighbourhood
+from torchsfm.reconstruction.calibration import CameraPrior, images_of_cameras, lone_cameras_plausible
 from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.register import MIN_VISIBLE, register_images, visibility_scores
@@ -27,8 +28,8 @@ SMALL = 20
 """Models of up to this many images are adjusted as a whole every time."""
 UNKNOWN_FOCAL = 0.4
 """Focal lengths more uncertain than this fraction are searched for when the first image of a camera is registered."""
-MIN_IMAGES_PRINCIPAL_POINT = 4
-"""Fewer images leave the principal point where it was expected."""
+LAST_ITERATIONS, LAST_TOLERANCE = 300, 1e-7
+"""The last adjustment goes to the minimum, to a small part of the standard deviations; there it is given up."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class MappingOptions:
 
     Attributes:
         free: Intrinsic parameters to estimate.
-        expected: The cameras before any image point was seen; see `adjust`.
+        expected: The cameras before any image point was seen; see `CameraPrior`.
         focal_sigma: How uncertain the expected focal lengths are, as a fraction.
         reprojection: Largest reprojection error of an observation.
         registration: Largest reprojection error of an inlier when an image is registered.
@@ -53,17 +54,17 @@ class MappingOptions:
     min_angle: float = 0.026
     generator: torch.Generator | None = None
 
-    def free_for(self, images: int, *, final: bool = False) -> tuple[str, ...]:
-        """The parameters that a model of so many images determines; the principal point last, when all images are in."""
-        if images < 3:
-            return ()
-        late = set() if final and images >= MIN_IMAGES_PRINCIPAL_POINT else {"principal_point"}
-        return tuple(name for name in self.free if name not in late)
-
-    def priors(self, model: Mapping) -> dict[str, Any]:
+    def prior(self, model: Mapping) -> CameraPrior:
         """What to expect of the cameras, as `adjust` takes it."""
-        used = torch.unique(model.camera_index[model.registered])
-        return {"expected": self.expected, "focal_sigma": float(self.focal_sigma[used].max())}
+        return CameraPrior.of(model, self.expected, self.focal_sigma)
+
+    def adjust(self, model: Mapping, *, last: bool = False, lone: bool = False, **limits: Any) -> Mapping:
+        """Adjust all of a model, with those numbers of its cameras free that its images determine.
+
+        The principal point, which other errors pass for most easily, waits for the `last` adjustments, when all images are in.
+        """
+        names = [name for name in self.free if last or name != "principal_point"]
+        return adjust_all(model, names, self.prior(model), lone=lone, **limits)
 
 
 def grow_model(
@@ -87,7 +88,7 @@ def grow_model(
     starts = starting_pairs(mapping, unknown_focal, threshold=options.reprojection, generator=options.generator)
     for start in starts[:MAX_STARTS]:
         model = place_start(empty, start, threshold=options.reprojection)
-        model = adjust(model, free=(), tolerance=1e-4)
+        model = adjust(model, tolerance=1e-4)
         model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
         if len(model.X) < MIN_POINTS:
             continue
@@ -146,11 +147,11 @@ def extend_model(
         registered = int(model.registered.sum())
         progress(registered, v)
         if registered <= SMALL or registered >= GLOBAL_GROWTH * adjusted_at:
-            model = adjust(model, free=options.free_for(registered), **options.priors(model), max_iterations=8, tolerance=1e-3)
+            model = options.adjust(model, max_iterations=8, tolerance=1e-3)
             adjusted_at = registered
             failed = {}
         else:
-            model = adjust(model, free=(), moving=neighbourhood(model, new), max_iterations=8, tolerance=1e-3)
+            model = adjust(model, moving=neighbourhood(model, new), max_iterations=8, tolerance=1e-3)
         model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
         model = _drop_unsupported(model, failed)
     return _refine(model, options), failed
@@ -183,9 +184,8 @@ def _drop_unsupported(model: Mapping, failed: dict[int, str]) -> Mapping:
 
 def _refine(model: Mapping, options: MappingOptions) -> Mapping:
     """Alternate global bundle adjustment with filtering, merging, completion and re-triangulation until little changes."""
-    free = options.free_for(int(model.registered.sum()), final=True)
     for _ in range(4):
-        model = adjust(model, free=free, **options.priors(model), max_iterations=20, tolerance=3e-4)
+        model = options.adjust(model, last=True, max_iterations=20, tolerance=3e-4)
         before = model.point
         model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
         model = merge_points(model, threshold=options.reprojection)
@@ -194,5 +194,8 @@ def _refine(model: Mapping, options: MappingOptions) -> Mapping:
         changed = int(((before >= 0) != (model.point >= 0)).sum())
         if changed <= 0.01 * max(1, int((before >= 0).sum())):
             break
-    model = adjust(model, free=free, **options.priors(model), max_iterations=40, tolerance=1e-5)
+    model = options.adjust(model, last=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
+    if "principal_point" in options.free and bool((images_of_cameras(model) == 1).any()):
+        freed = options.adjust(model, last=True, lone=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
+        model = freed if lone_cameras_plausible(freed, options.prior(freed)) else model
     return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)

@@ -1,14 +1,31 @@
 """The state of a model while it grows: which images have poses, which image points have 3D points."""
 
+from collections.abc import Mapping as Dict
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.geometry import Camera, Pose
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.view_graph import ViewGraph
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """How an adjustment of a whole model went.
+
+    Attributes:
+        status: `OK` where it reached a minimum, `NOT_CONVERGED` where its limit of steps came first.
+        iterations: Steps tried.
+        free: By the names that `bundle_adjust` knows, the cameras in which a number was estimated.
+    """
+
+    status: Status
+    iterations: int
+    free: Dict[str, Bool[Tensor, "g"]]
 
 
 @dataclass(frozen=True)
@@ -24,6 +41,7 @@ class Mapping:
         registered: Images with a pose.
         X: Points.
         point: 3D point of each image point, or -1. Only image points of registered images have one.
+        adjustment: How the last adjustment of the whole went, if there was one.
     """
 
     graph: ViewGraph
@@ -34,6 +52,7 @@ class Mapping:
     registered: Bool[Tensor, "v"]
     X: Float[Tensor, "p 3"]
     point: Int[Tensor, "n"]
+    adjustment: Adjustment | None = None
 
     @classmethod
     def start(cls, graph: ViewGraph, track: Int[Tensor, "n"], cameras: Camera, camera_index: Int[Tensor, "v"]) -> "Mapping":

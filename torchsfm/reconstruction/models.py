@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm._types import check_one_problem, check_options
 from torchsfm.geometry import DISTORTION_MODELS
+from torchsfm.reconstruction.adjust import LOSS
+from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
@@ -85,7 +86,7 @@ def build_models(
         free += ("principal_point",) if free_principal_point and K is None else ()
         options = MappingOptions(free=free, expected=cameras, focal_sigma=focal_uncertainty(source), generator=generator)
         empty = Mapping.start(graph, track, cameras, camera_index)
-        found: list[tuple[Reconstruction, Standing]] = []
+        found: list[tuple[Reconstruction, Standing, Calibration]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
         taken = empty.registered
@@ -117,7 +118,7 @@ def build_models(
                 reasons |= failed
             taken = taken | model.registered
             standing = examine(model, free=free, focal_sigma=known.focal_sigma, threshold=options.reprojection)
-            found.append((model.reconstruction(), standing))
+            found.append((model.reconstruction(), standing, calibration_of(model, known.prior(model), loss=LOSS)))
             if stages.folder is not None:
                 _save_model(found[-1][0], stages.folder, len(found) - 1)
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
@@ -125,10 +126,10 @@ def build_models(
     unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[camera_index]
     verdict = graph.verdicts(cameras.K[camera_index], unknown_focal)
     pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
-    images = _image_reports(graph, found, reasons, failures, order)
-    return SfmResult(
-        tuple(model for model, _ in found), Report(images, pairs, dict(stages.seconds), source, tuple(autocalibration))
-    )
+    images = _image_reports(graph, [(model, standing) for model, standing, _ in found], reasons, failures, order)
+    calibrations = tuple(calibration for _, _, calibration in found)
+    course = Report(images, pairs, dict(stages.seconds), source, tuple(autocalibration), calibrations=calibrations)
+    return SfmResult(tuple(model for model, _, _ in found), course)
 
 
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
@@ -210,11 +211,9 @@ def reconstruct_tracks(
     Raises:
         ValueError: Shapes disagree or an index is out of range.
     """
-    check_one_problem(x=(x, "n 2"), view=(view, "n: int"), track=(track, "n: int"), image_size=(image_size, "v 2: int"))
-    check_one_problem(color=(color, "?n 3"))
-    check_one_problem(K=(K, "?3 3"))
-    check_options(names=(names, Sequence | None), focal=(focal, "?float > 0"), seed=(seed, "int"))
     v = len(image_size)
+    if not len(x) == len(view) == len(track):
+        raise ValueError(f"x, view, track: wanted one length, got {len(x)}, {len(view)}, {len(track)}")
     if len(view) and not (int(view.min()) >= 0 and int(view.max()) < v):
         raise ValueError(f"view: wanted indices from 0 to {v - 1}, got {int(view.min())} to {int(view.max())}")
     if len(track) and int(track.min()) < 0:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.view_graph import Verdict
 
@@ -77,6 +78,7 @@ class Report:
             matrices" or "default".
         autocalibration: For each set of images that was autocalibrated what was assumed, found and determined, or why not.
         skipped: Files and folders in the input folder that may hold photographs but were passed over, each with the reason.
+        calibrations: For each model how its cameras were found, and how well they are known.
     """
 
     images: tuple[ImageReport, ...]
@@ -85,6 +87,7 @@ class Report:
     focal_source: tuple[str, ...] = ()
     autocalibration: tuple[str, ...] = ()
     skipped: tuple[tuple[str, str], ...] = ()
+    calibrations: tuple[Calibration, ...] = ()
 
     def summary(self) -> str:
         """A few lines for people."""
@@ -96,6 +99,9 @@ class Report:
         if self.focal_source:
             lines.append("focal length first from: " + ", ".join(sorted(set(self.focal_source))))
         lines += [f"autocalibration: {text}" for text in self.autocalibration]
+        for number, calibration in enumerate(self.calibrations):
+            prefix = f"model {number}: " if len(self.calibrations) > 1 else ""
+            lines += [prefix + text for text in calibration.doubts()]
         for image in self.images:
             if image.model is None:
                 lines.append(printable(f"not registered: {image.name} ({image.reason})"))

@@ -3,11 +3,14 @@
 import html
 import math
 import re
+from itertools import zip_longest
 from typing import Any
 
 import torch
 
+from torchsfm._types import Status
 from torchsfm.geometry import DISTORTION_MODELS
+from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, SfmResult, printable
 from torchsfm.reconstruction.view_graph import Verdict
@@ -59,7 +62,7 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         for (i, j), matches, num_F, num_H, verdict in zip(*(column.tolist() for column in columns), strict=True)
     ]
     return {
-        "models": [_model_record(model) for model in result.models],
+        "models": [_model_record(model, found) for model, found in zip_longest(result.models, report.calibrations)],
         "images": images,
         "pairs": pairs,
         "seconds": {stage: round(value, 3) for stage, value in report.seconds.items()},
@@ -132,8 +135,8 @@ def _readable(image: ImageReport) -> bool:
     return image.model is not None or image.features > 0 or image.reason.startswith("only 0 features")
 
 
-def _model_record(model: Reconstruction) -> Record:
-    cameras = []
+def _model_record(model: Reconstruction, found: Calibration | None) -> Record:
+    cameras: list[Record] = []
     kind = next(name for name, cls in DISTORTION_MODELS.items() if type(model.cameras.distortion) is cls)
     for index in torch.unique(model.camera_index[model.registered]).tolist():
         camera = model.cameras[index]
@@ -148,6 +151,20 @@ def _model_record(model: Reconstruction) -> Record:
                 "distortion": dict(zip(names, camera.distortion.parameters().tolist(), strict=True)),
             }
         )
+        if found is not None:
+            sigma, estimated = found.deviation[index].tolist(), found.estimated[index].tolist()
+            cameras[-1] |= {
+                "deviation": {name: s if math.isfinite(s) else None for name, s in zip(found.names, sigma, strict=True)},
+                "held": [name for name, free in zip(found.names, estimated, strict=True) if not free],
+                "doubts": found.camera_doubts(index),
+            }
+    adjustment = {}
+    if found is not None:
+        adjustment = {
+            "converged": found.status == Status.OK,
+            "adjustment_steps": found.iterations,
+            "noise_px": found.noise,
+        }
     return {
         "images": model.num_registered,
         "points": model.num_points,
@@ -155,6 +172,7 @@ def _model_record(model: Reconstruction) -> Record:
         "mean_track_length": model.num_observations / max(model.num_points, 1),
         "mean_error_px": float(model.residuals().mean()) if model.num_observations else 0.0,
         "cameras": cameras,
+        **adjustment,
     }
 
 
@@ -172,12 +190,11 @@ def _models_text(record: Record) -> list[str]:
             ["mean track length", f"{model['mean_track_length']:.2f}"],
             ["mean reprojection error", f"{model['mean_error_px']:.3f} px"],
         ]
+        if "converged" in model:
+            ending = "converged" if model["converged"] else "**did not converge**"
+            rows.append(["last adjustment", f"{ending} in {model['adjustment_steps']} steps"])
         for camera in model["cameras"]:
-            fx, fy = camera["focal"]
-            cx, cy = camera["principal_point"]
-            text = f"f = {fx:.2f}" + ("" if abs(fx - fy) <= 1e-9 * fx else f", {fy:.2f}") + f", c = ({cx:.2f}, {cy:.2f}) px"
-            text += "".join(f", {name} = {value:.5f}" for name, value in camera["distortion"].items())
-            rows.append([f"camera of {camera['images']} images ({camera['model']})", text])
+            rows.append([f"camera of {camera['images']} images ({camera['model']})", _camera_text(camera)])
         lines += [*_table(["", ""], rows), ""]
     return lines
 
@@ -189,6 +206,23 @@ MARKUP = re.compile(r"[\\`*~|$\[\]]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9])")
 def _escape(value: object) -> str:
     """Text that a markdown page shows as it is, in one line."""
     return MARKUP.sub(r"\\\g<0>", html.escape(printable(str(value)), quote=False))
+
+
+def _camera_text(camera: Record) -> str:
+    """The numbers of a camera, each with its standard deviation where it was estimated."""
+    fx, fy = camera["focal"]
+    cx, cy = camera["principal_point"]
+    spread = camera.get("deviation", {})
+
+    def number(name: str, value: float, digits: int) -> str:
+        sigma = spread.get(name, 0.0)
+        known = "" if sigma == 0 else " +- ?" if sigma is None else f" +- {sigma:.{digits}f}"
+        return f"{value:.{digits}f}{known}" + (" (held)" if known and name in camera.get("held", []) else "")
+
+    text = f"f = {number('focal', fx, 2)}" + ("" if abs(fx - fy) <= 1e-9 * fx else f", {fy:.2f}")
+    text += f", c = ({number('cx', cx, 2)}, {number('cy', cy, 2)}) px"
+    text += "".join(f", {name} = {number(name, value, 5)}" for name, value in camera["distortion"].items())
+    return "; ".join([text, *camera.get("doubts", [])])
 
 
 def _table(header: list[str], rows: list[list[Any]]) -> list[str]:
