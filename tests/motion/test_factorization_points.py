@@ -191,21 +191,6 @@ def test_data_that_do_not_determine_the_answer_say_so() -> None:
         assert torch.isfinite(tensor).all()
 
 
-@pytest.mark.parametrize(("views", "n"), [(4, 20), (8, 60)])
-def test_noise_on_a_plane_is_not_taken_for_depth(views: int, n: int) -> None:
-    x, _ = scene(20, views, n, noise=1.0)
-    assert (factorize_points(x).status != Status.DEGENERATE).all()
-    # Homographies of one image, as a plane makes them.
-    kind = {"generator": seeded(1), "dtype": torch.float64}
-    H = torch.eye(3, dtype=torch.float64) + 0.2 * torch.randn(20, views, 3, 3, **kind)
-    H[..., 2, :2] *= 1e-3
-    H[..., :2, 2] *= 1e3
-    flat = from_homogeneous(to_homogeneous(x[:, :1]) @ H.mT)[0]
-    for noise in (0.1, 1.0):
-        found = factorize_points(flat + noise * torch.randn(flat.shape, **kind))
-        assert (found.status != Status.OK).all()
-
-
 def test_two_halves_that_share_nothing_are_degenerate() -> None:
     x, visible = scene(1, 8, 60)
     visible[:, :4, 30:] = False

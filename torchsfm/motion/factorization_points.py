@@ -43,9 +43,8 @@ _NUMBERS = 1 << 25
 """Numbers in the largest array of the problems solved at a time."""
 _SCALES = (8.0, 6.0, 4.0, 3.0)
 """Where the robust loss lets go, in medians of the sines, one after the other."""
-_CHANCE = 3.0
-"""Noise makes points of a plane stand off it, which seems to tell cameras: information of up to so many times the variance of
-all observations together may be nothing else."""
+_UNDETERMINED = 0.3
+"""Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined."""
 
 
 @dataclass(frozen=True)
@@ -208,9 +207,8 @@ def _undetermined(rays: Rays, fit: Fit, view: Tensor, unknowns: Tensor) -> Tenso
     first = (15 + 12 * (~view).sum(-1)).clamp(max=values.shape[-1] - 1)
     least = values.gather(-1, first[:, None])[:, 0]
     redundancy = (2 * (rays.w > 0).sum((-2, -1)) - unknowns).clamp(min=1)
-    number = rays.w.sum((-2, -1))
-    variance = fit.cost * number / redundancy
-    return (least <= 1e-11 * values[:, -1]) | (_CHANCE * variance * number > least) | ~torch.isfinite(least)
+    variance = fit.cost * rays.w.sum((-2, -1)) / redundancy
+    return (least <= 1e-11 * values[:, -1]) | (variance > _UNDETERMINED**2 * least) | ~torch.isfinite(least)
 
 
 def _signs(depths: Tensor) -> tuple[Tensor, Tensor]:
