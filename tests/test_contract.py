@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from chance import seeded
+from chance import assert_share, seeded
 from scenes import Scene, make_scene
 
 import torchsfm
@@ -55,7 +55,7 @@ def test_estimators_keep_the_protocol(kind: type, generator: torch.Generator) ->
 def test_recall(kind: type, dtype: torch.dtype, tolerance: float, recall: float, generator: torch.Generator) -> None:
     scene = sample_scene(kind, (1000,), generator)
     estimator, data = cast(scene, dtype)
-    assert (nearest(scene, estimator.minimal(*data)) < tolerance).double().mean() >= recall
+    assert_share(nearest(scene, estimator.minimal(*data)) < tolerance, at_least=recall)
 
 
 def test_solutions_meet_their_sample(kind: type, generator: torch.Generator) -> None:

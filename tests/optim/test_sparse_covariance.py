@@ -131,7 +131,8 @@ class TestDerivative:
             plus, minus = (function(*(v + s * step if k == n else v for n, v in enumerate(inputs))) for s in (1, -1))
             numeric = (plus - minus) / 2
             assert numeric.abs() > 0
-            torch.testing.assert_close((gradient * step).sum(), numeric, rtol=rtol, atol=1e-10)
+            # By chance the terms may nearly cancel: their sum is measured by what it would be with signs drawn by lot.
+            assert ((gradient * step).sum() - numeric).abs() < rtol * (gradient * step).norm()
 
     @pytest.mark.parametrize("loss", [None, SoftL1(1.0)])
     def test_data_weights_and_fixed_variables(self, generator: torch.Generator, loss: object) -> None:
