@@ -31,20 +31,23 @@ def problems(count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Te
     return x1, x2, torch.stack((alike, nothing), -1)[:, :200], y1, y2
 
 
-def main() -> None:
+def main(seed: int = 0) -> None:
     """Train for a few seconds, then compare on image pairs never seen."""
-    generator = torch.Generator().manual_seed(0)
-    torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(2, 16), nn.ReLU(), nn.Linear(16, 1)).double()
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    network = nn.Sequential(nn.Linear(2, 16), nn.Tanh(), nn.Linear(16, 1)).double()
     optimizer = torch.optim.Adam(network.parameters(), lr=0.1)
-    for step in range(151):
+    for step in range(91):
         x1, x2, clues, y1, y2 = problems(32, generator)
-        F = fundamental_8pt(x1, x2, network(clues)[..., 0].softmax(-1))
+        logits = network(clues)[..., 0]
+        # Where F is hardly determined its derivative is huge and says little. No pair is to outvote the others.
+        logits.register_hook(lambda g: g / g.norm(dim=-1, keepdim=True).clamp_min(1e-12))
+        F = fundamental_8pt(x1, x2, logits.softmax(-1))
         loss = torch.log1p(sampson_distance(F, y1, y2)).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        if step % 30 == 0:
+        if step % 15 == 0:
             print(f"step {step:3d}: loss {loss.item():.3f}")
     x1, x2, clues, y1, y2 = problems(200, generator)
     with torch.no_grad():

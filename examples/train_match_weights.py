@@ -56,6 +56,7 @@ def main(steps: int = 60, seed: int = 0) -> None:
     for step in range(steps + 1):
         x1, x2, clues, y1, y2 = problems(32, generator)
         logits = network(clues)[..., 0]
+        # At first hardly one sample in two thousand is free of wrong matches: few hypotheses would find nothing to learn from.
         hypotheses = soft_ransac(
             FundamentalEstimator(), x1, x2, threshold=3 / SCALE, logits=logits, hypotheses=64, generator=generator
         )

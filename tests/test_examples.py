@@ -2,11 +2,13 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from chance import stream_seed
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -45,6 +47,15 @@ def test_differentiable_geometry(tmp_path: Path) -> None:
     text = run("differentiable_geometry.py", tmp_path)
     assert number(r"all matches alike: median error ([\d.]+) px", text) > 20
     assert number(r"weights of the network: median error ([\d.]+) px", text) < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "best"), [("differentiable_geometry", 3), ("train_match_weights", 1)])
+def test_learning_succeeds_whatever_the_seed(name: str, best: float, capsys: pytest.CaptureFixture[str]) -> None:
+    main = runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"]
+    for seed in range(50):
+        main(seed=stream_seed(seed))
+        assert float(re.findall(r"median error ([\d.]+)", capsys.readouterr().out)[-1]) < best, seed
 
 
 def test_train_match_weights(tmp_path: Path) -> None:
