@@ -1,6 +1,8 @@
 """Shape checks and maps over tensors."""
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -8,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchsfm._types import Solutions, broadcast_shapes, check_tensors, tensor_map
+from torchsfm._types import Solutions, broadcast_shapes, check_options, check_tensors, tensor_map
 
 shapes = st.lists(st.lists(st.sampled_from([0, 1, 1, 2, 3]), max_size=3).map(tuple), max_size=4)
 
@@ -26,7 +28,7 @@ def test_shapes_broadcast_as_torch_has_it(many: list[tuple[int, ...]]) -> None:
 
 def test_the_batch_shape_is_returned() -> None:
     x, y = torch.zeros(4, 1, 7, 2), torch.zeros(3, 5, 2)
-    assert check_tensors(x=(x, "n>=5 2"), y=(y, "k 2"), z=(None, "3")) == (4, 3)
+    assert check_tensors(x=(x, "n>=5 2"), y=(y, "k 2"), z=(None, "?3")) == (4, 3)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +39,9 @@ def test_the_batch_shape_is_returned() -> None:
         ({"x": (torch.zeros(6, 2), "n>=7 2")}, "n >= 7"),
         ({"x": (torch.zeros(6, 2), "n 2"), "y": (torch.zeros(5, 2), "n 2")}, "y: wanted n = 6 as x has"),
         ({"x": (torch.zeros(6, 2), "n 2"), "y": (torch.zeros(6, 2).double(), "n 2")}, "y: wanted dtype torch.float32"),
-        ({"x": (torch.zeros(6, 2).long(), "n 2")}, "x: wanted a floating point tensor"),
+        ({"x": (torch.zeros(6, 2).long(), "n 2")}, "x: wanted a float32 or float64 tensor"),
+        ({"x": (torch.zeros(6, 2).half(), "n 2")}, "x: wanted a float32 or float64 tensor, got torch.float16"),
+        ({"x": (None, "n 2")}, r"x: wanted a torch.Tensor of shape \(\*batch, n, 2\), got NoneType"),
         ({"m": (torch.zeros(6), "n: bool")}, "m: wanted a bool tensor"),
         ({"i": (torch.zeros(6, dtype=torch.bool), "n: int")}, "i: wanted a int tensor"),
         ({"x": (torch.zeros(6, device="meta"), "n"), "y": (torch.zeros(6), "n")}, "y: wanted device meta"),
@@ -48,6 +52,27 @@ def test_the_batch_shape_is_returned() -> None:
 def test_wrong_arguments_are_named(arguments: dict[str, tuple[Tensor, str]], message: str, unchecked: None) -> None:
     with pytest.raises(ValueError, match=message):
         check_tensors(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "good", "bad"),
+    [
+        ("int >= 1", (1, 10**6), (0, -1, 1.5, 1.0, True, "1", None, math.inf)),
+        ("float > 0", (1e-300, 5, 1e300), (0, 0.0, -1.0, math.inf, math.nan, None, False, "2", [1.0], torch.ones(()))),
+        ("0 <= float <= 1", (0, 0.5, 1), (-1e-9, 1.1, math.nan)),
+        ("0 < float < 1", (1e-9, 0.5), (0, 1, math.nan)),
+        ("?int >= 0", (None, 0, 3), (-1, 0.5, "none")),
+        (("a", "b"), ("a", "b"), ("c", None, ["a"], torch.ones(3))),
+        (bool, (True, False), (0, 1, None, "yes")),
+        (str | None, ("", None), (1, b"")),
+    ],
+)
+def test_options_are_what_is_wanted(wanted: Any, good: tuple[Any, ...], bad: tuple[Any, ...]) -> None:
+    for value in good:
+        check_options(option=(value, wanted))
+    for value in bad:
+        with pytest.raises(ValueError, match="option: wanted"):
+            check_options(option=(value, wanted))
 
 
 @dataclass(frozen=True)

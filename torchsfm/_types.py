@@ -1,9 +1,13 @@
 """The words every room shares: solutions, statuses, shape checks, and a map over tensors in a dataclass."""
 
+import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import IntEnum
-from typing import Any, Generic, TypeVar
+from functools import cache
+from numbers import Integral, Real
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import torch
 from jaxtyping import Bool
@@ -82,8 +86,9 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
     """Check shapes, dtypes and devices of named arguments, and return their common batch shape.
 
     Each argument comes as `(tensor, spec)`. The spec describes the trailing dimensions: a number is exact, a name is the same
-    number wherever it stands, `name>=k` sets a minimum. A spec may end in `: bool` or `: int`; otherwise the tensor must be
-    floating point, and all floating-point tensors must share one dtype. `None` stands for an option not given.
+    number wherever it stands, `name>=k` sets a minimum. A spec may end in `: bool` or `: int`; otherwise the tensor must be of
+    single or double precision, and all such tensors must share one dtype: half precision holds neither pixels nor products of
+    them. A spec that begins with `?` is that of an option, which may be None.
 
     Args:
         **arguments: The tensors under the names the caller knows them by.
@@ -94,16 +99,38 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
     Raises:
         ValueError: An argument has the wrong type, number of dimensions, size, dtype or device, or batches do not broadcast.
     """
+    batches = _batches(arguments)
+    try:
+        return broadcast_shapes(*batches.values())
+    except ValueError:
+        listing = ", ".join(f"{name} {tuple(shape)}" for name, shape in batches.items())
+        raise ValueError(f"batch dimensions do not broadcast: {listing}") from None
+
+
+def check_one_problem(**arguments: tuple[Tensor | None, str]) -> None:
+    """Check arguments as `check_tensors` does, which may not have batch dimensions.
+
+    Raises:
+        ValueError: An argument has the wrong type, number of dimensions, size, dtype or device.
+    """
+    for name, shape in _batches(arguments).items():
+        if shape:
+            wanted = _words(arguments[name][1].removeprefix("?").partition(":")[0]).replace("*batch, ", "")
+            raise ValueError(f"{name}: wanted shape {wanted} of one problem, got batch dimensions {tuple(shape)}")
+
+
+def _batches(arguments: dict[str, tuple[Tensor | None, str]]) -> dict[str, torch.Size]:
+    """The batch dimensions of checked arguments."""
     sizes: dict[str, tuple[int, str]] = {}
     batches: dict[str, torch.Size] = {}
     first: tuple[str, Tensor] | None = None
     floating: tuple[str, Tensor] | None = None
     for name, (tensor, spec) in arguments.items():
-        if tensor is None:
+        if tensor is None and spec.startswith("?"):
             continue
-        shape_spec, _, kind = (part.strip() for part in spec.partition(":"))
+        shape_spec, _, kind = (part.strip() for part in spec.removeprefix("?").partition(":"))
         if not isinstance(tensor, Tensor):
-            raise ValueError(f"{name}: wanted a torch.Tensor of shape (*batch, {shape_spec}), got {type(tensor).__name__}")
+            raise ValueError(f"{name}: wanted a torch.Tensor of shape {_words(shape_spec)}, got {type(tensor).__name__}")
         _check_kind(name, tensor, kind)
         if kind == "":
             if floating is not None and tensor.dtype != floating[1].dtype:
@@ -113,28 +140,90 @@ def check_tensors(**arguments: tuple[Tensor | None, str]) -> torch.Size:
             raise ValueError(f"{name}: wanted device {first[1].device} as {first[0]} has, got {tensor.device}")
         first = first or (name, tensor)
         tokens = shape_spec.split()
-        wanted = f"(*batch, {', '.join(tokens)})" if tokens else "(*batch)"
         if tensor.ndim < len(tokens):
-            raise ValueError(f"{name}: wanted shape {wanted}, got {tuple(tensor.shape)}")
+            raise ValueError(f"{name}: wanted shape {_words(shape_spec)}, got {tuple(tensor.shape)}")
         trailing = tensor.shape[tensor.ndim - len(tokens) :]
         for token, size in zip(tokens, trailing, strict=True):
             label, _, minimum = token.partition(">=")
             if token.isdigit():
                 if size != int(token):
-                    raise ValueError(f"{name}: wanted shape {wanted}, got {tuple(tensor.shape)}")
+                    raise ValueError(f"{name}: wanted shape {_words(shape_spec)}, got {tuple(tensor.shape)}")
                 continue
             if minimum and size < int(minimum):
-                raise ValueError(f"{name}: wanted {label} >= {minimum} in shape {wanted}, got {tuple(tensor.shape)}")
+                raise ValueError(f"{name}: wanted {label} >= {minimum} in {_words(shape_spec)}, got {tuple(tensor.shape)}")
             if label in sizes and sizes[label][0] != size:
                 known, owner = sizes[label]
                 raise ValueError(f"{name}: wanted {label} = {known} as {owner} has, got shape {tuple(tensor.shape)}")
             sizes.setdefault(label, (size, name))
         batches[name] = tensor.shape[: tensor.ndim - len(tokens)]
-    try:
-        return broadcast_shapes(*batches.values())
-    except ValueError:
-        listing = ", ".join(f"{name} {tuple(shape)}" for name, shape in batches.items())
-        raise ValueError(f"batch dimensions do not broadcast: {listing}") from None
+    return batches
+
+
+def check_options(**arguments: tuple[object, Any]) -> None:
+    """Check options, which are no tensors: numbers, choices and objects.
+
+    Each argument comes as `(value, wanted)`: a tuple of the values there are, a type, or the range of a finite number as in
+    `int >= 1`, `float > 0`, `0 <= float <= 1`. `2 float > 0` stands for a tuple of two; a range that begins with `?` is that
+    of an option which may be None.
+
+    Args:
+        **arguments: The options under the names the caller knows them by.
+
+    Raises:
+        ValueError: An option is not what is wanted.
+    """
+    for name, (value, wanted) in arguments.items():
+        if isinstance(wanted, str):
+            good, words = _range(wanted).holds(value), wanted.replace("?", "None or ")
+        elif isinstance(wanted, tuple):
+            good, words = any(type(value) is type(w) and value == w for w in wanted), f"one of {', '.join(map(repr, wanted))}"
+        else:
+            good, words = isinstance(value, wanted), getattr(wanted, "__name__", str(wanted))
+        if not good:
+            raise ValueError(f"{name}: wanted {words}, got {value!r}")
+
+
+class _Range(NamedTuple):
+    """What numbers an option may be."""
+
+    kind: type
+    length: int
+    optional: bool
+    bounds: tuple[tuple[Callable[[Any, float], bool], float], ...]
+
+    def holds(self, value: object) -> bool:
+        """Whether a value is one of them, or a tuple of as many as are wanted."""
+        if value is None:
+            return self.optional
+        if not self.length:
+            return self._holds(value)
+        return isinstance(value, Sequence) and len(value) == self.length and all(self._holds(v) for v in value)
+
+    def _holds(self, value: Any) -> bool:
+        if not isinstance(value, self.kind) or isinstance(value, bool) or not math.isfinite(cast(float, value)):
+            return False
+        return all(compare(value, bound) for compare, bound in self.bounds)
+
+
+@cache
+def _range(words: str) -> _Range:
+    """The range of `0 < float <= 1`, say; a `?` in front allows None."""
+    tokens = words.removeprefix("?").split()
+    length = int(tokens.pop(0)) if tokens[1:] and tokens[1] in _NUMBERS else 0
+    i = next(i for i, token in enumerate(tokens) if token in _NUMBERS)
+    below = [(_COMPARE[tokens[k + 1].replace("<", ">")], float(tokens[k])) for k in range(0, i, 2)]
+    above = [(_COMPARE[tokens[k]], float(tokens[k + 1])) for k in range(i + 1, len(tokens), 2)]
+    return _Range(_NUMBERS[tokens[i]], length, words.startswith("?"), (*below, *above))
+
+
+_NUMBERS: dict[str, type] = {"int": Integral, "float": Real}
+_COMPARE: dict[str, Callable[[Any, Any], bool]] = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
+}  # fmt: skip
+
+
+def _words(shape_spec: str) -> str:
+    return f"({', '.join(['*batch', *shape_spec.split()])})"
 
 
 def _check_kind(name: str, tensor: Tensor, kind: str) -> None:
@@ -143,6 +232,6 @@ def _check_kind(name: str, tensor: Tensor, kind: str) -> None:
     elif kind == "int":
         good = not (tensor.dtype.is_floating_point or tensor.dtype.is_complex or tensor.dtype == torch.bool)
     else:
-        good, kind = tensor.dtype.is_floating_point, "floating point"
+        good, kind = tensor.dtype in (torch.float32, torch.float64), "float32 or float64"
     if not good:
         raise ValueError(f"{name}: wanted a {kind} tensor, got {tensor.dtype}")

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import torchsfm
 from bench.fuzz.campaign import Target, Trial, main
 from bench.fuzz.functions import EXCEPTIONS, FUNCTIONS, Function, public_functions
 from bench.fuzz.poison import poison
@@ -23,26 +24,35 @@ from torchsfm._types import tensor_map
 BATCH = (4,)
 OPTIONAL = 0.3
 """How often an optional argument is given."""
+JUDGED_BY_TORCH = {"device", "dtype", "generator", "shape", "progress"}
+"""Options of which torch itself, or Python, says what is wrong with them."""
+ELSEWHERE = "on another device"
 
 Arguments = dict[str, Any]
 Call = Callable[..., Any]
 
 
 def load() -> list[Target]:
-    """A target for the values and one for the arguments of each function."""
+    """A target for the values of each function, and one for the arguments of those that the package itself exports.
+
+    The others are for the library's own inner loops, which know what they pass.
+    """
     targets = []
     for name, call in public_functions().items():
         if name in EXCEPTIONS:
             continue
         how = FUNCTIONS.get(name, Function())
         targets.append(Target(f"{name} values", lambda seed, call=call, how=how: _bad_values(call, how, seed)))
-        targets.append(Target(f"{name} arguments", lambda seed, call=call, how=how: _wrong_arguments(call, how, seed)))
+        if name.partition(".")[2] in torchsfm.__all__:
+            targets.append(Target(f"{name} arguments", lambda seed, call=call, how=how: _wrong_arguments(call, how, seed)))
     return targets
 
 
 def good_arguments(call: Call, how: Function, scene: Scene) -> Arguments:
     """Arguments by name that make sense together; optional ones now and then."""
     arguments: Arguments = {}
+    left_out = {name for group in how.together if torch.rand((), generator=scene.generator) > OPTIONAL for name in group}
+    together = {name for group in how.together for name in group} - left_out
     for name, parameter in inspect.signature(call).parameters.items():
         if name in how.given:
             value = how.given[name]
@@ -50,7 +60,8 @@ def good_arguments(call: Call, how: Function, scene: Scene) -> Arguments:
             continue
         kinds = [a for a in (parameter.annotation, *get_args(parameter.annotation)) if hasattr(a, "dim_str")]
         needed = parameter.default is parameter.empty and parameter.kind is not parameter.VAR_KEYWORD
-        if not needed and (not kinds or torch.rand((), generator=scene.generator) > OPTIONAL):
+        given = name in together or torch.rand((), generator=scene.generator) < OPTIONAL
+        if not needed and (not kinds or name in left_out or not given):
             continue
         dims = [tuple(d for d in kind.dim_str.split() if not d.startswith(("*", "_"))) for kind in kinds]
         found = (scene.value(name, d) for d in dims)
@@ -119,7 +130,10 @@ def _bad_values(call: Call, how: Function, seed: int) -> Trial:
         while not bool(kept.any()) or bool(kept.all()):
             kept = torch.rand(scene.batch, generator=generator) < 0.5
     bad = _poisoned(arguments, how, kept, generator)
-    result = apply(call, bad)
+    try:
+        result = apply(call, bad)
+    except how.raises:
+        return Trial(1)
     broken = [*not_finite(result), *zero_models(result)]
     if how.batched:
         broken += changed(result, apply(call, arguments), kept)
@@ -131,17 +145,22 @@ def _wrong_arguments(call: Call, how: Function, seed: int) -> Trial:
     batch: tuple[int, ...] = ((), (2,), (0,))[int(torch.randint(3, (), generator=generator))]
     arguments = good_arguments(call, how, _scene(how, generator, batch))
     parameters = inspect.signature(call).parameters
-    names = [n for n, p in parameters.items() if p.kind is not p.VAR_KEYWORD and not callable(arguments.get(n, p.default))]
+    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    names = [n for n, p in parameters.items() if p.kind not in several and n not in JUDGED_BY_TORCH]
+    names = [n for n in names if not callable(arguments.get(n, parameters[n].default))]
     if not names:
         return Trial(0)
     name = names[int(torch.randint(len(names), (), generator=generator))]
     value = arguments.get(name, parameters[name].default)
-    wrong = list(_wrong_values(value, generator))
+    alone = sum(isinstance(a, Tensor) for a in arguments.values()) < 2
+    wrong = [w for w in _wrong_values(value, generator) if not (alone and w[0] == ELSEWHERE)]
     if not wrong:
         return Trial(0)
     what, wrong_value = wrong[int(torch.randint(len(wrong), (), generator=generator))]
     try:
         result = apply(call, arguments | {name: wrong_value})
+    except how.raises:
+        return Trial(1)
     except ValueError as error:
         said = str(error)
         return Trial(1, () if name in said else (f"unnamed: {name} = {what}: {' '.join(said.split())[:160]}",))
@@ -166,8 +185,8 @@ def _wrong_values(value: Any, generator: torch.Generator) -> Iterator[tuple[str,
         yield "a string", "tensor"
         for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.int64, torch.bool, torch.complex128):
             yield str(dtype), value.to(dtype)
-        yield "on another device", value.to("meta")
-        if value.ndim:
+        yield ELSEWHERE, value.to("meta")
+        if value.ndim and value.numel():
             yield "a longer last dimension", torch.cat((value, value[..., :1]), -1)
             yield "a shorter last dimension", value[..., :-1]
             yield "an empty last dimension", value[..., :0]

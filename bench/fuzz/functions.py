@@ -16,6 +16,7 @@ from torchsfm.geometry import Camera, Pose, Radial, camera_from_krt, project_poi
 from torchsfm.images import Features
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
 from torchsfm.optim import Block, Cauchy, Term
+from torchsfm.reconstruction import ReconstructionError
 from torchsfm.simulation import random_bundle_problem
 
 
@@ -33,6 +34,10 @@ class Function:
     """Whether the principal point is 0."""
     batched: bool = True
     """Whether the function takes batches of problems."""
+    together: tuple[tuple[str, ...], ...] = ()
+    """Optional arguments that come together or not at all."""
+    raises: tuple[type[Exception], ...] = ()
+    """What it says of data that are good for nothing."""
     half: bool = True
     """Whether single precision is tried too."""
 
@@ -115,7 +120,7 @@ FUNCTIONS: dict[str, Function] = {
     "geometry.rotation_from_euler": Function({"axes": "xyz"}),
     "geometry.random_rotation": Function({"shape": (2,), "generator": _generator}),
     "images.describe_images": Function({"features": _features, "words": 4, "generator": _generator}, batched=False),
-    "images.detect_corners": Function({"image": lambda s: s.rand(1, 32, 40)}),
+    "images.detect_corners": Function({"image": lambda s: s.rand(1, 32, 40)}, {"h": 32, "w": 40}),
     "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
     "images.match_descriptors": Function({f"descriptors{i}": lambda s: s.rand(9, 16) for i in (1, 2)}, batched=False),
     "images.match_features": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),
@@ -129,6 +134,7 @@ FUNCTIONS: dict[str, Function] = {
     "images.track_sequence": Function({"images": lambda s: list(s.rand(3, 1, 40, 40))}, batched=False),
     "linalg.nearest_rank": Function({"rank": 2}),
     "linalg.nullspace_rows": Function(batched=False),
+    "linalg.usable": Function({"x": lambda s: s.randn(5)}),
     "linalg.null_vector": Function({"A": lambda s: s.randn(6, 4)}),
     "linalg.orthonormal_nullspace": Function({"A": lambda s: s.randn(3, 5)}),
     "motion.estimate_essential": Function(RAYS, {"n": 30}),
@@ -143,6 +149,7 @@ FUNCTIONS: dict[str, Function] = {
     "motion.homography_4pt": Function(planar=True),
     "motion.homography_dlt": Function(planar=True),
     "motion.relative_6pt_focal": Function(centred=True),
+    "motion.trifocal_7pt": Function(together=(("l", "ends", "line_weights"),)),
     "optim.attach_implicit": Function(
         {"equations": lambda _: lambda y, a: y * y - a, "y": lambda s: s.rand(2).sqrt(), "inputs": lambda s: (s.rand(2),)}
     ),
@@ -162,7 +169,9 @@ FUNCTIONS: dict[str, Function] = {
         },
         {"n": 60},
         batched=False,
+        raises=(ReconstructionError,),
     ),
+    "resection.camera_dlt": Function(together=(("l", "L", "line_weights"),)),
     "resection.camera_gp3p": Function({"p": lambda s: s.points(3) - 5 * s.rays(0, 3) - 0.1, "d": lambda s: s.rays(0, 3)}),
     "resection.camera_p4pf": Function(centred=True),
     "resection.camera_p35pf": Function(centred=True),
@@ -201,8 +210,8 @@ EXCEPTIONS: dict[str, str] = {
     "cli.main": "a program; its options and files are tested in tests/test_cli.py",
     **{f"formats.{name}": FILES for name in ("read_bal", "read_colmap", "read_libmv", "read_ply", "read_vgg")},
     **{f"formats.{name}": FILES for name in ("write_bal", "write_colmap", "write_ply")},
-    **{f"images.{name}": FILES for name in ("list_images", "load_detector", "load_matcher", "read_image", "save_image")},
-    "images.parse_exif": FILES,
+    **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},
+    **{f"images.{name}": FILES for name in ("parse_exif", "read_image", "save_image")},
     "linalg.compile_kernels": "a switch",
     "optim.wants_derivative": "a question about tensors, not their values",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",

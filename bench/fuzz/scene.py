@@ -51,11 +51,11 @@ class Scene:
 
     def rand(self, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
         """Uniform numbers."""
-        return low + (high - low) * torch.rand(*self.batch, *shape, generator=self.generator, dtype=F64)
+        return low + (high - low) * torch.rand((*self.batch, *shape), generator=self.generator, dtype=F64)
 
     def randn(self, *shape: int) -> Tensor:
         """Normal numbers."""
-        return torch.randn(*self.batch, *shape, generator=self.generator, dtype=F64)
+        return torch.randn((*self.batch, *shape), generator=self.generator, dtype=F64)
 
     def value(self, name: str, dims: tuple[str, ...]) -> Tensor | None:
         """What a parameter of this name and these trailing dimensions wants; None where the scene does not know."""

@@ -242,5 +242,5 @@ def test_wrong_input(generator, unchecked):
         Assumption(free=("focal", "zoom"))
     with pytest.raises(ValueError, match="distortion_sigma: wanted"):
         autocalibrate_points(scene.P, scene.X, image_size=SIZE, distortion_sigma=-1.0)
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="assume: wanted one Assumption or several"):
         autocalibrate_points(scene.P, scene.X, image_size=SIZE, assume=())

@@ -267,7 +267,7 @@ def test_wrong_shapes(generator: torch.Generator) -> None:
         bundle_adjust_projective(P, X, x, view, point + 1)
     with pytest.raises(ValueError, match="view: wanted numbers from 0 to 5"):
         bundle_adjust_projective(P, X, x, view - 1, point)
-    with pytest.raises(ValueError, match="without batch"):
+    with pytest.raises(ValueError, match="of one problem"):
         bundle_adjust_projective(P[None], X[None], x[None], view[None], point[None])
 
 

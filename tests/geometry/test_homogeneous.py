@@ -131,7 +131,7 @@ def test_transform_points_is_finite_at_infinity(dtype):
 
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_shapes_are_named():
-    with pytest.raises(ValueError, match="H: wanted shape"):
+    with pytest.raises(ValueError, match="H, x: wanted shapes"):
         transform_points(torch.eye(4), torch.zeros(5, 2))
     with pytest.raises(ValueError, match="weights: wanted n = 5"):
         normalizing_similarity(torch.zeros(5, 2), torch.zeros(4))

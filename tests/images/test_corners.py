@@ -139,5 +139,5 @@ def test_errors_name_the_argument() -> None:
         detect_corners(torch.zeros(1, 5, 40))
     with pytest.raises(ValueError, match="response"):
         detect_corners(image, response="moravec")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match="max_corners: wanted int >= 1"):
         detect_corners(image, 0)

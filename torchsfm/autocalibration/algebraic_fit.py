@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int8
 from torch import Tensor
 
-from torchsfm._types import Status
+from torchsfm._types import Status, check_options
 from torchsfm.autocalibration.intrinsics_model import Assumption, intrinsics_from_parameters
 from torchsfm.autocalibration.projective_input import image_scaling
 from torchsfm.optim import levenberg_marquardt
@@ -34,12 +34,13 @@ class IntrinsicsEstimate:
     the best found and not to be relied on."""
 
 
-def check_shared(assume: Assumption) -> None:
-    """Refuse assumptions under which views differ.
+def check_shared(assume: Assumption, image_size: tuple[float, float]) -> None:
+    """Refuse assumptions under which views differ, and images without size.
 
     Raises:
-        ValueError: They do.
+        ValueError: They do, or have none.
     """
+    check_options(assume=(assume, Assumption), image_size=(image_size, "2 float > 0"))
     if assume.varying:
         raise ValueError(f"assume: wanted intrinsics that are the same in all views, got varying {assume.varying}")
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.autocalibration.assumption_fit import FINALISTS, STARTS, AssumptionFit, solve_assumption
 from torchsfm.autocalibration.diagnosis import Motion, diagnose_motion
 from torchsfm.autocalibration.evidence import weigh_assumptions
@@ -132,22 +132,31 @@ def autocalibrate_points(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or nothing is assumed.
     """
-    sizes = torch.tensor([image_size], dtype=P.dtype, device=P.device) if isinstance(image_size, tuple) else image_size
-    options = (assume,) if isinstance(assume, Assumption) else tuple(assume)
-    if not options:
-        raise ValueError("assume: wanted at least one Assumption")
+    options = (assume,) if isinstance(assume, Assumption) else assume
+    check_options(
+        assume=(options, Sequence), noise=(noise, "?float > 0"), max_deviation=(max_deviation, "float > 0"),
+        distortion_sigma=(distortion_sigma, "float >= 0"),
+    )  # fmt: skip
+    if not options or not all(isinstance(option, Assumption) for option in options):
+        raise ValueError(f"assume: wanted one Assumption or several, got {assume!r}")
+    options = tuple(options)
+    given = image_size if isinstance(image_size, Tensor) else None
+    if given is None:
+        check_options(image_size=(image_size, "2 float > 0"))
+    batch = check_tensors(
+        P=(P, "v>=2 3 4"),
+        X=(X, "n>=1 4"),
+        x=(x, "?v n 2"),
+        image_size=(given, "?w 2"),
+        visible=(visible, "?v n : bool"),
+        K=(K, "?k 3 3"),
+    )
+    sizes = P.new_tensor([image_size]) if given is None else given
     v, n = P.shape[-3], X.shape[-2]
     if sizes.shape[-2] not in (1, v):
         raise ValueError(f"image_size: wanted 1 or {v} views, got shape {tuple(sizes.shape)}")
     if K is not None and K.shape[-3] not in (1, v):
         raise ValueError(f"K: wanted 1 or {v} views, got shape {tuple(K.shape)}")
-    batch = check_tensors(
-        P=(P, "v 3 4"), X=(X, "n 4"), x=(x, "v n 2"), image_size=(sizes, "w 2"), visible=(visible, "v n : bool"), K=(K, "k 3 3")
-    )
-    if not distortion_sigma >= 0:
-        raise ValueError(f"distortion_sigma: wanted a number that is not negative, got {distortion_sigma}")
-    if v < 2:
-        raise ValueError(f"P: wanted at least 2 views, got {v}")
 
     count = math.prod(batch)
 
@@ -172,7 +181,18 @@ def autocalibrate_points(
             observed = rest.pop(0) if x is not None else None
             expected = rest.pop(0) if K is not None else None
             pieces.append(
-                _solve(part[0], part[1], observed, part[2], part[3], expected, options, noise, max_deviation, distortion_sigma)
+                _solve(
+                    part[0],
+                    part[1],
+                    observed,
+                    part[2],
+                    part[3],
+                    expected,
+                    tuple(options),
+                    noise,
+                    max_deviation,
+                    distortion_sigma,
+                )
             )
         whole = pieces[0] if len(pieces) == 1 else _concatenate(pieces)
 

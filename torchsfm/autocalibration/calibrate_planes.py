@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry import Camera, Distortion, Pose, Radial
 from torchsfm.linalg import cross, eigvalsh, nearest_rotation, null_vector
 from torchsfm.motion import homography_dlt
@@ -94,7 +94,8 @@ def calibrate_planes(
     Raises:
         ValueError: Shapes, dtypes, devices or names do not fit.
     """
-    batch = check_tensors(x=(x, "v n>=4 2"), X=(X, "n 2"), visible=(visible, "v n : bool"))
+    batch = check_tensors(x=(x, "v n>=4 2"), X=(X, "n 2"), visible=(visible, "?v n : bool"))
+    check_options(image_size=(image_size, "?2 float > 0"), free=(free, Sequence), max_iterations=(max_iterations, "int >= 0"))
     if wrong := set(free) - set(_COLUMNS):
         raise ValueError(f"free: no intrinsic parameter {sorted(wrong)}; there are {', '.join(_COLUMNS)}")
     if "focal" not in free:

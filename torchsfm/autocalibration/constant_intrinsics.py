@@ -142,8 +142,8 @@ def intrinsics_from_modulus(
 def _ready(
     P: Tensor, X: Tensor, image_size: tuple[float, float], visible: Tensor | None, assume: Assumption
 ) -> tuple[torch.Size, _Canonical]:
-    batch = check_tensors(P=(P, "v>=2 3 4"), X=(X, "n 4"), visible=(visible, "v n : bool"))
-    check_shared(assume)
+    batch = check_tensors(P=(P, "v>=2 3 4"), X=(X, "n>=1 4"), visible=(visible, "?v n : bool"))
+    check_shared(assume, image_size)
     v, n = P.shape[-3], X.shape[-2]
     flat_P = P.detach().double().expand(*batch, v, 3, 4).reshape(-1, v, 3, 4)
     flat_X = X.detach().double().expand(*batch, n, 4).reshape(-1, n, 4)

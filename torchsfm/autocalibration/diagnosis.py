@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm._types import check_tensors
 from torchsfm.geometry import rotvec_from_rotation
 from torchsfm.linalg import eigh
 
@@ -86,6 +87,7 @@ def diagnose_motion(
     Returns:
         The measures; 0 where no view takes part.
     """
+    check_tensors(R=(R, "v>=1 3 3"), centre=(centre, "v 3"), present=(present, "v: bool"))
     w = present.to(R.dtype)[..., None]
     number = w.sum(-2).clamp_min(1)
     first = torch.nn.functional.one_hot(present.long().argmax(-1), R.shape[-3]).to(R.dtype)

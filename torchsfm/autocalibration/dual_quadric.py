@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.autocalibration.algebraic_fit import MAX_DEVIATION
 from torchsfm.autocalibration.projective_input import image_scaling
 from torchsfm.linalg import eigh, null_vector, svdvals
@@ -82,7 +82,12 @@ def dual_quadric_linear(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
     """
-    batch = check_tensors(P=(P, "v>=2 3 4"), weights=(weights, "v"))
+    batch = check_tensors(P=(P, "v>=2 3 4"), weights=(weights, "?v"))
+    check_options(
+        image_size=(image_size, "2 float > 0"),
+        expected_focal=(expected_focal, "?float > 0"),
+        iterations=(iterations, "int >= 1"),
+    )
     v = P.shape[-3]
     full = P.detach().double().expand(*batch, v, 3, 4)
     w = full.new_ones(*batch, v) if weights is None else weights.detach().double().expand(*batch, v)
@@ -120,7 +125,7 @@ def dual_quadric_linear(
     rounding = 64 * torch.finfo(P.dtype).eps
     scale = torch.ones_like(w)
     q = A.new_zeros(*batch, 10)
-    for _ in range(max(iterations, 1)):
+    for _ in range(iterations):
         weight = (w.sqrt() / scale)[..., None, None]
         equations = A * weight
         values, _ = svdvals(torch.nn.functional.pad(equations.flatten(-3, -2), (0, 0, 0, 10)))

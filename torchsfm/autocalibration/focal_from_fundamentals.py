@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int8
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
-from torchsfm.linalg import cross
+from torchsfm._types import Status, check_options, check_tensors
+from torchsfm.linalg import cross, usable
 from torchsfm.optim import attach_optimum
 
 WIDE = (0.15, 12.0)
@@ -85,16 +85,17 @@ def focal_from_fundamentals(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the search range is empty.
     """
-    batch = check_tensors(F=(F, "p 3 3"), c1=(c1, "p 2"), c2=(c2, "p 2"), weights=(weights, "p"), image_size=(image_size, "2"))
-    if focal_range is not None and not 0 < focal_range[0] < focal_range[1]:
+    batch = check_tensors(
+        F=(F, "p 3 3"), c1=(c1, "p 2"), c2=(c2, "p 2"), weights=(weights, "?p"), image_size=(image_size, "?2")
+    )
+    check_options(focal_range=(focal_range, "?2 float > 0"), num_candidates=(num_candidates, "int >= 8"))
+    if focal_range is not None and not focal_range[0] < focal_range[1]:
         raise ValueError(f"focal_range: wanted 0 < smallest < largest, got {focal_range}")
-    if num_candidates < 8:
-        raise ValueError(f"num_candidates: wanted at least 8, got {num_candidates}")
     p = F.shape[-3]
     F64, a, b = (t.double().expand(*batch, p, *t.shape[-k:]) for t, k in ((F, 2), (c1, 1), (c2, 1)))
     w = torch.ones(*batch, p, dtype=torch.float64, device=F.device) if weights is None else weights.double().expand(*batch, p)
     wanted = ~(w <= 0)
-    finite = torch.isfinite(F64).all(-1).all(-1) & torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1) & torch.isfinite(w)
+    finite = usable(F64).all(-1).all(-1) & usable(a).all(-1) & usable(b).all(-1) & usable(w)
     finite = finite & (F64.abs() > 0).any(-1).any(-1)
     used = wanted & finite
     w = torch.where(used, w, 0.0)

@@ -48,7 +48,7 @@ def orient_projective(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
     """
-    batch = check_tensors(P=(P, "v 3 4"), X=(X, "n 4"), visible=(visible, "v n : bool"))
+    batch = check_tensors(P=(P, "v 3 4"), X=(X, "n 4"), visible=(visible, "?v n : bool"))
     v, n = P.shape[-3], X.shape[-2]
     P, X = P.expand(*batch, v, 3, 4), X.expand(*batch, n, 4)
     with torch.no_grad():

@@ -1,12 +1,12 @@
 """A bundle as blocks of variables and terms over them, and back."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import check_one_problem, check_options, check_tensors
 from torchsfm.bundle.intrinsics import Switched, camera_from_rows, camera_rows, free_columns, free_switches
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.projection import Projection
@@ -44,25 +44,32 @@ class Bundle:
             ValueError: Something does not fit.
         """
         poses, cameras, rig = self.poses, self.cameras, self.rig
+        check_options(
+            poses=(poses, Pose),
+            cameras=(cameras, Camera),
+            free=(self.free, Sequence),
+            fixed_intrinsics=(self.fixed_intrinsics, Mapping | None),
+            rig=(rig, Rig | None),
+            loss=(self.loss, Callable | None),
+            priors=(self.priors, list | tuple),
+        )
         if len(poses.shape) != 1 or len(cameras.shape) != 1:
             got = f"{tuple(poses.shape)}, {tuple(cameras.shape)}"
             raise ValueError(f"poses, cameras: wanted one batch dimension each, got {got}")
         views = poses.shape[0] if rig is None else rig.frame.shape[0]
-        batch = check_tensors(
+        check_one_problem(
             poses=(poses.R, f"{poses.shape[0]} 3 3"),
             cameras=(cameras.K, "g 3 3"),
             X=(self.X, "n 3"),
             x=(self.x, "m 2"),
             view=(self.view, "m: int"),
             point=(self.point, "m: int"),
-            camera_index=(self.camera_index, f"{views}: int"),
-            fixed_poses=(self.fixed_poses, f"{poses.shape[0]}: bool"),
-            fixed_points=(self.fixed_points, "n: bool"),
-            fixed_cameras=(self.fixed_cameras, "g: bool"),
-            weights=(self.weights, "m"),
+            camera_index=(self.camera_index, f"?{views}: int"),
+            fixed_poses=(self.fixed_poses, f"?{poses.shape[0]}: bool"),
+            fixed_points=(self.fixed_points, "?n: bool"),
+            fixed_cameras=(self.fixed_cameras, "?g: bool"),
+            weights=(self.weights, "?m"),
         )
-        if batch:
-            raise ValueError(f"wanted one problem without batch dimensions, got batch {tuple(batch)}")
         groups = cameras.shape[0]
         index = self.camera_index
         if index is None:
@@ -76,7 +83,7 @@ class Bundle:
             check_tensors(
                 poses=(poses.R, "f 3 3"),
                 cam_from_rig=(rig.cam_from_rig.R, "k 3 3"),
-                fixed_sensors=(self.fixed_sensors, "k: bool"),
+                fixed_sensors=(self.fixed_sensors, "?k: bool"),
             )
             check_index(**{"rig.sensor": (rig.sensor, rig.cam_from_rig.shape[0]), "rig.frame": (rig.frame, poses.shape[0])})
         elif self.fixed_sensors is not None:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status
+from torchsfm._types import Status, check_options
 from torchsfm.bundle.blocks import Bundle, cheapest_elimination, moved_cameras, moved_poses
 from torchsfm.bundle.gauge import Gauge, restore_gauge
 from torchsfm.bundle.intrinsics import intrinsics_prior
@@ -124,9 +124,10 @@ def bundle_adjust(
         poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras,
         fixed_intrinsics, fixed_sensors, weights, loss, priors,
     )  # fmt: skip
-    held = priors or any(mask is not None and bool(mask.any()) for mask in (fixed_poses, fixed_points))
-    if gauge not in ("free", "first") or (gauge == "first" and held):
-        raise ValueError(f"gauge: wanted 'free', or 'first' where nothing is fixed or known beforehand, got {gauge!r}")
+    check_options(gauge=(gauge, ("free", "first")), intrinsics_sigma=(intrinsics_sigma, Mapping | None))
+    held = priors or any(isinstance(mask, Tensor) and bool(mask.any()) for mask in (fixed_poses, fixed_points))
+    if gauge == "first" and held:
+        raise ValueError("gauge: wanted 'free' where something is fixed or known beforehand, got 'first'")
     blocks, terms = bundle.problem()
     if intrinsics_sigma:
         terms.append(intrinsics_prior(intrinsics_sigma, cameras if intrinsics_mean is None else intrinsics_mean))

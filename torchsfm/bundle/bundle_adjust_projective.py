@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_one_problem, check_options
 from torchsfm.bundle.blocks import check_index
 from torchsfm.bundle.projection import NEAREST
 from torchsfm.geometry import normalize_sphere
@@ -83,18 +83,17 @@ def bundle_adjust_projective(
     Raises:
         ValueError: Shapes, dtypes or indices do not fit.
     """
-    batch = check_tensors(
+    check_one_problem(
         P=(P, "v 3 4"),
         X=(X, "n 4"),
         x=(x, "m 2"),
         view=(view, "m: int"),
         point=(point, "m: int"),
-        fixed_cameras=(fixed_cameras, "v: bool"),
-        fixed_points=(fixed_points, "n: bool"),
-        weights=(weights, "m"),
+        fixed_cameras=(fixed_cameras, "?v: bool"),
+        fixed_points=(fixed_points, "?n: bool"),
+        weights=(weights, "?m"),
     )
-    if batch:
-        raise ValueError(f"wanted one problem without batch dimensions, got batch {tuple(batch)}")
+    check_options(loss=(loss, Callable | None), tolerance=(tolerance, "float >= 0"))
     check_index(view=(view, P.shape[0]), point=(point, X.shape[0]))
     with torch.no_grad():
         image, scale = _image_frames(x.double(), view, P.shape[0])

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import check_options
 from torchsfm.bundle.blocks import Bundle
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.rig import Rig
@@ -92,6 +93,7 @@ def bundle_covariance(
         poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras,
         fixed_intrinsics, fixed_sensors, weights, loss, priors,
     )  # fmt: skip
+    check_options(sigma=(sigma, "?float > 0"))
     with torch.no_grad():
         blocks, terms = bundle.problem()
         unit = sparse_covariance(blocks, terms, eliminate="point")

@@ -51,7 +51,7 @@ class CentrePrior:
     block = "pose"
 
     def __post_init__(self) -> None:
-        check_tensors(index=(self.index, "k: int"), centre=(self.centre, "k 3"), covariance=(self.covariance, "k 3 3"))
+        check_tensors(index=(self.index, "k: int"), centre=(self.centre, "k 3"), covariance=(self.covariance, "?k 3 3"))
 
     def term(self) -> Term:
         """The prior as a term of the optimiser."""
@@ -81,7 +81,7 @@ class PosePrior:
     block = "pose"
 
     def __post_init__(self) -> None:
-        check_tensors(index=(self.index, "k: int"), poses=(self.poses.R, "k 3 3"), covariance=(self.covariance, "k 6 6"))
+        check_tensors(index=(self.index, "k: int"), poses=(self.poses.R, "k 3 3"), covariance=(self.covariance, "?k 6 6"))
 
     def term(self) -> Term:
         """The prior as a term of the optimiser."""
@@ -114,7 +114,7 @@ class PointPrior:
     block = "point"
 
     def __post_init__(self) -> None:
-        check_tensors(index=(self.index, "k: int"), X=(self.X, "k 3"), covariance=(self.covariance, "k 3 3"))
+        check_tensors(index=(self.index, "k: int"), X=(self.X, "k 3"), covariance=(self.covariance, "?k 3 3"))
 
     def term(self) -> Term:
         """The prior as a term of the optimiser."""

@@ -57,7 +57,7 @@ def write_ply(
         X, color = points.X, points.color
     else:
         X = points
-        check_tensors(points=(points, "n 3"), color=(color, "n 3"))
+        check_tensors(points=(points, "n 3"), color=(color, "?n 3"))
         if points.ndim != 2:
             raise ValueError(f"points: wanted shape (n, 3), got {tuple(points.shape)}")
     real = "<f8" if X.dtype == torch.float64 else "<f4"

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import broadcast_shapes, check_tensors, tensor_map
+from torchsfm._types import broadcast_shapes, check_options, check_tensors, tensor_map
 from torchsfm.geometry.distortion import Distortion, NoDistortion
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.poses import Index, index_batch
@@ -105,9 +105,11 @@ def intrinsics(
     batch = check_tensors(
         f=(f, ""),
         c=(c, "2"),
-        aspect=(aspect if isinstance(aspect, Tensor) else None, ""),
-        skew=(skew if isinstance(skew, Tensor) else None, ""),
+        aspect=(aspect if isinstance(aspect, Tensor) else None, "?"),
+        skew=(skew if isinstance(skew, Tensor) else None, "?"),
     )
+    numbers = (("aspect", aspect), ("skew", skew))
+    check_options(**{name: (value, "float") for name, value in numbers if not isinstance(value, Tensor)})
     zero = torch.zeros_like(f)
     entries = [f, zero + skew, c[..., 0], zero, f * aspect, c[..., 1], zero, zero, zero + 1]
     return torch.stack([entry.expand(batch) for entry in entries], -1).reshape(*batch, 3, 3)

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import check_options, check_tensors
 from torchsfm.linalg import eigh
 
 
@@ -22,6 +23,8 @@ def line_and_plane_distances(
     Returns:
         Distances from the line and from the plane (in two dimensions, both from the line), in the unit of the points.
     """
+    check_tensors(X=(X, "n d>=2"), present=(present, "n: bool"))
+    check_options(steps=(steps, "int >= 1"))
     X = torch.where(present[..., None], X, 0).double()
     found = []
     for axes in (1, 2) if X.shape[-1] > 2 else (1,):
@@ -56,7 +59,11 @@ def least_number_off(
         present: Which points count.
         tolerance: Of each point, in the unit of the points.
     """
+    batch = check_tensors(X=(X, "n d>=1"), present=(present, "n: bool"), tolerance=(tolerance, "k"))
     n, d = X.shape[-2:]
+    if tolerance.shape[-1] not in (1, n):
+        raise ValueError(f"tolerance: wanted 1 or {n} in the last dimension, got shape {tuple(tolerance.shape)}")
+    X, present = X.expand(*batch, n, d), present.expand(*batch, n)
     number = n // (d + 1)
     place = present.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., : number * (d + 1)]
     corners = X.gather(-2, place[..., None].expand(*place.shape, d)).reshape(*place.shape[:-1], number, d + 1, d)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.linalg import unit_scale
 
 
 def to_homogeneous(x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d+1"]:
@@ -76,21 +77,24 @@ def normalizing_similarity(
         The transformation T, homogeneous, with `T (x, 1) = (x', 1)`. Where the points coincide, only the centroid is moved;
         where none is present, T is the identity.
     """
-    check_tensors(x=(x, "n d"), weights=(weights, "n"))
+    check_tensors(x=(x, "n d>=1"), weights=(weights, "?n"))
     dimension = x.shape[-1]
     present = torch.isfinite(x).all(-1)
     w = present.to(x.dtype) if weights is None else torch.where(present & torch.isfinite(weights), weights.clamp(min=0), 0.0)
     w = w[..., None]
     x = torch.where(w > 0, x, 0.0)
-    total = w.sum(-2)
-    safe_total = torch.where(total > 0, total, 1.0)
-    centroid = (w * x).sum(-2) / safe_total
-    variance = (w * (x - centroid[..., None, :]).square()).sum((-2, -1))[..., None] / safe_total
+    # A power of two, so that squares of very large and very small coordinates exist.
+    unit = unit_scale(x)
+    x, unit = x * unit, unit[..., 0]
+    total = w.sum(-2, keepdim=True)
+    w = w / torch.where(total > 0, total, 1.0)
+    centroid = (w * x).sum(-2)
+    variance = (w * (x - centroid[..., None, :]).square()).sum((-2, -1))[..., None]
     # Below this, what is left of the spread is rounding error of the centroid.
     floor = 16 * torch.finfo(x.dtype).eps * centroid.detach().abs().amax(-1, keepdim=True)
     spread = variance.detach() > floor.square()
-    scale = torch.where(spread, math.sqrt(dimension) / torch.where(spread, variance, 1.0).sqrt(), 1.0)
-    linear = scale[..., None] * torch.eye(dimension, dtype=x.dtype, device=x.device)
+    scale = torch.where(spread, math.sqrt(dimension) / torch.where(spread, variance, 1.0).sqrt(), 1 / unit)
+    linear = (scale * unit)[..., None] * torch.eye(dimension, dtype=x.dtype, device=x.device)
     top = torch.cat([linear, -(scale * centroid)[..., None]], -1)
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., -1] = 1
@@ -108,7 +112,10 @@ def transform_points(H: Float[Tensor, "*#batch h h"], x: Float[Tensor, "*#batch 
         The transformed points, finite always: a point sent to infinity is returned very far away, in its own direction
         (about 1 / machine epsilon), and a point with NaN or inf as the image of the origin.
     """
-    check_tensors(x=(x, "n d"), H=(H, f"{x.shape[-1] + 1} {x.shape[-1] + 1}"))
+    check_tensors(H=(H, "h h"), x=(x, "n d"))
+    if H.shape[-1] != x.shape[-1] + 1:
+        got = f"{tuple(H.shape)} and {tuple(x.shape)}"
+        raise ValueError(f"H, x: wanted shapes (*batch, d + 1, d + 1) and (*batch, n, d), got {got}")
     y = finite_or_zero(x) @ H[..., :-1, :-1].mT + H[..., None, :-1, -1]
     w = (finite_or_zero(x) * H[..., -1:, :-1]).sum(-1) + H[..., -1:, -1]
     return divide_safely(y, w)

@@ -130,8 +130,8 @@ def rotation_from_euler(angles: Float[Tensor, "*batch k"], axes: str) -> Float[T
         ValueError: `axes` is not such a string or its length is not the number of angles.
     """
     check_tensors(angles=(angles, "k"))
-    moving = axes.isupper()
-    if not axes or set(axes) - set("XYZ" if moving else "xyz"):
+    moving = isinstance(axes, str) and axes.isupper()
+    if not isinstance(axes, str) or not axes or set(axes) - set("XYZ" if moving else "xyz"):
         raise ValueError(f"axes: wanted letters of 'xyz' or of 'XYZ', got {axes!r}")
     if angles.shape[-1] != len(axes):
         raise ValueError(f"angles: wanted shape (*batch, {len(axes)}) for axes {axes!r}, got {tuple(angles.shape)}")

@@ -52,7 +52,7 @@ def affine_shape(
     Raises:
         ValueError: Wrong shape, dtype or device, or fewer than d + 1 points.
     """
-    check_tensors(x=(x, f"n>={x.shape[-1] + 1} d"), depths=(depths, "n"))
+    _check_points(x, depths)
     with torch.no_grad():
         basis, _, _ = qr(_weighted(x, depths), complete=True)
     return basis[..., x.shape[-1] + 1 :]
@@ -74,7 +74,7 @@ def normalize_shape(
     Raises:
         ValueError: Wrong shape, dtype or device, or fewer than d + 1 points.
     """
-    check_tensors(x=(x, f"n>={x.shape[-1] + 1} d"), depths=(depths, "n"))
+    _check_points(x, depths)
     moved = normalizing_similarity(x.detach(), None if depths is None else depths.detach().abs())
     h = _weighted(x, depths) @ moved.mT
     basis, R, _ = qr(h)
@@ -130,7 +130,7 @@ def balanced_frame(
     Raises:
         ValueError: Wrong shape, dtype or device.
     """
-    batch = check_tensors(x=(x, "n d"), weights=(weights, "n"))
+    batch = check_tensors(x=(x, "n d>=1"), weights=(weights, "?n"))
     with torch.no_grad():
         size = x.shape[-1] + 1
         present = torch.isfinite(x).all(-1).expand(*batch, x.shape[-2])
@@ -145,8 +145,9 @@ def balanced_frame(
             a = torch.nn.functional.normalize(h @ frame.mT, dim=-1)
             values, vectors, _ = eigh((a * w[..., None]).mT @ a)
             step = (vectors * values.clamp(min=1e-3).rsqrt()[..., None, :]) @ vectors.mT
-            frame = torch.where(done[..., None, None], frame, step @ frame)
-            frame = frame / torch.linalg.matrix_norm(frame)[..., None, None]
+            moved = step @ frame
+            moved = moved / torch.linalg.matrix_norm(moved)[..., None, None]
+            frame = torch.where(done[..., None, None], frame, moved)
             done = done | ((values - 1).abs().amax(-1) < tolerance)
             if bool(done.all()):
                 break
@@ -154,6 +155,12 @@ def balanced_frame(
         good = (values - 1).abs().amax(-1) < 1e-3
         T = frame @ T
         return T / torch.linalg.matrix_norm(T)[..., None, None], good
+
+
+def _check_points(x: Tensor, depths: Tensor | None) -> None:
+    check_tensors(x=(x, "n d>=1"), depths=(depths, "?n"))
+    if x.shape[-2] <= x.shape[-1]:
+        raise ValueError(f"x: wanted at least d + 1 points of d coordinates, got shape {tuple(x.shape)}")
 
 
 def _weighted(x: Tensor, depths: Tensor | None) -> Tensor:

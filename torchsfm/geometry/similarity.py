@@ -62,7 +62,7 @@ def similarity_from_points(
         The similarity, with status: TOO_FEW for fewer than three pairs, DEGENERATE where the points of either set lie on one
         line (the rotation is then one of many, or the identity).
     """
-    check_tensors(X=(X, "n 3"), Y=(Y, "n 3"), weights=(weights, "n"))
+    check_tensors(X=(X, "n 3"), Y=(Y, "n 3"), weights=(weights, "?n"))
     present = torch.isfinite(X).all(-1) & torch.isfinite(Y).all(-1)
     w = present.to(X.dtype) if weights is None else torch.where(present & torch.isfinite(weights), weights.clamp(min=0), 0.0)
     used = (w > 0)[..., None]

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import check_options, check_tensors
 
 _SOBEL = ((-0.125, 0.0, 0.125), (-0.25, 0.0, 0.25), (-0.125, 0.0, 0.125))
 
@@ -55,13 +55,15 @@ def detect_corners(
     Raises:
         ValueError: A shape or an option is wrong.
     """
-    batch = check_tensors(image=(image, "c h>=8 w>=8"))
+    batch = check_tensors(image=(image, "c h>=8 w>=8"), mask=(mask, "?h w: bool"))
+    check_options(
+        max_corners=(max_corners, "int >= 1"), response=(response, ("gftt", "harris")), quality=(quality, "float >= 0"),
+        min_distance=(min_distance, "int >= 1"), border=(border, "int >= 1"),
+    )  # fmt: skip
     channels, height, width = image.shape[-3:]
     if channels not in (1, 3):
         raise ValueError(f"image: wanted 1 or 3 channels, got {channels}")
-    if max_corners < 1 or min_distance < 1 or border < 1:
-        raise ValueError(f"wanted positive max_corners, min_distance and border, got {max_corners}, {min_distance}, {border}")
-    gray = to_gray(image.reshape(-1, channels, height, width))
+    gray = to_gray(image.expand(*batch, channels, height, width).reshape(-1, channels, height, width))
     tensor = structure_tensor(gray)
     strength = corner_response(tensor, response)
     strength = torch.where(strength.isfinite(), strength, 0.0)
@@ -124,14 +126,12 @@ def image_gradient(gray: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 2 h w"]:
     return torch.nn.functional.conv2d(padded, torch.stack([kernel, kernel.mT])[:, None])
 
 
-def corner_response(tensor: Float[Tensor, "b 3 h w"], response: str) -> Float[Tensor, "b 1 h w"]:
+def corner_response(tensor: Float[Tensor, "b 3 h w"], response: Literal["gftt", "harris"]) -> Float[Tensor, "b 1 h w"]:
     """The response map of a structure tensor."""
     xx, xy, yy = tensor[:, :1], tensor[:, 1:2], tensor[:, 2:]
     if response == "gftt":
         return (xx + yy - ((xx - yy).square() + 4 * xy.square()).sqrt()) / 2
-    if response == "harris":
-        return xx * yy - xy.square() - (xx + yy).square() * 0.04
-    raise ValueError(f"response: wanted 'gftt' or 'harris', got {response!r}")
+    return xx * yy - xy.square() - (xx + yy).square() * 0.04
 
 
 def _blur(maps: Tensor) -> Tensor:

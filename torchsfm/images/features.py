@@ -1,6 +1,8 @@
 """Distinctive points with descriptors (SIFT), for matching photographs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import torch
@@ -8,6 +10,7 @@ from jaxtyping import Float, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsfm._types import check_options
 from torchsfm.images.reading import Photograph
 
 _SCALE = 0.5 * 2 ** (1 / 6)
@@ -33,6 +36,17 @@ class Features:
 
     def __len__(self) -> int:
         return int(self.x.shape[0])
+
+
+def check_features(features: object) -> None:
+    """See that an argument is a sequence of `Features`.
+
+    Raises:
+        ValueError: It is not.
+    """
+    check_options(features=(features, Sequence))
+    if not all(isinstance(f, Features) for f in cast(Sequence[object], features)):
+        raise ValueError("features: wanted Features of each image")
 
 
 def detect_features(
@@ -64,8 +78,10 @@ def detect_features(
     """
     import cv2
 
-    if max_features < 1:
-        raise ValueError(f"max_features: wanted at least 1, got {max_features}")
+    check_options(
+        max_features=(max_features, "int >= 1"), contrast=(contrast, "float >= 0"), edge=(edge, "float > 0"),
+        max_size=(max_size, "int >= 1"),
+    )  # fmt: skip
     gray = _gray_bytes(image.pixels if isinstance(image, Photograph) else image)
     height, width = gray.shape
     shrink = min(1.0, max_size / max(height, width))
@@ -100,6 +116,7 @@ def _spread(table: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
 
 
 def _gray_bytes(pixels: Tensor) -> NDArray[np.uint8]:
+    check_options(image=(pixels, Tensor))
     if pixels.ndim != 3 or pixels.shape[0] not in (1, 3) or 0 in pixels.shape:
         raise ValueError(f"image: wanted shape (1, h, w) or (3, h, w), got {tuple(pixels.shape)}")
     pixels = pixels.detach().to("cpu", torch.float32)

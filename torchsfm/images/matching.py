@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from torchsfm.images.features import Features
+from torchsfm._types import check_one_problem, check_options
+from torchsfm.images.features import Features, check_features
 
 _ROWS = 128
 """Rows of one block of similarities: 128 x 8192 integers stay in a processor's cache through all that is done with them."""
@@ -52,7 +53,9 @@ def match_features(
     Raises:
         ValueError: As `match_descriptors`; or a pair names an image that is not there.
     """
-    _check(ratio, max_distance)
+    _check(ratio, mutual, max_distance)
+    check_features(features)
+    check_one_problem(pairs=(pairs, "p 2: int"))
     if pairs.numel() and not 0 <= int(pairs.min()) <= int(pairs.max()) < len(features):
         raise ValueError(f"pairs: wanted indices from 0 to {len(features) - 1}, got {int(pairs.min())} to {int(pairs.max())}")
     ready = {i: _prepare(features[i].descriptors) for i in sorted(set(pairs.flatten().tolist()))}
@@ -95,7 +98,15 @@ def match_descriptors(
     Raises:
         ValueError: Descriptors of two lengths or two precisions, or an option is wrong.
     """
-    _check(ratio, max_distance)
+    _check(ratio, mutual, max_distance)
+    for name, descriptors in (("descriptors1", descriptors1), ("descriptors2", descriptors2)):
+        check_options(**{name: (descriptors, Tensor)})
+        if descriptors.ndim != 2 or descriptors.is_complex():
+            raise ValueError(f"{name}: wanted shape (n, d) of real numbers, got {tuple(descriptors.shape)} {descriptors.dtype}")
+    alike = descriptors1.is_floating_point() and descriptors2.is_floating_point() and descriptors1.dtype != descriptors2.dtype
+    if descriptors1.device != descriptors2.device or descriptors1.shape[1] != descriptors2.shape[1] or alike:
+        first, second = (f"{tuple(d.shape)} {d.dtype} {d.device}" for d in (descriptors1, descriptors2))
+        raise ValueError(f"descriptors1, descriptors2: wanted one length, precision and device, got {first} and {second}")
     return _match(_prepare(descriptors1), _prepare(descriptors2), ratio, mutual, max_distance)
 
 
@@ -115,9 +126,8 @@ def _single_threads() -> Iterator[int]:
             torch.set_num_threads(count)
 
 
-def _check(ratio: float, max_distance: float) -> None:
-    if not (ratio > 0 and max_distance > 0):
-        raise ValueError(f"wanted positive ratio and max_distance, got {ratio} and {max_distance}")
+def _check(ratio: float, mutual: bool, max_distance: float) -> None:
+    check_options(ratio=(ratio, "float > 0"), mutual=(mutual, bool), max_distance=(max_distance, "float > 0"))
 
 
 def unit_descriptors(descriptors: Shaped[Tensor, "n d"]) -> Float[Tensor, "n d"]:

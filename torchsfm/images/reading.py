@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsfm._types import check_options, check_tensors
 from torchsfm.images.exif import parse_exif
 from torchsfm.images.headers import guess_contents, image_size, is_complete
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
@@ -174,6 +175,8 @@ def scale_image(image: Float[Tensor, "*batch h w"], *, low: float | None = None,
     Returns:
         Images in [0, 1]. An image of one value, or of `low >= high`, becomes 0 everywhere.
     """
+    check_tensors(image=(image, "h>=1 w>=1"))
+    check_options(low=(low, "?float"), high=(high, "?float"))
     bottom = image.amin((-2, -1), keepdim=True) if low is None else torch.full_like(image[..., :1, :1], low)
     top = image.amax((-2, -1), keepdim=True) if high is None else torch.full_like(image[..., :1, :1], high)
     spread = top - bottom

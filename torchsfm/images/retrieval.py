@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm.images.features import Features
+from torchsfm._types import check_options
+from torchsfm.images.features import Features, check_features
 from torchsfm.images.matching import unit_descriptors
 
 
@@ -34,8 +35,8 @@ def retrieve_pairs(
     Raises:
         ValueError: `neighbours` or `words` is not positive.
     """
-    if neighbours < 1 or words < 1:
-        raise ValueError(f"wanted positive neighbours and words, got {neighbours} and {words}")
+    check_features(features)
+    check_options(neighbours=(neighbours, "int >= 1"), words=(words, "int >= 1"))
     usable = torch.tensor([i for i, f in enumerate(features) if len(f) > 0], dtype=torch.long)
     n = len(usable)
     if n - 1 <= neighbours:
@@ -65,6 +66,8 @@ def describe_images(
     Returns:
         One row for each image; zeros for an image without features.
     """
+    check_features(features)
+    check_options(words=(words, "int >= 1"))
     if not features:
         return torch.zeros(0, 0)
     if not any(len(f) for f in features):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import broadcast_shapes, check_one_problem, check_options, check_tensors
 from torchsfm.images.alignment import align, cut_templates
 from torchsfm.images.corners import box_maximum, detect_corners, to_gray
 from torchsfm.images.reading import Photograph
@@ -70,13 +70,14 @@ def track_points(
     Raises:
         ValueError: A shape or an option is wrong.
     """
-    check_tensors(x1=(x1, "n 2"), guess=(guess, "n 2"))
+    places = check_tensors(x1=(x1, "n 2"), guess=(guess, "?n 2"))
+    pictures = check_tensors(image1=(image1, "c h>=1 w>=1"), image2=(image2, "c h w"))
+    try:
+        batch = broadcast_shapes(pictures, places)
+    except ValueError:
+        raise ValueError(f"x1, guess: wanted batch dimensions {tuple(pictures)} of the images, got {tuple(places)}") from None
+    _check_tracking(window, levels, max_error)
     start = x1 if guess is None else guess
-    batch = check_tensors(
-        image1=(image1, "c h w"), image2=(image2, "c h w"), x1=(x1.to(image1), "n 2"), guess=(start.to(image1), "n 2")
-    )
-    if window < 3 or levels < 1:
-        raise ValueError(f"wanted window >= 3 and levels >= 1, got {window} and {levels}")
     n, count = x1.shape[-2], batch.numel()
     first, second = (_bytes(to_gray(i)).expand(*batch, *i.shape[-2:]).reshape(count, *i.shape[-2:]) for i in (image1, image2))
     points, starts = (p.expand(*batch, n, 2).reshape(count, n, 2) for p in (x1, start))
@@ -89,6 +90,10 @@ def track_points(
     x, error = x.reshape(*batch, n, 2).to(x1), error.reshape(*batch, n).to(x1)
     valid = error <= max_error
     return TrackedPoints(x, valid, torch.where(valid, error, 0.0))
+
+
+def _check_tracking(window: int, levels: int, max_error: float) -> None:
+    check_options(window=(window, "int >= 3"), levels=(levels, "int >= 1"), max_error=(max_error, "float >= 0"))
 
 
 def track_sequence(
@@ -132,9 +137,17 @@ def track_sequence(
     Raises:
         ValueError: Frames of different sizes, or an option is wrong.
     """
+    check_options(
+        images=(images, Iterable), max_points=(max_points, "int >= 1"), min_distance=(min_distance, "int >= 1"),
+        quality=(quality, "float >= 0"), min_similarity=(min_similarity, "float"), min_survival=(min_survival, "float"),
+        min_length=(min_length, "int >= 1"),
+    )  # fmt: skip
+    _check_tracking(window, levels, max_error)
     follower: _Follower | None = None
     for number, image in enumerate(images):
-        gray = to_gray((image.pixels if isinstance(image, Photograph) else image).detach().to("cpu", torch.float32))[0]
+        pixels = image.pixels if isinstance(image, Photograph) else image
+        check_one_problem(images=(pixels, "c h>=1 w>=1"))
+        gray = to_gray(pixels.detach().to("cpu", torch.float32))[0]
         if follower is None:
             follower = _Follower(
                 gray, max_points, min_distance, quality, window, levels, max_error, min_similarity, min_survival

@@ -3,6 +3,7 @@
 from torchsfm.linalg.compilation import compile_kernels
 from torchsfm.linalg.decompositions import eigh, eigvals, eigvalsh, inverse, qr, solve, svd, svdvals, triangular_factor
 from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3
+from torchsfm.linalg.magnitude import unit_scale, usable
 from torchsfm.linalg.nullspace import null_vector, nullspace_rows, orthonormal_nullspace
 from torchsfm.linalg.polynomial import companion_roots, evaluate, solve_cubic, solve_quadratic
 from torchsfm.linalg.projections import nearest_psd, nearest_rank, nearest_rotation
@@ -35,4 +36,6 @@ __all__ = [
     "svd",
     "svdvals",
     "triangular_factor",
+    "unit_scale",
+    "usable",
 ]

@@ -101,12 +101,6 @@ def inverse(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"]
     return torch.where(ok[..., None, None], B, 0.0), ok
 
 
-def unit_scale(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch 1 1"]:
-    """A power of two by which the largest number of a finite matrix, unless it is 0, comes to between 1/2 and 1."""
-    largest = A.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(A.dtype).tiny)
-    return torch.frexp(largest).mantissa / largest
-
-
 def _sound(A: Tensor) -> tuple[Tensor, Tensor]:
     """The matrices, those with numbers that cannot be worked with replaced by axes, and which were not."""
     sound = _is_sound(A)

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm.linalg.decompositions import eigh, qr, unit_scale
+from torchsfm.linalg.decompositions import eigh, qr
+from torchsfm.linalg.magnitude import unit_scale
 from torchsfm.linalg.rows import combine_rows
 
 

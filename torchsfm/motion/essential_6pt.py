@@ -84,12 +84,13 @@ def essential_6pt(
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 6.
     """
-    check_tensors(d1=(d1, "n>=6 3"), d2=(d2, "n 3"), weights=(weights, "n"))
+    check_tensors(d1=(d1, "n>=6 3"), d2=(d2, "n 3"), weights=(weights, "?n"))
     shape = broadcast_shapes(d1.shape[:-1], d2.shape[:-1], d1.shape[:-1] if weights is None else weights.shape)
     batch = shape[:-1]
     with torch.no_grad():
         rays = [d.detach().double().expand(*shape, 3).reshape(-1, shape[-1], 3) for d in (d1, d2)]
-        w = torch.ones_like(rays[0][..., 0]) if weights is None else weights.detach().double().expand(shape).flatten(0, -2)
+        w = rays[0].new_ones(shape) if weights is None else weights.detach().double().expand(shape)
+        w = w.reshape(-1, shape[-1])
         starts = range(0, max(len(w), 1), _CHUNK)
         parts = [_solve(*(v[i : i + _CHUNK] for v in (*rays, w))) for i in starts]
         E, valid = (torch.cat(p) for p in zip(*parts, strict=True))

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import check_options, check_tensors
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.normalization import common_scale
@@ -43,7 +43,9 @@ def estimate_fundamentals(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"))
+    if limit is None:
+        check_options(threshold=(threshold, "float > 0"))
+    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, "?"), mask=(mask, "?n: bool"))
     y = common_scale(x1.double(), x2.double(), mask)
     found = find_structures(
         FundamentalEstimator(), y.x1, y.x2, threshold=y.scale * threshold, mask=mask, slots=slots, smallest=smallest,
@@ -83,7 +85,9 @@ def estimate_homographies(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, ""), mask=(mask, "n: bool"))
+    if limit is None:
+        check_options(threshold=(threshold, "float > 0"))
+    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), threshold=(limit, "?"), mask=(mask, "?n: bool"))
     y = common_scale(x1.double(), x2.double(), mask)
     found = find_structures(
         HomographyEstimator(), y.x1, y.x2, threshold=y.scale * threshold, mask=mask, slots=slots, smallest=smallest,

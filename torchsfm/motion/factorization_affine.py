@@ -6,13 +6,13 @@ eliminated exactly. What is known of the cameras, equal scales and right angles 
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry.homogeneous import finite_or_zero
 from torchsfm.linalg import eigh, inverse, qr, solve, svd, svdvals
 from torchsfm.motion.bilinear_fit import Rays, core, fit_with_prior
@@ -83,9 +83,8 @@ def factorize_affine(
     Raises:
         ValueError: Wrong shape, dtype, device or option.
     """
-    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "v n: bool"), weights=(weights, "v n"))
-    if model not in ("orthographic", "weak_perspective", "paraperspective"):
-        raise ValueError(f'model: wanted "orthographic", "weak_perspective" or "paraperspective", got {model!r}')
+    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
+    check_options(model=(model, get_args(AffineModel)), max_iterations=(max_iterations, "int >= 0"))
     v, n = x.shape[-3:-1]
     with torch.no_grad():
         flat = x.detach().double().expand(*batch, v, n, 2).reshape(-1, v, n, 2)

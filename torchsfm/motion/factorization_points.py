@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import to_homogeneous
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.shape import balanced_frame
@@ -108,9 +108,8 @@ def factorize_points(
     Raises:
         ValueError: Wrong shape, dtype, device or option.
     """
-    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "v n: bool"), weights=(weights, "v n"))
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations: wanted a positive number, got {max_iterations}")
+    batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
+    check_options(robust=(robust, bool), max_iterations=(max_iterations, "int >= 1"))
     v, n = x.shape[-3:-1]
     full = x.double().expand(*batch, v, n, 2).reshape(-1, v, n, 2)
     w = torch.isfinite(full).all(-1).double()

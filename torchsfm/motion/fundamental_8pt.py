@@ -28,7 +28,7 @@ def fundamental_8pt(
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 8.
     """
-    check_tensors(x1=(x1, "n>=8 2"), x2=(x2, "n 2"), weights=(weights, "n"))
+    check_tensors(x1=(x1, "n>=8 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     y1, y2, w, T1, T2_inverse, finite = _normalised(x1, x2, weights)
     one = torch.ones_like(y1[..., :1])
     h1, h2 = torch.cat((y1, one), -1), torch.cat((y2, one), -1)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
-from torchsfm.linalg import eigvalsh, null_vector
+from torchsfm.linalg import eigvalsh, null_vector, usable
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.sample_rows import in_chunks, rows_of
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -50,7 +50,7 @@ def fundamental_affine_4pt(
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 4.
     """
-    batch = check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "n"))
+    batch = check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     if x1.shape[-2] == 4 and weights is None:
         with torch.no_grad():
             rows, good = in_chunks(_solve, _CHUNK, *rows_of(batch, x1, x2))
@@ -71,7 +71,7 @@ def _solve(x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
     z = torch.cat((x2, x1), 1)
     centre, y = z[3], z[:3] - z[3]
     size = y.abs().amax((0, 1))
-    fine = torch.isfinite(z).all(0).all(0) & (size > 0) & torch.isfinite(size)
+    fine = usable(z).all(0).all(0) & (size > 0)
     (p0, p1, p2, p3), (q0, q1, q2, q3), (r0, r1, r2, r3) = (row.unbind(0) for row in y / torch.where(fine, size, 1))
     m01, m02, m03 = p0 * q1 - p1 * q0, p0 * q2 - p2 * q0, p0 * q3 - p3 * q0
     m12, m13, m23 = p1 * q2 - p2 * q1, p1 * q3 - p3 * q1, p2 * q3 - p3 * q2
@@ -103,7 +103,7 @@ def _fit(x1: Tensor, x2: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor
     w = w.double().expand(shape)
     z = torch.cat((x2.double().expand(*shape, 2), x1.double().expand(*shape, 2)), -1)
     absent = w == 0
-    fine = (torch.isfinite(z).all(-1) & torch.isfinite(w) & (w >= 0) | absent).all(-1)
+    fine = (usable(z).all(-1) & usable(w) & (w >= 0) | absent).all(-1)
     keep = fine[..., None] & ~absent
     w, z = torch.where(keep, w, 0), torch.where(keep[..., None], z, 0)
     total = w.sum(-1, keepdim=True)

@@ -28,7 +28,7 @@ def homography_dlt(
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 4.
     """
-    check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "n"))
+    check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     y1, y2, w, T1, T2_inverse, finite = _normalised(x1, x2, weights)
     u1, v1, u2, v2 = y1[..., 0], y1[..., 1], y2[..., 0], y2[..., 1]
     one, zero = torch.ones_like(u1), torch.zeros_like(u1)

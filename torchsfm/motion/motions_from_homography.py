@@ -86,7 +86,7 @@ def motions_from_homography(
     Raises:
         ValueError: Wrong shape, dtype or device.
     """
-    batch = check_tensors(H=(H, "3 3"), K1=(K1, "3 3"), K2=(K2, "3 3"))
+    batch = check_tensors(H=(H, "3 3"), K1=(K1, "?3 3"), K2=(K2, "?3 3"))
     G = H.double()
     if K1 is not None:
         G = G @ K1.double()
@@ -169,7 +169,7 @@ def motion_from_homography(
     Raises:
         ValueError: Wrong shape, dtype or device.
     """
-    kind = "n: bool" if weights is not None and weights.dtype == torch.bool else "n"
+    kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
     batch = check_tensors(H=(H, "3 3"), d1=(d1, "n 3"), d2=(d2, "n 3"), weights=(weights, kind))
     n = d1.shape[-2]
     w = torch.ones_like(d1[..., 0]) if weights is None else weights.to(d1.dtype)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.motion.multilinear_fit import (
     NormalizedViews,
     combined_status,
@@ -64,7 +64,8 @@ def quadrifocal_6pt(
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 6.
     """
-    batch = check_tensors(x=(x, "4 n>=6 2"), weights=(weights, "n"))
+    batch = check_tensors(x=(x, "4 n>=6 2"), weights=(weights, "?n"))
+    check_options(max_iterations=(max_iterations, "int >= 0"))
     n = x.shape[-2]
     views = normalized_views(x.expand(*batch, 4, n, 2), x.new_zeros(*batch, 4, 0, 3), weights, None)
     A = _equations(views)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.motion.multilinear_fit import (
     NormalizedViews,
     combined_status,
@@ -75,8 +75,9 @@ def trifocal_7pt(
         ValueError: Wrong shape, dtype or device, or too few points and lines.
     """
     batch = check_tensors(
-        x=(x, "3 n 2"), l=(l, "3 m 3"), ends=(ends, "m 2 2"), weights=(weights, "n"), line_weights=(line_weights, "m")
+        x=(x, "3 n 2"), l=(l, "?3 m 3"), ends=(ends, "?m 2 2"), weights=(weights, "?n"), line_weights=(line_weights, "?m")
     )
+    check_options(max_iterations=(max_iterations, "int >= 0"))
     if l is None and (ends is not None or line_weights is not None):
         raise ValueError("l: wanted the lines to which ends or line_weights belong, got None")
     lines = x.new_zeros(*x.shape[:-3], 3, 0, 3) if l is None else l

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm._types import check_options
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.loss import loss_slope
 from torchsfm.optim.schur import Elimination
@@ -50,6 +51,7 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
     Returns:
         The covariances, float64.
     """
+    check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple), eliminate=(eliminate, (None, *blocks)))
     with torch.no_grad():
         double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
         x = {name: b.x for name, b in double.items()}

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchsfm._types import check_options
 from torchsfm.linalg import qr
 
 
@@ -53,6 +54,7 @@ def attach_implicit(
     Returns:
         `y`, unchanged in value, with derivatives attached.
     """
+    check_options(y=(y, Tensor), **{f"inputs[{i}]": (x, Tensor) for i, x in enumerate(inputs)})
     y = y.detach()
     if not wants_derivative(*inputs):
         return y

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, tensor_map
+from torchsfm._types import Status, check_options, tensor_map
 from torchsfm.optim.damped_steps import Found, Options, minimise
 from torchsfm.optim.dense_problem import DenseProblem, Linearize
 from torchsfm.optim.implicit import attach_optimum, wants_derivative
@@ -83,6 +83,11 @@ def levenberg_marquardt(
     Raises:
         ValueError: `residual` does not return `(*batch, n, d)`, or `size` is missing for parameters that are not one tensor.
     """
+    check_options(
+        max_iterations=(max_iterations, "int >= 0"), function_tolerance=(function_tolerance, "float >= 0"),
+        step_tolerance=(step_tolerance, "float >= 0"), initial_damping=(initial_damping, "float >= 0"),
+        size=(size, "?int >= 1"), loss=(loss, Callable | None),
+    )  # fmt: skip
     move = retract if retract is not None else _add
     if size is None:
         if not isinstance(x0, Tensor):

@@ -8,7 +8,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.optim.covariance import to_double, usable
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import Layout, lay_out
@@ -88,8 +88,11 @@ def sparse_levenberg_marquardt(
             two eliminated variables.
     """
     _check(blocks, terms, eliminate)
-    if linear_solver not in get_args(Solver):
-        raise ValueError(f"linear_solver: wanted one of {get_args(Solver)}, got {linear_solver!r}")
+    check_options(linear_solver=(linear_solver, get_args(Solver)), max_iterations=(max_iterations, "int >= 0"))
+    check_options(
+        function_tolerance=(function_tolerance, "float >= 0"), gradient_tolerance=(gradient_tolerance, "float >= 0"),
+        step_tolerance=(step_tolerance, "float >= 0"), initial_damping=(initial_damping, "float >= 0"),
+    )  # fmt: skip
     options = _Options(max_iterations, function_tolerance, gradient_tolerance, step_tolerance, initial_damping, progress)
     with torch.no_grad():
         double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
@@ -194,6 +197,7 @@ def _double(x: Tensor) -> Tensor:
 
 
 def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | None) -> None:
+    check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple), eliminate=(eliminate, str | None))
     if eliminate is not None and eliminate not in blocks:
         raise ValueError(f"eliminate: wanted one of {sorted(blocks)}, got {eliminate!r}")
     for k, term in enumerate(terms):

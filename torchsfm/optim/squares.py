@@ -14,6 +14,7 @@ class Squares:
 
     def __init__(self, layout: Layout, some: Tensor) -> None:
         self.size = layout.size
+        self._nothing = some.new_zeros(0)
         wide = [piece.columns.new_full((piece.columns.shape[0], 1), layout.size) for piece in layout.pieces]
         self.columns = [torch.cat((p.columns, w), 1) for p, w in zip(layout.pieces, wide, strict=True)]
         self.values = [some.new_zeros((*c.shape, c.shape[1])) for c in self.columns]
@@ -25,7 +26,7 @@ class Squares:
 
     def dense(self) -> Tensor:
         """The matrix (size + 2, size + 2): row and column `size` are the gradient, the last ones belong to fixed variables."""
-        S = self.values[0].new_zeros((self.size + 2, self.size + 2))
+        S = self._nothing.new_zeros((self.size + 2, self.size + 2))
         for columns, values in zip(self.columns, self.values, strict=True):
             add_squares(S, columns, values)
         return S
@@ -44,7 +45,7 @@ class Squares:
         return self._sum([(v @ full[c][:, :, None])[:, :, 0] for c, v in zip(self.columns, self.values, strict=True)])
 
     def _sum(self, parts: list[Tensor]) -> Tensor:
-        out = parts[0].new_zeros(self.size + 2)
+        out = self._nothing.new_zeros(self.size + 2)
         for columns, part in zip(self.columns, parts, strict=True):
             out.index_add_(0, columns.flatten(), part.flatten())
         return out[: self.size]

@@ -93,7 +93,7 @@ def plot_points_2d(
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
     """
-    check_tensors(x=(x, "n 2"), visible=(visible, "n: bool"))
+    check_tensors(x=(x, "n 2"), visible=(visible, "?n: bool"))
     fresh = ax is None
     ax = flat_axes(ax)
     shown = torch.isfinite(x).all(-1)
@@ -137,7 +137,7 @@ def plot_matches(
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
     """
-    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), inliers=(inliers, "n: bool"))
+    check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), inliers=(inliers, "?n: bool"))
     check_tensors(image1=(image1, "h1 w1"), image2=(image2, "h2 w2"))
     if every < 1:
         raise ValueError(f"every: wanted at least 1, got {every}")

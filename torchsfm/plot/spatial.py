@@ -38,7 +38,7 @@ def plot_points_3d(
         ValueError: A shape or option is wrong.
         ImportError: matplotlib is not installed.
     """
-    check_tensors(X=(X, "n 3"), color=(color if isinstance(color, Tensor) else None, "n 3"))
+    check_tensors(X=(X, "n 3"), color=(color if isinstance(color, Tensor) else None, "?n 3"))
     if not 0 < share <= 1:
         raise ValueError(f"share: wanted a number in (0, 1], got {share}")
     ax = spatial_axes(ax)
@@ -121,7 +121,7 @@ def _image_corners(count: int, like: Tensor, cameras: Camera | None, image_size:
     if cameras is None:
         corners = (0.5 * signs).expand(count, 4, 2)
     else:
-        check_tensors(K=(cameras.K, "3 3"), image_size=(image_size, "2: int"))
+        check_tensors(K=(cameras.K, "3 3"), image_size=(image_size, "?2: int"))
         K = cameras.K.detach().to(like).expand(count, 3, 3)
         size = 2 * K[:, :2, 2] + 1 if image_size is None else image_size.to(like).expand(count, 2)
         pixels = (signs + 1) / 2 * size[:, None] - 0.5

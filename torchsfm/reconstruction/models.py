@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchsfm._types import check_one_problem, check_options
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.adjust import LOSS
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
@@ -211,9 +212,11 @@ def reconstruct_tracks(
     Raises:
         ValueError: Shapes disagree or an index is out of range.
     """
+    check_one_problem(x=(x, "n 2"), view=(view, "n: int"), track=(track, "n: int"), image_size=(image_size, "v 2: int"))
+    check_one_problem(color=(color, "?n 3"))
+    check_one_problem(K=(K, "?3 3"))
+    check_options(names=(names, Sequence | None), focal=(focal, "?float > 0"), seed=(seed, "int"))
     v = len(image_size)
-    if not len(x) == len(view) == len(track):
-        raise ValueError(f"x, view, track: wanted one length, got {len(x)}, {len(view)}, {len(track)}")
     if len(view) and not (int(view.min()) >= 0 and int(view.max()) < v):
         raise ValueError(f"view: wanted indices from 0 to {v - 1}, got {int(view.min())} to {int(view.max())}")
     if len(track) and int(track.min()) < 0:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry import normalizing_similarity
-from torchsfm.linalg import cross, eigh
+from torchsfm.linalg import cross, eigh, unit_scale, usable
 
 FLAT = 1e-6
 """Singular value, over the largest, at which a second null vector is taken for exact (a plane, in float32 coordinates)."""
@@ -57,17 +57,17 @@ def camera_dlt(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit; only one of `l` and `L` is given; or fewer than 11 equations in all.
     """
-    if (l is None) != (L is None):
-        raise ValueError("l, L: wanted both or neither")
-    n = x.shape[-2] if x.ndim > 1 else 0
-    per_coordinate = weights is not None and weights.ndim > 1 and weights.shape[-1] == 2 and n != 2
+    if (l is None) != (L is None) or (l is None and line_weights is not None):
+        raise ValueError("l, L: wanted both or neither, and line_weights only with them")
+    n = x.shape[-2] if isinstance(x, Tensor) and x.ndim > 1 else 0
+    per_coordinate = isinstance(weights, Tensor) and weights.ndim > 1 and weights.shape[-1] == 2 and n != 2
     batch = check_tensors(
         x=(x, "n 2"),
         X=(X, "n 3"),
-        l=(l, "k 3"),
-        L=(L, "k 6"),
-        weights=(weights, "n 2" if per_coordinate else "n"),
-        line_weights=(line_weights, "k"),
+        l=(l, "?k 3"),
+        L=(L, "?k 6"),
+        weights=(weights, "?n 2" if per_coordinate else "?n"),
+        line_weights=(line_weights, "?k"),
     )
     k = 0 if l is None else l.shape[-2]
     if 2 * (n + k) < 11:
@@ -114,7 +114,7 @@ def camera_dlt(
 def _clean(batch: torch.Size, a: Tensor, b: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """In float64 and full batch shape, absent rows zero; and which elements have rows with weight that are not finite."""
     a, b, w = (t.double().expand(*batch, *t.shape[-2:]) for t in (a, b, w.expand(*w.shape[:-2], a.shape[-2], w.shape[-1])))
-    good = torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1) & torch.isfinite(w).all(-1) & (w >= 0).all(-1)
+    good = usable(a).all(-1) & usable(b).all(-1) & usable(w).all(-1) & (w >= 0).all(-1)
     wanted = (w != 0).any(-1)
     use = (wanted & good)[..., None]
     return torch.where(use, a, 0.0), torch.where(use, b, 0.0), torch.where(use, w, 0.0), (wanted & ~good).any(-1)
@@ -174,6 +174,7 @@ def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
 
 def _scaled(P: Tensor, X: Tensor, w: Tensor) -> Tensor:
     """|third row of the left part| = 1 (|P| = 1 for affine cameras), and most points at positive third coordinates."""
+    P = P * unit_scale(P)
     third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
     whole = torch.linalg.vector_norm(P, dim=(-2, -1), keepdim=True)
     size = torch.where(third.detach() > 1e-12 * whole.detach(), third, torch.where(whole.detach() > 0, whole, 1.0))

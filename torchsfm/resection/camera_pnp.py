@@ -56,7 +56,7 @@ def camera_pnp(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
     """
-    batch = check_tensors(d=(d, "n 3"), X=(X, "n 3"), weights=(weights, "n"))
+    batch = check_tensors(d=(d, "n 3"), X=(X, "n 3"), weights=(weights, "?n"))
     with torch.no_grad():
         fixed = (d.detach(), X.detach(), None if weights is None else weights.detach())
         parts = [_solve(data) for data in in_pieces(*fixed, batch)]

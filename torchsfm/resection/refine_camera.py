@@ -1,6 +1,6 @@
 """The pose, and on request the inside, of cameras whose reprojection error is smallest."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry import Camera, NoDistortion, Pose
 from torchsfm.optim import Loss, levenberg_marquardt
 from torchsfm.resection._pinhole import minimise_pinhole
@@ -84,16 +84,24 @@ def refine_camera(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or `free` names what the camera does not have.
     """
+    check_options(
+        pose=(pose, Pose), camera=(camera, Camera), free=(free, Sequence), loss=(loss, Callable | None),
+        max_iterations=(max_iterations, "int >= 0"),
+    )  # fmt: skip
     names = (*INSIDE, *camera.distortion.parameter_names)
     unknown = [name for name in free if name not in names]
     if unknown or len(set(free)) != len(free):
         raise ValueError(f"free: wanted distinct names out of {names}, got {tuple(free)}")
-    floating = weights if weights is None or weights.dtype != torch.bool else weights.to(x.dtype)
-    batch = check_tensors(x=(x, "n 2"), X=(X, "n 3"), R=(pose.R, "3 3"), K=(camera.K, "3 3"), weights=(floating, "n"))
+    kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
+    batch = check_tensors(x=(x, "n 2"), X=(X, "n 3"), R=(pose.R, "3 3"), K=(camera.K, "3 3"), weights=(weights, kind))
     x, X = x.expand(*batch, *x.shape[-2:]), X.expand(*batch, *X.shape[-2:])
     pose = Pose(pose.R.expand(*batch, 3, 3), pose.t.expand(*batch, 3))
     camera = _expand(camera, batch)
-    w = torch.ones(x.shape[:-1], dtype=x.dtype, device=x.device) if floating is None else floating.expand(x.shape[:-1])
+    w = (
+        torch.ones(x.shape[:-1], dtype=x.dtype, device=x.device)
+        if weights is None
+        else weights.to(x.dtype).expand(x.shape[:-1])
+    )
     wanted = ~(w <= 0)
     finite = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1) & torch.isfinite(w)
     bad = (wanted & ~finite).any(-1) | ~(torch.isfinite(pose.R).all(-1).all(-1) & torch.isfinite(pose.t).all(-1))

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import Camera, Pose
 from torchsfm.resection.camera_dlt import camera_dlt
 from torchsfm.resection.camera_pnp import camera_pnp
@@ -64,7 +64,12 @@ def resect_cameras(
         ValueError: Shapes, dtypes or devices do not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
-    batch = check_tensors(x=(x, "v n 2"), X=(X, "n 3"), K=(K, "v 3 3"), threshold=(limit, "v"), visible=(visible, "v n: bool"))
+    if limit is None:
+        check_options(threshold=(threshold, "?float > 0"))
+    check_options(max_iterations=(max_iterations, "int >= 1"))
+    batch = check_tensors(
+        x=(x, "v n 2"), X=(X, "n 3"), K=(K, "?v 3 3"), threshold=(limit, "?v"), visible=(visible, "?v n: bool")
+    )
     v, n = x.shape[-3:-1]
     shape = (*batch, v)
     x, X = x.expand(*shape, n, 2), X[..., None, :, :].expand(*shape, n, 3)

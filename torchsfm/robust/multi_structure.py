@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import cast, join, tensors_of
 from torchsfm.robust.scoring import squared_residual
@@ -94,19 +94,21 @@ def find_structures(
     """
     if not data:
         raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
+    check_options(estimator=(estimator, Estimator))
     m = estimator.sample_size
     smallest = m + 4 if smallest is None else smallest
-    for name, value, least in (
-        ("slots", slots, 1),
-        ("smallest", smallest, m),
-        ("hypotheses", hypotheses, 1),
-        ("kept", kept, 1),
-    ):
-        if value < least:
-            raise ValueError(f"{name}: wanted at least {least}, got {value}")
-    known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
-    limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(threshold)
-    batch = check_tensors(**known, threshold=(limit, ""), mask=(mask, "n: bool"))
+    check_options(
+        slots=(slots, "int >= 1"),
+        smallest=(smallest, f"int >= {m}"),
+        hypotheses=(hypotheses, "int >= 1"),
+        kept=(kept, "int >= 1"),
+    )
+    known = {f"data[{i}]": (d, f"n d{i}") for i, d in enumerate(data)}
+    limit = threshold if isinstance(threshold, Tensor) else None
+    if limit is None:
+        check_options(threshold=(threshold, "float > 0"))
+    batch = check_tensors(**known, threshold=(limit, "?"), mask=(mask, "?n: bool"))
+    limit = data[0].new_tensor(threshold) if limit is None else limit
     dtype, device, n, p = data[0].dtype, data[0].device, data[0].shape[-2], batch.numel()
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
     with torch.no_grad():

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.optim import wants_derivative
 from torchsfm.robust.degeneracy import Degeneracy
 from torchsfm.robust.estimator import Estimator
@@ -114,20 +114,29 @@ def ransac(
     """
     if not data:
         raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence: wanted a number between 0 and 1, got {confidence}")
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations: wanted a positive number, got {max_iterations}")
+    check_options(
+        estimator=(estimator, Estimator),
+        confidence=(confidence, "0 < float < 1"),
+        min_iterations=(min_iterations, "int >= 0"),
+        max_iterations=(max_iterations, "int >= 1"),
+        score=(score, Score | None),
+        covariance=(covariance, bool),
+        scoring_dtype=(scoring_dtype, torch.dtype | None),
+    )
     if covariance and not has_manifold(estimator):
         raise ValueError(f"covariance: {type(estimator).__name__} does not say how its models move (`retract`)")
-    if isinstance(threshold, (int, float)) and not 0 < threshold < math.inf:
-        raise ValueError(f"threshold: wanted a positive number, got {threshold}")
+    limit = threshold if isinstance(threshold, Tensor) else None
+    if limit is None:
+        check_options(threshold=(threshold, "?float > 0"))
     score = score or (LeastMedian() if threshold is None else Msac())
     if threshold is None and score.needs_threshold:
         raise ValueError(f"threshold: {type(score).__name__} wants one, got None")
-    known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
-    limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(1.0 if threshold is None else threshold)
-    batch = check_tensors(**known, threshold=(limit, ""), mask=(mask, "n: bool"), scores=(scores, "n"), weights=(weights, "n"))
+    known = {f"data[{i}]": (d, f"n d{i}") for i, d in enumerate(data)}
+    batch = check_tensors(
+        **known, threshold=(limit, "?"), mask=(mask, "?n: bool"), scores=(scores, "?n"), weights=(weights, "?n")
+    )
+    if limit is None:
+        limit = data[0].new_tensor(1.0 if threshold is None else threshold)
     dtype, n = data[0].dtype, data[0].shape[-2]
     seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
     p = batch.numel()

@@ -1,6 +1,5 @@
 """What all doors of robust estimation share: the options of a call, checked, and answered in the unit and type of the data."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import check_options, check_tensors
 from torchsfm.robust.optimum import push_forward
 from torchsfm.robust.ransac import RobustResult, ransac
 from torchsfm.robust.scores import Score
@@ -39,10 +38,10 @@ class Request:
             ValueError: A shape, dtype, device or option does not fit.
         """
         limit = self.threshold if isinstance(self.threshold, Tensor) else None
-        if isinstance(self.threshold, (int, float)) and not 0 < self.threshold < math.inf:
-            raise ValueError(f"threshold: wanted a positive number, got {self.threshold}")
-        options = {"mask": (self.mask, "n: bool"), "scores": (self.scores, "n"), "weights": (self.weights, "n")}
-        return check_tensors(**data, threshold=(limit, ""), **options)
+        if limit is None:
+            check_options(threshold=(self.threshold, "?float > 0"))
+        options = {"mask": (self.mask, "?n: bool"), "scores": (self.scores, "?n"), "weights": (self.weights, "?n")}
+        return check_tensors(**data, threshold=(limit, "?"), **options)
 
     def answer(
         self,

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_tensors, tensor_map
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.sampling import hash_integers
 from torchsfm.robust.scoring import squared_residual
@@ -144,14 +144,18 @@ def soft_ransac(
     """
     if not data:
         raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
-    for name, value in (("temperature", temperature), ("sharpness", sharpness)):
-        if not value > 0:
-            raise ValueError(f"{name}: wanted a positive number, got {value}")
-    if hypotheses < 1:
-        raise ValueError(f"hypotheses: wanted a positive number, got {hypotheses}")
-    known = {f"data[{i}]": (d, f"n {d.shape[-1]}" if d.ndim > 1 else "n d") for i, d in enumerate(data)}
-    limit = threshold if isinstance(threshold, Tensor) else data[0].new_tensor(threshold)
-    batch = check_tensors(**known, threshold=(limit, ""), logits=(logits, "n"), mask=(mask, "n: bool"))
+    check_options(
+        estimator=(estimator, Estimator),
+        temperature=(temperature, "float > 0"),
+        sharpness=(sharpness, "float > 0"),
+        hypotheses=(hypotheses, "int >= 1"),
+    )
+    known = {f"data[{i}]": (d, f"n d{i}") for i, d in enumerate(data)}
+    limit = threshold if isinstance(threshold, Tensor) else None
+    if limit is None:
+        check_options(threshold=(threshold, "float > 0"))
+    batch = check_tensors(**known, threshold=(limit, "?"), logits=(logits, "?n"), mask=(mask, "?n: bool"))
+    limit = data[0].new_tensor(threshold) if limit is None else limit
     n, m, p = data[0].shape[-2], estimator.sample_size, batch.numel()
     if n < m:
         raise ValueError(f"data: wanted n >= {m}, the size of a sample, got {n}")

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import check_options
 from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics
 from torchsfm.simulation.viewpoints import look_at
 
@@ -66,13 +67,14 @@ def random_bundle_problem(
         ValueError: Fewer than two cameras, or counts that cannot be had: fewer than two observations a point, or more than
             the cameras around a point can make.
     """
-    if num_cameras < 2:
-        raise ValueError(f"num_cameras: wanted at least 2, got {num_cameras}")
+    places = {"path": _path, "dome": _dome}
+    check_options(
+        num_cameras=(num_cameras, "int >= 2"), num_points=(num_points, "int >= 1"),
+        num_observations=(num_observations, "int >= 2"), layout=(layout, tuple(places)), noise=(noise, "float >= 0"),
+        outliers=(outliers, "0 <= float <= 1"), disturbance=(disturbance, "float >= 0"),
+    )  # fmt: skip
     if num_observations < 2 * num_points:
         raise ValueError(f"num_observations: wanted at least 2 for each of {num_points} points, got {num_observations}")
-    places = {"path": _path, "dome": _dome}
-    if layout not in places:
-        raise ValueError(f"layout: wanted one of {sorted(places)}, got {layout!r}")
     poses = places[layout](num_cameras, generator)
     f = 900 * (0.15 * _normal(generator, num_cameras)).exp()
     k1, k2 = -0.08 + 0.02 * _normal(generator, num_cameras), 0.01 + 0.005 * _normal(generator, num_cameras)

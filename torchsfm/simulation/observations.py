@@ -1,12 +1,13 @@
 """Simulated observations of points: projections with noise, outliers and missing data, batched over problems."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import check_options, check_tensors
 from torchsfm.geometry.cameras import Camera, intrinsics
 from torchsfm.geometry.poses import Pose
 
@@ -61,14 +62,19 @@ def simulate_images(
         Observations and truth, with batch shape that of all arguments together.
     """
     check_tensors(X=(X, "n 3"))
+    check_options(
+        poses=(poses, Pose), cameras=(cameras, Camera), image_size=(image_size, "?2 int >= 1"), noise=(noise, "float >= 0"),
+        outliers=(outliers, "0 <= float <= 1"), dropout=(dropout, "0 <= float <= 1"),
+    )  # fmt: skip
+    if (
+        not isinstance(depth_range, Sequence)
+        or len(depth_range) != 2
+        or not all(isinstance(d, int | float) for d in depth_range)
+    ):
+        raise ValueError(f"depth_range: wanted the least and the largest depth, got {depth_range!r}")
     if len(poses.shape) < 1:
         raise ValueError(f"poses: wanted batch shape (*batch, views), got {tuple(poses.shape)}")
     check_tensors(X=(X[..., None, :, :], "n 3"), R=(poses.R, "3 3"), K=(cameras.K, "3 3"))
-    for name, value in (("outliers", outliers), ("dropout", dropout)):
-        if not 0 <= value <= 1:
-            raise ValueError(f"{name}: wanted a probability in [0, 1], got {value}")
-    if noise < 0:
-        raise ValueError(f"noise: wanted a standard deviation >= 0, got {noise}")
     X_cam = poses.transform(X[..., None, :, :])
     depth = X_cam[..., 2]
     x_true = cameras.project(X_cam)
@@ -117,6 +123,7 @@ def random_points(
         dtype: Of the points.
         device: Of the points.
     """
+    check_options(kind=(kind, ("ball", "cube", "plane", "line", "gauss")), size=(size, "float"))
     options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
     if kind == "gauss":
         return size * torch.randn(*shape, 3, **options)  # type: ignore[call-overload, no-any-return]
@@ -124,9 +131,7 @@ def random_points(
         direction = torch.randn(*shape, 3, **options)  # type: ignore[call-overload]
         radius = torch.rand(*shape, 1, **options) ** (1 / 3)  # type: ignore[call-overload]
         return size * radius * direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-30)  # type: ignore[no-any-return]
-    used = {"cube": 3, "plane": 2, "line": 1}.get(kind)
-    if used is None:
-        raise ValueError(f"kind: wanted one of ball, cube, plane, line, gauss, got {kind!r}")
+    used = {"cube": 3, "plane": 2, "line": 1}[kind]
     draw = size * (2 * torch.rand(*shape, 3, **options) - 1)  # type: ignore[call-overload]
     draw[..., used:] = 0
     return draw  # type: ignore[no-any-return]
@@ -153,6 +158,7 @@ def random_intrinsics(
         device: Of the matrices.
     """
     options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
+    check_options(image_size=(image_size, "2 int >= 1"), view_angle=(view_angle, "2 float > 0"), wobble=(wobble, "float >= 0"))
     low, high = view_angle
     angle = low + (high - low) * torch.rand(*shape, **options)  # type: ignore[call-overload]
     width, height = image_size

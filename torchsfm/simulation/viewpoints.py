@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import broadcast_shapes, check_tensors
+from torchsfm._types import broadcast_shapes, check_options, check_tensors
 from torchsfm.geometry.poses import Pose
 
 
@@ -27,9 +27,9 @@ def look_at(
     Returns:
         World to camera. Where centre and target coincide the camera looks along the world's z axis.
     """
+    check_tensors(centre=(centre, "3"), target=(target, "3"), up=(up, "?3"))
     if up is None:
         up = centre.new_tensor([0.0, 0.0, 1.0])
-    check_tensors(centre=(centre, "3"), target=(target, "3"), up=(up, "3"))
     shape = broadcast_shapes(centre.shape, target.shape, up.shape)
     centre, target, up = centre.expand(shape), target.expand(shape), up.expand(shape)
     z_axis, x_axis = centre.new_tensor([0.0, 0.0, 1.0]), centre.new_tensor([1.0, 0.0, 0.0])
@@ -71,8 +71,10 @@ def orbit_poses(
     Returns:
         World to camera, batch (views,).
     """
-    if views < 1:
-        raise ValueError(f"views: wanted at least 1, got {views}")
+    check_options(
+        views=(views, "int >= 1"), radius=(radius, "float"), height=(height, "2 float"), sweep=(sweep, "float"),
+        start=(start, "float"), target=(target, "3 float"),
+    )  # fmt: skip
     whole = abs(sweep) >= 2 * math.pi - 1e-9
     i = torch.arange(views, dtype=dtype, device=device)
     angle = start + sweep * i / max(views if whole else views - 1, 1)
@@ -110,6 +112,7 @@ def random_poses(
     Returns:
         World to camera, with the given batch shape.
     """
+    check_options(distance=(distance, "2 float"), spread=(spread, "float"), wobble=(wobble, "float"), roll=(roll, "float"))
     options: dict[str, object] = {"dtype": dtype, "device": device}
     draw = torch.rand(*shape, 3, generator=generator, **options)  # type: ignore[call-overload]
     normal = torch.randn(*shape, 4, generator=generator, **options)  # type: ignore[call-overload]

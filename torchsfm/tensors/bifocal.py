@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, Status, check_tensors
+from torchsfm._types import Solutions, Status, check_options, check_tensors
 from torchsfm.geometry.rotations import cross_matrix
 from torchsfm.linalg import adjugate_3x3, cross, determinant_3x3, nearest_rank, nearest_rotation
 
@@ -122,7 +122,8 @@ def pose_from_essential(
     Raises:
         ValueError: Wrong shape, dtype or device.
     """
-    kind = "n: bool" if weights is not None and weights.dtype == torch.bool else "n"
+    kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
+    check_options(parallax=(parallax, "float >= 0"))
     batch = check_tensors(E=(E, "3 3"), d1=(d1, "n 3"), d2=(d2, "n 3"), weights=(weights, kind))
     shape = (*batch, d1.shape[-2])
     w = torch.ones_like(d1[..., 0]) if weights is None else weights.to(d1.dtype)

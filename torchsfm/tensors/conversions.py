@@ -1,5 +1,7 @@
 """From tensors of fewer views to tensors of more, and back: F, T and Q by way of the cameras they allow."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -92,7 +94,7 @@ def reordered_trifocal(T: Float[Tensor, "*batch 3 3 3"], views: tuple[int, int, 
     Raises:
         ValueError: Wrong shape or dtype, or `views` is no permutation.
     """
-    if sorted(views) != [0, 1, 2]:
+    if not isinstance(views, Sequence) or len(views) != 3 or set(views) != {0, 1, 2}:
         raise ValueError(f"views: wanted a permutation of (0, 1, 2), got {views}")
     P = cameras_from_trifocal(T).P
     return unit_tensor(trifocal_from_cameras(*(P[..., k, :, :] for k in views)), 3)[0]

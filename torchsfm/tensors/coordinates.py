@@ -107,6 +107,7 @@ def reduced_fundamental(
     Returns:
         The reduced matrix with norm 1.
     """
+    check_tensors(F=(F, "3 3"), x1=(x1, "4 2"), x2=(x2, "4 2"))
     return unit_tensor(transform_fundamental(F, basis_homography(x1), basis_homography(x2)), 2)[0]
 
 

@@ -5,6 +5,8 @@ second, r of the third and s of the fourth. Lines l1, l2, l3, l4 through the ima
 `l1_p l2_q l3_r l4_s Q^pqrs = 0`. Another order of the views is another order of the indices, up to sign.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -75,7 +77,7 @@ def trifocal_from_quadrifocal(
         ValueError: Wrong shape or dtype, or `views` are not three different numbers from 0 to 3.
     """
     check_tensors(Q=(Q, "3 3 3 3"))
-    if len(views) != 3 or len(set(views)) != 3 or not set(views) <= {0, 1, 2, 3}:
+    if not isinstance(views, Sequence) or len(views) != 3 or len(set(views)) != 3 or not set(views) <= {0, 1, 2, 3}:
         raise ValueError(f"views: wanted three different numbers from 0 to 3, got {views}")
     t, _ = null_vector(_transfer_equations(unit_tensor(_reordered(Q, views), 4)[0]))
     return split_last(t, 3, 3, 3)

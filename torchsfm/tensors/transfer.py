@@ -39,7 +39,7 @@ def transfer_points_trifocal(
     e2, e3 = trifocal_epipoles(T)
     epipolar = cross(e2[..., None, :], (M @ e3[..., None, :, None])[..., 0])
     a, b = epipolar[..., 0], epipolar[..., 1]
-    line = torch.stack((b, -a, a * x2[..., 1] - b * x2[..., 0]), -1)
+    line = torch.stack(torch.broadcast_tensors(b, -a, a * x2[..., 1] - b * x2[..., 0]), -1)  # type: ignore[no-untyped-call]
     y = (line[..., None, :] @ M)[..., 0, :]
     return divide_safely(y[..., :2], y[..., 2])
 

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.linalg import usable
 
-LARGEST = 1e60
-"""Numbers from here on count as not finite."""
 PIECE = 32768
 """Observations in one piece: some ten temporaries of it fit a second-level cache."""
 
@@ -71,7 +70,7 @@ def row_dot(row: tuple[Tensor, ...], X: Tensor | tuple[Tensor, ...]) -> Tensor:
 
 def check(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> tuple[torch.Size, int]:
     """The batch shape and the number of points."""
-    batch = check_tensors(x=(x, "v n 2"), P=(P, "v 3 4"), visible=(visible, "v n: bool"), weights=(weights, "v n"))
+    batch = check_tensors(x=(x, "v n 2"), P=(P, "v 3 4"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
     return batch, x.shape[-2]
 
 
@@ -164,14 +163,14 @@ def _observe(x: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | Non
     size = entries[:, :3].detach().abs().amax((0, 1))
     entries = entries / torch.where((size > 0) & (size < torch.inf), size, 1.0)
     # Squares must be finite too.
-    good_P = entries.detach().abs().amax((0, 1)) < LARGEST
-    good = (u.detach().abs() < LARGEST) & (v.detach().abs() < LARGEST) & good_P
+    good_P = usable(entries.detach().abs().amax((0, 1)))
+    good = usable(u) & usable(v) & good_P
     wanted = torch.ones_like(good) if visible is None else visible.permute(1, 0, 2)
     w = torch.ones_like(u)
     if weights is not None:
         w = weights.permute(1, 0, 2).double()
         wanted = wanted & (w.detach() != 0)
-        good = good & (w.detach() >= 0) & (w.detach() < LARGEST)
+        good = good & (w.detach() >= 0) & usable(w)
     use = wanted & good
     zero = torch.zeros((), dtype=torch.float64, device=x.device)
     w, u, v = torch.where(use, w, zero), torch.where(use, u, zero), torch.where(use, v, zero)

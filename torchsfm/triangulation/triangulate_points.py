@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from torchsfm._types import Status
+from torchsfm._types import Status, check_options
 from torchsfm.optim import wants_derivative
 from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
 from torchsfm.triangulation._symmetric import inverse, symmetric, tangent_step
@@ -69,6 +69,7 @@ def triangulate_points(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
     """
+    check_options(max_iterations=(max_iterations, "int >= 0"))
 
     def solve(data: Observations) -> tuple[Tensor, ...]:
         return _solve(data, max_iterations)

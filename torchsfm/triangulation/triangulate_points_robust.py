@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, Status, broadcast_shapes, check_tensors
+from torchsfm._types import Solutions, Status, broadcast_shapes, check_options, check_tensors
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.robust import Score, damped_solve, ransac
 from torchsfm.robust.local_optimisation import Weigh
@@ -219,9 +219,14 @@ def triangulate_points_robust(
         ValueError: A shape, dtype, device or option does not fit.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
+    if limit is None:
+        check_options(threshold=(threshold, "?float > 0"))
+    check_options(
+        confidence=(confidence, "0 < float < 1"), max_iterations=(max_iterations, "int >= 1"), score=(score, Score | None)
+    )
     batch = check_tensors(
-        x=(x, "v n 2"), P=(P, "v 3 4"), threshold=(limit, "n"), visible=(visible, "v n: bool"), scores=(scores, "v n"),
-        weights=(weights, "v n"),
+        x=(x, "v n 2"), P=(P, "v 3 4"), threshold=(limit, "?n"), visible=(visible, "?v n: bool"), scores=(scores, "?v n"),
+        weights=(weights, "?v n"),
     )  # fmt: skip
     dtype, (v, n) = x.dtype, x.shape[-3:-1]
     x, P = x.double(), P.double()

@@ -1,0 +1,21 @@
+"""What size numbers may have: floating point goes to 1e308, and squares and products of them not nearly as far."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+LARGEST = 1e60
+"""Numbers from here on count as not finite: the fifth power is the last that exists."""
+
+
+def usable(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
+    """Which numbers are finite and of a size that products of several can be computed with."""
+    return x.detach().abs() < LARGEST
+
+
+def unit_scale(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch 1 1"]:
+    """A power of two by which the largest number of a finite matrix, unless it is 0, comes to between 1/2 and 1."""
+    if 0 in A.shape[-2:]:
+        return A.new_ones(*A.shape[:-2], 1, 1)
+    largest = A.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(A.dtype).tiny)
+    return torch.frexp(largest).mantissa / largest
