@@ -46,7 +46,7 @@ def test_the_derivative_is_that_of_the_whole_estimation(door: Door, generator: t
         assert ((g == 0).all(-1) & plain.inliers).sum() <= 2, d.shape
     for i, (x, g) in enumerate(zip(inputs, gradients, strict=True)):
         assert torch.isfinite(g).all()
-        step = 1e-3 * torch.randn(x.shape, generator=generator, dtype=F64)
+        step = 2e-4 * torch.randn(x.shape, generator=generator, dtype=F64)
         step = step if i < door.images else 0.1 * step * x.abs()
         if door is DOORS["upright"] and data <= i < data + 2:
             step = 0.1 * (step - (step * x).sum(-1, keepdim=True) * x)

@@ -134,3 +134,9 @@ def divide_safely(y: Float[Tensor, "*batch d"], w: Float[Tensor, "*batch"]) -> F
     replacement = torch.where(floor > 0, floor, 1.0)
     replacement = torch.where(value < 0, -replacement, replacement)
     return y / torch.where(value.abs() > floor, w, replacement)[..., None]
+
+
+def moderate_directions(d: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    """The same directions, the largest coordinate of each 1 or -1: squares of them neither vanish nor overflow."""
+    largest = d.detach().abs().amax(-1, keepdim=True)
+    return d / torch.where((largest > 0) & (largest < torch.inf), largest, 1)

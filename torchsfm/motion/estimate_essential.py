@@ -41,6 +41,7 @@ class RelativePoseEstimator:
     max_solutions: ClassVar[int] = 10
     codimension: ClassVar[int] = 1
     dimension: ClassVar[int] = 5
+    never_zero: ClassVar[bool] = True
 
     def minimal(
         self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]
@@ -156,7 +157,7 @@ def estimate_essential(
     Args:
         d1: Rays of the first camera, of any length, pointing to the points.
         d2: The corresponding rays of the second camera.
-        threshold: Largest Sampson distance of an inlier in radians: pixels divided by the focal length.
+        threshold: Largest Sampson distance of an inlier in radians, at most 0.1: pixels divided by the focal length.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite or of length 0 are left out too.
         scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
@@ -174,13 +175,14 @@ def estimate_essential(
         respect to the inliers (see `ransac`).
 
     Raises:
-        ValueError: A shape, dtype, device or option does not fit.
+        ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
     """
     request = Request(
         threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
         confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
     batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"))
+    request.check_radians()
     estimator = RelativePoseEstimator(pose_slack(threshold, d1).expand(batch))
 
     def back(model: Tensor) -> Tensor:

@@ -35,6 +35,7 @@ class FundamentalEstimator:
     max_solutions: ClassVar[int] = 3
     codimension: ClassVar[int] = 1
     dimension: ClassVar[int] = 7
+    never_zero: ClassVar[bool] = True
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]

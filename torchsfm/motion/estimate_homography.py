@@ -38,6 +38,7 @@ class HomographyEstimator:
     max_solutions: ClassVar[int] = 1
     codimension: ClassVar[int] = 2
     dimension: ClassVar[int] = 8
+    never_zero: ClassVar[bool] = True
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]

@@ -35,6 +35,7 @@ class TrifocalEstimator:
     max_solutions: ClassVar[int] = 3
     codimension: ClassVar[int] = 3
     dimension: ClassVar[int] = 18
+    never_zero: ClassVar[bool] = True
     traceable: ClassVar[bool] = False
     """Compiled steps differ from those of eager mode (PyTorch 2.13)."""
 

@@ -40,6 +40,7 @@ class UprightPoseEstimator:
     max_solutions: ClassVar[int] = 4
     codimension: ClassVar[int] = 1
     dimension: ClassVar[int] = 3
+    never_zero: ClassVar[bool] = True
 
     def minimal(
         self, d1: Float[Tensor, "*#batch 3 3"], d2: Float[Tensor, "*#batch 3 3"]
@@ -134,7 +135,7 @@ def estimate_upright(
         d2: The corresponding rays of the second camera.
         gravity1: The vertical in the first camera, of any length.
         gravity2: The vertical in the second camera.
-        threshold: Largest Sampson distance of an inlier in radians: pixels divided by the focal length.
+        threshold: Largest Sampson distance of an inlier in radians, at most 0.1: pixels divided by the focal length.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         mask: Which correspondences exist. Rows that are not finite or of length 0 are left out too.
         scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
@@ -150,13 +151,14 @@ def estimate_upright(
         (12 x 12, of rank 3). The pose carries its derivatives with respect to the inliers and the verticals (see `ransac`).
 
     Raises:
-        ValueError: A shape, dtype, device or option does not fit.
+        ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
     """
     request = Request(
         threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
         confidence=confidence, max_iterations=max_iterations, covariance=covariance,
     )  # fmt: skip
     batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"))
+    request.check_radians()
     up1, up2 = (unit_rays(g[..., None, :])[..., 0, :].expand(*batch, 3) for g in (gravity1, gravity2))
     known = torch.isfinite(up1 + up2).all(-1)[..., None]
     down = torch.eye(3, dtype=up1.dtype, device=up1.device)[2]

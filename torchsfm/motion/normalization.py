@@ -1,6 +1,5 @@
 """Bringing two images to a common moderate scale, so that a threshold stays a threshold."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,12 +7,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm._types import broadcast_shapes
+from torchsfm.robust.moderation import middle_and_size, moved_and_scaled, present
+
 
 class CommonScale(NamedTuple):
     """Points centred in each image, both divided by the same number.
 
     Attributes:
-        x1: Points of the first image, between -1 and 1.
+        x1: Points of the first image, most of them not far from the unit square; NaN where they are absurdly far.
         x2: Points of the second image.
         T1: The similarity from the caller's first image to `x1`.
         T2: The similarity from the caller's second image to `x2`.
@@ -30,9 +32,9 @@ class CommonScale(NamedTuple):
 def common_scale(
     x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"], mask: Bool[Tensor, "*#batch n"] | None
 ) -> CommonScale:
-    """Centre the bounding boxes of both images' points, and divide by the larger half side.
+    """Centre both images' points, and divide by the larger of their sizes: medians, which wrong points do not move far.
 
-    Bounding boxes, because they do not depend on the order of the points or on how many absent ones surround them, bit for bit.
+    What is then absurdly far is NaN: it agrees with nothing, and would cost the others their precision.
     """
     (y1, y2), (T1, T2), scale = common_scale_of_views((x1, x2), mask)
     return CommonScale(y1, y2, T1, T2, scale)
@@ -42,47 +44,20 @@ def common_scale_of_views(
     x: Sequence[Float[Tensor, "*#batch n 2"]], mask: Bool[Tensor, "*#batch n"] | None
 ) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """The same for any number of images: the points, the similarities, the common factor."""
-    # One coordinate in a row: extremes and differences are then taken along the memory.
-    rows = [view.mT.contiguous() for view in x]
     # The similarity is held when the points move.
-    fixed = [row.detach() for row in rows]
-    low, high = _extremes(fixed, mask)
-    centre = (low + high) / 2
-    size = (high - low).amax((-2, -1)) / 2
-    scale = torch.where((size > 0) & (size < torch.inf), 1 / size, 1)
-    s = scale[..., None, None]
+    fixed = [view.detach() for view in x]
+    usable = present(mask, *fixed)
+    middles, sizes = zip(*(middle_and_size(view, usable) for view in fixed), strict=True)
+    batch = broadcast_shapes(*(size.shape for size in sizes))
+    centre = torch.stack([middle.expand(*batch, 2) for middle in middles], -2)
+    size = torch.stack([own.expand(batch) for own in sizes]).amax(0)
+    s = 1 / size[..., None, None]
     similarities = s.new_zeros(*centre.shape[:-1], 3, 3)
     similarities.diagonal(dim1=-2, dim2=-1)[..., :2] = s
     similarities[..., :2, 2] = -s * centre
     similarities[..., 2, 2] = 1
-    points = [((row - c[..., None]) * s).mT for row, c in zip(rows, centre.unbind(-2), strict=True)]
-    return points, list(similarities.unbind(-3)), scale
-
-
-def _extremes(rows: Sequence[Tensor], mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Of each coordinate of each view `(*batch, view, 2)`, the least and the largest where all views are finite, or 0."""
-    if mask is None and rows[0].shape[-1]:
-        low, high = _in_one([row.amin(-1) for row in rows]), _in_one([row.amax(-1) for row in rows])
-        if math.isfinite(float((high - low).sum())):
-            return low, high
-    usable = torch.isfinite(rows[0]).all(-2)
-    for row in rows[1:]:
-        usable = usable & torch.isfinite(row).all(-2)
-    if mask is not None:
-        usable = usable & mask
-    usable = usable[..., None, :]
-    some = usable.any(-1)
-    if not rows[0].shape[-1]:
-        none = _in_one([torch.zeros_like(some * row.sum(-1)) for row in rows])
-        return none, none
-    low = _in_one([torch.where(some, torch.where(usable, row, torch.inf).amin(-1), 0) for row in rows])
-    return low, _in_one([torch.where(some, torch.where(usable, row, -torch.inf).amax(-1), 0) for row in rows])
-
-
-def _in_one(views: list[Tensor]) -> Tensor:
-    if any(view.shape != views[0].shape for view in views):
-        views = list(torch.broadcast_tensors(*views))  # type: ignore[no-untyped-call]
-    return torch.stack(views, -2)
+    points = [moved_and_scaled(view, c, size) for view, c in zip(x, centre.unbind(-2), strict=True)]
+    return points, list(similarities.unbind(-3)), 1 / size
 
 
 def largest_positive(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

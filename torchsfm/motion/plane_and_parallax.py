@@ -17,6 +17,7 @@ from torchsfm.motion.epipolar_fit import cross_rows, forms, plane_rows
 from torchsfm.motion.plane_glance import best_triple, plane_errors
 from torchsfm.robust import damped_solve
 from torchsfm.robust.sampling import draw_samples
+from torchsfm.robust.scoring import squared_residual
 
 _JUDGES = 256
 """How many data to judge planes by before all of them are looked at."""
@@ -134,12 +135,10 @@ def plane_rivals(
     # Problem by problem, or what is being computed leaves the cache.
     loss = []
     for i in range(len(row)):
-        squared = estimator.squared_residual(both[i : i + 1], z1[i : i + 1, None], z2[i : i + 1, None])
+        squared = squared_residual(estimator, both[i : i + 1], z1[i : i + 1, None], z2[i : i + 1, None])
         ratio = (squared / bound[i]).clamp(max=1).nan_to_num(nan=1.0)
         loss.append((ratio * counts[i]).sum(-1))
-    # Two points on one epipolar line determine no F: zero, which everything would agree with.
-    nothing = (both == 0).all(-1).all(-1)
-    least = torch.where(nothing, torch.inf, torch.cat(loss)).topk(_RIVALS, dim=-1, largest=False)
+    least = torch.cat(loss).topk(_RIVALS, dim=-1, largest=False)
     out[row] = both.gather(1, least.indices[..., None, None].expand(-1, -1, 3, 4))
     valid[row] = (least.values < counts.sum(-1, keepdim=True)) & (count >= 2)[:, None]
     return Solutions(out, valid)
@@ -150,7 +149,7 @@ def _on_plane(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The homography of the dominant plane, the inliers on it, and all inliers."""
     F, e = model[..., :3], model[..., 3]
-    near = (estimator.squared_residual(model, x1, x2) < limit[:, None]) & inside
+    near = (squared_residual(estimator, model, x1, x2) < limit[:, None]) & inside
     H, on = dominant_plane(cross_rows(e, F), e, plane_rows(x1), plane_rows(x2), near, 4 * limit, sphere=False)
     return H, on, near
 

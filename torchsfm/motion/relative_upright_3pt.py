@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross
 from torchsfm.linalg.quartic import quartic_rows
 from torchsfm.linalg.rows import combine_rows
@@ -81,6 +82,7 @@ def relative_upright_3pt(
         pose, valid = in_chunks(_solve, _CHUNK, *rows)
         pose, valid = pose.permute(2, 1, 0).to(d1.dtype).reshape(*batch, 4, 3, 4), valid.mT.reshape(*batch, 4)
     if wants_derivative(d1, d2, gravity1, gravity2):
+        d1, d2, gravity1, gravity2 = (moderate_directions(v) for v in (d1, d2, gravity1, gravity2))
         inputs = (d1[..., None, :, :], d2[..., None, :, :], gravity1[..., None, :], gravity2[..., None, :])
         pose = attach_implicit(equations, pose, *inputs, dims=2, valid=valid)
     return Solutions(pose, valid)

@@ -17,6 +17,7 @@ from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.plane_and_parallax import dominant_plane, squared_transfer
 from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.robust.sampling import draw_samples
+from torchsfm.robust.scoring import squared_residual
 from torchsfm.tensors.canonical import canonical_frame
 
 _PAIRS, _OFF_PLANE, _RIVALS = 256, 256, 4
@@ -46,7 +47,7 @@ def rivals_of_plane(
     out = model[:, None].expand(-1, _RIVALS, -1, -1, -1).clone()
     valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
     limit = threshold * threshold
-    near = (estimator.squared_residual(model, *x) < limit[:, None]) & inside
+    near = (squared_residual(estimator, model, *x) < limit[:, None]) & inside
     H, on = _planes(model, x, near, limit)
     row = ((2 * on.sum(-1) >= near.sum(-1)) & (on.sum(-1) >= 5)).nonzero()[:, 0]
     if not len(row):
@@ -74,7 +75,7 @@ def rivals_of_plane(
     # Problem by problem, or what is being computed leaves the cache.
     loss = []
     for i in range(len(row)):
-        squared = estimator.squared_residual(found[i : i + 1], *(y[i : i + 1, None] for y in z))
+        squared = squared_residual(estimator, found[i : i + 1], *(y[i : i + 1, None] for y in z))
         ratio = (squared / limit[i]).clamp(max=1).nan_to_num(nan=1.0)
         loss.append((ratio * counts[i]).sum(-1))
     least = torch.cat(loss).topk(_RIVALS, dim=-1, largest=False)

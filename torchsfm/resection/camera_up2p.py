@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
+from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.optim import attach_implicit, wants_derivative
 
 
@@ -66,6 +67,7 @@ def camera_up2p(
         model, valid = _solve(rays, points, down, world, eps)
         model, valid = model.permute(3, 0, 1, 2).reshape(*batch, 2, 3, 4).to(d.dtype), valid.T.reshape(*batch, 2)
     if wants_derivative(d, X, g, G):
+        d, g, G = (moderate_directions(v) for v in (d, g, G))
         inputs = (d[..., None, :, :], X[..., None, :, :], g[..., None, :], G[..., None, :])
         model = attach_implicit(equations, model, *inputs, dims=2, valid=valid)
     return Solutions(model, valid)

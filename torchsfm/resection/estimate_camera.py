@@ -1,6 +1,5 @@
 """The pose of a calibrated camera from correspondences with known points, of which many are wrong."""
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -8,17 +7,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, broadcast_shapes
+from torchsfm._types import Solutions
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
 from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
-from torchsfm.robust.sampling import compact, spread_order
-
-_MANY = 128
-"""Of how many points to take the median."""
+from torchsfm.robust.moderation import moderate, moved_and_scaled, present
 
 
 @dataclass(frozen=True)
@@ -37,6 +33,7 @@ class CameraEstimator:
     max_solutions: ClassVar[int] = 4
     codimension: ClassVar[int] = 2
     dimension: ClassVar[int] = 6
+    never_zero: ClassVar[bool] = True
 
     def minimal(
         self, x: Float[Tensor, "*#batch 3 2"], X: Float[Tensor, "*#batch 3 3"]
@@ -192,67 +189,8 @@ def estimate_camera(
     return request.answer(estimator, y, Y, dtype=dtype, scale=1 / focal, back=back, step_unit=unit)
 
 
-def present(mask: Tensor | None, *data: Tensor) -> Tensor | None:
-    """Which data exist and are finite; None for all."""
-    usable = mask
-    for d in data:
-        # A sum is finite only if all numbers are.
-        if not math.isfinite(float(d.detach().sum())):
-            row = torch.isfinite(d).all(-1)
-            usable = row if usable is None else usable & row
-    return usable
-
-
-def moderate(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Points of moderate size around 0, and their `middle_and_size`, which are held when the points move."""
-    centre, size = middle_and_size(X.detach(), usable)
-    return moved_and_scaled(X, centre, size), centre, size
-
-
-def moved_and_scaled(X: Tensor, centre: Tensor, size: Tensor) -> Tensor:
-    """(X - centre) / size, computed with one coordinate in a row."""
-    return ((X.mT.contiguous() - centre[..., None]) / size[..., None, None]).mT
-
-
 def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:
     """[R | t] in the world, from that in the world of `moderate` points."""
     R = model[..., :3]
     t = model[..., 3:] * size[..., None, None] - R @ centre[..., None]
     return torch.cat((R, t), -1)
-
-
-def middle_and_size(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Medians of the usable points and of their distances from it: points far away must not cost the others precision.
-
-    Of many points, some that are spread over all will do. Which ones depends on the usable points alone.
-    """
-    n = X.shape[-2]
-    if n <= 2 * _MANY:
-        return _medians(X, usable)
-    if usable is None:
-        return _medians(X[..., spread_order(n, n, X.device)[:_MANY], :], None)
-    usable = usable.expand(*broadcast_shapes(X.shape[:-2], usable.shape[:-1]), n)
-    count = usable.sum(-1)
-    many = count > 2 * _MANY
-    if not bool(many.any()):
-        return _medians(X, usable)
-    part = compact(usable.reshape(-1, n), count.flatten(), n)[:, :_MANY].reshape(*usable.shape[:-1], _MANY, 1)
-    middle, radius = _medians(X.expand(*usable.shape, -1).gather(-2, part.expand(*part.shape[:-1], X.shape[-1])), None)
-    if bool(many.all()):
-        return middle, radius
-    centre, size = _medians(X, usable)
-    return torch.where(many[..., None], middle, centre), torch.where(many, radius, size)
-
-
-def _medians(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
-    rows = X.mT.contiguous()
-    if not rows.shape[-1]:
-        centre = rows.new_zeros(rows.shape[:-1] if usable is None else (*usable.shape[:-1], rows.shape[-2]))
-        return centre, torch.ones_like(centre[..., 0])
-    if usable is not None:
-        rows = torch.where(usable[..., None, :], rows, torch.nan)
-    centre = rows.nanmedian(dim=-1).values
-    if usable is not None:
-        centre = torch.where(usable.any(-1)[..., None], centre, 0)
-    size = (rows - centre[..., None]).abs_().amax(-2).nanmedian(dim=-1).values
-    return centre, torch.where((size > 0) & (size < torch.inf), size, 1)

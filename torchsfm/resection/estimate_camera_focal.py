@@ -12,9 +12,10 @@ from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
-from torchsfm.resection.estimate_camera import middle_and_size, moderate, moved_and_scaled, present, world_pose
+from torchsfm.resection.estimate_camera import world_pose
 from torchsfm.robust import Request, RobustResult, Score
 from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust.moderation import middle_and_size, moderate, moved_and_scaled, present
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class FocalCameraEstimator:
     max_solutions: ClassVar[int] = 1
     codimension: ClassVar[int] = 2
     dimension: ClassVar[int] = 7
+    never_zero: ClassVar[bool] = True
 
     def minimal(
         self, x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]

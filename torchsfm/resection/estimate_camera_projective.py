@@ -13,9 +13,9 @@ from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._focal import incidence_rows
 from torchsfm.resection._reprojection_step import normal_equations, squared_reprojection
-from torchsfm.resection.estimate_camera import moderate, present
 from torchsfm.robust import Request, RobustResult, Score, damped_solve
 from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust.moderation import moderate, present
 
 _CHUNK = 4096
 
@@ -34,6 +34,7 @@ class ProjectiveCameraEstimator:
     max_solutions: ClassVar[int] = 1
     codimension: ClassVar[int] = 2
     dimension: ClassVar[int] = 11
+    never_zero: ClassVar[bool] = True
 
     def minimal(
         self, x: Float[Tensor, "*#batch 6 2"], X: Float[Tensor, "*#batch 6 3"]

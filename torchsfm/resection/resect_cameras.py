@@ -10,9 +10,10 @@ from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import Camera, Pose
 from torchsfm.resection.camera_dlt import camera_dlt
 from torchsfm.resection.camera_pnp import camera_pnp
-from torchsfm.resection.estimate_camera import estimate_camera, middle_and_size
+from torchsfm.resection.estimate_camera import estimate_camera
 from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
 from torchsfm.resection.refine_camera import refine_camera
+from torchsfm.robust.moderation import middle_and_size
 
 _STEPS = 8
 

@@ -25,6 +25,8 @@ class Estimator(Protocol[M]):
 
     An implementation may also define
 
+    - `never_zero: ClassVar[bool]`: True if a model of zeros alone is none, as for what is homogeneous or holds a rotation. Such
+      models, as those that are not finite, agree with no data, whatever the residual makes of them;
     - `squared_residual(model, *data)`: the square of `residual`, where that is cheaper;
     - `reweighted_step(model, *data, weigh)`: a step as `refine` does it, with weights that follow from the distances:
       `weigh(squared) -> (weights, curvature)`, all `(*batch, n)`. The weights belong in the gradient, the curvature stands in

@@ -2,16 +2,16 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.models import join, take_slots, tensors_of, zip_map
+from torchsfm.robust.models import join, put, select, take_slots, tensors_of, zip_map
 from torchsfm.robust.scores import Score
 from torchsfm.robust.scoring import squared_residual
 
@@ -43,8 +43,11 @@ SCALE_STEPS = 3
 """Rounds of the final refinement that estimate the scale of the noise."""
 FIRST_STEPS, LAST_STEPS = 1, 3
 """Rounds that hold it, in the precision of scoring and in float64; twice as many without the curvature of the loss."""
-_MOST_STEPS, _STILL, _SMALL = 24, 3e-4, 1e-10
-"""More of the last ones for what still moves so much, compared to the first of them and to the model: at most so many."""
+_MOST_STEPS, _STILL, _SMALL = 64, 1e-5, 1e-10
+"""At most so many of the last ones, for what still moves by more than so much of the first of them, and of the model."""
+_FLAT, _ROUNDING, _DRAWN = 0.1, 1e-6, 9.0
+"""The least curvature of a datum in units of its weight; the share by which a step may raise the loss, as it leaves its
+manifold a little; how many times its length a step is drawn out at most."""
 _GLANCE, LOCAL_DATA, SCALE_DATA = 128, 256, 512
 """The first guess of the scale, local optimisation, and the estimation of the scale look at so many data at most."""
 
@@ -232,42 +235,6 @@ def _peak(k: int) -> float:
     return float((2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1))
 
 
-def optimise_fully(
-    estimator: Estimator[M],
-    model: M,
-    data: Sequence[Tensor],
-    reach: Float[Tensor, "g"],
-    counts: Tensor,
-) -> M:
-    """The same to convergence, of each problem: its derivative is that of an optimum."""
-    before, first = model, None
-    for _ in range(LAST_STEPS if hasattr(estimator, "reweighted_step") else 2 * LAST_STEPS):
-        before, model = model, _step_within(estimator, model, data, reach, counts)
-        first = _size(before, model) if first is None else first
-    assert first is not None
-    last = _size(before, model)
-    row = ((last > _STILL * first) & (last > _SMALL * _size(model))).nonzero()[:, 0]
-    for _ in range(_MOST_STEPS):
-        if not len(row):
-            break
-
-        def take(tree: T, row: Tensor = row) -> T:
-            return tensor_map(lambda t: t[row], tree)
-
-        old = take(model)
-        new = _step_within(take(estimator), old, take(data), reach[row], counts[row])
-        model = zip_map(lambda t, part: t.index_copy(0, row, part), model, new)  # noqa: B023
-        last = _size(old, new)
-        row = row[(last > _STILL * first[row]) & (last > _SMALL * _size(new))]
-    return model
-
-
-def _size(model: M, other: M | None = None) -> Float[Tensor, "g"]:
-    """The length of the entries of models `(g, 1, ...)`, or of their differences."""
-    change = model if other is None else zip_map(torch.sub, model, other)
-    return torch.stack([(t * t).flatten(1).sum(-1) for t in tensors_of(change)]).sum(0).sqrt()
-
-
 def optimise_within(
     estimator: Estimator[M],
     model: M,
@@ -276,32 +243,102 @@ def optimise_within(
     counts: Tensor,
     steps: int,
 ) -> M:
-    """The optimum of the sum of u - u^2 / 2, u the squared distance over the squared reach, near a model `(g, 1, ...)`."""
+    """Steps from models `(g, 1, ...)` to a minimum of the sum of u - u^2 / 2, u the squared distance over the squared reach."""
     for _ in range(steps if hasattr(estimator, "reweighted_step") else 2 * steps):
-        model = _step_within(estimator, model, data, reach, counts)
+        model, _ = _step_within(estimator, model, data, reach, counts, torch.zeros_like(reach))
     return model
 
 
-@fused("g 1", "g 1", "g 1 n", "g", "g n")
-def _step_within(estimator: Estimator[M], model: M, data: Sequence[Tensor], reach: Tensor, counts: Tensor) -> M:
-    scale = (1 / reach)[:, None, None]
+def optimise_fully(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    reach: Float[Tensor, "g"],
+    counts: Tensor,
+) -> tuple[M, Bool[Tensor, "g"]]:
+    """That minimum itself, and where it was reached: only a minimum has a derivative.
+
+    A step that raises the loss is taken back and the next one damped (Levenberg 1944): in the limit it is a short one of
+    reweighted least squares, which cannot raise it. Steps that shrink slowly are drawn out (Anderson 1965, of depth 1).
+    """
+    settled = torch.zeros_like(reach, dtype=torch.bool)
+    # What comes in lower precision is beside the manifold, where the loss may be less than anywhere on it.
+    coarse, model = model, optimise_within(estimator, model, data, reach, counts, 1)
+    found, row = model, torch.arange(len(reach), device=reach.device)
+    problem: tuple[Any, ...] = (estimator, tuple(data), reach, counts)
+    start, last, step = model, model, zip_map(torch.sub, model, coarse)
+    first, least, damping = _size(step), torch.full_like(reach, torch.inf), torch.zeros_like(reach)
+    for count in range(2, _MOST_STEPS + 1):
+        own, values, edge, counted = problem
+        moved, loss = _step_within(own, model, values, edge, counted, damping)
+        # A loss that is no number is none.
+        good = loss <= least * (1 + _ROUNDING)
+        damping = torch.where(good, torch.where(loss < least, damping / 4, damping), (4 * damping).clamp(min=1))
+        start, least = select(good, model, start), torch.where(good, loss, least)
+        before, step = step, zip_map(torch.sub, moved, model)
+        size = _size(step)
+        done = good & ((size <= _STILL * first) | (size <= _SMALL * _size(moved)))
+        drawn = _drawn_out(moved, last, step, before) if count > 2 else moved
+        last, model = moved, select(good, drawn, start)
+        if count < LAST_STEPS or not (bool(done.any()) or count == _MOST_STEPS):
+            continue
+        found = put(found, row, select(done, moved, start))
+        settled = settled.index_copy(0, row, done)
+        rest = (~done).nonzero()[:, 0]
+        if not len(rest):
+            break
+        row, problem, start, last, model, step, first, least, damping = tensor_map(
+            lambda t: t[rest],  # noqa: B023
+            (row, problem, start, last, model, step, first, least, damping),
+        )
+    return found, settled
+
+
+def _drawn_out(moved: M, last: M, step: M, before: M) -> M:
+    """Where two steps, and the models they led to, say that steps lead."""
+    change = zip_map(torch.sub, step, before)
+    share = (_dot(step, change) / _dot(change, change)).nan_to_num(nan=0.0).clamp(-_DRAWN, 0.5)
+    return zip_map(lambda t, old: t - share.reshape(-1, *(1,) * (t.ndim - 1)) * (t - old), moved, last)
+
+
+def _dot(model: M, other: M) -> Float[Tensor, "g"]:
+    """The sum of products of the entries of models `(g, 1, ...)`."""
+    return torch.stack([t.flatten(1).sum(-1) for t in tensors_of(zip_map(torch.mul, model, other))]).sum(0)
+
+
+def _size(model: M) -> Float[Tensor, "g"]:
+    """The length of the entries of models."""
+    return _dot(model, model).sqrt()
+
+
+@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
+def _step_within(
+    estimator: Estimator[M], model: M, data: Sequence[Tensor], reach: Tensor, counts: Tensor, damping: Tensor
+) -> tuple[M, Tensor]:
+    """A step, and the loss `(g)` before it."""
+    scale, loss = (1 / reach)[:, None, None], reach
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
-        return _falling(squared * scale, counts, estimator.codimension)
+        nonlocal loss
+        u = (squared * scale).clamp(max=1)
+        loss = ((u - 0.5 * u * u) * counts[:, None]).sum(-1)[:, 0]
+        weights, curvature = _falling(u, counts, estimator.codimension)
+        return weights, curvature + damping[:, None, None] * weights
 
-    return reweighted_step(estimator, model, data, weigh)
+    return reweighted_step(estimator, model, data, weigh), loss
 
 
 def _falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tensor]:
     """Weight and curvature of the loss u - u^2 / 2, up to its maximum.
 
-    Negative curvatures could make the Hessian indefinite. They are taken from all positive ones in proportion instead, so that
-    steps are as long as they should be on average.
+    Curvatures that are negative, or next to nothing, could make the Hessian indefinite or vanish. What they are raised by is
+    taken from all in proportion, so that steps are as long as they should be on average, and bounded by a multiple of those of
+    reweighted least squares.
     """
     u, counts = u.clamp(max=1), counts[:, None]
     slope = 1 - u
     curvature = slope - (2 / codimension) * u * (slope > 0)
-    total, curvature = (curvature * counts).sum(-1, keepdim=True), curvature.clamp_(min=0) * counts
+    total, curvature = (curvature * counts).sum(-1, keepdim=True), torch.maximum(curvature, _FLAT * slope) * counts
     share = total / curvature.sum(-1, keepdim=True).clamp(min=_LEAST)
     return slope * counts, curvature * share.clamp(min=0.3)
 
@@ -309,11 +346,14 @@ def _falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tenso
 def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"]) -> Float[Tensor, "*batch k r"]:
     """Solve normal equations `A x = b`, damped as little as makes them definite; zero where even that fails.
 
-    The damping is relative to the diagonal, so that the unknowns may be of different units.
+    The damping is relative to the diagonal, so that the unknowns may be of different units. An unknown that nothing depends on
+    is 0.
     """
     A = A.clone()
+    diagonal = A.diagonal(dim1=-2, dim2=-1)
+    known = diagonal > 1e-290
     # As much as 1e-10 on the diagonal of the matrix scaled to a unit one; the scaling itself changes nothing.
-    A.diagonal(dim1=-2, dim2=-1).mul_(1 + 1e-10).add_(1e-290)
+    diagonal.mul_(1 + 1e-10).add_(~known)
     factor, info = torch.linalg.cholesky_ex(A)
     x = torch.cholesky_solve(b, factor).nan_to_num_(0, 0, 0)
-    return x.mul_((info == 0)[..., None, None])
+    return x.mul_(((info == 0)[..., None] & known)[..., None])

@@ -47,6 +47,11 @@ def select(condition: Tensor, models: T, others: T) -> T:
     )
 
 
+def put(models: T, index: Tensor, others: T) -> T:
+    """Models with those at an index `(k)` of the first batch dimension replaced by others `(k, ...)`."""
+    return zip_map(lambda t, new: t.index_copy(0, index, new), models, others)
+
+
 def cast(tree: T, dtype: torch.dtype) -> T:
     """Convert the floating-point tensors of a tree."""
     return tensor_map(lambda t: t.to(dtype) if t.dtype.is_floating_point else t, tree)

@@ -8,10 +8,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_options, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.robust.optimum import push_forward
 from torchsfm.robust.ransac import RobustResult, ransac
 from torchsfm.robust.scores import Score
+
+_MOST_RADIANS = 0.1
+"""No camera is so inexact: a larger threshold is one in pixels."""
+_WIDEST = 0.5
+"""The widest threshold that tells right from wrong, in units of the median distance of the data from their middle."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,22 @@ class Request:
         options = {"mask": (self.mask, "?n: bool"), "scores": (self.scores, "?n"), "weights": (self.weights, "?n")}
         return check_tensors(**data, threshold=(limit, "?"), **options)
 
+    def check_radians(self) -> None:
+        """Refuse thresholds that cannot be meant as angles.
+
+        Raises:
+            ValueError: A threshold is larger than 0.1 radians.
+        """
+        threshold = self.threshold
+        if isinstance(threshold, Tensor):
+            wide = threshold.detach()[threshold.detach() > _MOST_RADIANS]
+            threshold = float(wide.max()) if len(wide) else None
+        if threshold is not None and threshold > _MOST_RADIANS:
+            raise ValueError(
+                f"threshold: wanted radians, at most {_MOST_RADIANS}, got {threshold}; "
+                "for rays that is pixels divided by the focal length: threshold / focal"
+            )
+
     def answer(
         self,
         estimator: Any,
@@ -53,6 +74,8 @@ class Request:
         step_unit: Float[Tensor, "*#batch k"] | None = None,
     ) -> RobustResult[Tensor]:
         """Estimate in float64, hypotheses scored in float32, and bring the result back.
+
+        The data should be of moderate size around 0 (see `moderation`), or rays of length 1.
 
         Args:
             estimator: The problem, its fields for the whole batch.
@@ -75,6 +98,8 @@ class Request:
             covariance=self.covariance,
         )  # fmt: skip
         model, spread = result.model, result.covariance
+        # All data agree with any model within so much, also those of another unit than the threshold's.
+        vain = (result.threshold > _WIDEST) & (result.status == Status.OK)
         if spread is not None and step_unit is not None:
             spread = spread * step_unit[..., :, None] * step_unit[..., None, :]
         elif spread is not None:
@@ -88,6 +113,7 @@ class Request:
         return replace(
             result,
             model=(model if back is None else back(model)).to(dtype),
+            status=torch.where(vain, int(Status.NO_CONSENSUS), result.status).to(torch.int8),
             score=result.score.to(dtype),
             threshold=(result.threshold if scale is None else result.threshold / scale).to(dtype),
             covariance=None if spread is None else spread.to(dtype),

@@ -27,7 +27,8 @@ SHARE = 64
 
 
 def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#batch n _"]) -> Float[Tensor, "*batch n"]:
-    """The squared distance of data to models; infinite where it is not a number."""
+    """The squared distance of data to models of as many batch dimensions: infinite or no number where a model is none."""
+    model = _no_numbers_for_none(estimator, model, data[0].ndim - 2)
     direct = getattr(estimator, "squared_residual", None)
     if direct is None:
         residual = estimator.residual(model, *data)
@@ -35,6 +36,18 @@ def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#
     else:
         squared = direct(model, *data)
     return squared
+
+
+def _no_numbers_for_none(estimator: Estimator[M], model: M, dims: int) -> M:
+    """NaN in the place of what is no model: not finite, or zero where the estimator says that this is none."""
+    with torch.no_grad():
+        parts = [
+            torch.linalg.vector_norm(t.flatten(dims) if t.ndim > dims else t[..., None], dim=-1) for t in tensors_of(model)
+        ]
+        size = parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
+        # 1, but 0 / 0 or inf / inf; or 0, but inf - inf.
+        one = size / size if getattr(estimator, "never_zero", False) else size - size + 1
+    return tensor_map(lambda t: t * one.reshape(one.shape + (1,) * (t.ndim - dims)), model)
 
 
 def losses(

@@ -22,7 +22,7 @@ from torchsfm.robust.local_optimisation import (
     optimise_within,
     scale_of_noise,
 )
-from torchsfm.robust.models import cast, join, select, take_slots, zip_map
+from torchsfm.robust.models import cast, join, put, select, take_slots
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.scores import Msac, Score, limits
 from torchsfm.robust.scoring import around_model, losses, smallest, squared_residual
@@ -209,7 +209,7 @@ def _optimised(
         needed=torch.where(gain, needed, old.needed),
         minimal_loss=torch.minimum(loss[:, 0], old.minimal_loss),
     )
-    return _put(best, index, new)
+    return put(best, index, new)
 
 
 def _explored(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
@@ -282,7 +282,7 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         model = optimise_within(rough.estimator, model, rough.data, reach * old.limit, counts, FIRST_STEPS)
         old, reach = cast(old, torch.float64), reach.double() * old.limit
         wide, counts = some.spread(), some.inside if some.weight is None else some.weight
-        model = optimise_fully(wide.estimator, cast(model, torch.float64), wide.data, reach, counts)
+        model, settled = optimise_fully(wide.estimator, cast(model, torch.float64), wide.data, reach, counts)
         squared = squared_residual(wide.estimator, model, *wide.data)
         # A threshold smaller than the noise would blame the better model.
         judged = torch.maximum(old.limit, reach)
@@ -290,7 +290,7 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
         before = squared_residual(rough.estimator, start, *rough.data)
         before_loss = score.cost(before, judged, counts, k)[:, 0].double()
         # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
-        won = loss <= 1.02 * before_loss + 1
+        won = (loss <= 1.02 * before_loss + 1) & (loss < torch.inf)
         # Noise that leaves the threshold so much less support is none: the model is not quite that of the data.
         within, within_before = (((d < old.limit[:, None, None]) * counts[:, None]).sum(-1)[:, 0] for d in (squared, before))
         won &= within >= _SUPPORT * within_before
@@ -300,7 +300,7 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
                 old,
                 model=select(won, tensor_map(lambda t: t[:, 0], model), old.model),
                 loss=torch.where(won, loss, before_loss),
-                reach=torch.where(won, reach, 0),
+                reach=torch.where(won & settled, reach, 0),
             )
         )
     return join(parts), torch.cat(distances)
@@ -308,7 +308,3 @@ def _polished(fine: Problems, coarse: Problems, best: Best, options: Options) ->
 
 def _take(best: Best, index: Tensor) -> Best:
     return tensor_map(lambda t: t[index], best)
-
-
-def _put(best: Best, index: Tensor, new: Best) -> Best:
-    return zip_map(lambda old, part: old.index_copy(0, index, part), best, new)
