@@ -36,9 +36,9 @@ def main(seed: int = 0) -> None:
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     network = nn.Sequential(nn.Linear(2, 16), nn.Tanh(), nn.Linear(16, 1)).double()
-    optimizer = torch.optim.Adam(network.parameters(), lr=0.1)
-    for step in range(91):
-        x1, x2, clues, y1, y2 = problems(32, generator)
+    optimizer = torch.optim.Adam(network.parameters(), lr=0.05)
+    for step in range(151):
+        x1, x2, clues, y1, y2 = problems(64, generator)
         logits = network(clues)[..., 0]
         # Where F is hardly determined its derivative is huge and says little. No pair is to outvote the others.
         logits.register_hook(lambda g: g / g.norm(dim=-1, keepdim=True).clamp_min(1e-12))
@@ -47,7 +47,7 @@ def main(seed: int = 0) -> None:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        if step % 15 == 0:
+        if step % 30 == 0:
             print(f"step {step:3d}: loss {loss.item():.3f}")
     x1, x2, clues, y1, y2 = problems(200, generator)
     with torch.no_grad():
