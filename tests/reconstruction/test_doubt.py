@@ -10,7 +10,8 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation
-from torchsfm.reconstruction.consistency import pair_agreement
+from torchsfm.reconstruction.adjust import adjust
+from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.doubt import examine
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions
@@ -248,3 +249,16 @@ def test_a_model_of_two_halves_is_parted(generator: torch.Generator) -> None:
     )
     assert settled.registered.tolist() == [False] * 4 + [True] * 6
     assert sorted(parted) == [0, 1, 2, 3]
+
+
+def test_scatter_tells_common_errors_from_independent_ones(generator: torch.Generator) -> None:
+    for _ in range(3):
+        mapping = scene(generator, share=0.35)
+        independent = excess_scatter(adjust(mapping, free=()), threshold=4.0)
+        assert independent < 1.5
+        # Whole regions of each image lie off by about the noise, as where highlights and outlines pass for marks.
+        graph = mapping.graph
+        region = (graph.view * 16 + (graph.x[:, 0] / SIZE[0] * 4).long() * 4 + (graph.x[:, 1] / SIZE[1] * 4).long()).clamp(0)
+        offset = torch.randn(int(region.max()) + 1, 2, generator=generator, dtype=torch.float64)
+        bent = replace(mapping, graph=replace(graph, x=graph.x + offset[region]))
+        assert excess_scatter(adjust(bent, free=()), threshold=4.0) > 2 * independent

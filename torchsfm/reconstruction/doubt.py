@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
 from torchsfm.optim import Cauchy
-from torchsfm.reconstruction.consistency import pair_agreement
+from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
 
@@ -25,7 +25,8 @@ class Standing:
 
     Attributes:
         rotation_sigma: Standard deviation of each camera's rotation, degrees, in the gauge in which the cameras move least;
-            infinite where it is not determined, and of images that are not registered.
+            infinite where it is not determined, and of images that are not registered. It
+            grows with what the matches of a pair have in common, see `excess_scatter`.
         position_sigma: Standard deviation of each camera's place over the median depth of the points that it sees; likewise.
         doubt: Why each camera may be wrong; empty where nothing says so, and of images that are not registered.
     """
@@ -47,6 +48,8 @@ def examine(mapping: Mapping, *, free: Sequence[str], focal_sigma: Float[Tensor,
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
     rotation, position = pose_deviations(mapping, free=free if count >= 3 else ())
+    excess = excess_scatter(mapping, threshold=threshold) ** 0.5
+    rotation, position = rotation * excess, position * excess
     agreement = pair_agreement(mapping, threshold=threshold)
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
