@@ -14,7 +14,9 @@ from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
 
 WRONG_ANGLE = 5.0
-"""Degrees by which a camera may be turned or displaced before it counts as wrong; twice the deviation is not to reach it."""
+"""Degrees by which a camera may be turned or displaced before it counts as wrong."""
+DEVIATIONS = 3.0
+"""So many standard deviations of a camera that is not doubtful stay below that: one chance in 370 to be wrong."""
 GUESSED_FOCAL = 0.2
 """A focal length at least so uncertain, as a fraction, is a guess where the images do not determine it."""
 
@@ -54,15 +56,17 @@ def examine(mapping: Mapping, *, free: Sequence[str], focal_sigma: Float[Tensor,
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
     outvoted = agreement.balance(v) < 0
-    refuted = missing_correspondences(mapping).refuted.tolist()
+    refuted = missing_correspondences(mapping).refuted
+    # One pair may miss what something without features hides. A place taken for another is refuted by more than one camera,
+    # and folds the whole model.
+    folded = bool((torch.bincount(refuted.flatten(), minlength=1) >= 2).any())
     guessed = focal_sigma[mapping.camera_index] >= GUESSED_FOCAL
     degrees = torch.atan(position).rad2deg()
 
     def doubt(i: int) -> str:
-        own = [pair for pair in refuted if i in pair]
-        # One such pair may have another reason; of several, one thing that occurs twice is the likeliest, and folds the whole.
-        if own or len(refuted) > 1:
-            first, second = (mapping.graph.names[k] for k in (own or refuted)[0])
+        if folded:
+            own = (refuted == i).any(1)
+            first, second = (mapping.graph.names[k] for k in refuted[int(own.long().argmax())].tolist())
             return f"things that look alike may be taken for one: {first} and {second} each miss what the other sees"
         if bool(outvoted[i]):
             return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
@@ -70,9 +74,9 @@ def examine(mapping: Mapping, *, free: Sequence[str], focal_sigma: Float[Tensor,
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
         if count < 3 and bool(guessed[i]):
             return "two images alone, with a guessed focal length"
-        if not 2 * rotation[i] < WRONG_ANGLE:
+        if not DEVIATIONS * rotation[i] < WRONG_ANGLE:
             return f"its rotation is known to {rotation[i]:.1f} degrees only"
-        if not 2 * degrees[i] < WRONG_ANGLE:
+        if not DEVIATIONS * degrees[i] < WRONG_ANGLE:
             return f"its place is known to {100 * position[i]:.1f} % of its distance from the points only"
         return ""
 
