@@ -84,3 +84,18 @@ def test_derivative_of_a_bundle(scene: Scene, generator: torch.Generator) -> Non
             step = step * 30 * torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=F64)
         plus, minus = (shape(*(v + s * step if n == k else v for n, v in enumerate(inputs))) for s in (1, -1))
         torch.testing.assert_close((gradient * step).sum(), (plus - minus) / 2, rtol=1e-4, atol=1e-9)
+
+
+def test_priors_of_intrinsics_count(scene: Scene) -> None:
+    poses, camera, X, x, view, point = scene
+    data = (poses, camera, X, x, view, point)
+    free = bundle_covariance(*data, sigma=1.0, free=("focal",))
+    fixed = bundle_covariance(*data, sigma=1.0, free=())
+    for width in (1e-9, 1e9):
+        known = bundle_covariance(*data, sigma=1.0, free=("focal",), intrinsics_sigma={"focal": width})
+        expected = free if width > 1 else fixed
+        torch.testing.assert_close(known.poses, expected.poses, rtol=1e-4, atol=1e-12)
+    # A prior as wide as what the images say halves the variance.
+    sigma = float(free.cameras[0, 0, 0].sqrt() / camera.K[..., 0, 0].flatten()[0])
+    both = bundle_covariance(*data, sigma=1.0, free=("focal",), intrinsics_sigma={"focal": sigma})
+    torch.testing.assert_close(both.cameras[0, 0, 0], free.cameras[0, 0, 0] / 2, rtol=1e-6, atol=0)

@@ -11,8 +11,9 @@ from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation
 from torchsfm.reconstruction.adjust import adjust
+from torchsfm.reconstruction.calibration import CameraPrior
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
-from torchsfm.reconstruction.doubt import examine
+from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
@@ -90,8 +91,14 @@ def folded(generator: torch.Generator, v: int = 12) -> Mapping:
     return mapping_of(cameras_on_an_arc(v, 0.6), torch.cat([thing, around]), sees, generator)
 
 
+def stand(mapping: Mapping, focal_sigma: float = 0.5) -> Standing:
+    """The standing of a model whose focal length was known so well, as a fraction, before it was made."""
+    prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), focal_sigma, dtype=torch.float64))
+    return examine(mapping, open_numbers=("focal", "k1"), prior=prior, threshold=4.0)
+
+
 def judged(mapping: Mapping) -> tuple[str, ...]:
-    return examine(mapping, free=("focal",), focal_sigma=torch.tensor([0.5]), threshold=4.0).doubt
+    return stand(mapping).doubt
 
 
 def test_a_right_model_is_not_doubted(generator: torch.Generator) -> None:
@@ -161,8 +168,7 @@ def test_deviations_do_not_depend_on_the_frame(generator: torch.Generator) -> No
     X = 7 * mapping.X @ R.mT + shift
     R_cam = mapping.poses.R @ R.mT
     moved = replace(mapping, X=X, poses=Pose(R_cam, 7 * mapping.poses.t - (R_cam @ shift)))
-    options = {"free": (), "focal_sigma": torch.tensor([0.01]), "threshold": 4.0}
-    first, second = examine(mapping, **options), examine(moved, **options)
+    first, second = stand(mapping, 0.01), stand(moved, 0.01)
     torch.testing.assert_close(first.rotation_sigma, second.rotation_sigma, rtol=1e-5, atol=0)
     torch.testing.assert_close(first.position_sigma, second.position_sigma, rtol=0.05, atol=0)
     assert (first.rotation_sigma > 0).all()
@@ -172,12 +178,7 @@ def test_images_that_are_not_registered_have_no_standing(generator: torch.Genera
     mapping = scene(generator)
     registered = torch.arange(8) != 5
     point = torch.where(mapping.graph.view == 5, -1, mapping.point)
-    standing = examine(
-        replace(mapping, registered=registered, point=point).compacted(),
-        free=("focal",),
-        focal_sigma=torch.tensor([0.5]),
-        threshold=4.0,
-    )
+    standing = stand(replace(mapping, registered=registered, point=point).compacted())
     assert standing.rotation_sigma[5] == torch.inf
     assert standing.position_sigma[5] == torch.inf
     assert standing.rotation_sigma[registered].isfinite().all()
@@ -187,8 +188,7 @@ def test_images_that_are_not_registered_have_no_standing(generator: torch.Genera
 @pytest.mark.parametrize("guessed", [True, False])
 def test_two_images_with_a_guessed_focal_length_are_doubted(guessed: bool, generator: torch.Generator) -> None:
     mapping = scene(generator, v=2)
-    sigma = torch.tensor([0.5 if guessed else 0.01])
-    doubt = examine(mapping, free=("focal",) if guessed else (), focal_sigma=sigma, threshold=4.0).doubt
+    doubt = stand(mapping, 0.5 if guessed else 0.01).doubt
     assert all(("focal" in reason) == guessed for reason in doubt)
 
 
@@ -198,9 +198,7 @@ def test_a_camera_of_few_points_is_less_well_known(generator: torch.Generator) -
     own = (mapping.graph.view == 7).nonzero()[:, 0]
     point = mapping.point.clone()
     point[own[4:]] = -1
-    standing = examine(
-        replace(mapping, point=point).compacted(), free=("focal",), focal_sigma=torch.tensor([0.5]), threshold=4.0
-    )
+    standing = stand(replace(mapping, point=point).compacted())
     assert standing.rotation_sigma[7] > 3 * standing.rotation_sigma[:7].max()
 
 
@@ -254,11 +252,17 @@ def test_a_model_of_two_halves_is_parted(generator: torch.Generator) -> None:
 def test_scatter_tells_common_errors_from_independent_ones(generator: torch.Generator) -> None:
     for _ in range(3):
         mapping = scene(generator, share=0.35)
-        independent = excess_scatter(adjust(mapping, free=()), threshold=4.0)
+        independent = excess_scatter(adjust(mapping, free=None), threshold=4.0)
         assert independent < 1.5
         # Whole regions of each image lie off by about the noise, as where highlights and outlines pass for marks.
         graph = mapping.graph
         region = (graph.view * 16 + (graph.x[:, 0] / SIZE[0] * 4).long() * 4 + (graph.x[:, 1] / SIZE[1] * 4).long()).clamp(0)
         offset = torch.randn(int(region.max()) + 1, 2, generator=generator, dtype=torch.float64)
         bent = replace(mapping, graph=replace(graph, x=graph.x + offset[region]))
-        assert excess_scatter(adjust(bent, free=()), threshold=4.0) > 2 * independent
+        assert excess_scatter(adjust(bent, free=None), threshold=4.0) > 2 * independent
+
+
+def test_what_was_held_is_still_uncertain(generator: torch.Generator) -> None:
+    mapping = scene(generator)
+    known, guessed = stand(mapping, 1e-6), stand(mapping, 0.5)
+    assert (known.rotation_sigma < guessed.rotation_sigma).all()

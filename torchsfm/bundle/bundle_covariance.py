@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm._types import check_options
 from torchsfm.bundle.blocks import Bundle
+from torchsfm.bundle.intrinsics import intrinsics_prior
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.rig import Rig
 from torchsfm.geometry import Camera, Pose
@@ -56,6 +57,8 @@ def bundle_covariance(
     weights: Float[Tensor, "m"] | None = None,
     loss: Loss | None = None,
     priors: Sequence[Prior] = (),
+    intrinsics_sigma: Mapping[str, float | Tensor] | None = None,
+    intrinsics_mean: Camera | None = None,
     sigma: float | None = None,
 ) -> BundleCovariance:
     """Compute the covariance of an adjusted bundle, by the arguments of `bundle_adjust` at its result.
@@ -81,6 +84,8 @@ def bundle_covariance(
         loss: The robust loss; observations count by its slope.
         priors: What was known of poses and points. Their covariances count in the unit of the observations, as in
             `bundle_adjust`: where `sigma` is not 1, all of them grow by its square.
+        intrinsics_sigma: What was known of intrinsics, as in `bundle_adjust`; in the unit of the observations like `priors`.
+        intrinsics_mean: Its means, which the covariance does not depend on but by the scale of focal lengths.
         sigma: Standard deviation of an image coordinate of weight 1, pixels; estimated from the residuals if not given.
 
     Returns:
@@ -96,6 +101,8 @@ def bundle_covariance(
     check_options(sigma=(sigma, "?float > 0"))
     with torch.no_grad():
         blocks, terms = bundle.problem()
+        if intrinsics_sigma:
+            terms.append(intrinsics_prior(intrinsics_sigma, cameras if intrinsics_mean is None else intrinsics_mean))
         unit = sparse_covariance(blocks, terms, eliminate="point")
     scale = sigma if sigma is not None else (unit.square_sum / max(unit.redundancy, 1)) ** 0.5
     pose, camera, points = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))

@@ -71,7 +71,7 @@ def adjust(
         loss=LOSS,
         max_iterations=max_iterations,
         tolerance=tolerance,
-        **_about_cameras(mapping, free, prior),
+        **about_cameras(mapping, free, prior),
     )
     if result.status == Status.INTERRUPTED:
         # There is more to do than this: let the interrupt through.
@@ -101,7 +101,7 @@ def adjust_all(mapping: Mapping, names: Sequence[str], prior: CameraPrior, *, lo
     return adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
 
 
-def _about_cameras(mapping: Mapping, free: Free | None, prior: CameraPrior | None) -> dict[str, Any]:
+def about_cameras(mapping: Mapping, free: Free | None, prior: CameraPrior | None) -> dict[str, Any]:
     """What is free in the cameras and expected of it, in the words of `bundle_adjust`."""
     if not free or prior is None:
         return {"free": ()}

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
-from torchsfm.optim import Cauchy
+from torchsfm.reconstruction.adjust import LOSS, about_cameras
+from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
@@ -38,18 +39,18 @@ class Standing:
     doubt: tuple[str, ...]
 
 
-def examine(mapping: Mapping, *, free: Sequence[str], focal_sigma: Float[Tensor, "g"], threshold: float) -> Standing:
+def examine(mapping: Mapping, *, open_numbers: Sequence[str], prior: CameraPrior, threshold: float) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
     Args:
         mapping: The model.
-        free: Intrinsic parameters that were estimated from three images or more.
-        focal_sigma: How uncertain the cameras' focal lengths were at first, as a fraction.
+        open_numbers: Intrinsic parameters that are not given, whether the images were found to determine them or not.
+        prior: What was expected of the cameras before any image point was seen.
         threshold: Largest reprojection error of an observation, in pixels.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
-    rotation, position = pose_deviations(mapping, free=free if count >= 3 else ())
+    rotation, position = pose_deviations(mapping, open_numbers, prior)
     excess = excess_scatter(mapping, threshold=threshold) ** 0.5
     rotation, position = rotation * excess, position * excess
     agreement = pair_agreement(mapping, threshold=threshold)
@@ -60,7 +61,7 @@ def examine(mapping: Mapping, *, free: Sequence[str], focal_sigma: Float[Tensor,
     # One pair may miss what something without features hides. A place taken for another is refuted by more than one camera,
     # and folds the whole model.
     folded = bool((torch.bincount(refuted.flatten(), minlength=1) >= 2).any())
-    guessed = focal_sigma[mapping.camera_index] >= GUESSED_FOCAL
+    guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL
     degrees = torch.atan(position).rad2deg()
 
     def doubt(i: int) -> str:
@@ -83,10 +84,14 @@ def examine(mapping: Mapping, *, free: Sequence[str], focal_sigma: Float[Tensor,
     return Standing(rotation, position, tuple(doubt(i) if mapping.registered[i] else "" for i in range(v)))
 
 
-def pose_deviations(mapping: Mapping, *, free: Sequence[str]) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"]]:
+def pose_deviations(
+    mapping: Mapping, open_numbers: Sequence[str], prior: CameraPrior
+) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"]]:
     """Standard deviations of rotations (degrees) and of places (over the median depth), as in `Standing`."""
     node = mapping.observations()
     view, point = mapping.graph.view[node], mapping.point[node]
+    # A number that was held where it was expected is as uncertain as it was expected to be.
+    uncertain = {name: torch.ones(len(mapping.cameras.K), dtype=torch.bool) for name in open_numbers}
     covariance = bundle_covariance(
         mapping.poses,
         mapping.cameras,
@@ -95,8 +100,9 @@ def pose_deviations(mapping: Mapping, *, free: Sequence[str]) -> tuple[Float[Ten
         view,
         point,
         camera_index=mapping.camera_index,
-        free=free,
-        loss=Cauchy(1.0),
+        loss=LOSS,
+        sigma=measure_noise(mapping, LOSS),
+        **about_cameras(mapping, uncertain, prior),
     )
     depth = mapping.project(point, view)[1]
     seen = torch.bincount(view, minlength=len(mapping.registered))

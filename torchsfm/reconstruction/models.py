@@ -118,7 +118,7 @@ def build_models(
             if not found:
                 reasons |= failed
             taken = taken | model.registered
-            standing = examine(model, free=free, focal_sigma=known.focal_sigma, threshold=options.reprojection)
+            standing = examine(model, open_numbers=free, prior=known.prior(model), threshold=options.reprojection)
             found.append((model.reconstruction(), standing, calibration_of(model, known.prior(model), loss=LOSS)))
             if stages.folder is not None:
                 _save_model(found[-1][0], stages.folder, len(found) - 1)
