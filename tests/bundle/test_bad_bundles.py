@@ -219,6 +219,25 @@ def test_far_numbers_without_weight_change_nothing(problem: BundleProblem, kind:
         assert torch.equal(found.X[rest], wanted.X[rest])
 
 
+@pytest.mark.parametrize("loss", [None, Cauchy(2.0)])
+@pytest.mark.parametrize("kind", ["point", "pose", "camera", "observation"])
+def test_far_numbers_that_count_never_end_it_early(
+    problem: BundleProblem, kind: str, loss: Cauchy | None, generator: torch.Generator
+) -> None:
+    """Nothing is called right that is not finite, or from which the same adjustment still gets down by more than a little."""
+    for value in FAR:
+        place = int(torch.randint(100_000, (), generator=generator))
+        bad, _ = poisoned(problem, kind, place, value)
+        first = bundle_adjust_model(bad, free=FREE, loss=loss, max_iterations=60)
+        result = first.result
+        if result.status != Status.OK:
+            continue
+        assert np.isfinite(result.cost)
+        assert result.residuals[result.used].isfinite().all()
+        again = bundle_adjust_model(first.model, free=FREE, loss=loss, max_iterations=60).result
+        assert result.cost - again.cost <= 1e-5 * result.cost
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_indices_and_names(problem: BundleProblem) -> None:
     args = [problem.poses, problem.cameras, problem.X, problem.x, problem.view, problem.point]

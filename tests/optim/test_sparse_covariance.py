@@ -146,7 +146,7 @@ class TestDerivative:
             moved = blocks | {"station": Block(station, None, fixed)}
             term = dataclasses.replace(terms[0], data=(d,), weights=weights, loss=loss)
             result = sparse_levenberg_marquardt(
-                moved, [term], eliminate="mark", function_tolerance=1e-15, step_tolerance=1e-14, max_iterations=200
+                moved, [term], eliminate="mark", function_tolerance=1e-19, step_tolerance=1e-14, max_iterations=200
             )
             return (torch.cat((result.x["station"], result.x["mark"])) * away).sum()
 

@@ -1,7 +1,7 @@
 """A bundle as blocks of variables and terms over them, and back."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torchsfm._types import check_one_problem, check_options, check_tensors
 from torchsfm.bundle.intrinsics import Switched, camera_from_rows, camera_rows, free_columns, free_switches
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.projection import Projection
+from torchsfm.bundle.rays import RayPoint, ray_points
 from torchsfm.bundle.rig import Rig, RigProjection
 from torchsfm.geometry import Camera, Pose
 from torchsfm.optim import Block, Loss, RigidMotion, Subset, Term
@@ -107,10 +108,14 @@ class Bundle:
             manifold = Switched(rows.shape[1], columns)
             switches = free_switches(columns, self.fixed_intrinsics, model, self.cameras.K)
             rows = torch.cat((rows, switches.to(rows.dtype)), 1)
+        counts = (self.x.isfinite().all(-1)) & rows.isfinite().all(-1)[camera_index[self.view]]
+        if self.weights is not None:
+            counts &= self.weights > 0
+        centres = (self.poses if self.rig is None else self.rig.view_poses(self.poses)).centre
         blocks = {
             "pose": Block(_pose_rows(self.poses), RigidMotion(), self.fixed_poses),
             "camera": Block(rows, manifold, self.fixed_cameras),
-            "point": Block(self.X, None, self.fixed_points),
+            "point": Block(ray_points(self.X, centres, self.view, self.point, counts), RayPoint(), self.fixed_points),
         }
         skew = 4 in columns or self.cameras.K.requires_grad or bool((rows[:, 4] != 0).any())
         projection = Projection(model, columns, skew, bool(self.fixed_intrinsics))
@@ -125,7 +130,7 @@ class Bundle:
             names = ("pose", "sensor", "camera", "point")
             places = (self.rig.frame[self.view], self.rig.sensor[self.view], camera, self.point)
             term = Term(through.residual, names, places, data, *options, through.linearize)
-        return blocks, [term, *(prior.term() for prior in self.priors)]
+        return blocks, [term, *(_prior_term(prior) for prior in self.priors)]
 
 
 def cheapest_elimination(blocks: Mapping[str, Block]) -> str:
@@ -159,6 +164,14 @@ def moved_cameras(cameras: Camera, start: Tensor, end: Tensor) -> Camera:
     changed = (start[:, :5] != end[:, :5]).any(-1)
     new = camera_from_rows(end, type(cameras.distortion))
     return Camera(torch.where(changed[:, None, None], new.K, cameras.K), new.distortion)
+
+
+def _prior_term(prior: Prior) -> Term:
+    """A prior's term; one on points sees them without where their rays begin."""
+    term = prior.term()
+    if prior.block != "point":
+        return term
+    return replace(term, residual=lambda point, *data: term.residual(point[:, :3], *data))
 
 
 def _pose_rows(poses: Pose) -> Tensor:

@@ -144,7 +144,7 @@ def bundle_adjust(
     used = result.used[0]
     distance = torch.linalg.vector_norm(result.residuals[0], dim=-1)
     new_poses = moved_poses(poses, blocks["pose"].x, result.x["pose"])
-    points = result.x["point"]
+    points = result.x["point"][:, :3].to(X.dtype)
     if rig is not None:
         rig = Rig(moved_poses(rig.cam_from_rig, blocks["sensor"].x, result.x["sensor"]), rig.sensor, rig.frame)
     if gauge == "first":

@@ -16,7 +16,10 @@ from torchsfm.geometry.decentring import brown_jacobian
 
 @dataclass(frozen=True)
 class Projection:
-    """Projection of points `(m, 3)` by poses `(m, 12)` and cameras `(m, 5 + p)`, minus the image points `(m, 2)`."""
+    """Projection of points `(m, 3)` by poses `(m, 12)` and cameras `(m, 5 + p)`, minus the image points `(m, 2)`.
+
+    A point may have more numbers behind its coordinates; see `RayPoint`.
+    """
 
     model: type[DistortionModel]
     free: tuple[int, ...]
@@ -118,9 +121,9 @@ def _focal(rows: Tensor) -> Tensor:
 
 
 def transform(pose: Tensor, point: Tensor) -> Tensor:
-    """Points (m, 3) after motions (m, 12), as (3, m)."""
+    """Points (m, 3), or rows that begin with one, after motions (m, 12), as (3, m)."""
     p = pose.mT
-    X, Y, Z = point.unbind(-1)
+    X, Y, Z = point.mT[:3]
     return torch.addcmul(torch.addcmul(torch.addcmul(p[9:], p[0:9:3], X), p[1:9:3], Y), p[2:9:3], Z)
 
 

@@ -15,7 +15,7 @@ from torchsfm.optim.coupling_pairs import PairCoupling
 from torchsfm.optim.coupling_rows import RowCoupling
 from torchsfm.optim.layout import Layout
 from torchsfm.optim.squares import Squares
-from torchsfm.optim.triangle import Triangle, backward, diagonal, factor, floor, forward, place
+from torchsfm.optim.triangle import Triangle, backward, diagonal, factor, floor, forward, measure, place, product
 
 NULL = 1e-11
 """Eigenvalues of the reduced system, scaled to unit diagonal of U, that count as zero: directions of gauge."""
@@ -26,6 +26,10 @@ class NormalEquations:
     """`U` with the gradient, `V`, and the coupling `W`.
 
     `V` holds the distinct entries of the blocks row by row, each row followed by its entry of the gradient.
+
+    Damping is measured by the Gauss-Newton matrix, that of retained variables by its diagonal (Marquardt 1963), that of
+    eliminated ones by their whole blocks: each has a system of its own, so a direction in which it is hardly determined is
+    damped by how little, in whatever coordinates it comes.
     """
 
     layout: Layout
@@ -35,7 +39,9 @@ class NormalEquations:
     clusters: Clusters | None
     """The preconditioner's blocks where the reduced system is not formed."""
     diagonal: Tensor
-    """Of U."""
+    """Of the Gauss-Newton U."""
+    metric: Tensor
+    """The Gauss-Newton V."""
     slope: Tensor
     """The gradient by retained variables."""
 
@@ -46,12 +52,12 @@ class NormalEquations:
         """
         q = self.layout.point_size
         weight = damping * floor(self.diagonal)
-        h = self.point_gradient()
-        point_weight, z = h, h
+        z = h = self.point_gradient()
         L: Triangle = []
+        positive = torch.ones_like(self.V[:1], dtype=torch.bool)
+        metric = damping * measure(self.metric, q)
         if q:
-            point_weight = damping * floor(diagonal(self.V, q))
-            L = factor(self.V, point_weight, q)
+            L, positive = factor(self.V + metric, q)
             z = forward(L, h)
         kept, solved = self._reduced(weight, L, z)
         promise = kept @ (weight * kept - self.slope)
@@ -60,8 +66,8 @@ class NormalEquations:
             if self.coupling is not None:
                 z = z + forward(L, self.coupling.product(extend(kept)))
             point = -backward(L, z)
-            promise = promise + (point * (point_weight * point - h)).sum()
-        return self.split(kept, point), promise / 2, solved
+            promise = promise + (point * (product(metric, point) - h)).sum()
+        return self.split(kept, point), promise / 2, solved & (positive.all() | (self.V is self.metric))
 
     def _reduced(self, weight: Tensor, L: Triangle, z: Tensor) -> tuple[Tensor, Tensor]:
         """The step of the retained variables, and whether there is one."""
@@ -90,7 +96,7 @@ class NormalEquations:
         determined = torch.ones(self.V.shape[-1], dtype=torch.bool, device=S.device)
         if q:
             pivots = diagonal(self.V, q)
-            L = factor(self.V, torch.zeros_like(pivots), q)
+            L, _ = factor(self.V, q)
             for a in range(q):
                 # Directions that no residual sees are left out: a basic solution.
                 L[a][a] = torch.where(L[a][a] * L[a][a] * pivots[a] < 1e13, L[a][a], 0.0)
@@ -115,8 +121,9 @@ class NormalEquations:
         S = self.squares.dense()
         if q and self.coupling is not None:
             assert not isinstance(self.coupling, RowCoupling), "asked for without conjugate gradients"
-            pivots = diagonal(self.V, q)
-            self.coupling.reduce(S, factor(self.V, NULL * floor(pivots), q), torch.zeros_like(pivots))
+            V, pivots = self.V.clone(), diagonal(self.V, q)
+            V[[place(a, a, q) for a in range(q)]] += NULL * floor(pivots)
+            self.coupling.reduce(S, factor(V, q)[0], torch.zeros_like(pivots))
         S = S[:size, :size]
         S = S.tril() + S.tril(-1).mT
         others = torch.ones(size, dtype=torch.bool, device=S.device)

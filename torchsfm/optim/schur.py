@@ -25,8 +25,19 @@ from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.normal_equations import NormalEquations
 from torchsfm.optim.runs import Runs, find_runs
 from torchsfm.optim.squares import Squares
-from torchsfm.optim.terms import Block, Term, Workspace, gather, lift_of, linearize, residual_costs, term_cost, term_residual
-from torchsfm.optim.triangle import backward, diagonal, factor, floor, forward, place
+from torchsfm.optim.terms import (
+    Block,
+    Term,
+    Workspace,
+    curvature,
+    gather,
+    lift_of,
+    linearize,
+    residual_costs,
+    term_cost,
+    term_residual,
+)
+from torchsfm.optim.triangle import backward, factor, forward, measure, place
 
 LARGEST = 9000
 """Columns of the largest reduced system formed without being asked: its square and factor take 1.3 GB."""
@@ -36,6 +47,8 @@ PASS = 4e-6
 """Seconds per residual of a solution by conjugate gradients, of some 100 iterations."""
 SETTLING = 1e-6
 """Damping of the steps of eliminated variables by themselves."""
+PARTS = (0.25, 0.0625, 0.0)
+"""Of a step that eliminated variables may take instead of a whole one that leads them up."""
 Solver = Literal["auto", "dense", "pcg"]
 """How the reduced system is solved: by a dense Cholesky factor, or by conjugate gradients without forming it."""
 
@@ -80,6 +93,7 @@ class Elimination:
         self.work = Workspace(some)
         self.coupling: GroupCoupling | PairCoupling | RowCoupling | None = None
         self.clusters: Clusters | None = None
+        self._exact: Elimination | None = None
         coupled = any(piece.coupled for piece in layout.pieces)
         if solver == "pcg" or (solver == "auto" and too_large(layout)):
             rows = RowCoupling(layout, some) if coupled else None
@@ -89,10 +103,64 @@ class Elimination:
             grouped = spread or seconds <= estimate_pairs(layout)
             self.coupling = GroupCoupling(layout, spans, some) if grouped else PairCoupling(layout, some)
 
+    def curve(self, x: dict[str, Tensor], system: NormalEquations) -> NormalEquations:
+        """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
+
+        It holds until the next call. Not for `pcg`.
+        """
+        if self._exact is None:
+            self._exact = Elimination(self.blocks, self.layout, "dense")
+        exact, q = self._exact, self.layout.point_size
+        exact.squares.clear()
+        exact.V.zero_()
+        if exact.coupling is not None:
+            exact.coupling.clear()
+        for part in exact.parts:
+            exact._add_curvature(part, x)
+        for mine, given in zip(exact.squares.values, system.squares.values, strict=True):
+            mine[:, -1], mine[:, :, -1] = given[:, -1], given[:, :, -1]
+        for a in range(q):
+            exact.V[place(a, q, q)] = system.V[place(a, q, q)]
+        return replace(system, coupling=exact.coupling, squares=exact.squares, V=exact.V)
+
+    def _add_curvature(self, part: _Part, x: dict[str, Tensor]) -> None:
+        """Add a part's exact second derivatives to the system."""
+        starts = torch.tensor([start for start, _ in part.runs.ends], device=part.runs.slots.device)
+        lengths = [end - start for start, end in part.runs.ends]
+        run = torch.arange(len(lengths), device=starts.device).repeat_interleave(torch.tensor(lengths, device=starts.device))
+        U, W, V = curvature(part.term, x, self.blocks, part.wanted, self.layout.eliminated, (run, starts))
+        if part.width:
+            self.squares.values[part.piece][:, :-1, :-1].index_add_(0, part.runs.slots, U.permute(2, 0, 1))
+        if part.point is None:
+            return
+        q = len(V)
+        for a in range(q):
+            self.V[place(a, a, q) : place(a, q, q)].index_add_(1, part.point, V[a, a:])
+        if part.width and self.coupling is not None:
+            eye = torch.eye(q, dtype=V.dtype, device=V.device)[:, :, None].expand(-1, -1, V.shape[2])
+            self.coupling.add(part.piece, part.start, W.transpose(0, 1), eye)
+
     def cost(self, x: dict[str, Tensor]) -> Tensor:
         """The cost of all residuals that depend on something free."""
         costs = [term_cost(part.term, term_residual(part.term, x, self.work)) for part in self.parts]
         return torch.stack(costs).sum()
+
+    def shorten(self, x: dict[str, Tensor], step: dict[str, Tensor], trial: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The `trial` that `step` leads to from `x`, where each eliminated variable takes the part of its step that is best.
+
+        They do not depend on each other once the retained ones have moved; a few that go astray need not hold back all.
+        """
+        name = self.layout.eliminated
+        if name is None:
+            return trial
+        free, best, least = self.layout.free[name], trial[name], self._point_costs(trial)
+        for part in PARTS:
+            other = move(self.blocks, self.layout, x, {name: part * step[name]})[name]
+            cost = self._point_costs(trial | {name: other})
+            better = free[cost < least]
+            best = best.index_copy(0, better, other[better])
+            least = torch.minimum(cost, least)
+        return trial | {name: best.mT.contiguous().mT}
 
     def linearize(self, x: dict[str, Tensor]) -> "NormalEquations":
         """The blocks of the normal equations at `x`; they are overwritten by the next call."""
@@ -105,7 +173,7 @@ class Elimination:
             self._add(part, x, lifts, self.V)
         squares = self.squares
         return NormalEquations(
-            self.layout, self.coupling, squares, self.V, self.clusters, squares.diagonal(), squares.gradient()
+            self.layout, self.coupling, squares, self.V, self.clusters, squares.diagonal(), self.V, squares.gradient()
         )
 
     def settle(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -118,24 +186,24 @@ class Elimination:
         if layout.eliminated is None:
             return x
         V, lifts = self.work.get("settled", *self.V.shape).zero_(), self._lifts(x)
-        parts = [part for part in self.parts if part.point is not None]
-        for part in parts:
-            self._add(part, x, lifts, V, held=True)
-        L = factor(V, SETTLING * floor(diagonal(V, q)), q)
+        for part in self.parts:
+            if part.point is not None:
+                self._add(part, x, lifts, V, held=True)
+        L, _ = factor(V + SETTLING * measure(V, q), q)
         step = -backward(L, forward(L, V[[place(a, q, q) for a in range(q)]]))
         moved = move(self.blocks, layout, x, {layout.eliminated: step.mT})
-        before, after = (self._point_costs(parts, y) for y in (x, moved))
+        before, after = self._point_costs(x), self._point_costs(moved)
         better = torch.zeros(x[layout.eliminated].shape[0], dtype=torch.bool, device=V.device)
         better[layout.free[layout.eliminated]] = after < before
         return x | {layout.eliminated: torch.where(better, moved[layout.eliminated].mT, x[layout.eliminated].mT).mT}
 
-    def _point_costs(self, parts: list[_Part], x: dict[str, Tensor]) -> Tensor:
-        """The cost of each eliminated variable's residuals."""
+    def _point_costs(self, x: dict[str, Tensor]) -> Tensor:
+        """The cost of each eliminated variable's residuals, inf where it is not a number."""
         total = self.V.new_zeros(self.layout.points)
-        for part in parts:
-            assert part.point is not None, "chosen so"
-            total.index_add_(0, part.point, residual_costs(part.term, term_residual(part.term, x, self.work)))
-        return total
+        for part in self.parts:
+            if part.point is not None:
+                total.index_add_(0, part.point, residual_costs(part.term, term_residual(part.term, x, self.work)))
+        return total.nan_to_num(nan=torch.inf)
 
     def _lifts(self, x: dict[str, Tensor]) -> dict[str, Tensor | None]:
         """Derivatives of the retractions that derivatives of terms are multiplied by."""

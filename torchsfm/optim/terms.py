@@ -4,7 +4,7 @@ A `Block` is a family of variables of one kind (all poses, all points); a `Term`
 depends on. The sum to be minimised is `sum_i w_i rho(|r_i|^2) / 2` over all residuals of all terms.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -109,9 +109,7 @@ def term_cost(term: Term, residual: Float[Tensor, "m d"]) -> Float[Tensor, ""]:
     if term.loss is None and term.weights is None:
         flat = residual.mT.flatten()
         return flat @ flat / 2
-    square = residual.square().sum(-1)
-    rho = square if term.loss is None else term.loss(square)
-    return (rho.sum() if term.weights is None else rho @ term.weights) / 2
+    return residual_costs(term, residual).sum()
 
 
 def residual_costs(term: Term, residual: Float[Tensor, "m d"]) -> Float[Tensor, "m"]:
@@ -163,6 +161,67 @@ def _differentiate(term: Term, arguments: list[Tensor], lifts: dict[str, Tensor 
                     ambient = (ambient[:, None] * lift.index_select(-1, index)).sum(0)
                 target[:, k] = ambient.mT
     return value.detach()
+
+
+def curvature(
+    term: Term,
+    x: dict[str, Tensor],
+    blocks: dict[str, Block],
+    wanted: Sequence[bool],
+    eliminated: str | None,
+    slots: tuple[Int[Tensor, "m"], Int[Tensor, "s"]],
+) -> tuple[Float[Tensor, "c c s"], Float[Tensor, "c q m"], Float[Tensor, "q q m"]]:
+    """The exact second derivatives of the cost, in which the loss's and the residual's own are, so they need not be positive.
+
+    Args:
+        term: The residuals.
+        x: All variables.
+        blocks: The blocks they belong to.
+        wanted: The blocks of the term by whose tangent steps to differentiate.
+        eliminated: The block that is eliminated.
+        slots: The slot of each residual, of s in which all wanted retained variables are the same, and a residual of each.
+
+    Returns:
+        Those by the retained variables summed over each slot, by retained and eliminated ones, and by eliminated ones.
+    """
+    slot, some = slots
+    kept, point, moved = [], [], []
+    with torch.enable_grad():
+        for name, a, index, w in zip(term.blocks, _arguments(term, x, None), term.index, wanted, strict=True):
+            if not w:
+                moved.append(a)
+            elif name == eliminated:
+                point.append(a.new_zeros((blocks[name].tangent, len(a))).requires_grad_())
+                moved.append(blocks[name].retract(a, point[-1].mT))
+            else:
+                kept.append(a.new_zeros((blocks[name].tangent, len(some))).requires_grad_())
+                each = blocks[name].retract(gather(x[name], index[some]), kept[-1].mT)
+                # Fixed variables, whichever they are, share a slot: they stay.
+                same = index == index[some][slot]
+                moved.append(torch.where(same, each.mT.index_select(1, slot), a.mT).mT)
+        cost = term_cost(term, term.residual(*moved, *term.data))
+        by_kept, by_point = _rows(cost, kept, [*kept, *point]), _rows(cost, point, point)
+    size = sum(len(k) for k in kept)
+    empty = x[term.blocks[0]].new_zeros
+    U = torch.stack([torch.cat(row[: len(kept)]) for row in by_kept]) if kept else empty((0, 0, len(some)))
+    if not point:
+        return U, empty((size, 0, len(slot))), empty((0, 0, len(slot)))
+    W = torch.stack([row[-1] for row in by_kept]) if kept else empty((0, len(point[0]), len(slot)))
+    return U, W, torch.stack([row[0] for row in by_point])
+
+
+def _rows(cost: Tensor, by: list[Tensor], then: list[Tensor]) -> list[tuple[Tensor, ...]]:
+    """The derivatives of a cost by the rows of some leaves, and of each of these, summed, by all rows of others."""
+    if not by or not cost.requires_grad:
+        return [tuple(torch.zeros_like(leaf) for leaf in then) for leaf in by for _ in leaf]
+    slopes = torch.autograd.grad(cost, by, create_graph=True, materialize_grads=True)
+    rows = [row for slope in slopes for row in slope]
+    return [
+        torch.autograd.grad(row.sum(), then, retain_graph=True, materialize_grads=True)
+        if row.requires_grad
+        else tuple(torch.zeros_like(leaf) for leaf in then)
+        for row in rows
+    ]
 
 
 def lift_of(block: Block, x: Float[Tensor, "n k"]) -> Tensor | None:

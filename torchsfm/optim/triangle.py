@@ -6,6 +6,8 @@ Blocks come as the distinct entries of their upper triangle row by row, each row
 import torch
 from torch import Tensor
 
+SPHERE = 1e-5
+"""Share of a sphere in the measure of a step, small enough to leave points far away as free as others."""
 Triangle = list[list[Tensor]]
 """Lower triangular factors, entry by entry, with the reciprocals of the diagonal in its place."""
 
@@ -28,25 +30,47 @@ def floor(diagonal: Tensor) -> Tensor:
     return torch.where(least > 0, torch.maximum(diagonal, least), torch.ones_like(diagonal))
 
 
-def factor(V: Tensor, damping: Tensor, q: int) -> Triangle:
-    """Cholesky factors `V + damping = L L'`; damping (q, n)."""
+def measure(V: Tensor, q: int) -> Tensor:
+    """The blocks by which steps are measured: V itself, and a little of a sphere, so that what nothing depends on stays."""
+    if not q:
+        return V
+    top = diagonal(V, q).amax(0)
+    round_ = torch.where(top > 0, SPHERE * top, torch.ones_like(top))
+    measured = (1 - SPHERE) * V
+    for a in range(q):
+        measured[place(a, a, q)] += round_
+    return measured
+
+
+def product(V: Tensor, x: Tensor) -> Tensor:
+    """Each block times its vector, (q, n)."""
+    q = len(x)
+    rows = [torch.stack([V[place(min(a, b), max(a, b), q)] for b in range(q)]) for a in range(q)]
+    return torch.stack([(row * x).sum(0) for row in rows])
+
+
+def factor(V: Tensor, q: int) -> tuple[Triangle, Tensor]:
+    """Cholesky factors `V = L L'`, and which blocks (n) are positive definite."""
     L: Triangle = []
+    positive = torch.ones_like(V[0], dtype=torch.bool)
     for a in range(q):
         row: list[Tensor] = []
         for b in range(a + 1):
             value = V[place(b, a, q)]
             if a == b:
-                full = value + damping[a]
+                full = value
                 for c in range(b):
                     value = value - row[c] * row[c]
-                # Rounding must not take the pivot below what the damping guarantees.
-                row.append(torch.maximum(value + damping[a], 1e-15 * full).rsqrt())
+                # Rounding must not take a pivot to zero or below.
+                least = 1e-15 * full.abs()
+                positive &= value > least
+                row.append(torch.maximum(value, least).rsqrt())
             else:
                 for c in range(b):
                     value = value - row[c] * L[b][c]
                 row.append(value * L[b][b])
         L.append(row)
-    return L
+    return L, positive
 
 
 def forward(L: Triangle, z: Tensor) -> Tensor:

@@ -1,0 +1,119 @@
+"""Adjustments come to their minimum in few steps, with wrong data and robust losses too, and derivatives belong to minima."""
+
+import pytest
+import torch
+from chance import seeded
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.bundle import BundleResult, bundle_adjust, bundle_adjust_model
+from torchsfm.bundle.rays import RayPoint, ray_points
+from torchsfm.geometry import BundleProblem, Camera, Pose, Radial
+from torchsfm.optim import Cauchy
+from torchsfm.simulation import random_bundle_problem
+
+F64 = torch.float64
+FREE = ("focal", "k1", "k2")
+
+
+def problems(count: int, outliers: float) -> list[BundleProblem]:
+    """Six cameras in a row, each with its own f, k1 and k2, and eighty points; streams that show too little are left out."""
+    found: list[BundleProblem] = []
+    stream = 0
+    while len(found) < count:
+        stream += 1
+        try:
+            found.append(random_bundle_problem(6, 80, 400, outliers=outliers, generator=seeded(stream)).problem)
+        except ValueError:
+            continue
+    return found
+
+
+def check_convergence(outliers: float, loss: Cauchy | None, count: int, share: float) -> None:
+    fast = 0
+    for problem in problems(count, outliers):
+        first = bundle_adjust_model(problem, free=FREE, loss=loss, tolerance=1e-13, max_iterations=40)
+        if first.result.status != Status.OK:
+            continue
+        fast += 1
+        # From there nothing is left to gain.
+        again = bundle_adjust_model(first.model, free=FREE, loss=loss, tolerance=1e-15, max_iterations=40).result
+        assert again.cost >= first.result.cost * (1 - 1e-10)
+    assert fast >= share * count
+
+
+@pytest.mark.parametrize(("outliers", "loss", "share"), [(0.0, None, 1.0), (0.0, Cauchy(1.0), 1.0), (0.1, Cauchy(1.0), 0.6)])
+def test_forty_steps_to_the_minimum(outliers: float, loss: Cauchy | None, share: float) -> None:
+    check_convergence(outliers, loss, 6, share)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("outliers", "loss", "share"), [(0.0, None, 1.0), (0.0, Cauchy(1.0), 1.0), (0.1, Cauchy(1.0), 0.86)])
+def test_forty_steps_to_the_minimum_in_fifty_problems(outliers: float, loss: Cauchy | None, share: float) -> None:
+    check_convergence(outliers, loss, 50, share)
+
+
+@pytest.mark.parametrize(("outliers", "loss"), [(0.0, None), (0.0, Cauchy(1.0)), (0.1, Cauchy(1.0))])
+def test_the_derivative_of_the_default_call(outliers: float, loss: Cauchy | None, generator: torch.Generator) -> None:
+    """It is that of the minimum, by central differences, or is not said to be."""
+    right = 0
+    for problem in problems(4, outliers):
+
+        def adjust(x: Tensor, start: BundleProblem, problem: BundleProblem = problem, **options: float) -> BundleResult:
+            return bundle_adjust(
+                start.poses, start.cameras, start.X, x, problem.view, problem.point,
+                camera_index=problem.camera_index, free=FREE, loss=loss, **options,
+            )  # fmt: skip
+
+        def size(result: BundleResult) -> Tensor:
+            length = result.poses.centre.diff(dim=0).norm(dim=1)
+            return 100 * (length[1:] / length[:-1]).sum() + result.cameras.K[:, 0, 0].sum()
+
+        leaf = problem.x.clone().requires_grad_()
+        found = adjust(leaf, problem)
+        if found.status != Status.OK:
+            continue
+        (gradient,) = torch.autograd.grad(size(found), leaf)
+        lens = Radial(found.cameras.distortion.k1.detach(), found.cameras.distortion.k2.detach())
+        minimum = BundleProblem(
+            Pose(found.poses.R.detach(), found.poses.t.detach()), Camera(found.cameras.K.detach(), lens), problem.camera_index,
+            found.X.detach(), problem.x, problem.view, problem.point,
+        )  # fmt: skip
+        away = 1e-4 * torch.randn(leaf.shape, generator=generator, dtype=F64)
+        plus, minus = (size(adjust(problem.x + sign * away, minimum, tolerance=1e-15)) for sign in (1, -1))
+        # A sum of many terms may come near zero by chance.
+        torch.testing.assert_close(
+            (gradient * away).sum(), (plus - minus) / 2, rtol=1e-3, atol=1e-3 * float((gradient * away).norm())
+        )
+        right += 1
+    assert right >= 2
+
+
+def test_points_go_through_infinity(generator: torch.Generator) -> None:
+    """A step along the ray is one in inverse distance, and any step begins as plain addition."""
+    X, C = (torch.randn(200, 3, generator=generator, dtype=F64) for _ in range(2))
+    x, away = torch.cat((X, C), 1), X - C
+    k = 3 * torch.rand(200, 1, generator=generator, dtype=F64)
+    moved = RayPoint().retract(x, k * away)
+    torch.testing.assert_close(moved[:, :3] - C, away / (1 - k), rtol=1e-9, atol=1e-9)
+    assert torch.equal(moved[:, 3:], C)
+    assert torch.equal(RayPoint().retract(x, torch.zeros(200, 3, dtype=F64)), x)
+    delta = torch.randn(200, 3, generator=generator, dtype=F64)
+    small = (RayPoint().retract(x, 1e-6 * delta) - RayPoint().retract(x, -1e-6 * delta))[:, :3] / 2e-6
+    torch.testing.assert_close(small, delta, rtol=1e-4, atol=1e-4)
+
+
+def test_rays_begin_at_the_nearest_view_that_counts(generator: torch.Generator) -> None:
+    X, centre = (torch.randn(n, 3, generator=generator, dtype=F64) for n in (30, 7))
+    view, point = torch.cartesian_prod(torch.arange(7), torch.arange(30)).T
+    counts = torch.rand(210, generator=generator) < 0.5
+    counts[point == 4] = False
+    centre[2] = torch.nan
+    found = ray_points(X, centre, view, point, counts)
+    assert torch.equal(found[:, :3], X)
+    for k in range(30):
+        seen = view[counts & (point == k) & (view != 2)]
+        wanted = torch.zeros(3, dtype=F64)
+        if len(seen):
+            wanted = centre[seen[(X[k] - centre[seen]).norm(dim=1).argmin()]]
+        assert torch.equal(found[k, 3:], wanted)

@@ -1,0 +1,95 @@
+"""The exact Hessian in sparse form is the one that automatic differentiation of the whole cost gives."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.optim import Block, Cauchy, Huber, RigidMotion, Term, schur, sparse_levenberg_marquardt
+from torchsfm.optim.layout import lay_out
+from torchsfm.optim.terms import term_cost, term_residual
+
+F64 = torch.float64
+
+
+def pinhole(pose: Tensor, focal: Tensor, point: Tensor, x: Tensor) -> Tensor:
+    X = (pose[:, :9].unflatten(1, (3, 3)) @ point[:, :, None])[:, :, 0] + pose[:, 9:]
+    return focal * X[:, :2] / X[:, 2:] - x
+
+
+@pytest.fixture
+def problem(generator: torch.Generator) -> tuple[dict[str, Block], list[Term]]:
+    """Six views by two cameras of which two poses and some points are held, and a prior on the cameras."""
+    views, points = 6, 12
+    pose = torch.cat(
+        (torch.eye(3, dtype=F64).flatten().expand(views, 9), torch.tensor([0.0, 0.0, 6.0], dtype=F64).expand(views, 3)), 1
+    )
+    pose = RigidMotion().retract(pose, 0.3 * torch.randn(views, 6, generator=generator, dtype=F64))
+    point = torch.randn(points, 3, generator=generator, dtype=F64)
+    focal = torch.tensor([[500.0], [700.0]], dtype=F64)
+    view, seen = torch.cartesian_prod(torch.arange(views), torch.arange(points)).T
+    index = (view, view % 2, seen)
+    x = pinhole(pose[view], focal[view % 2], point[seen], torch.zeros(1, dtype=F64))
+    x = x + 2 * torch.randn(x.shape, generator=generator, dtype=F64)
+    weights = 0.5 + torch.rand(len(x), generator=generator, dtype=F64)
+    blocks = {
+        "pose": Block(pose, RigidMotion(), torch.arange(views) < 2),
+        "focal": Block(focal),
+        "point": Block(point, None, torch.arange(points) >= 10),
+    }
+    known = Term(lambda f: torch.sin(f / 50), ("focal",), (torch.arange(2),))
+    return blocks, [Term(pinhole, ("pose", "focal", "point"), index, (x,), weights=weights), known]
+
+
+@pytest.mark.parametrize("loss", [None, Cauchy(3.0), Huber(2.0)])
+@pytest.mark.parametrize("eliminate", ["point", "pose", None])
+@pytest.mark.parametrize("seconds", [0.0, torch.inf])
+def test_the_step_is_newtons(
+    problem: tuple[dict[str, Block], list[Term]],
+    loss: object,
+    eliminate: str | None,
+    seconds: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(schur, "estimate_pairs", lambda layout: seconds)
+    blocks, (main, known) = problem
+    terms = [Term(main.residual, main.blocks, main.index, main.data, loss, main.weights), known]
+    x = sparse_levenberg_marquardt(blocks, terms, eliminate=eliminate, function_tolerance=1e-3).x
+    blocks = {name: Block(x[name].mT.contiguous().mT, b.manifold, b.fixed) for name, b in blocks.items()}
+    x = {name: b.x for name, b in blocks.items()}
+    layout = lay_out(blocks, terms, eliminate)
+    engine = schur.Elimination(blocks, layout, "dense")
+    step, promise, solved = engine.curve(x, engine.linearize(x)).step(1e-13)
+    assert solved
+    widths = {name: (layout.free[name].numel(), blocks[name].tangent) for name in step}
+
+    def cost(flat: Tensor) -> Tensor:
+        rest = iter(flat.split([a * b for a, b in widths.values()]))
+        steps = {name: next(rest).view(shape) for name, shape in widths.items()}
+        moved = {
+            n: x[n].index_copy(0, layout.free[n], b.retract(x[n][layout.free[n]], steps[n])) if n in steps else x[n]
+            for n, b in blocks.items()
+        }
+        return torch.stack([term_cost(t, term_residual(t, moved)) for t in terms]).sum()
+
+    zero = torch.zeros(sum(a * b for a, b in widths.values()), dtype=F64)
+    slope, H = torch.func.jacrev(cost)(zero), torch.func.jacrev(torch.func.jacrev(cost))(zero)
+    newton = -torch.linalg.solve(H, slope)
+    torch.testing.assert_close(torch.cat([step[name].flatten() for name in widths]), newton, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(promise, -(slope @ newton) / 2, rtol=1e-6, atol=0)
+
+
+def test_a_few_bad_steps_do_not_hold_back_the_others(generator: torch.Generator) -> None:
+    """Of a step, each eliminated variable takes the part that is best for it alone."""
+    offset = torch.randn(40, 1, generator=generator, dtype=F64)
+    index = torch.arange(40)
+    term = Term(lambda c, p, o: torch.atan(p - o) + 0 * c, ("c", "p"), (index * 0, index), (offset,))
+    blocks = {"c": Block(torch.zeros(1, 1, dtype=F64)), "p": Block(torch.zeros(40, 1, dtype=F64))}
+    x = {name: b.x for name, b in blocks.items()}
+    engine = schur.Elimination(blocks, lay_out(blocks, [term], "p"), "dense")
+    order = engine.layout.free["p"]
+    # Overshoot for some, the very step for others.
+    factor = torch.where(torch.arange(40) % 2 == 0, 1.0, 4.0).double()[:, None]
+    step = {"c": torch.zeros(1, 1, dtype=F64), "p": (offset * factor)[order]}
+    trial = schur.move(blocks, engine.layout, x, step)
+    better = engine.shorten(x, step, trial)["p"]
+    torch.testing.assert_close(better, offset)
