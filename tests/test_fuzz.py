@@ -10,7 +10,7 @@ from bench.fuzz.functions import EXCEPTIONS, FUNCTIONS, Function, public_functio
 from bench.fuzz.promises import not_finite, verdict
 from bench.fuzz.scene import Scene
 
-TRIALS = 4
+TRIALS = 3
 TRIED = [name for name in public_functions() if name not in EXCEPTIONS]
 
 

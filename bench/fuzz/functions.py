@@ -95,7 +95,7 @@ def _blocks(s: Scene) -> dict[str, Block]:
 
 ROBUST = {"threshold": 2.0, "max_iterations": 64, "generator": _generator}
 RAYS = ROBUST | {"threshold": 0.003}
-SIZED = {"image_size": SIZE}
+SIZED = {"image_size": tuple(map(float, SIZE))}
 CENTRED = {"c": lambda s: s.rand(2, low=-1.0, high=1.0)}
 ADJUSTED = {name: _bundle(name) for name in ("poses", "cameras", "X", "x", "view", "point", "camera_index")}
 PROJECTIVE = {

@@ -62,7 +62,8 @@ def not_finite(result: Any) -> Iterator[str]:
 
 def zero_models(result: Any) -> Iterator[str]:
     """Models of zeros alone that are called good."""
-    good, model = verdict(result), getattr(result, "model", None)
+    good = verdict(result)
+    model = None if good is None else getattr(result, "model", None)
     if good is None or not isinstance(model, Tensor) or model.ndim <= good.ndim or model.shape[: good.ndim] != good.shape:
         return
     if bool((model[good].flatten(1) == 0).all(-1).any()):

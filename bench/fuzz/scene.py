@@ -162,6 +162,12 @@ def _trifocal(s: Scene, *views: int) -> Tensor:
     return trifocal_from_cameras(*(P[..., i, :, :] for i in views))
 
 
+def _polynomial(s: Scene, size: int) -> Tensor:
+    """Coefficients, lowest power first, of a polynomial that is zero somewhere: negative at 0, positive far away."""
+    c = s.randn(size)
+    return torch.cat((-c[..., :1].abs() - 0.1, c[..., 1:-1], c[..., -1:].abs() + 0.1), -1)
+
+
 def _symmetric(s: Scene, n: int) -> Tensor:
     A = s.randn(n, n)
     return A + A.mT
@@ -247,7 +253,7 @@ _VALUES: dict[str, Callable[[Scene, tuple[int, ...]], Tensor]] = {
     "angles": lambda s, shape: s.rand(3, low=-3.0, high=3.0),
     "aspect": lambda s, _: s.rand(low=0.9, high=1.1),
     "b": lambda s, shape: s.randn(*shape),
-    "c": lambda s, shape: s.randn(*shape),
+    "c": lambda s, shape: _polynomial(s, shape[0]),
     "c 2": lambda s, _: s.parameters(1)[0][..., 0, :2, 2],
     "c1 2": lambda s, _: s.parameters(1)[0][..., 0, :2, 2],
     "c2 2": lambda s, _: s.parameters(2)[0][..., 1, :2, 2],

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry import Camera, Distortion, Pose, Radial
-from torchsfm.linalg import cross, eigvalsh, nearest_rotation, null_vector
+from torchsfm.linalg import cross, eigvalsh, nearest_rotation, null_vector, usable
 from torchsfm.motion import homography_dlt
 from torchsfm.optim import levenberg_marquardt, rotation_exponential
 
@@ -103,9 +103,10 @@ def calibrate_planes(
     v, n = x.shape[-3:-1]
     seen = torch.ones(v, n, dtype=torch.bool, device=x.device) if visible is None else visible
     x64, X64 = (t.double().expand(*batch, *rest) for t, rest in ((x, (v, n, 2)), (X, (n, 2))))
-    seen = seen.expand(*batch, v, n) & torch.isfinite(x64).all(-1) & torch.isfinite(X64).all(-1)[..., None, :]
+    placed = usable(X64).all(-1)
+    seen = seen.expand(*batch, v, n) & usable(x64).all(-1) & placed[..., None, :]
     x64 = torch.where(seen[..., None], x64, 0.0)
-    X64 = torch.where(torch.isfinite(X64).all(-1, keepdim=True), X64, 0.0)
+    X64 = torch.where(placed[..., None], X64, 0.0)
     with torch.no_grad():
         used = (seen.sum(-1) >= 4) & _spread_out(X64, seen)
         seen = seen & used[..., None]
@@ -137,10 +138,9 @@ def calibrate_planes(
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
         focal = settled.intrinsics[..., 0].abs().clamp_min(1e-12)
-        unsure = covariance[..., 0, 0].reshape(batch).clamp_min(0).sqrt() > MAX_DEVIATION * focal
+        unsure = ~(covariance[..., 0, 0].reshape(batch).clamp_min(0).sqrt() <= MAX_DEVIATION * focal)
         measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
-        status = torch.where(result.status == Status.NOT_CONVERGED, int(Status.NOT_CONVERGED), int(Status.OK))
-        status = torch.where(unsure, int(Status.DEGENERATE), status)
+        status = torch.where(unsure, int(Status.DEGENERATE), result.status)
         status = torch.where((measured < unknowns) | ~used.any(-1), int(Status.TOO_FEW), status).to(torch.int8)
     dtype = x.dtype
     K = _matrix(found.intrinsics[..., :5]).to(dtype)

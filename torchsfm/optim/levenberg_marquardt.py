@@ -86,7 +86,8 @@ def levenberg_marquardt(
     check_options(
         max_iterations=(max_iterations, "int >= 0"), function_tolerance=(function_tolerance, "float >= 0"),
         step_tolerance=(step_tolerance, "float >= 0"), initial_damping=(initial_damping, "float >= 0"),
-        size=(size, "?int >= 1"), loss=(loss, Callable | None),
+        size=(size, "?int >= 1"), residual=(residual, Callable), retract=(retract, Callable | None),
+        loss=(loss, Callable | None), linearize=(linearize, Callable | None), weights=(weights, Tensor | None),
     )  # fmt: skip
     move = retract if retract is not None else _add
     if size is None:

@@ -139,5 +139,6 @@ def fundamentals_from_quadrifocal(Q: Float[Tensor, "*batch 3 3 3 3"]) -> Float[T
     Returns:
         F (*batch, pair, 3, 3) with norm 1, x_j' F x_i = 0 for the pair (i, j), of `cameras_from_quadrifocal`.
     """
+    check_tensors(Q=(Q, "3 3 3 3"))
     pairs = torch.tensor([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], device=Q.device)
     return unit_tensor(bifocal_tensors(cameras_from_quadrifocal(Q).P, pairs), 2)[0]
