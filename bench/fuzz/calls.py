@@ -17,7 +17,7 @@ import torchsfm
 from bench.fuzz.campaign import Target, Trial, main
 from bench.fuzz.functions import EXCEPTIONS, FUNCTIONS, Function, public_functions
 from bench.fuzz.poison import poison
-from bench.fuzz.promises import changed, not_finite, tensors, verdict, zero_models
+from bench.fuzz.promises import changed, not_finite, tensors, unsupported, verdict, zero_models
 from bench.fuzz.scene import Scene
 from torchsfm._types import tensor_map
 
@@ -135,6 +135,9 @@ def _bad_values(call: Call, how: Function, seed: int) -> Trial:
     except how.raises:
         return Trial(1)
     broken = [*not_finite(result), *zero_models(result)]
+    if how.distance is not None:
+        exact = _cast(bad, torch.float64)
+        broken += unsupported(result, how.distance(result.model.double(), exact), bad["threshold"])
     if how.batched:
         broken += changed(result, apply(call, arguments), kept)
     return Trial(int((~kept).sum()) if how.batched else 1, tuple(broken))

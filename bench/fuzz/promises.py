@@ -70,6 +70,19 @@ def zero_models(result: Any) -> Iterator[str]:
         yield f"zero model: of {type(result).__name__} is called good"
 
 
+def unsupported(result: Any, distance: Tensor, threshold: float) -> Iterator[str]:
+    """Robust models called good whose inliers are farther away than the threshold, or that have hardly any.
+
+    `distance` are those of all data, in the unit of the threshold.
+    """
+    good = result.status == int(Status.OK)
+    far = result.inliers & ~(distance <= 1.01 * threshold)
+    if bool(far[good].any()):
+        yield f"unsupported model: inliers up to {float(distance[good & far.any(-1)].max()):.1e} away"
+    if bool((result.inliers.sum(-1)[good] < 5).any()):
+        yield "unsupported model: called good with hardly an inlier"
+
+
 def changed(result: Any, reference: Any, kept: Tensor) -> Iterator[str]:
     """Elements of the batch, those of a mask, that are not what they are in a reference.
 
