@@ -142,6 +142,7 @@ FUNCTIONS: dict[str, Function] = {
     "bundle.bundle_adjust": Function(ADJUSTED | {"max_iterations": 10}, BUNDLE_SIZES, batched=False),
     "bundle.bundle_adjust_projective": Function(PROJECTIVE | {"max_iterations": 10}, BUNDLE_SIZES, batched=False),
     "bundle.bundle_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
+    "bundle.intrinsics_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
     "geometry.rotation_from_euler": Function({"axes": "xyz"}),
     "geometry.random_rotation": Function({"shape": (2,), "generator": _generator}),
     "images.describe_images": Function({"features": _features, "words": 4, "generator": _generator}, batched=False),
@@ -185,6 +186,7 @@ FUNCTIONS: dict[str, Function] = {
         {"residual": lambda _: _fit, "x0": lambda s: s.randn(2), "data": lambda s: (s.randn(12), s.randn(12))}
     ),
     "optim.loss_slope": Function({"loss": Cauchy(1.0), "s": lambda s: s.rand(5)}),
+    "optim.marginal_covariance": Function({"blocks": _blocks, "terms": _terms, "name": "p"}, batched=False),
     "optim.sparse_covariance": Function({"blocks": _blocks, "terms": _terms}, batched=False),
     "optim.sparse_levenberg_marquardt": Function({"blocks": _blocks, "terms": _terms}, batched=False),
     "reconstruction.reconstruct_tracks": Function(

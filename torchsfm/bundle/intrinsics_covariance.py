@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import check_options
 from torchsfm.bundle.blocks import Bundle
 from torchsfm.bundle.intrinsics import intrinsics_prior
 from torchsfm.geometry import Camera, Pose
@@ -44,6 +45,7 @@ def intrinsics_covariance(
     )
     with torch.no_grad():
         blocks, terms = bundle.problem()
+        check_options(intrinsics_sigma=(intrinsics_sigma, Mapping | None))
         if intrinsics_sigma:
             terms.append(intrinsics_prior(intrinsics_sigma, cameras if intrinsics_mean is None else intrinsics_mean))
         return marginal_covariance(blocks, terms, "camera", eliminate="point")

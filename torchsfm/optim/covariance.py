@@ -51,7 +51,7 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
     Returns:
         The covariances, float64.
     """
-    check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple), eliminate=(eliminate, (None, *blocks)))
+    _check(blocks, terms, eliminate)
     with torch.no_grad():
         double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
         x = {name: b.x for name, b in double.items()}
@@ -94,8 +94,11 @@ def marginal_covariance(
     """The covariance of each variable of one block alone, which costs no more than a step.
 
     The block must not be the one eliminated, and nothing in it may be part of the gauge. Zero where a variable is fixed, or
-    held in a coordinate; residuals in units of their standard deviation, as in `sparse_covariance`.
+    held in a coordinate; infinite where the terms do not determine the block; residuals in units of their standard deviation,
+    as in `sparse_covariance`.
     """
+    _check(blocks, terms, eliminate)
+    check_options(name=(name, tuple(blocks)))
     with torch.no_grad():
         double = {key: replace(b, x=b.x.detach().double().mT.contiguous().mT) for key, b in blocks.items()}
         x = {key: b.x for key, b in double.items()}
@@ -110,11 +113,17 @@ def marginal_covariance(
         information = Elimination(double, layout, "dense").linearize(x).information(columns)
         held = information.diagonal() <= 0
         information.diagonal()[held] = 1.0
-        joint = torch.cholesky_inverse(torch.linalg.cholesky_ex(information)[0])
+        factor, info = torch.linalg.cholesky_ex(information)
+        joint = torch.where(info == 0, torch.cholesky_inverse(factor), torch.inf)
         joint.diagonal()[held] = 0.0
         places = torch.arange(free.numel() * width, device=free.device).view(-1, width)
         out[free] = joint[places[:, :, None], places[:, None]]
     return out
+
+
+def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | None) -> None:
+    check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple))
+    check_options(eliminate=(eliminate, (None, *blocks)))
 
 
 def to_double(term: Term) -> Term:
