@@ -6,6 +6,7 @@ they get without bad neighbours. Wrong arguments must raise a `ValueError` that 
 """
 
 import inspect
+import re
 from collections.abc import Callable, Iterator
 from typing import Any, get_args
 
@@ -166,7 +167,9 @@ def _wrong_arguments(call: Call, how: Function, seed: int) -> Trial:
         return Trial(1)
     except ValueError as error:
         said = str(error)
-        return Trial(1, () if name in said else (f"unnamed: {name} = {what}: {' '.join(said.split())[:160]}",))
+        # Where two arguments do not fit together the other may be the one that is named.
+        named = name in said or bool(parameters.keys() & set(re.findall(r"\w+", said.partition(":")[0])))
+        return Trial(1, () if named else (f"unnamed: {name} = {what}: {' '.join(said.split())[:160]}",))
     except Exception as error:
         text = " ".join(str(error).split())[:120]
         return Trial(1, (f"not a ValueError: {name} = {what}: {type(error).__name__}: {text}",))

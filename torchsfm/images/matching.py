@@ -103,8 +103,8 @@ def match_descriptors(
         check_options(**{name: (descriptors, Tensor)})
         if descriptors.ndim != 2 or descriptors.is_complex():
             raise ValueError(f"{name}: wanted shape (n, d) of real numbers, got {tuple(descriptors.shape)} {descriptors.dtype}")
-    alike = descriptors1.is_floating_point() and descriptors2.is_floating_point() and descriptors1.dtype != descriptors2.dtype
-    if descriptors1.device != descriptors2.device or descriptors1.shape[1] != descriptors2.shape[1] or alike:
+    kinds = [(d.shape[1], d.dtype if d.is_floating_point() else torch.float32, d.device) for d in (descriptors1, descriptors2)]
+    if kinds[0] != kinds[1]:
         first, second = (f"{tuple(d.shape)} {d.dtype} {d.device}" for d in (descriptors1, descriptors2))
         raise ValueError(f"descriptors1, descriptors2: wanted one length, precision and device, got {first} and {second}")
     return _match(_prepare(descriptors1), _prepare(descriptors2), ratio, mutual, max_distance)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_options, check_tensors
+from torchsfm.linalg import unit_scale
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.normalization import common_scale
@@ -98,6 +99,9 @@ def estimate_homographies(
 
 
 def _unit(found: Structures[Tensor], model: Tensor, dtype: torch.dtype) -> Structures[Tensor]:
-    size = model.flatten(-2).norm(dim=-1)[..., None, None]
-    good = found.valid[..., None, None] & (size > 0)
-    return replace(found, model=torch.where(good, model / torch.where(good, size, 1), 0).to(dtype))
+    model = model * unit_scale(model)
+    size = model.flatten(-2).norm(dim=-1)
+    good = found.valid & (size > 0) & torch.isfinite(size)
+    scale = torch.where(good, 1 / torch.where(good, size, 1), 0)[..., None, None]
+    unit = torch.where(good[..., None, None], model, 0) * scale
+    return replace(found, model=unit.to(dtype), valid=good)

@@ -68,7 +68,7 @@ def starting_pairs(
         (r1, v1), (r2, v2) = mapping.rays(a[member]), mapping.rays(b[member])
         d1[row, : len(member)], d2[row, : len(member)], mask[row, : len(member)] = r1, r2, v1 & v2
     focal = K[graph.pairs[order], 0, 0].mean(-1)
-    essential = estimate_essential(d1, d2, threshold=threshold / focal, mask=mask, generator=generator)
+    essential = estimate_essential(d1, d2, threshold=(threshold / focal).clamp(max=0.1), mask=mask, generator=generator)
     relative = pose_from_essential(essential.model, d1, d2, essential.inliers.to(d1.dtype))
     R = relative.model[..., :3]
     cosine = torch.nn.functional.cosine_similarity((R[:, None] @ d1[..., None])[..., 0], d2, dim=-1)

@@ -338,5 +338,5 @@ def bifocal_tensors(P: Float[Tensor, "*batch v 3 4"], index: Int[Tensor, "m 2"])
     Returns:
         For each pair, F with xj' F xi = 0.
     """
-    check_tensors(P=(P, "v 3 4"), index=(index, "m 2: int"))
+    check_tensors(P=(P, "v>=1 3 4"), index=(index, "m 2: int"))
     return fundamental_from_cameras(P[..., index[:, 0], :, :], P[..., index[:, 1], :, :])

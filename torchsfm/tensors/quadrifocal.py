@@ -54,7 +54,7 @@ def quadrifocal_tensors(P: Float[Tensor, "*batch v 3 4"], index: Int[Tensor, "m 
     Returns:
         For each quadruplet the tensor of `quadrifocal_from_cameras`.
     """
-    check_tensors(P=(P, "v 3 4"), index=(index, "m 4: int"))
+    check_tensors(P=(P, "v>=1 3 4"), index=(index, "m 4: int"))
     return quadrifocal_from_cameras(*(P[..., index[:, k], :, :] for k in range(4)))
 
 

@@ -61,7 +61,7 @@ def trifocal_tensors(P: Float[Tensor, "*batch v 3 4"], index: Int[Tensor, "m 3"]
     Returns:
         For each triplet the tensor of `trifocal_from_cameras`.
     """
-    check_tensors(P=(P, "v 3 4"), index=(index, "m 3: int"))
+    check_tensors(P=(P, "v>=1 3 4"), index=(index, "m 3: int"))
     return trifocal_from_cameras(*(P[..., index[:, k], :, :] for k in range(3)))
 
 
