@@ -94,7 +94,7 @@ def calibrate_planes(
     Raises:
         ValueError: Shapes, dtypes, devices or names do not fit.
     """
-    batch = check_tensors(x=(x, "v n>=4 2"), X=(X, "n 2"), visible=(visible, "?v n : bool"))
+    batch = check_tensors(x=(x, "v>=1 n>=4 2"), X=(X, "n 2"), visible=(visible, "?v n : bool"))
     check_options(image_size=(image_size, "?2 float > 0"), free=(free, Sequence), max_iterations=(max_iterations, "int >= 0"))
     if wrong := set(free) - set(_COLUMNS):
         raise ValueError(f"free: no intrinsic parameter {sorted(wrong)}; there are {', '.join(_COLUMNS)}")

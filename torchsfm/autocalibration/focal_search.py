@@ -60,7 +60,7 @@ def search_focal(
     k = F * J * S
     chunk = max(1, _VIEWS // (k * v))
     pieces = []
-    for s in range(0, b, chunk):
+    for s in range(0, max(b, 1), chunk):
         part = slice(s, s + chunk)
         pieces.append(_score(P[part], X[part], seen[part], base[part], present[part], log1, log2, other[part], varying))
     score, log_f, p = (torch.cat(t) for t in zip(*pieces, strict=True))

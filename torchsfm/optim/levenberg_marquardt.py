@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_options, tensor_map
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.optim.damped_steps import Found, Options, minimise
 from torchsfm.optim.dense_problem import DenseProblem, Linearize
 from torchsfm.optim.implicit import attach_optimum, wants_derivative
@@ -93,6 +93,7 @@ def levenberg_marquardt(
     if size is None:
         if not isinstance(x0, Tensor):
             raise ValueError("size: wanted the number of tangent directions, since x0 is not one tensor")
+        check_tensors(x0=(x0, "k>=1"))
         size = x0.shape[-1]
     followed = leaves((data, weights))
     options = Options(max_iterations, function_tolerance, step_tolerance, initial_damping)
