@@ -26,6 +26,7 @@ from torchsfm.motion import FundamentalEstimator, HomographyEstimator
 from torchsfm.optim import Block, Cauchy, Term
 from torchsfm.reconstruction import ReconstructionError
 from torchsfm.simulation import random_bundle_problem
+from torchsfm.tensors import fundamental_from_cameras
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,11 @@ def _projective(s: Scene) -> Tensor:
     return camera_from_krt(problem.cameras.K[problem.camera_index], problem.poses.R, problem.poses.t)
 
 
+def _fundamentals(P: Tensor) -> Tensor:
+    first, second = PAIRS.unbind(-1)
+    return fundamental_from_cameras(P[..., first, :, :], P[..., second, :, :])
+
+
 def _fit(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
     return torch.stack((x[..., 0, None] * a - b, x[..., 1, None] * a.exp() - 1), -1)
 
@@ -127,12 +133,21 @@ PROJECTIVE = {
     "P": lambda s: _projective(s),
     "X": lambda s: torch.nn.functional.pad(_bundle("X")(s), (0, 1), value=1.0),
 } | {name: _bundle(name) for name in ("x", "view", "point")}  # fmt: skip
+PAIRS = torch.combinations(torch.arange(4))
 BUNDLE_SIZES = {"m": 60, "n": 20, "v": 4, "f": 4, "g": 1, "k": 1}
 TWO_VIEWS = {"estimator": FundamentalEstimator(), "data": lambda s: tuple(s.images(2, 30).unbind(-3))}
 
 FUNCTIONS: dict[str, Function] = {
     "autocalibration.autocalibrate_points": Function(SIZED, {"n": 20}),
     "autocalibration.calibrate_planes": Function({"X": lambda s: _board(s)[0], "x": lambda s: _board(s)[1]}),
+    "autocalibration.calibrate_view_graph": Function(
+        {
+            "F": lambda s: _fundamentals(camera_from_krt(*s.parameters(4))),
+            "cameras": lambda _: PAIRS, "c": lambda s: s.rand(4, 2, low=450.0, high=550.0),
+            "focal": lambda s: s.rand(4, low=700.0, high=900.0), "sigma": lambda s: s.rand(4, low=0.3, high=0.6),
+        },
+        {"p": 6, "v": 4},
+    ),
     "autocalibration.constant_intrinsics": Function(SIZED),
     "autocalibration.dual_quadric_linear": Function(SIZED),
     "autocalibration.intrinsics_from_kruppa": Function(SIZED),

@@ -4,6 +4,7 @@ from torchsfm.autocalibration.algebraic_fit import IntrinsicsEstimate
 from torchsfm.autocalibration.assumption_fit import AssumptionFit
 from torchsfm.autocalibration.autocalibrate_points import Autocalibration, autocalibrate_points
 from torchsfm.autocalibration.calibrate_planes import PlaneCalibration, calibrate_planes
+from torchsfm.autocalibration.calibrate_view_graph import ViewGraphFocals, calibrate_view_graph
 from torchsfm.autocalibration.constant_intrinsics import constant_intrinsics, intrinsics_from_modulus
 from torchsfm.autocalibration.diagnosis import Motion, diagnose_motion
 from torchsfm.autocalibration.dual_quadric import DualQuadric, dual_quadric_linear
@@ -25,8 +26,10 @@ __all__ = [
     "Motion",
     "Orientation",
     "PlaneCalibration",
+    "ViewGraphFocals",
     "autocalibrate_points",
     "calibrate_planes",
+    "calibrate_view_graph",
     "constant_intrinsics",
     "diagnose_motion",
     "dual_quadric_linear",

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.autocalibration import focal_from_fundamentals
+from torchsfm.autocalibration import calibrate_view_graph, focal_from_fundamentals
 from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
 from torchsfm.reconstruction.report import ReconstructionError
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph
@@ -16,7 +16,14 @@ DEFAULT_FOCAL = 1.2
 """Focal length over the longer side of the image (a view of 45 degrees) when nothing tells it."""
 
 
-FOCAL_SIGMA = {"given": 0.01, "exif": 0.05, "autocalibration": 0.05, "fundamental matrices": 0.2, "default": 0.5}
+FOCAL_SIGMA = {
+    "given": 0.01,
+    "exif": 0.05,
+    "autocalibration": 0.05,
+    "fundamental matrices": 0.2,
+    "view graph": 0.2,
+    "default": 0.5,
+}
 """How far a focal length may be off, as a fraction, by where it comes from."""
 
 
@@ -75,9 +82,10 @@ def guess_cameras(
             value, word = found, "fundamental matrices"
         focal.append(value)
         source.append(word)
-    matrices = intrinsics(torch.tensor(focal, dtype=dtype), c)
     if K is not None:
         matrices, source = K.to(dtype).expand(g, 3, 3).clone(), ["given"] * g
+    else:
+        matrices = intrinsics(_focals_of_graph(graph, camera_index, c, torch.tensor(focal, dtype=dtype), source), c)
     if model not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{model}'; there are {', '.join(DISTORTION_MODELS)}")
     distortion = DISTORTION_MODELS[model]
@@ -89,12 +97,31 @@ def _focal_of_pairs(
     graph: ViewGraph, member: Bool[Tensor, "v"], c: Float[Tensor, "2"], size: Float[Tensor, "2"]
 ) -> float | None:
     """One focal length that makes the fundamental matrices of a camera's pairs essential; None where they do not tell."""
-    # A plane or a rotation leaves F undetermined.
-    good = member[graph.pairs].all(-1) & (graph.fundamental_inliers >= 2 * MIN_INLIERS)
-    good &= graph.homography_inliers < 0.7 * graph.fundamental_inliers
+    good = member[graph.pairs].all(-1) & _telling(graph)
     if not bool(good.any()):
         return None
     weights = graph.fundamental_inliers[good].to(c.dtype)
     count = int(good.sum())
     found = focal_from_fundamentals(graph.F[good], c.expand(count, 2), c.expand(count, 2), weights=weights, image_size=size)
     return float(found.model) if found.status == Status.OK else None
+
+
+def _focals_of_graph(
+    graph: ViewGraph, camera_index: Int[Tensor, "v"], c: Float[Tensor, "g 2"], focal: Float[Tensor, "g"], source: list[str]
+) -> Float[Tensor, "g"]:
+    """Focal lengths that nothing told so far, by the pairs of images of different cameras; their `source` is changed."""
+    if "default" not in source:
+        return focal
+    pairs = camera_index[graph.pairs]
+    telling = _telling(graph) & (pairs[:, 0] != pairs[:, 1])
+    found = calibrate_view_graph(graph.F[telling], pairs[telling], c, focal, focal_uncertainty(source).to(focal.dtype))
+    told = (found.status == Status.OK) & torch.tensor([word == "default" for word in source])
+    for k in told.nonzero()[:, 0].tolist():
+        source[k] = "view graph"
+    return torch.where(told, found.model, focal)
+
+
+def _telling(graph: ViewGraph) -> Bool[Tensor, "q"]:
+    """Pairs that determine F: neither a plane nor a rotation explains most of what they have in common."""
+    several = graph.fundamental_inliers >= 2 * MIN_INLIERS
+    return several & (graph.homography_inliers < 0.7 * graph.fundamental_inliers)
