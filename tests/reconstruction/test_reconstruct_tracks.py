@@ -118,7 +118,7 @@ def test_a_plane_is_called_planar() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s: {"view": s.view[:-1]}, "one length"),
+        (lambda s: {"view": s.view[:-1]}, "view: wanted n = 330 as x has"),
         (lambda s: {"view": s.view + 1}, "view"),
         (lambda s: {"track": s.track - 1}, "track"),
     ],
