@@ -18,12 +18,12 @@ from torchsfm.autocalibration.focal_from_fundamentals import SCALE
 from torchsfm.linalg import cross, inverse, usable
 from torchsfm.optim import Cauchy, levenberg_marquardt
 
-STARTS = 9
-"""Starts: all focal lengths longer, or shorter, by up to `SPREAD` standard deviations of what was expected of them."""
-SPREAD = 1.6
+STARTS, SPREAD = 9, 1.6
+"""Starts: all focal lengths longer, or shorter, by up to so many standard deviations of what was expected of them."""
 COMMON = 0.5
 """Share of the variance of what was expected that is one and the same for all cameras: a guess is off for all of them."""
 TINY, ROUNDING = 1e-300, 1e-14
+"""The least denominator; the square of an asymmetry that rounding makes."""
 DETERMINED = 0.6
 """A focal length at most so uncertain, compared to what was expected, is determined by the pairs."""
 
