@@ -1,5 +1,7 @@
 """Adjustments come to their minimum in few steps, with wrong data and robust losses too, and derivatives belong to minima."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from chance import seeded
@@ -87,6 +89,31 @@ def test_the_derivative_of_the_default_call(outliers: float, loss: Cauchy | None
         )
         right += 1
     assert right >= 2
+
+
+def between_two_places(problem: BundleProblem, share: float, generator: torch.Generator) -> BundleProblem:
+    """Every other observation of some points shows something three pixels beside them."""
+    n = len(problem.X)
+    order = torch.argsort(problem.point, stable=True)
+    length = torch.bincount(problem.point, minlength=n)
+    rank = torch.empty_like(order).index_copy(0, order, torch.arange(len(order)))
+    rank = rank - (length.cumsum(0) - length)[problem.point]
+    angle = 2 * torch.pi * torch.rand(n, generator=generator, dtype=F64)
+    beside = 3 * torch.stack((angle.cos(), angle.sin()), 1) * (torch.rand(n, 1, generator=generator) < share)
+    return replace(problem, x=problem.x + beside[problem.point] * (rank % 2 == 0)[:, None])
+
+
+def test_points_between_two_places_do_not_hold_back_the_others() -> None:
+    steps = []
+    for stream in range(6):
+        g = seeded(stream)
+        problem = random_bundle_problem(10, 400, 2400, noise=0.2, generator=g).problem
+        problem = between_two_places(problem, 0.3, g)
+        found = bundle_adjust_model(problem, free=("focal", "k1"), loss=Cauchy(1.0), tolerance=1e-9, max_iterations=300).result
+        assert found.status == Status.OK
+        steps.append(found.iterations)
+    # Were all damped until the Hessian is positive, it would be nearly ninety on average.
+    assert sum(steps) < 60 * len(steps)
 
 
 def test_points_go_through_infinity(generator: torch.Generator) -> None:

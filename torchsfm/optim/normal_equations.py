@@ -20,6 +20,9 @@ from torchsfm.optim.triangle import Triangle, backward, diagonal, factor, floor,
 NULL = 1e-11
 """Eigenvalues of the reduced system, scaled to unit diagonal of U, that count as zero: directions of gauge."""
 
+LARGEST_BENT = 2000
+"""Columns of the largest reduced system whose eigenvalues are found where it is not positive."""
+
 
 @dataclass(frozen=True)
 class NormalEquations:
@@ -84,9 +87,22 @@ class NormalEquations:
             assert not isinstance(self.coupling, RowCoupling), "made so by Elimination"
             self.coupling.reduce(S, L, z)
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
+        if self.V is not self.metric and size <= LARGEST_BENT and bool(info):
+            return self._downhill(S[:size, :size], S[:size, size])
         half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
         kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
         return kept, (info == 0) & kept.isfinite().all()
+
+    def _downhill(self, S: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
+        """The step of the retained variables where the cost bends down in some directions: as far as were it up.
+
+        Away from a minimum it does so along every gauge freedom, too, since no orbit but that of a shift or a scale is
+        straight (saddle-free Newton steps, Dauphin et al. 2014).
+        """
+        scale = floor(self.diagonal).rsqrt()
+        values, vectors, ok = eigh(scale[:, None] * S * scale)
+        kept = -scale * (vectors @ ((vectors.mT @ (scale * slope)) / values.abs().clamp_min(NULL)))
+        return kept, ok & kept.isfinite().all()
 
     def invert(self) -> "Inverse":
         """The inverse without damping; its pseudo-inverse where a gauge is free."""

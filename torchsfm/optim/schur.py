@@ -47,6 +47,8 @@ PASS = 4e-6
 """Seconds per residual of a solution by conjugate gradients, of some 100 iterations."""
 SETTLING = 1e-6
 """Damping of the steps of eliminated variables by themselves."""
+BENT = 1e-3
+"""Exact blocks of eliminated variables that exceed no more than this part of the Gauss-Newton ones give way to these."""
 PARTS = (0.25, 0.0625, 0.0)
 """Of a step that eliminated variables may take instead of a whole one that leads them up."""
 Solver = Literal["auto", "dense", "pcg"]
@@ -106,7 +108,8 @@ class Elimination:
     def curve(self, x: dict[str, Tensor], system: NormalEquations) -> NormalEquations:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
 
-        It holds until the next call. Not for `pcg`.
+        An eliminated variable between two minima of its own keeps its Gauss-Newton block: it must not hold back all others.
+        The system holds until the next call. Not for `pcg`.
         """
         if self._exact is None:
             self._exact = Elimination(self.blocks, self.layout, "dense")
@@ -121,6 +124,8 @@ class Elimination:
             mine[:, -1], mine[:, :, -1] = given[:, -1], given[:, :, -1]
         for a in range(q):
             exact.V[place(a, q, q)] = system.V[place(a, q, q)]
+        if q:
+            exact.V.copy_(torch.where(factor(exact.V - BENT * measure(system.V, q), q)[1], exact.V, system.V))
         return replace(system, coupling=exact.coupling, squares=exact.squares, V=exact.V)
 
     def _add_curvature(self, part: _Part, x: dict[str, Tensor]) -> None:
