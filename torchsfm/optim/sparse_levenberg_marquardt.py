@@ -22,7 +22,8 @@ SLOW = 0.25
 NEAR = 1e-2
 """They do so only once they gain less than this fraction of the cost: before, the exact Hessian is rarely positive."""
 PATIENCE = 5
-"""And when that many in a row were slow, or the end is near: a Newton step takes the time of about five others."""
+"""A Newton step takes the time of about five others: when that many in a row were slow, or the end is near, and at their pace
+more than that many would be needed to the end."""
 MINIMUM = 1e-13
 """Relative decrease still promised at which a place is the minimum that a derivative belongs to."""
 LIGHT = 1e-3
@@ -227,7 +228,8 @@ def _descend(engine: Elimination, state: _Descent, constant: float, options: _Op
                 rate = gain / last
                 done = done or (light and gain <= least and rate < 1 and gain * rate <= least * (1 - rate))
                 dull = dull + 1 if rate > SLOW and gain <= NEAR * cost else 0
-                slow = engine.clusters is None and (dull > PATIENCE or (dull > 0 and gain <= 100 * least))
+                far = gain * rate ** (PATIENCE + 1) > least * (1 - rate)
+                slow = engine.clusters is None and far and (dull > PATIENCE or (dull > 0 and gain <= 100 * least))
             last, promised_last = (gain if gain > 0 else math.inf), max(promise, 1e-300)
             state.x, state.cost = trial, trial_cost
             trust = 1.0 if rounding else min(ratio, 1.0)
