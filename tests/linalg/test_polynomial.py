@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from chance import assert_share
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -30,7 +31,7 @@ def test_closed_forms_find_all_real_roots(degree: int, generator: torch.Generato
     truth = torch.randn(2000, degree, dtype=F64, generator=generator) * 3
     lead = torch.randn(2000, 1, dtype=F64, generator=generator).exp()
     roots, real = SOLVERS[degree](from_roots(truth, lead))
-    assert real.double().mean() > 0.999  # rounding may turn two very close roots into a complex pair
+    assert_share(real, 0.999)  # rounding may turn two very close roots into a complex pair
     separation = (truth[:, :, None] - truth[:, None]).abs() + 9 * torch.eye(degree, dtype=F64)
     apart = separation.amin((-2, -1)) > 0.05
     assert missed(roots, real, truth)[apart].max() < 1e-11
@@ -98,7 +99,7 @@ def test_real_roots_of_random_polynomials(degree: int, generator: torch.Generato
     assert lost.sum() <= 0.0005 * simple.sum()
     wrong = (missed(reference, is_root, roots) > 1e-4) & real
     assert wrong.sum() <= 0.0005 * simple.sum()
-    assert (evaluate(c, roots).abs()[real] <= 1e-13 * evaluate(c.abs(), roots.abs())[real]).double().mean() > 0.999
+    assert_share(evaluate(c, roots).abs()[real] <= 1e-13 * evaluate(c.abs(), roots.abs())[real], 0.999)
 
 
 def test_real_roots_pairs_and_clusters(generator: torch.Generator) -> None:
@@ -112,7 +113,18 @@ def test_real_roots_pairs_and_clusters(generator: torch.Generator) -> None:
         c = sum(torch.nn.functional.pad(c * pair[:, i : i + 1], (i, 2 - i)) for i in range(3))
     roots, real = real_roots(c)
     distance = missed(roots, real, torch.cat((middle, middle + gap), -1))
-    assert (distance < 1e-6).all(-1).double().mean() > 0.995
+    assert_share((distance < 1e-6).all(-1), 0.995)
+
+
+def test_four_roots_within_six_degrees(generator: torch.Generator) -> None:
+    """Polynomials all of whose roots are real; as angles, no two of the four are nearer than a twentieth of a degree."""
+    angle = torch.rand(5000, 7, dtype=F64, generator=generator) * torch.pi
+    near = angle[:, :1] + torch.deg2rad(6 * torch.rand(5000, 4, dtype=F64, generator=generator))
+    c = torch.ones(5000, 1, dtype=F64)
+    for a in torch.cat((near, angle[:, 1:]), -1).split(1, -1):
+        c = torch.nn.functional.pad(c, (1, 0)) * a.cos() - torch.nn.functional.pad(c, (0, 1)) * a.sin()
+    apart = near.sort(-1).values.diff(dim=-1).amin(-1) > torch.deg2rad(near.new_tensor(0.05))
+    assert_share(real_roots(c)[1].all(-1)[apart], 0.93)
 
 
 def test_real_roots_at_zero_and_infinity() -> None:

@@ -1,9 +1,9 @@
 """All real roots of batched polynomials of any degree, by elementwise arithmetic alone.
 
-The projective line is cut into 80 cells of equal angle, x = tan(phi), in four sectors: the polynomial and its reversal, for
+The projective line is cut into 160 cells of equal angle, x = tan(phi), in four sectors: the polynomial and its reversal, for
 arguments between 0 and 1 and between -1 and 0. On the circle the polynomial is the form h(phi) = cos(phi)^n p(tan phi). Values
 and derivatives at the nodes tell, by the Bernstein coefficients of the cubic through them, which cells may hold several roots;
-those are cut once more, in sixteen. There a sign change is one root, and a dip towards zero one pair of roots or none. The
+those are cut once more, in eight. There a sign change is one root, and a dip towards zero one pair of roots or none. The
 cubic gives a start, Newton's method between bounds the root. All arithmetic has the batch in the last dimension.
 """
 
@@ -20,11 +20,11 @@ from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.polynomial import attach_roots
 from torchsfm.linalg.rows import take_columns
 
-_CHUNK = 2048
+_CHUNK = 1024
 """Polynomials to look at a time: their values at all nodes fit the cache."""
-_CELLS = 20
+_CELLS = 40
 """Cells from 0 to 45 degrees."""
-_PARTS = 16
+_PARTS = 8
 """Parts of a cell that is looked at more closely."""
 _STEP = math.pi / 4 / _CELLS
 _NODES = [math.tan(i * _STEP) for i in range(_CELLS)] + [1.0]
@@ -54,9 +54,9 @@ def number_among_equals(item: Int[Tensor, " k"]) -> Int[Tensor, " k"]:
 def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]:
     """The real roots of polynomials of degree m - 1 >= 2, each in a slot of its own.
 
-    Found are all roots, except where three or more lie within about 0.15 degrees of each other as angles atan(x), or four or
-    more within about 2.5: scale the argument so that the roots of interest are around 1. Two real roots that rounding cannot
-    tell from a complex pair may be missing.
+    Found are all roots, except where three or more lie within about 0.15 degrees of each other as angles atan(x), and a pair
+    of some clusters of four or more within about 6: scale the argument so that the roots of interest are around 1. Two real
+    roots that rounding cannot tell from a complex pair may be missing.
 
     Args:
         c: Coefficients, lowest power first. Leading coefficients may be zero, which makes a root infinite.
@@ -92,7 +92,7 @@ def real_root_list(c: Float[Tensor, "m batch"], steps: int = 3, *, in_order: boo
     pieces = [_look(both[..., i : i + _CHUNK]) for i in range(0, max(batch, 1), _CHUNK)]
     changes, several = (torch.cat(bits, -1).flatten(0, 2) for bits in zip(*pieces, strict=True))
     both = both.view(n + 1, 2 * batch)
-    # A cell has the number (side * 20 + node) * 2 + reversal.
+    # A cell has the number (side * 40 + node) * 2 + reversal.
     cell, item = (changes & ~several).nonzero().unbind(1)
     column, path = torch.add(item, cell & 1, alpha=batch), take_columns(turn, cell)
     cell, item = several.nonzero().unbind(1)

@@ -22,11 +22,9 @@ from torchsfm.optim import attach_implicit, wants_derivative
 _CHUNK = 4096
 """Problems at a time: their matrices fit the cache."""
 _NEAR = 1e-8
-"""Distance from the manifold before a Newton step after which there is nothing left to gain."""
-_MORE = 4
-"""Newton steps for the others, among near-planar points and small baselines."""
-_CONVERGED = 1e-7
-"""Distance from the manifold before the last step, of what is a solution."""
+"""Distance from the manifold before a Newton step that ends at a solution."""
+_MORE = 6
+"""Newton steps for the others, among near-planar points and small baselines, where two solutions are almost one."""
 _POOR = 1e-4
 """Distance of a start from the manifold that casts doubt on the polynomial."""
 _SAME = 1e-5, 2e-7
@@ -107,7 +105,7 @@ def _solve(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"]) -> tu
         found.E.index_copy_(1, found.rest, combine(u, found.basis))
         found.error.index_copy_(0, found.rest, last)
     # A unit matrix is finite in all entries or in none.
-    keep = ((found.error < _CONVERGED) & torch.isfinite(found.E[0])).nonzero()[:, 0]
+    keep = ((found.error < _NEAR) & torch.isfinite(found.E[0])).nonzero()[:, 0]
     item, order = found.item.index_select(0, keep).sort(stable=True)
     size = batch + len(again)
     # An empty slot holds diag(1, 1, 0).

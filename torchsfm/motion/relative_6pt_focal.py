@@ -40,9 +40,9 @@ _MORE = 8
 """Newton steps for the others."""
 _CONVERGED = 1e-7
 """Distance from the essential matrices before the last step, of what is a solution."""
-_ISOLATED = 1e-11
+_ISOLATED = 4e-11
 """Slope of the conditions in the direction in which they change least, by log f and F of norm 1, below which the solution is
-one of a family: rounding leaves up to 4e-12 there, and 1e-10 is the least that was seen of single solutions."""
+one of a family: rounding leaves up to 2e-11 there, and less than that is left of three in 360,000 single solutions."""
 _SAME = 1e-6
 """Solutions nearer than this, in F of norm 1 and in log f, are one."""
 _SLOTS = 15
