@@ -144,7 +144,7 @@ def test_epipoles_and_fundamental_matrices(generator: torch.Generator) -> None:
 
 
 def test_tensor_from_fundamental_matrices(generator: torch.Generator) -> None:
-    P = cameras(60, v=3, generator=generator)
+    P = cameras(600, v=3, generator=generator)
     scale = torch.tensor([3.0, -1e4, 1e-3], dtype=F64)[:, None, None]
     F = bifocal_tensors(P, PAIRS) * scale
     T = trifocal_from_cameras(*P.unbind(1))

@@ -19,8 +19,9 @@ def cameras_from_fundamentals(
 ) -> ProjectiveCameras:
     """Three projective cameras from the fundamental matrices of their pairs (HZ 15.4).
 
-    P1 and P2 as of `cameras_from_fundamental`; P3 makes P3' F13 P1 and P3' F23 P2 antisymmetric, which are linear equations.
-    Where the three matrices are not compatible, P3 is their least-squares solution.
+    P1 = [I | 0] and P2 belong to F12; P3 makes P3' F13 P1 and P3' F23 P2 antisymmetric, which are linear equations. They are
+    solved in units in which the matrices are balanced: pixels or radians make no difference. Where the three matrices are not
+    compatible, P3 is their least-squares solution.
 
     Args:
         F12: x2' F12 x1 = 0.
@@ -39,7 +40,10 @@ def cameras_from_fundamentals(
     finite = torch.stack([torch.isfinite(F).all(-1).all(-1) for F in (F12, F13, F23)]).all(0)
     # A rank-2 stand-in where there is no F.
     stand_in = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=F12.dtype, device=F12.device))
-    P1, P2 = cameras_from_fundamental(torch.where(finite[..., None, None], F12, stand_in))
+    F = torch.stack([torch.where(finite[..., None, None], F, stand_in) for F in (F12, F13, F23)], -3)
+    unit = _image_units(F.detach())
+    F12, F13, F23 = _in_units(F, unit).unbind(-3)
+    P1, P2 = cameras_from_fundamental(F12)
     eye = torch.eye(4, dtype=F12.dtype, device=F12.device)
     blocks = []
     for F, P in ((F13, P1), (F23, P2)):
@@ -55,9 +59,32 @@ def cameras_from_fundamentals(
         rank2 = torch.stack([svdvals(unit_rank_2(F.detach()))[0][..., 1] for F in (F12, F13, F23)]).amin(0)
         floor = 256 * torch.finfo(F12.dtype).eps
         determined = (values[..., -2] > floor * values[..., 0]) & (rank2 > floor)
-    P = torch.stack((P1, P2, split_last(p, 3, 4)), -3)
+    P = torch.stack((P1, P2, split_last(p, 3, 4)), -3) * unit[..., None]
+    # The first camera at [I | 0] again.
+    P = torch.cat((P[..., :3] / unit[..., :1, None, :], P[..., 3:]), -1)
     status = torch.where(determined, Status.OK, Status.DEGENERATE)
     return ProjectiveCameras(P, torch.where(finite, status, Status.NOT_FINITE).to(torch.int8))
+
+
+def _image_units(F: Float[Tensor, "*batch 3 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """What (x, y, 1) of each view are multiplied by to give coordinates of size 1: (s, s, 1), for F12, F13, F23.
+
+    In them the last column and the last row of an F weigh as much as each of the other two.
+    """
+    s = F.new_ones(*F.shape[:-3], 3)
+    for _ in range(4):
+        square = _in_units(F, torch.stack((s, s, torch.ones_like(s)), -1)).square()
+        column, row = (2 * q[..., 2] / q[..., :2].sum(-1) for q in (square.sum(-2), square.sum(-1)))
+        ratio = torch.stack((column[..., 0] * column[..., 1], row[..., 0] * column[..., 2], row[..., 1] * row[..., 2]), -1)
+        # A quarter: of squares, and of two matrices.
+        s = s * torch.where(torch.isfinite(ratio) & (ratio > 0), ratio, 1.0) ** 0.25
+    return torch.stack((s, s, torch.ones_like(s)), -1)
+
+
+def _in_units(F: Float[Tensor, "*batch 3 3 3"], unit: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3 3"]:
+    """F12, F13, F23 of coordinates divided by the units of their views."""
+    first, second = unit[..., [0, 0, 1], :], unit[..., [1, 2, 2], :]
+    return second[..., :, None] * F * first[..., None, :]
 
 
 def trifocal_from_fundamentals(
