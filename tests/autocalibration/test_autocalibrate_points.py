@@ -2,6 +2,7 @@ import dataclasses
 
 import pytest
 import torch
+from chance import assert_share
 from projective_scenes import MOTIONS, SIZE, projective_scene, stack
 from torch import Tensor
 
@@ -69,11 +70,11 @@ def test_the_answer_does_not_depend_on_the_frame(generator):
     moved = dataclasses.replace(scene, P=-3 * (scene.P @ frame), X=torch.linalg.solve(frame, scene.X.mT).mT)
     again = solve(moved)
     assert torch.allclose(again.K, found.K, rtol=1e-7)
-    assert torch.allclose(again.P, found.P, rtol=1e-5, atol=1e-5)
+    assert (again.P - found.P).abs().max() < 1e-7 * found.P.abs().max()
     order = torch.randperm(7, generator=generator)
     moved = dataclasses.replace(scene, P=scene.P[order], x=scene.x[order], visible=scene.visible[order])
-    # Another view may be the reference then, and the weights be those of another linearisation.
-    assert torch.allclose(solve(moved).K, found.K[order], rtol=2e-4)
+    ratio = solve(moved).K[:, 0, 0] / found.K[order, 0, 0]
+    assert (ratio.log().abs() < 0.01 * found.deviation[order, 0]).all()
 
 
 def test_noise_stays_within_its_own_estimate(generator):
@@ -145,7 +146,7 @@ def test_deviations_hold_what_the_choice_leaves_open(generator):
     least = (1 - found.probability)[:, None].sqrt() * apart
     assert (told > 0.5 * least)[known].all()
     scores = (found.K[..., 0, 0] / scene.K[..., 0, 0]).log()[found.valid] / told[found.valid]
-    assert (scores.abs() < 3).double().mean() > 0.85
+    assert_share(scores.abs() < 3, 0.85)
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

@@ -74,7 +74,7 @@ class CanonicalCameras:
 def canonical_cameras(
     P: Float[Tensor, "b v 3 4"], X: Float[Tensor, "b n 4"], visible: Bool[Tensor, "b v n"], image_size: Float[Tensor, "b v 2"]
 ) -> CanonicalCameras:
-    """Scale, orient and move cameras and points to the frame of the view with most points.
+    """Scale, orient and move cameras and points to the frame of the view with most points, whatever the order of the views.
 
     Args:
         P: Cameras in pixels.
@@ -96,7 +96,7 @@ def canonical_cameras(
     image_size = torch.where(usable_size[..., None], image_size, 1.0)
     finite = finite & (usable_size | ~present).all(-1)
     T = image_scaling(image_size)
-    first = visible.sum(-1).argmax(-1)
+    first = _widest(T @ P, X, visible)
     order = torch.arange(v, device=P.device).expand(b, v).clone()
     order.scatter_(1, first[:, None], 0)
     order[:, 0] = first
@@ -119,6 +119,14 @@ def canonical_cameras(
     Q = torch.where((finite[:, None] & present)[..., None, None], Q, eye)
     Y = torch.where(finite[:, None, None], Y, torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=X.dtype, device=X.device))
     return CanonicalCameras(Q, Y, frame, T, order, visible, present, oriented.consistent, finite)
+
+
+def _widest(P: Float[Tensor, "b v 3 4"], X: Float[Tensor, "b n 4"], visible: Bool[Tensor, "b v n"]) -> Int[Tensor, "b"]:
+    """The view with most points, and of several the one over whose image they are spread most."""
+    h = X[:, None] @ P.mT
+    square = (h[..., :2] / h[..., 2:]).square().sum(-1)
+    spread = torch.where(visible & torch.isfinite(square), square, 0.0).sum(-1)
+    return (visible.sum(-1) + spread / (1 + spread)).argmax(-1)
 
 
 def prepare_cameras(
