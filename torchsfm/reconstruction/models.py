@@ -215,7 +215,10 @@ def reconstruct_tracks(
     check_one_problem(x=(x, "n 2"), view=(view, "n: int"), track=(track, "n: int"), image_size=(image_size, "v 2: int"))
     check_one_problem(color=(color, "?n 3"))
     check_one_problem(K=(K, "?3 3"))
-    check_options(names=(names, Sequence | None), focal=(focal, "?float > 0"), seed=(seed, "int"))
+    check_options(
+        names=(names, Sequence | None), focal=(focal, "?float > 0"), seed=(seed, "int"), camera=(camera, str | None),
+        shared_camera=(shared_camera, bool | None),
+    )  # fmt: skip
     v = len(image_size)
     if len(view) and not (int(view.min()) >= 0 and int(view.max()) < v):
         raise ValueError(f"view: wanted indices from 0 to {v - 1}, got {int(view.min())} to {int(view.max())}")
