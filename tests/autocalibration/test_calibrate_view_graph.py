@@ -1,5 +1,6 @@
 import pytest
 import torch
+from chance import assert_share
 from test_focal_from_fundamentals import fundamentals, poses
 from torch import Tensor
 
@@ -36,10 +37,10 @@ def test_focal_lengths_of_all_cameras_are_found(kind: str, noise: float, error: 
         determined.append(good)
         errors.append((model / truth).log().abs()[good])
         ratios.append(((model / truth).log() / deviation)[good])
-    assert torch.cat(determined).double().mean() > 0.8
+    assert_share(torch.cat(determined), 0.8)
     assert torch.cat(errors).median() < error
     # What is called determined is, within three of its own standard deviations.
-    assert (torch.cat(ratios).abs() < 3).double().mean() > 0.95
+    assert_share(torch.cat(ratios).abs() < 3, 0.95)
 
 
 def test_wrong_pairs_are_outvoted(generator: torch.Generator) -> None:

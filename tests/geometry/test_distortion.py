@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from chance import seeded
+from chance import assert_share, seeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -87,12 +87,12 @@ def test_every_ray_of_the_domain_is_found_again(name, seed, spread):
     found, valid = model.unproject(u)
     assert found.isfinite().all()
     inside = model.in_domain(d)
-    assert inside.double().mean() > 0.98
+    assert_share(inside, 0.98)
     good = valid & (angles_between(found, d) < 1e-6)
-    assert good[inside].double().mean() >= 0.99
+    assert_share(good[inside], 0.99)
     again = model.project(found)
     torch.testing.assert_close(again[valid], u[valid], rtol=1e-11, atol=1e-13)
-    assert model.in_domain(found)[valid].double().mean() > 0.999
+    assert_share(model.in_domain(found)[valid], 0.999)
 
 
 @settings(deadline=None, max_examples=100)

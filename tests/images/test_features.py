@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from chance import numpy_seeded
+from chance import assert_share, numpy_seeded
 from torch import Tensor
 
 from torchsfm.images import Photograph, detect_features, match_descriptors, read_image
@@ -45,12 +45,18 @@ def test_blobs_are_found_where_they_are(size: float, spread: float) -> None:
 
 def test_shrunk_images_give_positions_in_the_image_given() -> None:
     rng = numpy_seeded(2)
-    centres = np.array([[90.0, 120.0], [220.0, 110.0]]) + rng.uniform(-1, 1, (2, 2))
-    features = detect_features(blobs(centres, np.array([7.0, 10.0])), max_size=107)  # about a third
-    for centre, size in zip(centres, (7.0, 10.0), strict=True):
-        i = nearest(features.x, centre)
-        assert np.linalg.norm(features.x[i].double().numpy() - centre) < 0.3
-        assert float(features.scale[i]) == pytest.approx(size, rel=0.1)
+    found = []
+    for _ in range(8):
+        centres = np.array([[90.0, 120.0], [220.0, 110.0]]) + rng.uniform(-1, 1, (2, 2))
+        sizes = rng.uniform(6, 12, 2)
+        features = detect_features(blobs(centres, sizes), max_size=107)  # about a third
+        for centre, size in zip(centres, sizes, strict=True):
+            distance = (features.x.double() - torch.from_numpy(centre)).norm(dim=1)
+            found.append(bool((distance < 5).any()))
+            assert (distance[distance < 5] < 0.3).all()
+            assert features.scale[distance < 5].numpy() == pytest.approx(size, rel=0.1)
+    # OpenCV passes over one in ten perfect blobs: those whose size lies in the middle between two of its scales.
+    assert_share(torch.tensor(found), 0.8)
 
 
 def texture(seed: int, height: int = 240, width: int = 320) -> np.ndarray:

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from chance import assert_share
 
 from torchsfm.linalg.elimination import least_squares_rows
 from torchsfm.linalg.quadric_intersection import CUBIC, QUADRATIC, cubic_of_forms, intersect_quadrics, product_of_forms
@@ -33,9 +34,9 @@ def test_known_points_are_found(generator, size, most):
         assert (values(q[:, item], found).abs() < 1e-9 * q[:, item].abs().amax(0)).all()
     gap = torch.minimum((found - v[:, item]).norm(dim=0), (found + v[:, item]).norm(dim=0))
     nearest = torch.full((3000,), torch.inf, dtype=F64).scatter_reduce(0, item, gap, "amin")
-    assert (nearest < 1e-8).double().mean() > 0.999
+    assert_share(nearest < 1e-8, 0.999)
     # Real points come in pairs.
-    assert (torch.bincount(item, minlength=3000) % 2 == 0).double().mean() > 0.995
+    assert_share(torch.bincount(item, minlength=3000) % 2 == 0, 0.995)
 
 
 def test_products_of_forms(generator):

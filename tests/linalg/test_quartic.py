@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from chance import assert_share
 from torch import Tensor
 
 from torchsfm.linalg import solve_quartic
@@ -38,18 +39,18 @@ def test_four_real_roots(spread: float, generator: torch.Generator) -> None:
     roots = torch.randn(3000, 4, dtype=F64, generator=generator)
     roots = roots * 10 ** (spread * torch.rand(3000, 1, dtype=F64, generator=generator))
     x, real = solve_quartic(torch.randn(3000, 1, dtype=F64, generator=generator) * from_roots(roots))
-    assert real.all(-1).double().mean() > 0.999
-    assert (gaps(x, real, roots) < 1e-6).double().mean() > 0.999
+    assert_share(real.all(-1), 0.999)
+    assert_share(gaps(x, real, roots) < 1e-6, 0.999)
 
 
 def test_even_quartics_and_zero_roots(generator: torch.Generator) -> None:
     half = torch.randn(1000, 2, dtype=F64, generator=generator)
     roots = torch.cat((half, -half), -1)
     x, real = solve_quartic(from_roots(roots))
-    assert (gaps(x, real, roots) < 1e-7).double().mean() > 0.999
+    assert_share(gaps(x, real, roots) < 1e-7, 0.999)
     roots[:, 0] = 0
     x, real = solve_quartic(from_roots(roots))
-    assert (gaps(x, real, roots) < 1e-6).double().mean() > 0.999
+    assert_share(gaps(x, real, roots) < 1e-6, 0.999)
     assert not solve_quartic(torch.tensor([1.0, 0, 0, 0, 1], dtype=F64))[1].any()
     assert not solve_quartic(torch.tensor([2.0, 0, 3, 0, 1], dtype=F64))[1].any()
 
@@ -58,7 +59,7 @@ def test_double_roots_are_found_once(generator: torch.Generator) -> None:
     roots = torch.randn(2000, 4, dtype=F64, generator=generator)
     roots[:, 1] = roots[:, 0]
     x, real = solve_quartic(from_roots(roots))
-    assert (gaps(x, real, roots) < 1e-5).double().mean() > 0.999
+    assert_share(gaps(x, real, roots) < 1e-5, 0.999)
     assert ((real.sum(-1) == 3) | (real.sum(-1) == 4)).all()
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from chance import seeded
+from chance import assert_share, seeded
 from multiview_scenes import F64, cameras, images, points
 from oxford import lines_of, read
 from torch import Tensor
@@ -110,9 +110,9 @@ def test_a_plane_does_not_win_over_points_off_it(generator: torch.Generator) -> 
     found = estimate_trifocal(x, threshold=2.0, generator=generator)
     off = ~wrong[:, :16]
     assert (found.inliers[:, :16] & off).sum() > 0.9 * off.sum()
-    assert (found.degeneracy == Degeneracy.NONE).double().mean() > 0.9
+    assert_share(found.degeneracy == Degeneracy.NONE, 0.9)
     held = images(P, points(30, n=40, generator=generator))
-    assert (transfer_error(found.model, held).median(-1).values < 3).double().mean() > 0.85
+    assert_share(transfer_error(found.model, held).median(-1).values < 3, 0.85)
 
 
 def test_bad_problems_and_scale_of_the_threshold(generator: torch.Generator) -> None:
@@ -166,7 +166,7 @@ def test_transfer_in_oxford_triplets(name: str, views: list[int], limit: float, 
     assert transfer_error(fit.P, held).median() < limit
     robust = estimate_trifocal(x, threshold=2.0, generator=generator)
     assert robust.status == Status.OK
-    assert robust.inliers.double().mean() > 0.9
+    assert_share(robust.inliers, 0.9)
     assert transfer_error(robust.model, held).median() < limit
     # Half the points do as well as Oxford's cameras, which come from all of them in all views, but for a fifth of a pixel.
     assert transfer_error(robust.model, held).median() < transfer_error(P, held).median() + 0.2

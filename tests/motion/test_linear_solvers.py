@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from chance import assert_share
 from torch import Tensor
 from two_view_scenes import F64, distance, fundamental, pixels, two_views
 
@@ -39,11 +40,11 @@ def error(found: Tensor, truth: Tensor) -> Tensor:
 def test_exact_data(solve: Solver, extra: int, generator: torch.Generator) -> None:
     x1, x2, truth = sample(solve, 1000, LEAST[solve] + extra, generator)
     model = solve(x1, x2)
-    assert (error(model, truth) < 1e-8).double().mean() >= 0.999
+    assert_share(error(model, truth) < 1e-8, 0.999)
     torch.testing.assert_close(model.norm(dim=(-2, -1)), torch.ones(1000, dtype=F64))
     single = solve(x1.float(), x2.float())
     assert single.dtype == torch.float32
-    assert (error(single, truth) < 1e-2).double().mean() >= 0.95
+    assert_share(error(single, truth) < 1e-2, 0.95)
 
 
 def test_fundamental_has_rank_two(generator: torch.Generator) -> None:
@@ -179,4 +180,4 @@ def test_against_opencv(generator: torch.Generator) -> None:
 def test_seven_of_eight_points_contain_the_same_matrix(generator: torch.Generator) -> None:
     x1, x2, _ = sample(fundamental_8pt, 100, 8, generator)
     minimal = fundamental_7pt(x1[:, :7], x2[:, :7])
-    assert (distance(minimal.model, minimal.valid, fundamental_8pt(x1, x2)) < 1e-7).double().mean() > 0.99
+    assert_share(distance(minimal.model, minimal.valid, fundamental_8pt(x1, x2)) < 1e-7, 0.99)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from chance import assert_share
 from torch import Tensor
 from two_view_scenes import F64, K
 
@@ -49,7 +50,7 @@ def test_recall(generator: torch.Generator) -> None:
     single = motions_from_homography(H.float())
     assert single.model.R.dtype == torch.float32
     model = PlaneMotion(*(v.double() for v in (single.model.R, single.model.t, single.model.normal)))
-    assert (gap(model, slots(truth)).amin(-1) < 1e-2).double().mean() > 0.99
+    assert_share(gap(model, slots(truth)).amin(-1) < 1e-2, 0.99)
 
 
 def test_every_motion_gives_the_homography(generator: torch.Generator) -> None:
@@ -97,13 +98,13 @@ def test_points_choose_the_motion(generator: torch.Generator) -> None:
     assert chosen.in_front.all()
     assert right[~chosen.alternative_fits].all()
     assert (right | (gap(chosen.alternative, truth) < 1e-8)).all()
-    assert right.double().mean() > 0.7
+    assert_share(right, 0.7)
     # A plane that meets the optical axis behind the camera: the sign of (t, normal) follows the points.
     turn = rotation_from_rotvec(torch.tensor([0.0, 2.5, 0], dtype=F64))
     moved = motion_from_homography(H @ turn.mT, d1 @ turn.mT, d2)
     expected = PlaneMotion(truth.R @ turn.mT, truth.t, truth.normal @ turn.mT)
     found = torch.minimum(gap(moved.model, expected), gap(moved.alternative, expected))
-    assert (found < 1e-8).double().mean() > 0.99
+    assert_share(found < 1e-8, 0.99)
 
 
 def test_wrong_points_and_weights(generator: torch.Generator) -> None:

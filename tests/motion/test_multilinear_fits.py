@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from chance import assert_share
 from multiview_scenes import F64, cameras, images, line_images, points, up_to_scale
 from torch import Tensor
 
@@ -63,9 +64,9 @@ def test_lines_and_mixtures(generator: torch.Generator) -> None:
     scale = torch.tensor([2.0, -0.01, 300.0], dtype=F64)[:, None, None]
     for n, m in ((0, 13), (0, 14), (6, 1), (3, 8), (1, 12)):
         found = trifocal_7pt(x[:, :, :n], l[:, :, :m] * scale)
-        assert (found.status == Status.OK).double().mean() > 0.95
+        assert_share(found.status == Status.OK, 0.95)
         assert up_to_scale(found.T, T, 3).median() < 1e-10
-        assert (up_to_scale(found.T, T, 3) < 1e-6).double().mean() > 0.95
+        assert_share(up_to_scale(found.T, T, 3) < 1e-6, 0.95)
     ends = torch.stack((images(P, X)[:, 0], images(P, Y)[:, 0]), -2)
     found = trifocal_7pt(x[:, :, :0], l, ends=ends)
     assert up_to_scale(found.T, T, 3).median() < 1e-10
@@ -99,7 +100,7 @@ def test_noise_and_constraints(v: int, generator: torch.Generator) -> None:
     x, _, P = scene(40, v, 15, generator)
     noisy = x + 0.5 * torch.randn(x.shape, generator=generator, dtype=F64)
     found = fit(noisy)
-    assert (found.status == Status.OK).double().mean() > 0.9
+    assert_share(found.status == Status.OK, 0.9)
     held = images(P, points(40, n=20, generator=generator))
     if v == 3:
         assert trifocal_constraints(tensor(found)).abs().max() < 1e-12
@@ -220,8 +221,10 @@ def test_similarities_of_the_images(v: int, generator: torch.Generator) -> None:
         return transfer_points_quadrifocal(tensor(result), *y[:, :3].unbind(1))
 
     shift = torch.tensor([100.0, -50.0], dtype=F64)
-    plain, moved = last(fit(x), held), last(fit(3 * x + shift), 3 * held + shift)
-    torch.testing.assert_close(3 * plain + shift, moved, rtol=1e-4, atol=1e-2)
+    plain, moved = last(fit(x), held), (last(fit(3 * x + shift), 3 * held + shift) - shift) / 3
+    # Minima are flat: where two searches end differs by little of what noise does.
+    apart, error = ((a - b).norm(dim=-1).amax(-1) for a, b in ((plain, moved), (plain, held[:, -1])))
+    assert (apart < 0.05 * error + 1e-3).all()
 
 
 def test_derivatives(v: int, generator: torch.Generator) -> None:

@@ -1,6 +1,7 @@
 """The poses of five rays against all of every essential matrix, and formulas for compilers against those for eager mode."""
 
 import torch
+from chance import assert_share
 from torch import Tensor
 from two_view_scenes import F64, two_views
 
@@ -44,7 +45,7 @@ def test_poses_are_those_in_front(generator: torch.Generator) -> None:
     # The poses are unique, so that the sign of E is.
     error = (essential_from_pose(found.model[..., :3], found.model[..., 3])[:200] - E[:200, None]).norm(dim=(-2, -1))
     error = error.masked_fill(~found.valid[:200], torch.inf).amin(-1)
-    assert (error < 1e-6).double().mean() >= 0.99
+    assert_share(error < 1e-6, 0.99)
     assert relative_5pt.equations(found.model, d1[:, None], d2[:, None])[found.valid].abs().max() < 1e-6
     assert (torch.linalg.det(found.model[..., :3])[found.valid] > 0).all()
     least = depths(found.model, d1[:, None], d2[:, None]).amin((0, -1))
@@ -56,7 +57,7 @@ def test_poses_are_those_in_front(generator: torch.Generator) -> None:
     # Beyond doubt in front: found; beyond doubt behind: not.
     ahead, behind = (least > 0) & solutions.valid[..., None], (least < -2e-3) & solutions.valid[..., None]
     assert ahead.sum() > 500
-    assert (gap[ahead] < 1e-5).double().mean() > 0.997
+    assert_share(gap[ahead] < 1e-5, 0.997)
     assert (gap[behind] > 1e-6).all()
     # The valid slots come first.
     assert not (~found.valid[:, :-1] & found.valid[:, 1:]).any()
@@ -70,14 +71,14 @@ def test_formulas_for_the_compiler_are_the_same(generator: torch.Generator) -> N
     slack = torch.full_like(roots.s, 1e-3)
     whole, number = from_roots.function(*rows), _essential_numbers.from_roots(*rows)
     fine = whole[2] < 1e-6
-    assert fine.double().mean() > 0.9
+    assert_share(fine, 0.9)
     for a, b in zip(whole, number, strict=True):
         torch.testing.assert_close(a[..., fine], b[..., fine], rtol=0, atol=1e-9)
     u, worth = relative_5pt._starts.function(*rows, data, slack)
     v, likewise = _essential_numbers.starts(*rows, data, slack + relative_5pt._MARGIN, relative_5pt._GAP)
     torch.testing.assert_close(u, v, rtol=0, atol=1e-7)
-    assert (worth == likewise).double().mean() > 0.99
+    assert_share(worth == likewise, 0.99)
     whole, number = (f(u, roots.basis, data, slack) for f in (relative_5pt._polished.function, _essential_numbers.polished))
     for a, b in zip(whole[:2], number[:2], strict=True):
         torch.testing.assert_close(a[..., fine], b[..., fine], rtol=0, atol=1e-7)
-    assert (whole[2] == number[2]).double().mean() > 0.99
+    assert_share(whole[2] == number[2], 0.99)

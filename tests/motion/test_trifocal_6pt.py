@@ -1,5 +1,6 @@
 import pytest
 import torch
+from chance import assert_share
 from multiview_scenes import F64, K, cameras, images, points, up_to_scale
 from torch import Tensor
 
@@ -39,18 +40,18 @@ def test_recall(family: str, tolerance: float, generator: torch.Generator) -> No
     x, P = scene(2000, generator, family)
     solutions = trifocal_6pt(x)
     assert solutions.model.shape == (2000, 3, 3, 3, 4)
-    assert (error(solutions.model, solutions.valid, P) < tolerance).double().mean() >= 0.999
+    assert_share(error(solutions.model, solutions.valid, P) < tolerance, 0.999)
     single = trifocal_6pt(x.float())
     assert single.model.dtype == torch.float32
     if family == "random":
-        assert (error(single.model, single.valid, P) < 1e-2).double().mean() >= 0.98
+        assert_share(error(single.model, single.valid, P) < 1e-2, 0.98)
 
 
 def test_the_frame_is_the_canonical_one(generator: torch.Generator) -> None:
     x, P = scene(500, generator)
     solutions = trifocal_6pt(x)
     gap = (solutions.model - canonical_cameras(P)[:, None]).flatten(2).abs().amax(-1)
-    assert (torch.where(solutions.valid, gap, torch.inf).amin(-1) < 1e-6).double().mean() > 0.995
+    assert_share(torch.where(solutions.valid, gap, torch.inf).amin(-1) < 1e-6, 0.995)
     again = canonical_cameras(solutions.model)
     assert (again - solutions.model)[solutions.valid].abs().max() < 1e-8
 
@@ -64,13 +65,13 @@ def test_soundness_and_number_of_solutions(generator: torch.Generator) -> None:
     assert residual[solutions.valid].quantile(0.999) < 1e-9
     assert torch.isfinite(solutions.model).all()
     count = solutions.valid.sum(-1)
-    assert ((count == 1) | (count == 3)).double().mean() > 0.999
+    assert_share((count == 1) | (count == 3), 0.999)
     assert 0.7 < (count[:500] == 3).double().mean() < 0.95
     # No two alike.
     T = trifocal_from_cameras(*solutions.model.unbind(-3))
     for i, j in ((0, 1), (0, 2), (1, 2)):
         both = solutions.valid[:, i] & solutions.valid[:, j]
-        assert (up_to_scale(T[:, i], T[:, j], 3)[both] > 1e-7).double().mean() > 0.999
+        assert_share(up_to_scale(T[:, i], T[:, j], 3)[both] > 1e-7, 0.999)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (2, 3), (0,)])
@@ -94,13 +95,13 @@ def test_order_of_points_and_views_and_similarities(generator: torch.Generator) 
     x, P = scene(300, generator)
     order = torch.randperm(6, generator=generator)
     turned = trifocal_6pt(x[:, :, order])
-    assert (error(turned.model, turned.valid, P) < 1e-8).double().mean() > 0.995
+    assert_share(error(turned.model, turned.valid, P) < 1e-8, 0.995)
     views = trifocal_6pt(x[:, [2, 0, 1]])
-    assert (error(views.model, views.valid, P[:, [2, 0, 1]]) < 1e-8).double().mean() > 0.995
+    assert_share(error(views.model, views.valid, P[:, [2, 0, 1]]) < 1e-8, 0.995)
     S = torch.tensor([[0.0, -3, 1], [3, 0, -2], [0, 0, 1]], dtype=F64)
     moved = trifocal_6pt(x @ S[:2, :2].mT + S[:2, 2])
     back = torch.linalg.inv(S) @ moved.model
-    assert (error(back, moved.valid, P) < 1e-8).double().mean() > 0.995
+    assert_share(error(back, moved.valid, P) < 1e-8, 0.995)
 
 
 def test_degenerate_samples_leave_neighbours_alone(generator: torch.Generator) -> None:

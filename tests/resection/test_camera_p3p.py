@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from chance import seeded
+from chance import assert_share, seeded
 
 from torchsfm.resection import camera_p3p
 from torchsfm.resection.camera_p3p import equations
@@ -26,7 +26,7 @@ def distance(found, P):
 def test_recall_on_random_scenes(make_scene, width):
     Y, X, P = make_scene(10_000, width=width)
     found = camera_p3p(Y / Y[..., 2:], X)
-    assert (distance(found, P) < 1e-6).double().mean() >= 0.9999
+    assert_share(distance(found, P) < 1e-6, 0.9999)
     assert distance(found, P).median() < 1e-10 / width
 
 
@@ -34,7 +34,7 @@ def test_recall_in_single_precision(make_scene):
     Y, X, P = make_scene(10_000)
     found = camera_p3p((Y / Y[..., 2:]).float(), X.float())
     assert found.model.dtype == torch.float32
-    assert (distance(found, P.float()) < 1e-2).double().mean() >= 0.98
+    assert_share(distance(found, P.float()) < 1e-2, 0.98)
 
 
 def test_every_valid_slot_is_a_solution(make_scene):
@@ -136,7 +136,7 @@ def test_double_solutions(generator):
     centre = circle[:, 3] + height[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     Y = circle[:, :3] - centre[:, None]
     X, P = world(Y, generator)
-    assert (distance(camera_p3p(Y, X), P) < 1e-3).double().mean() > 0.97
+    assert_share(distance(camera_p3p(Y, X), P) < 1e-3, 0.97)
 
 
 def test_all_four_solutions_of_a_known_case():

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from chance import assert_share
 
 from torchsfm._types import Status
 from torchsfm.geometry import random_rotation, rotation_angle, rotvec_from_rotation
@@ -43,7 +44,7 @@ def test_exact_data(make_views, n, thickness):
     found = camera_pnp(d, X)
     assert (found.status == Status.OK).all()
     good = (turn(found.model, R) < 1e-8) & ((found.model[..., 3] - t).norm(dim=-1) < 1e-7)
-    assert good.double().mean() >= 0.999
+    assert_share(good, 0.999)
     torch.testing.assert_close(found.model[..., :3] @ found.model[..., :3].mT, torch.eye(3, dtype=F64).expand(400, 3, 3))
     assert (found.error[good] < 1e-8).all()
 
@@ -54,7 +55,7 @@ def test_rays_in_all_directions(generator):
     t = torch.randn(500, 3, generator=generator, dtype=F64)
     found = camera_pnp(2 * Y, (Y - t[:, None]) @ R)
     assert (found.status == Status.OK).all()
-    assert (turn(found.model, R) < 1e-8).double().mean() > 0.998
+    assert_share(turn(found.model, R) < 1e-8, 0.998)
 
 
 @pytest.mark.parametrize("thickness", [1.0, 0.02])
@@ -108,7 +109,7 @@ def test_the_gradient_vanishes(make_views, solve):
     moved = S.mT @ models
     moved = torch.cat((moved[..., :3], moved[..., 3:] + delta[..., 3:, None]), -1)
     (g,) = torch.autograd.grad(sines(moved, d[:, None], X[:, None]).square()[valid].sum(), delta)
-    assert (g[valid].abs() < 1e-7).double().mean() > 0.97
+    assert_share(g[valid].abs() < 1e-7, 0.97)
 
 
 @pytest.mark.parametrize("solve", [camera_pnp, camera_planar])
@@ -180,12 +181,12 @@ def test_both_planar_poses(make_views):
     assert found.valid[:, 0].all()
     assert 0.5 < found.valid[:, 1].double().mean() < 1
     assert (found.error[:, 0] <= found.error[:, 1]).all()
-    assert (turn(found.model[:, 0], R) < 1e-7).double().mean() > 0.998
-    assert ((found.model[:, 0, :, 3] - t).norm(dim=-1) < 1e-6).double().mean() > 0.998
+    assert_share(turn(found.model[:, 0], R) < 1e-7, 0.998)
+    assert_share((found.model[:, 0, :, 3] - t).norm(dim=-1) < 1e-6, 0.998)
     rms = sines(found.model, d[:, None], X[:, None]).square().mean(-1).sqrt()
     torch.testing.assert_close(rms, found.error)
     second = found.valid[:, 1]
-    assert (found.error[second, 1] > 1e-5).double().mean() > 0.995
+    assert_share(found.error[second, 1] > 1e-5, 0.995)
 
 
 def test_a_small_far_plane_is_ambiguous(make_views, generator):
@@ -197,8 +198,8 @@ def test_a_small_far_plane_is_ambiguous(make_views, generator):
     found = camera_planar(d, X)
     best = turn(found.model[:, 0], R)
     either = torch.where(found.valid, turn(found.model, R[:, None]), torch.inf).amin(-1)
-    assert (best > 0.3).double().mean() > 0.2
-    assert (either < 0.3).double().mean() > 0.9
+    assert_share(best > 0.3, 0.2)
+    assert_share(either < 0.3, 0.9)
 
 
 def test_points_in_no_plane_are_reported(make_views):

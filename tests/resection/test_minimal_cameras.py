@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+from chance import assert_share
 
 from torchsfm._types import Solutions
 from torchsfm.geometry import random_rotation
@@ -74,7 +75,7 @@ def distance(found: Solutions[torch.Tensor], P: torch.Tensor) -> torch.Tensor:
 def test_recall(kind, sample, width):
     *data, P = sample(kind, 2000, width=width)
     error = distance(kind.solve(*data), P)
-    assert (error < 1e-6).double().mean() >= 0.999
+    assert_share(error < 1e-6, 0.999)
     assert error.median() < 1e-12 / width
 
 
@@ -83,7 +84,7 @@ def test_recall_in_single_precision(kind, sample):
     found = kind.solve(*(d.float() for d in data))
     assert found.model.dtype == torch.float32
     assert found.model.isfinite().all()
-    assert (distance(found, P.float()) < 1e-2).double().mean() >= 0.98
+    assert_share(distance(found, P.float()) < 1e-2, 0.98)
 
 
 def test_every_valid_slot_is_a_solution(kind, sample):
@@ -113,8 +114,8 @@ def test_the_order_of_slots_and_points(kind, sample):
     if kind.solve is camera_p35pf:
         turned = [d[:, [2, 0, 1, 3]] for d in data]
     found, again = kind.solve(*data), kind.solve(*turned)
-    assert (distance(again, P) < 1e-6).double().mean() > 0.998
-    assert (found.valid.sum(-1) == again.valid.sum(-1)).double().mean() > 0.99
+    assert_share(distance(again, P) < 1e-6, 0.998)
+    assert_share(found.valid.sum(-1) == again.valid.sum(-1), 0.99)
 
 
 def test_the_world_may_be_anywhere_and_of_any_size(kind, sample, generator):
@@ -128,7 +129,7 @@ def test_the_world_may_be_anywhere_and_of_any_size(kind, sample, generator):
         data[3] = data[3] @ S.mT
     R = P[..., :3] @ S.mT
     moved = torch.cat((R, scale * P[..., 3:] - R @ shift[:, None]), -1)
-    assert (distance(kind.solve(*data), moved) < 1e-6).double().mean() > 0.995
+    assert_share(distance(kind.solve(*data), moved) < 1e-6, 0.995)
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3), (0,)])

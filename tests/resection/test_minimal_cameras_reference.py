@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from chance import assert_share
 
 from torchsfm.geometry import random_rotation
 from torchsfm.resection import camera_gp3p, camera_p3p, camera_p4pf, camera_p35pf, camera_up2p
@@ -86,7 +87,7 @@ def test_four_points_of_a_plane_fix_the_focal_length(generator):
     error = (found.model[:, 0, 0, :3].norm(dim=-1) / 800 - 1).abs()
     # A plane that faces the camera says nothing about the focal length.
     tilted = (R @ torch.tensor([-0.2, 0, 1], dtype=F64))[:, 2].abs() < 0.95
-    assert (error[tilted] < 1e-6).double().mean() > 0.995
+    assert_share(error[tilted] < 1e-6, 0.995)
 
 
 def test_noise_is_answered_by_least_squares(make_scene, generator):
@@ -101,7 +102,7 @@ def test_noise_is_answered_by_least_squares(make_scene, generator):
         X @ P[..., :3].mT + P[..., None, :, 3])[..., 2:] - x).square().sum((-1, -2))  # fmt: skip
     best = error(found.model[:, 0])
     seen = found.valid[:, 0]
-    assert seen.double().mean() > 0.9
+    assert_share(seen, 0.9)
     assert best[seen].median() < 1
     for _ in range(20):
         w = 1e-4 * torch.randn(300, 3, generator=generator, dtype=F64)
@@ -111,7 +112,7 @@ def test_noise_is_answered_by_least_squares(make_scene, generator):
         other = turn @ (found.model[:, 0] / K)
         other[..., 3] += 1e-4 * torch.randn(300, 3, generator=generator, dtype=F64)
         scale = torch.cat((zoom, zoom, torch.ones_like(zoom)), -2)
-        assert (error(scale * K * other) >= best * (1 - 1e-6))[seen].double().mean() > 0.96
+        assert_share((error(scale * K * other) >= best * (1 - 1e-6))[seen], 0.96)
 
 
 def test_one_centre_is_the_three_point_problem(make_scene):
@@ -119,7 +120,7 @@ def test_one_centre_is_the_three_point_problem(make_scene):
     p = torch.zeros_like(Y)
     central, rig = camera_p3p(Y, X), camera_gp3p(p, Y, X)
     assert all_found([central.model[i][central.valid[i]] for i in range(1000)], rig) > 0.998
-    assert (central.valid.sum(-1) == rig.valid.sum(-1)).double().mean() > 0.995
+    assert_share(central.valid.sum(-1) == rig.valid.sum(-1), 0.995)
 
 
 def test_symmetric_rigs(generator):
@@ -134,7 +135,7 @@ def test_symmetric_rigs(generator):
     found = camera_gp3p(p, Y - p, triangle)
     P = torch.cat((R, t[..., None]), -1)
     error = torch.where(found.valid, (found.model - P[:, None]).abs().amax((-1, -2)), torch.inf).amin(-1)
-    assert (error < 1e-5).double().mean() > 0.99
+    assert_share(error < 1e-5, 0.99)
 
 
 @pytest.mark.parametrize("solve", [camera_p4pf, camera_p35pf])
@@ -145,4 +146,4 @@ def test_a_point_at_the_principal_point(make_scene, solve):
     found = solve(900 * Y[..., :2] / Y[..., 2:], X)
     truth = torch.diag(torch.tensor([900.0, 900, 1], dtype=F64)) @ P
     gap = (found.model - truth[:, None]).norm(dim=(-1, -2)) / truth[:, None].norm(dim=(-1, -2))
-    assert (torch.where(found.valid, gap, torch.inf).amin(-1) < 1e-6).double().mean() >= 0.99
+    assert_share(torch.where(found.valid, gap, torch.inf).amin(-1) < 1e-6, 0.99)

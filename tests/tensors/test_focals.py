@@ -1,5 +1,6 @@
 import pytest
 import torch
+from chance import assert_share
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -31,9 +32,9 @@ def test_exact_focal_lengths(equal: bool, generator: torch.Generator) -> None:
     F, f = scenes(1000, generator, equal)
     scale = torch.randn(1000, 1, 1, dtype=F64, generator=generator)
     found = focals_from_fundamental(F * scale, C1, C2, equal=equal)
-    assert found.valid.double().mean() > 0.995
+    assert_share(found.valid, 0.995)
     error = ((found.model - f) / f).abs().amax(-1)
-    assert (error < 1e-8)[found.valid].double().mean() > 0.99
+    assert_share((error < 1e-8)[found.valid], 0.99)
     assert (error / found.sensitivity)[found.valid].max() < 1e-12
 
 
