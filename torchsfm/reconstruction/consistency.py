@@ -26,6 +26,8 @@ class PairAgreement:
     pairs: Int[Tensor, "q 2"]
     matches: Int[Tensor, "q"]
     agreeing: Int[Tensor, "q"]
+    index: Int[Tensor, "q"]
+    """Which pairs of the view graph these are."""
 
     @property
     def deviation(self) -> Float[Tensor, "q"]:
@@ -64,8 +66,8 @@ def pair_agreement(mapping: Mapping, *, threshold: float) -> PairAgreement:
     rays = _MatchedRays.of(mapping)
     matches = torch.bincount(rays.pair, minlength=len(mapping.graph.pairs))
     agreeing = torch.bincount(rays.pair[rays.agree(threshold)], minlength=len(matches))
-    compared = matches > 0
-    return PairAgreement(mapping.graph.pairs[compared], matches[compared], agreeing[compared])
+    compared = (matches > 0).nonzero()[:, 0]
+    return PairAgreement(mapping.graph.pairs[compared], matches[compared], agreeing[compared], compared)
 
 
 def excess_scatter(mapping: Mapping, *, threshold: float) -> float:

@@ -4,12 +4,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 from torch import Tensor
 
 from torchsfm.reconstruction.consistency import PairAgreement, pair_agreement
 from torchsfm.reconstruction.incremental import MappingOptions, extend_model
 from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.tracks import components
 
 ROUNDS = 3
 """Times that cameras are taken out and tried again."""
@@ -65,7 +66,7 @@ def _without_images(model: Mapping, images: Bool[Tensor, "v"]) -> Mapping:
 
 def _apart(model: Mapping, agreement: PairAgreement) -> Bool[Tensor, "v"]:
     """Images outside the largest set linked by pairs that agree more than not, if pairs between the sets contradict it."""
-    group = _components(agreement.pairs[agreement.deviation > 0], len(model.registered))
+    group = components(agreement.pairs[agreement.deviation > 0], len(model.registered))
     largest = torch.bincount(group[model.registered]).argmax()
     outside = model.registered & (group != largest)
     across = agreement.contradicts & (outside[agreement.pairs].sum(1) == 1)
@@ -74,15 +75,3 @@ def _apart(model: Mapping, agreement: PairAgreement) -> Bool[Tensor, "v"]:
     # A set goes as a whole.
     parted = torch.isin(group, group[outside & contradicted])
     return outside & parted
-
-
-def _components(pairs: Int[Tensor, "q 2"], count: int) -> Int[Tensor, "v"]:
-    """The smallest index that each vertex of a graph is connected to."""
-    label = torch.arange(count)
-    while True:
-        least = label[pairs].amin(1)
-        new = label.scatter_reduce(0, pairs.T.flatten(), least.repeat(2), "amin")
-        new = new[new]
-        if torch.equal(new, label):
-            return label
-        label = new

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -71,6 +71,17 @@ class ViewGraph:
     homography_inliers: Int[Tensor, "q"]
     match: Int[Tensor, "k 2"]
     match_pair: Int[Tensor, "k"]
+
+    def only(self, kept: Bool[Tensor, "q"]) -> "ViewGraph":
+        """The graph in which the other pairs have nothing in common."""
+        own = kept[self.match_pair]
+        return replace(
+            self,
+            match=self.match[own],
+            match_pair=self.match_pair[own],
+            fundamental_inliers=torch.where(kept, self.fundamental_inliers, 0),
+            homography_inliers=torch.where(kept, self.homography_inliers, 0),
+        )
 
     def verdicts(self, K: Float[Tensor, "v 3 3"], unknown_focal: Bool[Tensor, "v"]) -> Int[Tensor, "q"]:
         """The `Verdict` on each pair, given intrinsics of each image, and where their focal length is only a guess.
