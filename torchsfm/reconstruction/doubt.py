@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
@@ -39,7 +39,14 @@ class Standing:
     doubt: tuple[str, ...]
 
 
-def examine(mapping: Mapping, *, open_numbers: Sequence[str], prior: CameraPrior, threshold: float) -> Standing:
+def examine(
+    mapping: Mapping,
+    *,
+    open_numbers: Sequence[str],
+    prior: CameraPrior,
+    threshold: float,
+    uncertain: Bool[Tensor, "v"] | None = None,
+) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
     Args:
@@ -47,6 +54,7 @@ def examine(mapping: Mapping, *, open_numbers: Sequence[str], prior: CameraPrior
         open_numbers: Intrinsic parameters that are not given, whether the images were found to determine them or not.
         prior: What was expected of the cameras before any image point was seen.
         threshold: Largest reprojection error of an observation, in pixels.
+        uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -57,18 +65,20 @@ def examine(mapping: Mapping, *, open_numbers: Sequence[str], prior: CameraPrior
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
     outvoted = agreement.balance(v) < 0
-    refuted = missing_correspondences(mapping).refuted
-    # One pair may miss what something without features hides. A place taken for another is refuted by more than one camera,
-    # and folds the whole model.
-    folded = bool((torch.bincount(refuted.flatten(), minlength=1) >= 2).any())
+    conflicts = missing_correspondences(mapping)
+    refuted = conflicts.refuted
     guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL
     degrees = torch.atan(position).rad2deg()
 
     def doubt(i: int) -> str:
-        if folded:
+        if conflicts.folded:
             own = (refuted == i).any(1)
             first, second = (mapping.graph.names[k] for k in refuted[int(own.long().argmax())].tolist())
             return f"things that look alike may be taken for one: {first} and {second} each miss what the other sees"
+        if uncertain is not None and bool(uncertain[i]):
+            return (
+                "nothing that stands in one place alone connects it with the rest, and things that look alike stand in several"
+            )
         if bool(outvoted[i]):
             return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
         if count >= 3 and int(supporting[i]) < 2:

@@ -54,6 +54,20 @@ class Conflicts:
         """The pairs that chance does not explain."""
         return self.pairs[self.score > self.limit]
 
+    @property
+    def folded(self) -> bool:
+        """Whether two places pass for one.
+
+        One pair may miss what something without features hides. A place taken for another is refuted by more than one camera,
+        and folds the whole model.
+        """
+        return bool((torch.bincount(self.refuted.flatten(), minlength=1) >= 2).any())
+
+    @property
+    def strength(self) -> float:
+        """By how much the refuted pairs exceed what chance does, together."""
+        return float((self.score - self.limit).clamp(min=0).sum())
+
 
 def missing_correspondences(mapping: Mapping) -> Conflicts:
     """Compare every two cameras with like viewpoints, point by point, in each part of the image.

@@ -23,6 +23,7 @@ from torchsfm.reconstruction.report import ImageReport, Progress, Reconstruction
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.tracks import build_tracks
+from torchsfm.reconstruction.unfold import unfold
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
 
 METHODS = ("incremental", "projective")
@@ -79,6 +80,7 @@ def build_models(
     with stages.timed("map"), one_thread() if few else nullcontext():
         camera_index = group_cameras(graph.image_size, labels, shared_camera)
         cameras, source = guess_cameras(graph, camera_index, model=camera, K=K, exif_focal=exif_focal)
+        matched = track is None
         if track is None:
             # Matches of strongly linked pairs come first: they are wrong less often.
             track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
@@ -115,10 +117,18 @@ def build_models(
             model, failed = mapped
             model, parted = settle(model, taken, known, report)
             failed |= parted
+            uncertain = None
+            unfolded = unfold(empty, model, taken, known, report) if matched and method == "incremental" else None
+            if unfolded is not None:
+                model, uncertain = unfolded.model, unfolded.uncertain
+                # What is left is mapped without the relations that were given up.
+                empty = replace(empty, graph=model.graph, track=model.track)
             if not found:
                 reasons |= failed
             taken = taken | model.registered
-            standing = examine(model, open_numbers=free, prior=known.prior(model), threshold=options.reprojection)
+            standing = examine(
+                model, open_numbers=free, prior=known.prior(model), threshold=options.reprojection, uncertain=uncertain
+            )
             found.append((model.reconstruction(), standing, calibration_of(model, known.prior(model), loss=LOSS)))
             if stages.folder is not None:
                 _save_model(found[-1][0], stages.folder, len(found) - 1)

@@ -1,0 +1,241 @@
+"""Two places that look alike: which relations are distinctive, and how a folded model is put right."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Pose, intrinsics
+from torchsfm.geometry.distortion import Radial
+from torchsfm.reconstruction.calibration import CameraPrior
+from torchsfm.reconstruction.distinctive import Backbone, distinctiveness
+from torchsfm.reconstruction.doubt import examine
+from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.incremental import MappingOptions, grow_model
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.settle import settle
+from torchsfm.reconstruction.tracks import build_tracks, components
+from torchsfm.reconstruction.unfold import unfold
+from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.simulation import look_at
+
+SIZE = (640, 480)
+VIEWS = 14
+THING, AROUND = 260, 700
+
+
+def street(generator: torch.Generator, apart: float) -> tuple[Mapping, Pose, Bool[Tensor, "q"]]:
+    """Cameras along a street with two copies of one thing, `apart` from each other.
+
+    Every pair of images has the matches of the relation for which it has the most: the true one, or the one that takes the one
+    copy for the other. Also given are the true poses, and which pairs have true matches.
+    """
+
+    def uniform(n: int, *bounds: tuple[float, float]) -> Float[Tensor, "n 3"]:
+        low, high = torch.tensor(bounds, dtype=torch.float64).T
+        return low + (high - low) * torch.rand(n, 3, generator=generator, dtype=torch.float64)
+
+    thing = uniform(THING, (-1.2, 1.2), (5.0, 7.0), (-1.5, 1.5))
+    shift = torch.tensor([apart / 2, 0.0, 0.0], dtype=torch.float64)
+    reach = apart / 2 + 5
+    X = torch.cat([thing - shift, thing + shift, uniform(AROUND, (-reach, reach), (5.0, 8.0), (-2.2, 2.2))])
+    along = torch.linspace(-apart / 2 - 1.2, apart / 2 + 1.2, VIEWS, dtype=torch.float64)
+    centre = torch.stack([along, 0.6 * (2 * along).sin(), 0.3 * along.cos()], -1)
+    poses = look_at(centre, centre * torch.tensor([1.0, 0.0, 0.0]) + torch.tensor([0.0, 6.0, 0.0]))
+    zero = torch.zeros(1, dtype=torch.float64)
+    middle = torch.tensor([[SIZE[0] / 2, SIZE[1] / 2]], dtype=torch.float64)
+    camera = Camera(intrinsics(torch.full((1,), 600.0, dtype=torch.float64), middle), Radial(zero, zero))
+    x = camera[torch.zeros(VIEWS, dtype=torch.long)].project(poses.transform(X.expand(VIEWS, -1, -1)))
+    inside = ((x >= 1) & (x < torch.tensor(SIZE) - 2)).all(-1)
+    sees = inside & (torch.rand(inside.shape, generator=generator) < 0.7)
+    view, point = sees.nonzero(as_tuple=True)
+    node = torch.full(sees.shape, -1)
+    node[view, point] = torch.arange(len(view))
+    # The same thing at the other place.
+    other = torch.arange(len(X))
+    other[: 2 * THING] = other[: 2 * THING].roll(THING)
+    copies = torch.arange(len(X)) < 2 * THING
+    pairs = torch.combinations(torch.arange(VIEWS))
+    matches, true = [], []
+    for i, j in pairs.tolist():
+        right = torch.stack([node[i], node[j]], 1)[sees[i] & sees[j]]
+        wrong = torch.stack([node[i], node[j, other]], 1)[sees[i] & sees[j, other] & copies]
+        true.append(len(right) >= len(wrong))
+        chosen = right if true[-1] else wrong
+        matches.append(chosen if len(chosen) >= 15 else chosen[:0])
+    count = torch.tensor([len(m) for m in matches])
+    eye = torch.eye(3, dtype=torch.float64).repeat(len(pairs), 1, 1)
+    graph = ViewGraph(
+        names=tuple(f"{i}.png" for i in range(VIEWS)),
+        image_size=torch.tensor([SIZE] * VIEWS),
+        x=x[view, point] + 0.4 * torch.randn(len(view), 2, generator=generator, dtype=torch.float64),
+        view=view,
+        color=torch.zeros(len(view), 3, dtype=torch.float64),
+        pairs=pairs,
+        num_matches=count,
+        F=eye,
+        H=eye,
+        fundamental_inliers=count,
+        homography_inliers=torch.zeros_like(count),
+        match=torch.cat(matches),
+        match_pair=torch.arange(len(pairs)).repeat_interleave(count),
+    )
+    track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
+    empty = Mapping.start(graph, track, camera, torch.zeros(VIEWS, dtype=torch.long))
+    return empty, poses, torch.tensor(true)
+
+
+def options(empty: Mapping) -> MappingOptions:
+    sigma = torch.full((1,), 0.05, dtype=torch.float64)
+    return MappingOptions(
+        free=("focal",), expected=empty.cameras, focal_sigma=sigma, generator=torch.Generator().manual_seed(0)
+    )
+
+
+def quiet(done: int, total: int) -> None:
+    """No progress is shown."""
+
+
+def mapped(empty: Mapping) -> Mapping:
+    grown = grow_model(empty, options(empty), quiet)
+    assert grown is not None
+    return settle(grown[0], empty.registered, options(empty), quiet)[0]
+
+
+def wrong_cameras(model: Mapping, truth: Pose) -> int:
+    """Cameras more than five per cent of the street's length from where they are, after the best similarity."""
+    errors = pose_errors(model.poses, truth, model.registered)
+    return int((errors.image_position > 0.05 * (truth.centre[-1] - truth.centre[0]).norm())[model.registered].sum())
+
+
+def test_the_backbone_passes_by_copies(generator: torch.Generator) -> None:
+    fooled = 0
+    for _ in range(10):
+        empty, _, true = street(generator, apart=8.0)
+        graph = empty.graph
+        assert not true.all()
+        assert true[Backbone.of(graph.pairs, distinctiveness(graph), VIEWS).chosen].all()
+        fooled += int(not true[Backbone.of(graph.pairs, graph.fundamental_inliers.double(), VIEWS).chosen].all())
+    # The scenes are not so easy that numbers of matches would do.
+    assert fooled > 0
+
+
+def test_a_folded_model_is_put_right(generator: torch.Generator) -> None:
+    for _ in range(2):
+        empty, truth, _ = street(generator, apart=8.0)
+        folded = mapped(empty)
+        assert wrong_cameras(folded, truth) > 0
+        unfolded = unfold(empty, folded, empty.registered, options(empty), quiet)
+        assert unfolded is not None
+        assert unfolded.model.registered.all()
+        assert wrong_cameras(unfolded.model, truth) == 0
+        assert not unfolded.uncertain.any()
+        assert not len(missing_correspondences(unfolded.model).refuted)
+        # The pairs that took one copy for the other have no say in it any more.
+        left = torch.unique(unfolded.model.graph.match_pair)
+        assert set(left.tolist()) < set(empty.graph.match_pair.tolist())
+
+
+def test_what_nothing_refutes_is_left_alone(generator: torch.Generator) -> None:
+    empty, truth, true = street(generator, apart=8.0)
+    graph = empty.graph.only(true)
+    right = replace(empty, graph=graph, track=build_tracks(graph.view, graph.match))
+    model = mapped(right)
+    assert wrong_cameras(model, truth) == 0
+    assert unfold(right, model, right.registered, options(right), quiet) is None
+
+
+def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) -> None:
+    empty, truth, true = street(generator, apart=8.0)
+    across = (empty.graph.pairs < VIEWS // 2).sum(1) == 1
+    graph = empty.graph.only(~(across & true))
+    half = replace(empty, graph=graph, track=build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair]))
+    folded = mapped(half)
+    unfolded = unfold(half, folded, half.registered, options(half), quiet)
+    assert unfolded is not None
+    sides = unfolded.model.registered.reshape(2, -1)
+    assert sides.any(1).tolist().count(True) == 1
+    assert wrong_cameras(unfolded.model, truth) == 0
+
+
+def test_uncertain_images_are_doubted(generator: torch.Generator) -> None:
+    empty, _, true = street(generator, apart=8.0)
+    graph = empty.graph.only(true)
+    model = mapped(replace(empty, graph=graph, track=build_tracks(graph.view, graph.match)))
+    prior = CameraPrior.of(model, model.cameras, torch.full((1,), 0.05, dtype=torch.float64))
+    uncertain = torch.arange(VIEWS) < 3
+    plain, told = (
+        examine(model, open_numbers=("focal",), prior=prior, threshold=4.0, uncertain=marked).doubt
+        for marked in (None, uncertain)
+    )
+    assert not any(plain)
+    assert [bool(reason) for reason in told] == uncertain.tolist()
+
+
+def random_graph(generator: torch.Generator, views: int = 9, pairs: int = 14) -> tuple[Int[Tensor, "q 2"], Float[Tensor, "q"]]:
+    every = torch.combinations(torch.arange(views))
+    chosen = torch.randperm(len(every), generator=generator)[:pairs]
+    return every[chosen], torch.rand(pairs, generator=generator, dtype=torch.float64) + 0.1
+
+
+def test_a_backbone_is_a_spanning_forest_of_largest_weight(generator: torch.Generator) -> None:
+    for _ in range(50):
+        pairs, weight = random_graph(generator)
+        backbone = Backbone.of(pairs, weight, 9)
+        group = components(pairs, 9)
+        assert torch.equal(components(pairs[backbone.chosen], 9), group)
+        assert int(backbone.chosen.sum()) == 9 - len(torch.unique(group))
+        # No pair would make a better one: each is no stronger than the weakest on the way between its images.
+        for q, (i, j) in enumerate(pairs.tolist()):
+            way = backbone.way(i, j)
+            assert float(weight[way].min()) >= float(weight[q])
+
+
+def test_ways_and_sides_agree(generator: torch.Generator) -> None:
+    for _ in range(20):
+        pairs, weight = random_graph(generator)
+        backbone = Backbone.of(pairs, weight, 9)
+        group = components(pairs, 9)
+        sides = {q: backbone.sides(q, 9) for q in backbone.chosen.nonzero()[:, 0].tolist()}
+        for first, second in sides.values():
+            assert not (first & second).any()
+        for i, j in torch.combinations(torch.arange(9)).tolist():
+            way = backbone.way(i, j)
+            assert bool(way) == bool(group[i] == group[j])
+            parted = [q for q, (first, second) in sides.items() if (first[i] and second[j]) or (first[j] and second[i])]
+            assert sorted(way) == sorted(parted)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_pairs_of_no_weight_hold_nothing_together(weight: float) -> None:
+    pairs = torch.tensor([[0, 1], [1, 2]])
+    backbone = Backbone.of(pairs, torch.tensor([1.0, weight]), 3)
+    assert backbone.chosen.tolist() == [True, weight > 0]
+    assert bool(backbone.way(0, 2)) == (weight > 0)
+    assert not backbone.way(1, 1)
+
+
+def test_matches_that_return_to_an_image_do_not_count() -> None:
+    # Points 0 and 1 are of one image; both are matched with point 2, point 3 with point 4 alone.
+    view = torch.tensor([0, 0, 1, 0, 1])
+    match = torch.tensor([[0, 2], [1, 2], [3, 4]])
+    graph = ViewGraph(
+        names=("a", "b"),
+        image_size=torch.tensor([SIZE] * 2),
+        x=torch.zeros(5, 2, dtype=torch.float64),
+        view=view,
+        color=torch.zeros(5, 3, dtype=torch.float64),
+        pairs=torch.tensor([[0, 1]]),
+        num_matches=torch.tensor([3]),
+        F=torch.eye(3, dtype=torch.float64)[None],
+        H=torch.eye(3, dtype=torch.float64)[None],
+        fundamental_inliers=torch.tensor([3]),
+        homography_inliers=torch.tensor([0]),
+        match=match,
+        match_pair=torch.zeros(3, dtype=torch.long),
+    )
+    assert distinctiveness(graph).tolist() == [1.0]
+    assert distinctiveness(graph.only(torch.tensor([False]))).tolist() == [0.0]
