@@ -93,7 +93,7 @@ def test_the_gradient_of_a_step_vanishes_where_that_of_the_sum_does(rays: bool, 
     a += 1e-3 * torch.randn(a.shape, generator=generator, dtype=a.dtype)
     weights = weights * torch.isfinite(wise.squared_residual(model, a[None], b[None]))
     models = [model]
-    for _ in range(20):
+    for _ in range(100):
         models.append(wise.refine(models[-1], a[None], b[None], weights=weights))
         # What comes to lie behind a camera counts no more.
         weights = weights * torch.isfinite(wise.squared_residual(models[-1], a[None], b[None]))

@@ -47,7 +47,9 @@ def test_the_derivative_is_that_of_the_whole_estimation(door: Door, generator: t
     for i, (x, g) in enumerate(zip(inputs, gradients, strict=True)):
         assert torch.isfinite(g).all()
         step = 2e-4 * torch.randn(x.shape, generator=generator, dtype=F64)
-        step = step if i < door.images else 0.1 * step * x.abs()
+        if i >= door.images:
+            # Weights move the model so little that the change would be lost in how exactly the search ends.
+            step = (10 if i == len(inputs) - 1 else 0.1) * step * x.abs()
         if door is DOORS["upright"] and data <= i < data + 2:
             step = 0.1 * (step - (step * x).sum(-1, keepdim=True) * x)
         slope = (g * step).flatten(1).sum(-1)
@@ -148,7 +150,7 @@ def test_good_scenes_are_not_degenerate(door: Door, generator: torch.Generator) 
 @pytest.mark.parametrize("name", ["fundamental", "essential"])
 def test_planar_scenes_are_reported(name: str, generator: torch.Generator) -> None:
     planes = DOORS["homography"].make(16, 200, generator, noise=0.4, wrong=0.2)
-    assert (DOORS[name](planes).degeneracy == Degeneracy.PLANAR).double().mean() > 0.9
+    assert_share(DOORS[name](planes).degeneracy == Degeneracy.PLANAR, 0.9)
     assert (DOORS["homography"](planes).degeneracy == Degeneracy.NONE).all()
 
 
@@ -158,7 +160,7 @@ def test_rotations_are_reported(name: str, generator: torch.Generator) -> None:
     R = rotation_from_rotvec((torch.rand(16, 3, generator=generator, dtype=F64) - 0.5) * 0.5)
     scene = Scene((pixels(X), pixels(X @ R.mT))).noisy(0.4, 0.2, 2, generator)
     code = Degeneracy.PLANAR if name == "fundamental" else Degeneracy.ROTATION
-    assert (DOORS[name](scene).degeneracy == code).double().mean() > 0.9
+    assert_share(DOORS[name](scene).degeneracy == code, 0.9)
 
 
 def test_collinear_points_are_reported(generator: torch.Generator) -> None:

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import pytest
 import torch
-from chance import seeded
+from chance import assert_share, seeded
 from scenes import make_scene
 from torch import Tensor
 
@@ -140,10 +140,10 @@ def test_good_hypotheses_are_probable(generator: torch.Generator) -> None:
     uniform = soft_ransac(scene.estimator, *data, threshold=4e-3, generator=generator)
     told = soft_ransac(scene.estimator, *data, threshold=4e-3, logits=(~wrong).double() * 4, generator=generator)
     error = lambda s: s.expectation(scene.error(s.model, scene.model[:, None, None]))  # noqa: E731
-    assert (scene.error(uniform.best(), scene.model) < 0.1).double().mean() > 0.9
+    assert_share(scene.error(uniform.best(), scene.model) < 0.1, 0.9)
     assert error(told).median() < error(uniform).median()
     sharp = soft_ransac(scene.estimator, *data, threshold=4e-3, temperature=1e-4, generator=generator)
-    assert (sharp.probability.amax((-2, -1)) > 0.99).double().mean() > 0.9
+    assert_share(sharp.probability.amax((-2, -1)) > 0.99, 0.9)
     assert uniform.probability.amax((-2, -1)).mean() < sharp.probability.amax((-2, -1)).mean()
 
 
