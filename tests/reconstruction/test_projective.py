@@ -7,9 +7,12 @@ import torch
 from chance import seeded
 from test_reconstruct_tracks import SIZE, Scene, make_scene, run
 
-from torchsfm.geometry import Pose
+from torchsfm.geometry import Camera, Pose, Radial, intrinsics
 from torchsfm.reconstruction import ReconstructionError
 from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.projective import projective_start
+from torchsfm.reconstruction.view_graph import graph_from_tracks
 from torchsfm.simulation import orbit_poses
 
 
@@ -37,6 +40,23 @@ def test_metric_model_from_tracks_alone(seed: int) -> None:
     assert "determined by the images: focal length" in text
     assert result.report.focal_source == ("autocalibration",)
     assert "autocalibration" in result.report.summary()
+
+
+@pytest.mark.parametrize("distortion", [-0.03, 0.03])
+def test_a_lens_that_hardly_bends_is_passed_on(distortion: float) -> None:
+    """Too little to be searched for, but autocalibration finds it."""
+    scene = make_scene(wandering_poses(8, 0), points=250, distortion=distortion)
+    color = torch.zeros(len(scene.x), 3, dtype=torch.float64)
+    names = tuple(f"{i}" for i in range(8))
+    track = torch.unique(scene.track, return_inverse=True)[1]
+    graph, track = graph_from_tracks(names, scene.image_size, scene.x, scene.view, track, color, generator=seeded())
+    zero = torch.zeros(1, dtype=torch.float64)
+    K = intrinsics(torch.tensor([1200.0], dtype=torch.float64), torch.tensor([[499.5, 374.5]], dtype=torch.float64))
+    empty = Mapping.start(graph, track, Camera(K, Radial(zero, zero)), torch.zeros(8, dtype=torch.long))
+    start = projective_start(empty, ~empty.registered, threshold=4.0, min_angle=0.026)
+    assert start is not None
+    assert start.mapping is not None
+    assert abs(float(start.mapping.cameras.distortion.parameters()[0, 0]) - distortion) < 0.02
 
 
 def test_pure_translation_is_refused() -> None:

@@ -34,12 +34,13 @@ def make_scene(
     outliers: float = 0.05,
     seed: int = 0,
     kind: str = "ball",
+    distortion: float = -0.08,
 ) -> Scene:
     g = seeded(seed)
     poses = orbit_poses(8, radius=5.0, sweep=1.6) if poses is None else poses
     X = random_points(points, kind=kind, size=1.6, generator=g)
     v = len(poses.R)
-    k1 = torch.tensor(-0.08, dtype=torch.float64)
+    k1 = torch.tensor(distortion, dtype=torch.float64)
     camera = Camera(intrinsics(torch.tensor(Scene.focal), torch.tensor([499.5, 374.5])).double(), Radial(k1, 0 * k1))
     cameras = Camera(camera.K.expand(v, 3, 3), Radial(k1.expand(v), (0 * k1).expand(v)))
     seen = simulate_images(X, poses, cameras, image_size=SIZE, noise=noise, outliers=outliers, dropout=0.2, generator=g)

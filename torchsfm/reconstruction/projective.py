@@ -270,11 +270,12 @@ def _metric(empty: Mapping, problem: _Problem, found: Autocalibration, k: float)
     names = kind.parameter_names
     lens = torch.zeros(groups, len(names), dtype=K.dtype)
     if "k1" in names:
-        # To first order the inverse of the change of radius, in units of the focal length; and what the fisheye formula lacks
-        # of a tangent.
-        corner = size[first].norm(dim=-1) / 2
+        # To first order the inverse of the change of radius, and what autocalibration found to be left of it, in units of the
+        # focal length; and what the fisheye formula lacks of a tangent.
+        corner, side = size[first].norm(dim=-1) / 2, size[first].amax(-1)
         fisheye = 1 / 3 if kind is DISTORTION_MODELS["fisheye"] else 0.0
-        lens[:, names.index("k1")] = fisheye - k * (K[:, 0, 0] / corner).square()
+        focal = K[:, 0, 0]
+        lens[:, names.index("k1")] = fisheye - k * (focal / corner).square() + found.distortion * (focal / side).square()
     cameras = Camera(K, kind.from_parameters(lens))
     _, R, t = krt_from_camera(found.P)
     poses = Pose.identity(v, dtype=K.dtype)
