@@ -129,7 +129,6 @@ def test_a_folded_model_is_put_right(generator: torch.Generator) -> None:
         folded = mapped(empty)
         assert wrong_cameras(folded, truth) > 0
         unfolded = unfold(empty, folded, empty.registered, options(empty), quiet)
-        assert unfolded is not None
         assert unfolded.model.registered.all()
         assert wrong_cameras(unfolded.model, truth) == 0
         assert not unfolded.uncertain.any()
@@ -145,7 +144,22 @@ def test_what_nothing_refutes_is_left_alone(generator: torch.Generator) -> None:
     right = replace(empty, graph=graph, track=build_tracks(graph.view, graph.match))
     model = mapped(right)
     assert wrong_cameras(model, truth) == 0
-    assert unfold(right, model, right.registered, options(right), quiet) is None
+    unfolded = unfold(right, model, right.registered, options(right), quiet)
+    assert unfolded.model is model
+    assert not unfolded.uncertain.any()
+
+
+def test_what_contradicts_the_most_distinctive_relations_is_doubted(
+    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty, truth, _ = street(generator, apart=8.0)
+    folded = mapped(empty)
+    assert wrong_cameras(folded, truth) > 0
+    # Nothing better is found.
+    monkeypatch.setattr("torchsfm.reconstruction.unfold.ROUNDS", 0)
+    unfolded = unfold(empty, folded, empty.registered, options(empty), quiet)
+    assert unfolded.model is folded
+    assert unfolded.uncertain.any()
 
 
 def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) -> None:
@@ -155,7 +169,6 @@ def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) 
     half = replace(empty, graph=graph, track=build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair]))
     folded = mapped(half)
     unfolded = unfold(half, folded, half.registered, options(half), quiet)
-    assert unfolded is not None
     sides = unfolded.model.registered.reshape(2, -1)
     assert sides.any(1).tolist().count(True) == 1
     assert wrong_cameras(unfolded.model, truth) == 0

@@ -118,8 +118,8 @@ def build_models(
             model, parted = settle(model, taken, known, report)
             failed |= parted
             uncertain = None
-            unfolded = unfold(empty, model, taken, known, report) if matched and method == "incremental" else None
-            if unfolded is not None:
+            if matched and method == "incremental":
+                unfolded = unfold(empty, model, taken, known, report)
                 model, uncertain = unfolded.model, unfolded.uncertain
                 # What is left is mapped without the relations that were given up.
                 empty = replace(empty, graph=model.graph, track=model.track)

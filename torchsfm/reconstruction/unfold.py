@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.reconstruction.consistency import PairAgreement, pair_agreement
@@ -21,15 +21,19 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Unfolded:
-    """A model that was mapped again.
+    """A model as its most distinctive relations want it.
 
     Attributes:
-        model: The model; its view graph keeps the pairs that agree with it, and those between images that are not in it.
-        uncertain: Images that a relation connects with the rest which a false one may equal.
+        model: The model; if it was mapped again, its view graph keeps the pairs that agree with it, and those of other images.
+        uncertain: Images that hang on a relation which contradicts the model, or is no more distinctive than false ones are.
+        conflicts: What missing correspondences say of it.
+        support: How distinctive the pairs are together that agree with it.
     """
 
     model: Mapping
     uncertain: Bool[Tensor, "v"]
+    conflicts: Conflicts
+    support: float
 
 
 def unfold(
@@ -38,8 +42,8 @@ def unfold(
     elsewhere: Bool[Tensor, "v"],
     options: MappingOptions,
     progress: Callable[[int, int], None],
-) -> Unfolded | None:
-    """Look for a model that fewer missing correspondences refute.
+) -> Unfolded:
+    """Look for a better model where missing correspondences refute one, or it contradicts its most distinctive relations.
 
     Only the backbone of the most distinctive relations is mapped first; then the pairs that agree with that model come in. If
     two places still pass for one, some relation on the way between two cameras that refute each other is wrong: the one most
@@ -53,25 +57,47 @@ def unfold(
         progress: Called with the number of registered images and of all.
 
     Returns:
-        The best of the new models, or None if the given one is not refuted or no other is better.
+        The best of the given model and the new ones: that which is refuted least and which the most distinctive pairs support.
     """
-    before = missing_correspondences(model)
-    if not len(before.refuted):
-        return None
-    strength, best = before.strength, None
-    for unfolded, conflicts in _trials(empty, elsewhere, options, progress):
-        # One refuted pair is no reason to give images up.
-        complete = int(unfolded.model.registered.sum()) >= int(model.registered.sum())
-        if conflicts.strength < strength and (complete or before.folded):
-            strength, best = conflicts.strength, unfolded
+    graph, v = empty.graph, len(empty.graph.names)
+    weight = distinctiveness(graph)
+    backbone = Backbone.of(graph.pairs, torch.where(elsewhere[graph.pairs].any(1), 0.0, weight), v)
+    agreement = pair_agreement(replace(model, graph=graph), threshold=options.reprojection)
+    contradicted = agreement.index[agreement.contradicts & backbone.chosen[agreement.index]]
+    uncertain = _hanging_on(backbone, contradicted, model.registered)
+    first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, weight))
+    if not len(contradicted) and not first.conflicts.folded:
+        return first
+    for trial in _trials(empty, weight, elsewhere, options, progress):
+        # Less than a fold is no reason to give images up.
+        complete = int(trial.model.registered.sum()) >= int(model.registered.sum())
+        better = (trial.conflicts.strength, -trial.support) < (best.conflicts.strength, -best.support)
+        if better and (complete or first.conflicts.folded):
+            best = trial
     return best
 
 
+def _support(agreement: PairAgreement, weight: Float[Tensor, "q"]) -> float:
+    return float(weight[agreement.index[agreement.supports]].sum())
+
+
+def _hanging_on(backbone: Backbone, pairs: Int[Tensor, "k"], registered: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
+    """The registered images that pairs of the backbone connect with more others."""
+    hanging = torch.zeros_like(registered)
+    for q in pairs.tolist():
+        sides = [side & registered for side in backbone.sides(q, len(registered))]
+        hanging |= min(sides, key=lambda side: int(side.sum()))
+    return hanging
+
+
 def _trials(
-    empty: Mapping, elsewhere: Bool[Tensor, "v"], options: MappingOptions, progress: Callable[[int, int], None]
-) -> Iterator[tuple[Unfolded, Conflicts]]:
+    empty: Mapping,
+    weight: Float[Tensor, "q"],
+    elsewhere: Bool[Tensor, "v"],
+    options: MappingOptions,
+    progress: Callable[[int, int], None],
+) -> Iterator[Unfolded]:
     graph, v = empty.graph, len(empty.graph.names)
-    weight = distinctiveness(graph)
     refuted, suspected = (torch.zeros(len(graph.pairs), dtype=torch.bool) for _ in range(2))
     for _ in range(ROUNDS):
         usable = ~refuted & ~elsewhere[graph.pairs].any(1)
@@ -87,10 +113,9 @@ def _trials(
         false = refuted.clone()
         false[agreement.index[agreement.contradicts]] = True
         alike = weight < torch.where(false, weight, 0.0).amax()
-        uncertain = torch.zeros(v, dtype=torch.bool)
-        for q in (backbone.chosen & (suspected | alike)).nonzero()[:, 0].tolist():
-            uncertain |= min((side & grown.registered for side in backbone.sides(q, v)), key=lambda side: int(side.sum()))
-        yield Unfolded(_with_pairs(grown, graph, _agreeing(agreement, ~refuted)), uncertain), conflicts
+        uncertain = _hanging_on(backbone, (backbone.chosen & (suspected | alike)).nonzero()[:, 0], grown.registered)
+        model = _with_pairs(grown, graph, _agreeing(agreement, ~refuted))
+        yield Unfolded(model, uncertain, conflicts, _support(agreement, weight))
         if not any(ways):
             return
         refuted = refuted | _given_up(backbone, weight, ways, agreement, v)
