@@ -433,3 +433,11 @@ def test_known_rotation_is_kept(generator: torch.Generator) -> None:
     E = cross_matrix(pose[..., 3]) @ R
     assert ((d2 * (d1 @ E.mT)).sum(-1).abs() < 1e-12).all()
     assert (pose[..., 3] * truth[..., 3]).sum(-1).min() > 1 - 1e-9
+
+
+def test_linear_essential_matrices_are_essential_whatever_the_rays(generator: torch.Generator) -> None:
+    d1, d2 = (torch.randn(500, 12, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    found = essential_6pt(d1, d2)
+    values = torch.linalg.svdvals(found.model[found.valid])
+    assert len(values)
+    assert (values - torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)).abs().max() < 1e-9

@@ -223,10 +223,11 @@ def _pose(E: Float[Tensor, "batch 3 3"]) -> tuple[Tensor, Tensor]:
     t = C.gather(-1, best[:, None, None].expand(-1, 3, 1))[..., 0]
     t = t / t.norm(dim=-1, keepdim=True).clamp_min(1e-280)
     R = C - cross_matrix(t) @ E
-    for _ in range(4):
+    for _ in range(8):
         R = 1.5 * R - 0.5 * (R @ R.mT @ R)
-    good = (torch.isfinite(R).all(-1).all(-1) & ((R @ R.mT).diagonal(dim1=-2, dim2=-1).sum(-1) - 3).abs().lt(0.1))[:, None]
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    # False for NaN too.
+    good = ((R @ R.mT - eye).abs().amax((-2, -1)) < 1e-12)[:, None]
     return torch.where(good[..., None], R, eye), torch.where(good, t, eye[2])
 
 

@@ -33,6 +33,11 @@ from torchsfm.linalg.vectors import (
     vector,
 )
 
+NEAREST = 1e-9
+"""Least ratio of the depths of two points: in what direction a point still nearer is seen is up to rounding."""
+ASIDE = 1e-6
+"""Largest angle between a ray and its point, in radians, in what is called a solution."""
+
 SQRT2 = 2.0**0.5
 
 
@@ -192,18 +197,24 @@ class Triangle:
         Where two of the points are close to each other the start has a small error in the quadrics and a large one in the
         depths. The first step then trades one for the other, so that what counts is the error after three.
         """
-        before = self._worst(self._quadrics(depths)[0])
+        start = self._quadrics(depths)[0]
         rows = self.newton(self.newton(self.newton(depths)))
-        after = self._worst(self._quadrics(rows)[0])
+        end = self._quadrics(rows)[0]
         # False for NaN too.
-        better = after <= before
-        rows = chosen(better, rows, depths)
-        reach = greatest(rows)
-        shortest = least(self.a)
-        # Rounding of far points against a small triangle; but not so far that any depth would do.
-        rounding = (1e-14 / shortest * reach * reach).clamp_max(1e-5)
-        close = torch.where(better, after, before) <= 1e-10 + rounding
-        valid = valid & close & (least(rows) > 0)
+        better = self._worst(end) <= self._worst(start)
+        rows, left = chosen(better, rows, depths), chosen(better, end, start)
+        # Rounding of far points against a short side; but not so far that any depth would do.
+        over = each(
+            lambda r, k, x, y: (r * k).abs() - (1e-14 * k * torch.maximum(x, y).square()).clamp_max(1e-5),
+            left, self.side_inverse, *ahead(rows),
+        )  # fmt: skip
+        close = greatest(over) <= 1e-10
+        # Lengths that are wrong by so much, be it by rounding, turn the triangle, and take the nearest point off its ray.
+        longest, shortest = greatest(self.side).sqrt(), least(self.side).sqrt()
+        wrong = greatest(each(lambda r, k: r.abs() * k.sqrt(), left, self.side_inverse)) + 1e-15 * longest
+        nearest = least(rows)
+        steady = (nearest > NEAREST * greatest(rows)) & (wrong * longest <= ASIDE * shortest * nearest)
+        valid = valid & close & steady
         return each(lambda x: torch.where(valid, x, 1.0), rows), valid
 
     def follow(self, depths: Vector, valid: Tensor) -> Vector:

@@ -103,12 +103,15 @@ def camera_dlt(
     equations = (A.detach() != 0).any(-1).sum(-1)
     degenerate = (singular[..., 1] <= FLAT * singular[..., -1]) | (singular[..., 1] <= BLURRED * singular[..., 0])
     P = torch.linalg.solve_ex(T, p.reshape(*batch, 3, 4) @ S)[0]
-    P = _scaled(P, everything, both)
+    P = _scaled(P, everything, both).to(dtype)
+    # Points so far away that numbers of this kind hold no camera that sees them.
+    held = torch.isfinite(P).flatten(-2).all(-1) & (P != 0).flatten(-2).any(-1)
+    degenerate, P = degenerate | ~held, torch.where(held[..., None, None], P, 0)
 
     status = torch.full(batch, int(Status.OK), dtype=torch.int8, device=x.device)
     for condition, code in ((degenerate, Status.DEGENERATE), (equations < 11, Status.TOO_FEW), (bad, Status.NOT_FINITE)):
         status = torch.where(condition, int(code), status)
-    return CameraEstimate(P.to(dtype), status)
+    return CameraEstimate(P, status)
 
 
 def _clean(batch: torch.Size, a: Tensor, b: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

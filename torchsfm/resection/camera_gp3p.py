@@ -16,6 +16,7 @@ from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.quadric_intersection import intersect_quadrics, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.resection._triangle import ASIDE, NEAREST
 
 _CHUNK = 4096
 """Problems at a time: what is in use stays in the cache."""
@@ -117,8 +118,9 @@ def _solve(eps: float, p: Tensor, d: Tensor, X: Tensor) -> tuple[Tensor, Tensor]
     u[0] = u[0] * mean[item]
     l = torch.stack([u[0] + a * u[1] + b * u[2] for a, b in _DIFFERENCES]) / u[3]  # noqa: E741
     p, d, X, unit, shift = (take_columns(v, item) if v.ndim > 1 else v[item] for v in (p, d, X, unit, shift))
-    l, met = _refine(l, p, d, X)  # noqa: E741
-    right = met & (l + combine_rows(shift.unbind(1), d.unbind(1)) > 0).all(0)
+    l, met, turn = _refine(l, p, d, X)  # noqa: E741
+    nearest = (l + combine_rows(shift.unbind(1), d.unbind(1))).amin(0)
+    right = met & (nearest > NEAREST * l.abs().amax(0)) & (turn <= ASIDE * nearest)
     Y = p + d * l[:, None]
     pose = _motion(X, Y)
     pose = torch.cat((pose[:, :3], pose[:, 3:] * unit), 1)
@@ -148,15 +150,15 @@ def _common_depth(p: Tensor, d: Tensor, sides: list[Tensor]) -> Tensor:
     return torch.where(torch.isfinite(least), least, 0.0)
 
 
-def _refine(l: Tensor, p: Tensor, d: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:  # noqa: E741
-    """Newton steps on the three distances, and which depths meet them."""
+def _refine(l: Tensor, p: Tensor, d: Tensor, X: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # noqa: E741
+    """Newton steps on the three distances, which depths meet them, and how far those that do not take points off their rays."""
     sides = [combine_rows(e, e) for e in (X[i] - X[j] for i, j in _PAIRS)]
-    worst = torch.full_like(l[0], torch.inf)
+    left = torch.full_like(l, torch.inf)
     for step in range(3):
         Y = p + d * l[:, None]
         gaps = [Y[i] - Y[j] for i, j in _PAIRS]
         r = [combine_rows(e, e) - side for e, side in zip(gaps, sides, strict=True)]
-        worst = torch.stack([(a / side).abs() for a, side in zip(r, sides, strict=True)]).amax(0)
+        left = torch.stack([(a / side).abs() for a, side in zip(r, sides, strict=True)])
         if step == 2:
             break
         # Rows: (a0, a1, 0), (b0, 0, b2), (0, c1, c2).
@@ -170,8 +172,12 @@ def _refine(l: Tensor, p: Tensor, d: Tensor, X: Tensor) -> tuple[Tensor, Tensor]
         new = l - torch.stack((s0, s1, s2))
         l = torch.where(torch.isfinite(new).all(0), new, l)  # noqa: E741
     # Far away the distances are small differences.
-    reach = (l.abs().amax(0) ** 2) / torch.stack(sides).amin(0)
-    return l, (worst <= 1e-9 + (1e-14 * reach).clamp_max(1e-5))
+    reach = torch.stack([torch.maximum(l[i].abs(), l[j].abs()) ** 2 / side for (i, j), side in zip(_PAIRS, sides, strict=True)])
+    length = torch.stack(sides).sqrt()
+    longest = length.amax(0)
+    # Lengths that are wrong by so much, be it by rounding, turn the triangle.
+    turn = ((left * length).amax(0) + 1e-15 * longest) * longest / length.amin(0)
+    return l, (left <= 1e-9 + (1e-14 * reach).clamp_max(1e-5)).all(0), turn
 
 
 def _motion(X: Tensor, Y: Tensor) -> Tensor:

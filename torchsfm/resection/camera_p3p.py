@@ -126,8 +126,8 @@ def _sound(rays: Tensor, points: Tensor, eps: float) -> Tensor:
     reach = (points * points).sum(0)
     area = dot(normal, normal)
     bound = torch.maximum((256 * eps * eps) * longest, (16 * eps * eps) * reach) * longest
-    shortest = (rays * rays).view(3, 3, -1).sum(1).amin(0)
-    return (zero == 0) & (area > bound) & (shortest > 1e-200)
+    shortest, longest_ray = (rays * rays).view(3, 3, -1).sum(1).aminmax(dim=0)
+    return (zero == 0) & (area > bound) & (shortest > 1e-200) & (longest_ray < torch.inf)
 
 
 def _stacked_pose(u: Tensor, X: Tensor, depths: Tensor, valid: Tensor | None) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.resection._triangle import NEAREST
 
 
 def equations(
@@ -111,7 +112,7 @@ def _solve(d: Tensor, X: Tensor, g: Tensor, G: Tensor, eps: float) -> tuple[Tens
         first, second = d[0] * l, d[1] * m
         t = 0.5 * torch.stack([first[i] + second[i] - _dot(R[i], X[0] + X[1]) for i in range(3)])
         pose = torch.cat((R, t[:, None]), 1)
-        right = good & (l > 0) & (m > 0) & torch.isfinite(pose).all(0).all(0)
+        right = good & (torch.minimum(l, m) > NEAREST * torch.maximum(l, m)) & torch.isfinite(pose).all(0).all(0)
         if sign < 0:
             right = right & ((root > 0) | ~valid[0])
         poses.append(torch.where(right, pose, torch.eye(3, 4, dtype=d.dtype, device=d.device)[..., None]))

@@ -138,8 +138,9 @@ def _uncalibrated(x: Tensor, X: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     P = torch.cat((P[..., :2, :] * radius[..., None, None] + middle[..., None] * P[..., 2:, :], P[..., 2:, :]), -2)
     third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
     P = P / torch.where(third > 0, third, 1.0)
-    good = ((start.status == Status.OK) & torch.isfinite(P).all(-1).all(-1))[..., None, None]
-    return torch.where(good, P.to(dtype), start.model), start.status
+    P = P.to(dtype)
+    good = ((start.status == Status.OK) & torch.isfinite(P).all(-1).all(-1) & (P != 0).any(-1).any(-1))[..., None, None]
+    return torch.where(good, P, start.model), start.status
 
 
 def _error(P: Tensor, x: Tensor, X: Tensor, inliers: Tensor) -> Tensor:
