@@ -178,3 +178,12 @@ def test_verticals_of_any_length_give_finite_solutions_and_derivatives(length: f
         same = (found.valid == plain.valid).all(-1)
         assert same.double().mean() > 0.95
         torch.testing.assert_close(found.model[same], plain.model[same], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_weights_near_the_largest_number_leave_a_finite_score(dtype: torch.dtype, generator: torch.Generator) -> None:
+    x = 100 * torch.rand(30, 2, generator=generator, dtype=dtype)
+    weights = torch.full((30,), torch.finfo(dtype).max, dtype=dtype)
+    found = estimate_homography(x, x + 1, threshold=1.0, weights=weights, max_iterations=64, generator=generator)
+    assert found.status == Status.OK
+    assert torch.isfinite(found.score)

@@ -171,7 +171,8 @@ def ransac(
             for member, part in found:
                 result = zip_map(lambda old, new: old.index_copy(0, member, new), result, part)  # noqa: B023
     model, spread = result.model, None
-    support = result.support if given is None else result.support * unit
+    # Weights near the largest number there is leave it there.
+    support = result.support if given is None else (result.support * unit).clamp(max=torch.finfo(unit.dtype).max)
     if result.selected is not None:
         counts = bound.new_ones(p, n) if counts is None else counts
         if covariance:

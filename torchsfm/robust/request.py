@@ -114,7 +114,7 @@ class Request:
             result,
             model=(model if back is None else back(model)).to(dtype),
             status=torch.where(vain, int(Status.NO_CONSENSUS), result.status).to(torch.int8),
-            score=result.score.to(dtype),
+            score=result.score.clamp(max=torch.finfo(dtype).max).to(dtype),
             threshold=(result.threshold if scale is None else result.threshold / scale).to(dtype),
             covariance=None if spread is None else spread.to(dtype),
         )
