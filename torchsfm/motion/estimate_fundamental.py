@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.linalg import svd
+from torchsfm.motion.collinear import collinear, collinear_suspected
 from torchsfm.motion.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, with_left_epipole
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.normalization import common_scale, largest_positive
@@ -124,12 +125,13 @@ class FundamentalEstimator:
         threshold: Float[Tensor, "p"],
         chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
-        """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
+        """Whether half of the inliers may be in one plane, or all but so few as chance explains, there or on a line."""
         F, e = model[..., :3], model[..., 3]
         h1, h2 = (torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0) for x in (x1, x2))
         spare = most_by_chance(chance, 2)
         A = torch.linalg.cross(e[..., None], F, dim=-2)
-        return plane_suspected(A, e, h1, h2, inliers, 4 * threshold * threshold, spare)
+        flat = plane_suspected(A, e, h1, h2, inliers, 4 * threshold * threshold, spare)
+        return flat | collinear_suspected((x1, x2), inliers, threshold, chance)
 
     def degeneracy(
         self,
@@ -141,12 +143,17 @@ class FundamentalEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
-        """PLANAR: a homography relates all inliers but so few as chance explains, so that F is open in two dimensions."""
+        """What all inliers but so few as chance explains have in common, so that F is open.
+
+        PLANAR: a homography relates them; two dimensions are open. COLLINEAR: in an image they are on a line.
+        """
         F, e = model[..., :3], model[..., 3]
         limit = 4 * threshold * threshold
         _, on = dominant_plane(cross_rows(e, F), e, plane_rows(x1), plane_rows(x2), inliers, limit, sphere=False)
         planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
-        return torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE)).to(torch.int8)
+        code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
+        code = torch.where(collinear((x1, x2), inliers, threshold, chance), int(Degeneracy.COLLINEAR), code)
+        return code.to(torch.int8)
 
 
 def _cofactors(f: Tensor) -> Tensor:
@@ -205,8 +212,8 @@ def estimate_fundamental(
     Returns:
         F with x2' F x1 = 0, |F| = 1 (Frobenius), det F = 0 and its largest entry positive; inliers, score, iterations, status,
         degeneracy (PLANAR: a homography relates all inliers but so few as chance explains: a planar scene, or a camera that
-        only turned; F is then one of many), covariance (9 x 9, of rank 7). F carries its derivatives with respect to the
-        inliers (see `ransac`).
+        only turned; COLLINEAR: so many are on a line in an image; F is then one of many), covariance (9 x 9, of rank 7). F
+        carries its derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.

@@ -1,17 +1,21 @@
 """Several motions, or several planes, in one pair of images."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_options, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.linalg import unit_scale
+from torchsfm.motion.collinear import number_aside
 from torchsfm.motion.estimate_fundamental import FundamentalEstimator
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.normalization import common_scale
 from torchsfm.robust import Structures, find_structures
+
+_ROUNDING = 1e-14
 
 
 def estimate_fundamentals(
@@ -53,7 +57,7 @@ def estimate_fundamentals(
         generator=generator,
     )  # fmt: skip
     F = y.T2.mT[..., None, :, :] @ found.model[..., :3] @ y.T1[..., None, :, :]
-    return _unit(found, F, x1.dtype)
+    return _judged(found, F, x1.dtype, (y.x1, y.x2), y.scale * threshold, 5)
 
 
 def estimate_homographies(
@@ -95,13 +99,29 @@ def estimate_homographies(
         generator=generator,
     )  # fmt: skip
     H = torch.linalg.inv_ex(y.T2)[0][..., None, :, :] @ found.model @ y.T1[..., None, :, :]
-    return _unit(found, H, x1.dtype)
+    return _judged(found, H, x1.dtype, (y.x1,), y.scale * threshold, 2)
 
 
-def _unit(found: Structures[Tensor], model: Tensor, dtype: torch.dtype) -> Structures[Tensor]:
+def _judged(
+    found: Structures[Tensor], model: Tensor, dtype: torch.dtype, x: Sequence[Tensor], threshold: Tensor, least: int
+) -> Structures[Tensor]:
+    """The structures that there is something to, with models of norm 1.
+
+    They have `least` members or more off any line in the images, which are of size 1, and a threshold beyond rounding.
+    """
     model = model * unit_scale(model)
     size = model.flatten(-2).norm(dim=-1)
-    good = found.valid & (size > 0) & torch.isfinite(size)
+    good = found.valid & (size > 0) & torch.isfinite(size) & (threshold > _ROUNDING)[..., None]
+    slots = torch.arange(good.shape[-1], device=good.device)
+    member = (found.label[..., None, :] == slots[:, None]) & good[..., None]
+    for view in x:
+        wide = view.expand(*member.shape[:-2], *view.shape[-2:])[..., None, :, :].expand(*member.shape, 2)
+        limit = threshold[..., None].expand(good.shape)
+        good = good & (number_aside(wide, member, limit) >= least)
     scale = torch.where(good, 1 / torch.where(good, size, 1), 0)[..., None, None]
     unit = torch.where(good[..., None, None], model, 0) * scale
-    return replace(found, model=unit.to(dtype), valid=good)
+    label = torch.where((member & good[..., None]).any(-2), found.label, -1)
+    number = found.found - (found.valid & ~good).sum(-1)
+    vain = (found.status == Status.OK) & ~good.any(-1)
+    status = torch.where(vain, int(Status.NO_CONSENSUS), found.status).to(torch.int8)
+    return replace(found, model=unit.to(dtype), valid=good, label=label, found=number, status=status)

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
+from torchsfm.motion.collinear import collinear, collinear_suspected
 from torchsfm.motion.multilinear_fit import frame_directions, free_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
 from torchsfm.motion.plane_and_parallax import more_than_chance, most_by_chance
@@ -144,9 +145,9 @@ class TrifocalEstimator:
         threshold: Float[Tensor, "p"],
         chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
-        """Whether half of the inliers may be in one plane, or all but so few as chance explains."""
-        spare = most_by_chance(chance, 2)
-        return planar_suspected(model, (x1, x2, x3), inliers, threshold * threshold, spare)
+        """Whether half of the inliers may be in one plane, or all but so few as chance explains, there or on a line."""
+        flat = planar_suspected(model, (x1, x2, x3), inliers, threshold * threshold, most_by_chance(chance, 2))
+        return flat | collinear_suspected((x1, x2, x3), inliers, threshold, chance)
 
     def degeneracy(
         self,
@@ -159,10 +160,15 @@ class TrifocalEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
-        """PLANAR: homographies from the first image relate all inliers but so few as chance explains to both others."""
+        """What all inliers but so few as chance explains have in common, so that the cameras are open.
+
+        PLANAR: homographies from the first image relate them to both others. COLLINEAR: in an image they are on a line.
+        """
         on = planar(model, (x1, x2, x3), inliers, threshold * threshold)
         flat = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
-        return torch.where(flat, int(Degeneracy.PLANAR), int(Degeneracy.NONE)).to(torch.int8)
+        code = torch.where(flat, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
+        lined = collinear((x1, x2, x3), inliers, threshold, chance)
+        return torch.where(lined, int(Degeneracy.COLLINEAR), code).to(torch.int8)
 
 
 def _rows(x: Tensor) -> list[Tensor]:
@@ -205,7 +211,8 @@ def estimate_trifocal(
 
     Returns:
         Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, score, iterations, status, degeneracy
-        (PLANAR: homographies relate all inliers but so few as chance explains; the cameras are then some of many), covariance
+        (PLANAR: homographies relate all inliers but so few as chance explains; COLLINEAR: so many are on a line in an image;
+        the cameras are then some of many), covariance
         (36 x 36, of rank 18). The cameras carry their derivatives with respect to the inliers (see `ransac`).
 
     Raises:
