@@ -18,11 +18,15 @@ import torchsfm
 from bench.fuzz.campaign import Target, Trial, main
 from bench.fuzz.functions import EXCEPTIONS, FUNCTIONS, Function, public_functions
 from bench.fuzz.poison import poison
-from bench.fuzz.promises import changed, not_finite, tensors, unsupported, verdict, zero_models
+from bench.fuzz.promises import changed, not_finite, tensors, verdict, zero_models
 from bench.fuzz.scene import Scene
+from bench.fuzz.support import JUDGES
 from torchsfm._types import tensor_map
 
-BATCH = (4,)
+BATCHES = ((4,), (2, 3), (64,), (64,), (64,), (64,), (64,), (64,))
+"""Shapes of batches: most are large, for one call then judges many problems."""
+BAD = 0.75
+"""Share of the problems of a batch that are made bad."""
 OPTIONAL = 0.3
 """How often an optional argument is given."""
 JUDGED_BY_TORCH = {"device", "dtype", "generator", "shape", "progress"}
@@ -43,7 +47,7 @@ def load() -> list[Target]:
         if name in EXCEPTIONS:
             continue
         how = FUNCTIONS.get(name, Function())
-        targets.append(Target(f"{name} values", lambda seed, call=call, how=how: _bad_values(call, how, seed)))
+        targets.append(Target(f"{name} values", lambda seed, name=name, call=call: _bad_values(name, call, seed)))
         if name.partition(".")[2] in torchsfm.__all__:
             targets.append(Target(f"{name} arguments", lambda seed, call=call, how=how: _wrong_arguments(call, how, seed)))
     return targets
@@ -120,25 +124,25 @@ def _is_data(t: Tensor, how: Function) -> bool:
     return t.is_floating_point() or (t.dtype == torch.bool and how.batched)
 
 
-def _bad_values(call: Call, how: Function, seed: int) -> Trial:
+def _bad_values(name: str, call: Call, seed: int) -> Trial:
+    how = FUNCTIONS.get(name, Function())
     generator = torch.Generator().manual_seed(seed)
-    scene = _scene(how, generator, BATCH)
+    scene = _scene(how, generator, BATCHES[seed % len(BATCHES)])
     arguments = good_arguments(call, how, scene)
     if how.half and torch.rand((), generator=generator) < 0.3:
         arguments = _cast(arguments, torch.float32)
     kept = torch.zeros(scene.batch, dtype=torch.bool)
     if how.batched:
         while not bool(kept.any()) or bool(kept.all()):
-            kept = torch.rand(scene.batch, generator=generator) < 0.5
+            kept = torch.rand(scene.batch, generator=generator) >= BAD
     bad = _poisoned(arguments, how, kept, generator)
     try:
         result = apply(call, bad)
     except how.raises:
         return Trial(1)
     broken = [*not_finite(result), *zero_models(result)]
-    if how.distance is not None:
-        exact = _cast(bad, torch.float64)
-        broken += unsupported(result, how.distance(result.model.double(), exact), bad["threshold"])
+    if name in JUDGES:
+        broken += JUDGES[name](result, _cast(bad, torch.float64))
     if how.batched:
         broken += changed(result, apply(call, arguments), kept)
     return Trial(int((~kept).sum()) if how.batched else 1, tuple(broken))

@@ -77,15 +77,18 @@ def targets_of(modules: Sequence[str]) -> dict[str, Target]:
 
 
 def _work(modules: Sequence[str], names: list[str], first: int, step: int, pipe: Connection) -> None:
-    """Try one target after the other, the one with the least time so far first; tell before and after each trial."""
+    """Try the targets by turns; tell before and after each trial.
+
+    Next is the one of which inputs times seconds so far are least: slow ones get fewer inputs, fast ones less time.
+    """
     import torch
 
     torch.set_num_threads(1)
     targets = targets_of(modules)
-    spent = dict.fromkeys(names, 0.0)
+    spent, inputs = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0)
     seeds = dict.fromkeys(names, first)
     while True:
-        name = min(spent, key=spent.__getitem__)
+        name = min(names, key=lambda name: inputs[name] * spent[name])
         seed = seeds[name]
         seeds[name] += step
         pipe.send((name, seed, None, 0.0))
@@ -93,6 +96,7 @@ def _work(modules: Sequence[str], names: list[str], first: int, step: int, pipe:
         trial = attempt(targets[name], seed)
         seconds = time.perf_counter() - start
         spent[name] += seconds
+        inputs[name] += trial.inputs
         pipe.send((name, seed, trial, seconds))
 
 
@@ -203,6 +207,10 @@ def main(modules: Sequence[str], description: str | None) -> None:
     parser.add_argument("--out", type=Path, help="write the table here too")
     options = parser.parse_args()
     targets = targets_of(modules)
+    rooms = {name.partition(".")[0] for name in targets}
+    unknown = set(options.rooms or ()) - rooms
+    if unknown:
+        parser.error(f"no room or format {', '.join(sorted(unknown))}; there are {', '.join(sorted(rooms))}")
     names = [name for name in targets if not options.rooms or name.partition(".")[0] in options.rooms]
     if options.list:
         print("\n".join(names))

@@ -18,8 +18,6 @@ from torchsfm.geometry import (
     Radial,
     camera_from_krt,
     project_points,
-    reprojection_distance,
-    sampson_distance,
 )
 from torchsfm.images import Features
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
@@ -43,8 +41,6 @@ class Function:
     """Whether the principal point is 0."""
     batched: bool = True
     """Whether the function takes batches of problems."""
-    distance: Callable[..., Tensor] | None = None
-    """Of robust results: `distance(model, arguments)`, the distances of all data from models called good."""
     together: tuple[tuple[str, ...], ...] = ()
     """Optional arguments that come together or not at all."""
     raises: tuple[type[Exception], ...] = ()
@@ -109,21 +105,6 @@ def _blocks(s: Scene) -> dict[str, Block]:
     return {"p": Block(s.randn(4, 1), fixed=fixed), "q": Block(s.randn(3, 1))}
 
 
-def _from_epipolar_lines(F: Tensor, a: Mapping[str, Tensor]) -> Tensor:
-    return sampson_distance(F, a["x1"], a["x2"])
-
-
-def _from_projections(P: Tensor, a: Mapping[str, Tensor]) -> Tensor:
-    return reprojection_distance(P, a["X"], a["x"])
-
-
-def _from_projections_with_intrinsics(P: Tensor, a: Mapping[str, Tensor]) -> Tensor:
-    distance = reprojection_distance(a["K"] @ P, a["X"], a["x"])
-    # What else stands in the last row of K than (0, 0, 1) is not looked at.
-    proper = (a["K"][..., 2, :] == torch.tensor([0.0, 0.0, 1.0], dtype=P.dtype)).all(-1)
-    return torch.where(proper[..., None], distance, 0.0)
-
-
 ROBUST = {"threshold": 2.0, "max_iterations": 64, "generator": _generator}
 RAYS = ROBUST | {"threshold": 0.003}
 SIZED = {"image_size": tuple(map(float, SIZE))}
@@ -179,7 +160,7 @@ FUNCTIONS: dict[str, Function] = {
     "linalg.null_vector": Function({"A": lambda s: s.randn(6, 4)}),
     "linalg.orthonormal_nullspace": Function({"A": lambda s: s.randn(3, 5)}),
     "motion.estimate_essential": Function(RAYS, {"n": 30}),
-    "motion.estimate_fundamental": Function(ROBUST, {"n": 30}, distance=_from_epipolar_lines),
+    "motion.estimate_fundamental": Function(ROBUST, {"n": 30}),
     "motion.estimate_fundamentals": Function({"threshold": 2.0, "generator": _generator, "slots": 2}, {"n": 30}),
     "motion.estimate_homographies": Function({"threshold": 2.0, "generator": _generator, "slots": 2}, {"n": 30}, planar=True),
     "motion.estimate_homography": Function(ROBUST, {"n": 30}, planar=True),
@@ -218,9 +199,9 @@ FUNCTIONS: dict[str, Function] = {
     "resection.camera_p4pf": Function(centred=True),
     "resection.camera_p35pf": Function(centred=True),
     "resection.camera_planar": Function(planar=True),
-    "resection.estimate_camera": Function(ROBUST, {"n": 20}, distance=_from_projections_with_intrinsics),
-    "resection.estimate_camera_focal": Function(ROBUST, {"n": 20}, distance=_from_projections),
-    "resection.estimate_camera_projective": Function(ROBUST, {"n": 20}, distance=_from_projections),
+    "resection.estimate_camera": Function(ROBUST, {"n": 20}),
+    "resection.estimate_camera_focal": Function(ROBUST, {"n": 20}),
+    "resection.estimate_camera_projective": Function(ROBUST, {"n": 20}),
     "resection.refine_camera": Function(
         {"pose": lambda s: _poses(s)[..., 0], "camera": lambda s: Camera(s.parameters(1)[0][..., 0, :, :])}
     ),
