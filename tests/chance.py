@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 from torch import Tensor
 
 FALSE_ALARM = 1e-6
@@ -43,4 +43,22 @@ def assert_share(right: Tensor, at_least: float) -> None:
     chance = float(binom.cdf(count, trials, at_least))
     assert chance > FALSE_ALARM, (
         f"{count} of {trials} are right; a rate of {at_least:g} gives as few once in {1 / max(chance, 1e-300):.1g} runs"
+    )
+
+
+def assert_unit_variance(scores: Tensor, lost: int = 0, dim: int | None = None) -> None:
+    """Fail where errors divided by their standard deviations are larger, or smaller, than normal numbers of variance 1 are.
+
+    Their sum of squares, over all or over a dimension, is chi-square with as many degrees of freedom as there are, less those
+    `lost` to what was estimated from them: refused is what is as far out with a probability below `FALSE_ALARM`.
+    """
+    squares = scores.square().sum() if dim is None else scores.square().sum(dim)
+    freedom = (scores.numel() if dim is None else scores.shape[dim]) - lost
+    assert freedom > 0, "no trials"
+    law = chi2(freedom)
+    sums = squares.reshape(-1).numpy(force=True)
+    chance = 2 * len(sums) * np.minimum(law.cdf(sums), law.sf(sums)).min()
+    assert chance > FALSE_ALARM, (
+        f"mean squares from {sums.min() / freedom:.3g} to {sums.max() / freedom:.3g} with {freedom} degrees of freedom are "
+        f"as far from 1 once in {1 / max(chance, 1e-300):.1g} runs"
     )
