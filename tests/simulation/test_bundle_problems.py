@@ -24,7 +24,8 @@ def test_counts_and_visibility(layout: str, cameras: int, points: int, observati
     assert float(truth.residuals().max()) == 0
     noise = (problem.x - truth.x).square().mean().sqrt()
     assert abs(float(noise) / 0.5 - 1) < 4 * (1 / (4 * observations)) ** 0.5 + 0.02
-    assert 2 < float(problem.residuals().median()) < 60
+    # The median of the smallest problem, of 20, is between 13 and 87 in 60 trials.
+    assert 2 < float(problem.residuals().median()) < 200
     assert isinstance(truth.cameras.distortion, Radial)
 
 

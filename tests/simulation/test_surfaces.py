@@ -66,7 +66,8 @@ def test_rays_end_on_the_surface_and_nowhere_before(kind: str, generator: torch.
     d = torch.randn(3, N, generator=generator, dtype=torch.float64) * 0.5 - origin
     s = thing.intersect(origin, d)
     hit = torch.isfinite(s)
-    assert hit.sum() > N / 10
+    # A rectangle or disc is hit by one ray in thirty where it is seen from the side.
+    assert hit.sum() > N / 100
     assert outside(thing, origin + torch.where(hit, s, 0.0) * d)[hit].abs().max() < 1e-9
     # Marching along each ray finds nothing before the hit, and nothing at all on rays that miss.
     steps = torch.linspace(0, 4, 4001, dtype=torch.float64)
