@@ -88,7 +88,7 @@ def _work(modules: Sequence[str], names: list[str], first: int, step: int, pipe:
     spent, inputs = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0)
     seeds = dict.fromkeys(names, first)
     while True:
-        name = min(names, key=lambda name: inputs[name] * spent[name])
+        name = min(names, key=lambda name: (1 + inputs[name]) * spent[name])
         seed = seeds[name]
         seeds[name] += step
         pipe.send((name, seed, None, 0.0))
