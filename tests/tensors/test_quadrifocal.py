@@ -151,7 +151,7 @@ def test_degenerate_and_bad_input_leave_neighbours_alone(generator: torch.Genera
     wanted = [Status.OK, Status.NOT_FINITE, Status.DEGENERATE, Status.DEGENERATE, Status.OK, Status.OK]
     assert found.status.tolist() == wanted
     assert torch.isfinite(found.P).all()
-    torch.testing.assert_close(found.P[[0, 5]], reference.P[[0, 5]], rtol=1e-10, atol=1e-12)
+    assert torch.equal(found.P[[0, 5]], reference.P[[0, 5]])
     assert up_to_scale(quadrifocal_from_cameras(*found.P[4]), Q[4], 4) < 1e-9
     found.P.sum().backward()
     assert Q.grad is not None

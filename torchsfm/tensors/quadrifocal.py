@@ -138,6 +138,8 @@ def cameras_from_quadrifocal(Q: Float[Tensor, "*batch 3 3 3 3"]) -> ProjectiveCa
         clear = values[..., -2] > 256 * torch.finfo(Q.dtype).eps * values[..., 0]
         determined = clear & solved & (three.status == Status.OK)
         damping = torch.full_like(damping, 1e-12)
+    # What is not determined has no derivative.
+    unit = torch.where((determined & finite)[..., None, None, None, None], unit, base)
     P = canonical_frame(_step(unit, P, damping))
     status = torch.where(determined, Status.OK, Status.DEGENERATE)
     return ProjectiveCameras(P.to(Q.dtype), torch.where(finite, status, Status.NOT_FINITE).to(torch.int8))
