@@ -1,6 +1,7 @@
 """Numbers without geometry: decompositions that never raise, null spaces, roots of polynomials, nearest matrices."""
 
 from torchsfm.linalg.compilation import compile_kernels
+from torchsfm.linalg.damped_solve import damped_solve
 from torchsfm.linalg.decompositions import eigh, eigvals, eigvalsh, inverse, qr, solve, svd, svdvals, triangular_factor
 from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3
 from torchsfm.linalg.magnitude import unit_scale, usable
@@ -15,6 +16,7 @@ __all__ = [
     "companion_roots",
     "compile_kernels",
     "cross",
+    "damped_solve",
     "determinant_3x3",
     "eigh",
     "eigvals",

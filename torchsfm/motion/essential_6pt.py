@@ -14,12 +14,11 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.geometry.rotations import cross_matrix
-from torchsfm.linalg import svd, triangular_factor
+from torchsfm.linalg import damped_solve, svd, triangular_factor
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.motion.epipolar_fit import cofactors
 from torchsfm.optim import attach_implicit, wants_derivative
-from torchsfm.robust import damped_solve
 
 _CHUNK = 1024
 """Problems at a time: their matrices fit the cache."""

@@ -1,7 +1,7 @@
 """The essential matrix from corresponding rays of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,8 +14,7 @@ from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.motion.relative_5pt import relative_5pt
 from torchsfm.motion.sampson_sphere import pose_step, squared_distance, step_equations, turned
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.tensors import essential_from_pose
 
 _SLACK = 2e-3
@@ -55,28 +54,11 @@ class RelativePoseEstimator:
         """Squared angular Sampson distance; infinite behind a camera."""
         return squared_distance(model, d1, d2, self.slack)
 
-    def residual(
-        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Sampson distance in radians: by how much the two rays must turn together to meet, to first order."""
-        return self.squared_residual(model, d1, d2).sqrt()
-
     def degenerate(self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]) -> Bool[Tensor, "*batch"]:
         """Whether the first two rays coincide in an image."""
         return ((d1[..., 0, :] == d1[..., 1, :]).all(-1)) | ((d2[..., 0, :] == d2[..., 1, :]).all(-1))
 
-    def refine(
-        self,
-        model: Float[Tensor, "*#batch 3 4"],
-        d1: Float[Tensor, "*#batch n 3"],
-        d2: Float[Tensor, "*#batch n 3"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on Sampson's distance: R <- exp(w) R, and t along the unit sphere."""
-        return self.reweighted_step(model, d1, d2, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         d1: Float[Tensor, "*#batch n 3"],
@@ -84,7 +66,7 @@ class RelativePoseEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
-        """The step of `refine` with weights that follow from the distances."""
+        """A Gauss-Newton step on Sampson's distance: R <- exp(w) R, and t along the unit sphere."""
         A, b = step_equations(model, d1, d2, self.slack, weigh)
         R, t = model[..., :3].double(), model[..., 3].double()
         step = pose_step(A, b, t)
@@ -97,7 +79,7 @@ class RelativePoseEstimator:
         R = rotation_exponential(step[..., :3]) @ model[..., :3]
         return torch.cat((R, UnitSphere(3).retract(model[..., 3], step[..., 3:])[..., None]), -1)
 
-    def suspect(
+    def may_be_degenerate(
         self,
         model: Float[Tensor, "p 3 4"],
         d1: Float[Tensor, "p n 3"],
@@ -139,14 +121,7 @@ def estimate_essential(
     d2: Float[Tensor, "*#batch n 3"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The essential matrix of each pair of calibrated cameras, from corresponding rays of which many may be wrong.
 
@@ -159,17 +134,10 @@ def estimate_essential(
         d2: The corresponding rays of the second camera.
         threshold: Largest Sampson distance of an inlier in radians, at most 0.1: pixels divided by the focal length.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite or of length 0 are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of the entries of E, row by row.
+        **options: See `RansacOptions`.
 
     Returns:
-        E with d2' E d1 = 0, |E|^2 = 2 and singular values (1, 1, 0); inliers, score, iterations, status, degeneracy
+        E with d2' E d1 = 0, |E|^2 = 2 and singular values (1, 1, 0); inliers, support, iterations, status, degeneracy
         (ROTATION: a rotation relates all inliers but so few as chance explains, and the translation means nothing; PLANAR: a
         homography does, and a second pose may fit as well), covariance (9 x 9, of rank 5). E carries its derivatives with
         respect to the inliers (see `ransac`).
@@ -177,18 +145,13 @@ def estimate_essential(
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"))
-    request.check_radians()
+    batch = check_door({"d1": (d1, "n 3"), "d2": (d2, "n 3")}, threshold, options, radians=True)
     estimator = RelativePoseEstimator(pose_slack(threshold, d1).expand(batch))
 
     def back(model: Tensor) -> Tensor:
         return essential_from_pose(model[..., :3], model[..., 3])
 
-    return request.answer(estimator, unit_rays(d1), unit_rays(d2), dtype=d1.dtype, back=back)
+    return estimate_robustly(estimator, unit_rays(d1), unit_rays(d2), threshold=threshold, dtype=d1.dtype, back=back, **options)
 
 
 def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:

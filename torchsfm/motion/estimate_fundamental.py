@@ -1,14 +1,14 @@
 """The fundamental matrix from correspondences of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.linalg import svd
+from torchsfm.linalg import damped_solve, svd
 from torchsfm.motion.collinear import collinear, collinear_suspected
 from torchsfm.motion.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, with_left_epipole
 from torchsfm.motion.estimate_homography import HomographyEstimator
@@ -17,8 +17,7 @@ from torchsfm.motion.oriented_7pt import oriented_7pt
 from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_rivals
 from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.motion.sampson_plane import squared_distance, step_equations
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
 
 @dataclass(frozen=True)
@@ -50,28 +49,11 @@ class FundamentalEstimator:
         """Squared Sampson distance; infinite for points that are behind one camera."""
         return squared_distance(model, x1, x2)
 
-    def residual(
-        self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Sampson distance; infinite for points that are behind one camera."""
-        return self.squared_residual(model, x1, x2).sqrt()
-
     def degenerate(self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]) -> Bool[Tensor, "*batch"]:
         """Whether the first two points coincide in an image."""
         return ((x1[..., 0, :] == x1[..., 1, :]).all(-1)) | ((x2[..., 0, :] == x2[..., 1, :]).all(-1))
 
-    def refine(
-        self,
-        model: Float[Tensor, "*#batch 3 4"],
-        x1: Float[Tensor, "*#batch n 2"],
-        x2: Float[Tensor, "*#batch n 2"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and, to second order, of determinant 0."""
-        return self.reweighted_step(model, x1, x2, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x1: Float[Tensor, "*#batch n 2"],
@@ -79,7 +61,7 @@ class FundamentalEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
-        """The step of `refine` with weights that follow from the distances.
+        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and, to second order, of determinant 0.
 
         The step minimises the quadratic model under the linearised constraint (sequential quadratic programming).
         """
@@ -102,7 +84,7 @@ class FundamentalEstimator:
         f = model[..., :3].flatten(-2) + (step[..., None, :] @ basis)[..., 0, :]
         return with_left_epipole(matrices(_determinant_step(f), 3), model[..., 3])
 
-    def rivals(
+    def alternative_models(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x1: Float[Tensor, "*#batch n 2"],
@@ -115,7 +97,7 @@ class FundamentalEstimator:
         """Where a plane holds most inliers: F of its homography and of two points off it (Chum, Werner & Matas 2005)."""
         return plane_rivals(self, HomographyEstimator(), model, x1, x2, inside=inside, threshold=threshold, seed=seed)
 
-    def suspect(
+    def may_be_degenerate(
         self,
         model: Float[Tensor, "p 3 4"],
         x1: Float[Tensor, "p n 2"],
@@ -179,14 +161,7 @@ def estimate_fundamental(
     x2: Float[Tensor, "*#batch n 2"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The fundamental matrix of each pair of images, from correspondences of which many may be wrong.
 
@@ -200,32 +175,23 @@ def estimate_fundamental(
         x2: The corresponding points in the second image, in the same unit.
         threshold: Largest Sampson distance of an inlier, in the unit of the points.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of the entries of F, row by row.
+        **options: See `RansacOptions`.
 
     Returns:
-        F with x2' F x1 = 0, |F| = 1 (Frobenius), det F = 0 and its largest entry positive; inliers, score, iterations, status,
-        degeneracy (PLANAR: a homography relates all inliers but so few as chance explains: a planar scene, or a camera that
-        only turned; COLLINEAR: so many are on a line in an image; F is then one of many), covariance (9 x 9, of rank 7). F
-        carries its derivatives with respect to the inliers (see `ransac`).
+        F with x2' F x1 = 0, |F| = 1 (Frobenius), det F = 0 and its largest entry positive; inliers, support, iterations,
+        status, degeneracy (PLANAR: a homography relates all inliers but so few as chance explains: a planar scene, or a camera
+        that only turned; COLLINEAR: so many are on a line in an image; F is then one of many), covariance (9 x 9, of rank 7).
+        F carries its derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    request.check(x1=(x1, "n 2"), x2=(x2, "n 2"))
-    y = common_scale(x1.double(), x2.double(), mask)
+    check_door({"x1": (x1, "n 2"), "x2": (x2, "n 2")}, threshold, options)
+    y = common_scale(x1.double(), x2.double(), options.get("mask"))
 
     def back(model: Tensor) -> Tensor:
         return largest_positive(_singular(y.T2.mT @ _singular(model[..., :3]) @ y.T1))
 
-    return request.answer(FundamentalEstimator(), y.x1, y.x2, dtype=x1.dtype, scale=y.scale, back=back)
+    return estimate_robustly(
+        FundamentalEstimator(), y.x1, y.x2, threshold=threshold, dtype=x1.dtype, scale=y.scale, back=back, **options
+    )  # fmt: skip

@@ -1,9 +1,8 @@
 """The homography from correspondences of which many are wrong."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,12 +10,13 @@ from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.geometry import least_number_off, line_and_plane_distances
+from torchsfm.linalg import damped_solve
 from torchsfm.motion.epipolar_fit import matrices
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.plane_and_parallax import more_than_chance
 from torchsfm.optim import UnitSphere
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
+from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
 # Where entry ((i, j), (k, l)) of a sum of Kronecker products is among 6 x 6 products, both in the order 00, 01, 11, 02, 12, 22.
 _PAIR = ((0, 1, 3), (1, 2, 4), (3, 4, 5))
@@ -57,12 +57,6 @@ class HomographyEstimator:
         second = (s00 * c1).addcmul_(s01, c0, value=-1)
         return first.mul_(c0).addcmul_(second, c1).div_(det).abs_()
 
-    def residual(
-        self, H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Sampson distance."""
-        return self.squared_residual(H, x1, x2).sqrt()
-
     def degenerate(self, x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]) -> Bool[Tensor, "*batch"]:
         """Whether three of the points are collinear in an image, or turn the other way round in the other.
 
@@ -77,26 +71,15 @@ class HomographyEstimator:
         a, b, c, d = (one * other for one, other in zip(*areas, strict=True))
         return torch.minimum(torch.minimum(a, b), torch.minimum(c, d)) <= 0
 
-    def refine(
+    def step(
         self,
         H: Float[Tensor, "*#batch 3 3"],
         x1: Float[Tensor, "*#batch n 2"],
         x2: Float[Tensor, "*#batch n 2"],
         *,
-        weights: Float[Tensor, "*#batch n"],
+        weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 3"]:
-        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1."""
-        return self.reweighted_step(H, x1, x2, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
-        self,
-        H: Float[Tensor, "*#batch 3 3"],
-        x1: Float[Tensor, "*#batch n 2"],
-        x2: Float[Tensor, "*#batch n 2"],
-        *,
-        weigh: Callable[[Tensor], tuple[Tensor, Tensor]],
-    ) -> Float[Tensor, "*batch 3 3"]:
-        """The step with weights and curvature that follow from the squared distances.
+        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1.
 
         Up to second order, the derivative of the distance is that of the constraint at the points corrected to first order,
         with S held fixed. The constraint is [I, -x2] H x1, so the normal matrix is a sum of Kronecker products of 3 x 3
@@ -134,7 +117,7 @@ class HomographyEstimator:
         """H moved along the unit sphere."""
         return matrices(UnitSphere(9).retract(H.flatten(-2), step), 3)
 
-    def suspect(
+    def may_be_degenerate(
         self,
         H: Float[Tensor, "*#batch 3 3"],
         x1: Float[Tensor, "*#batch n 2"],
@@ -192,14 +175,7 @@ def estimate_homography(
     x2: Float[Tensor, "*#batch n 2"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
     """The homography between each pair of images, from correspondences of which many may be wrong.
 
@@ -212,29 +188,18 @@ def estimate_homography(
         threshold: Largest Sampson distance of an inlier, in the unit of the points. It counts errors in both images together:
             with the same noise in both, a transfer error to one image is about 1.4 times larger.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of the entries of H, row by row.
+        **options: See `RansacOptions`.
 
     Returns:
-        H with x2 ~ H x1, |H| = 1 (Frobenius) and its largest entry positive; inliers, score, iterations, status, degeneracy
+        H with x2 ~ H x1, |H| = 1 (Frobenius) and its largest entry positive; inliers, support, iterations, status, degeneracy
         (COLLINEAR: the inliers are on a line but for so few as chance explains), covariance (9 x 9, of rank 8). H carries its
         derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    request.check(x1=(x1, "n 2"), x2=(x2, "n 2"))
-    y = common_scale(x1.double(), x2.double(), mask)
+    check_door({"x1": (x1, "n 2"), "x2": (x2, "n 2")}, threshold, options)
+    y = common_scale(x1.double(), x2.double(), options.get("mask"))
     T2_inverse = torch.linalg.inv_ex(y.T2)[0]
 
     def back(model: Tensor) -> Tensor:
@@ -242,4 +207,6 @@ def estimate_homography(
         size = (H * H).sum(-1, keepdim=True).sum(-2, keepdim=True)
         return largest_positive(H * torch.where(size > 0, size, 1).rsqrt())
 
-    return request.answer(HomographyEstimator(), y.x1, y.x2, dtype=x1.dtype, scale=y.scale, back=back)
+    return estimate_robustly(
+        HomographyEstimator(), y.x1, y.x2, threshold=threshold, dtype=x1.dtype, scale=y.scale, back=back, **options
+    )  # fmt: skip

@@ -1,13 +1,14 @@
 """Three projective cameras from correspondences over three images of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
+from torchsfm.linalg import damped_solve
 from torchsfm.motion.collinear import collinear, collinear_suspected
 from torchsfm.motion.multilinear_fit import frame_directions, free_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
@@ -15,8 +16,7 @@ from torchsfm.motion.plane_and_parallax import more_than_chance, most_by_chance
 from torchsfm.motion.three_view_parallax import planar, planar_suspected, rivals_of_plane
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
-from torchsfm.robust import Degeneracy, Request, RobustResult, Score, damped_solve
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.tensors import canonical_cameras
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -64,16 +64,6 @@ class TrifocalEstimator:
         squared, front = squared_distance(model, [_rows(x) for x in (x1, x2, x3)])
         return squared.masked_fill(~front, torch.inf)
 
-    def residual(
-        self,
-        model: Float[Tensor, "*#batch 2 3 4"],
-        x1: Float[Tensor, "*#batch n 2"],
-        x2: Float[Tensor, "*#batch n 2"],
-        x3: Float[Tensor, "*#batch n 2"],
-    ) -> Float[Tensor, "*batch n"]:
-        """Distance; infinite for points behind a camera."""
-        return self.squared_residual(model, x1, x2, x3).sqrt()
-
     def degenerate(
         self, x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#batch 6 2"], x3: Float[Tensor, "*#batch 6 2"]
     ) -> Bool[Tensor, "*batch"]:
@@ -81,19 +71,7 @@ class TrifocalEstimator:
         same = [(x[..., 0, :] == x[..., 1, :]).all(-1) for x in (x1, x2, x3)]
         return same[0] | same[1] | same[2]
 
-    def refine(
-        self,
-        model: Float[Tensor, "*#batch 2 3 4"],
-        x1: Float[Tensor, "*#batch n 2"],
-        x2: Float[Tensor, "*#batch n 2"],
-        x3: Float[Tensor, "*#batch n 2"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 2 3 4"]:
-        """A Gauss-Newton step on the reprojection error over cameras and points, the frame and scales of the cameras held."""
-        return self.reweighted_step(model, x1, x2, x3, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         model: Float[Tensor, "*#batch 2 3 4"],
         x1: Float[Tensor, "*#batch n 2"],
@@ -102,7 +80,7 @@ class TrifocalEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 2 3 4"]:
-        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        """A Gauss-Newton step on the reprojection error over cameras and points, the frame and scales of the cameras held."""
         A, b = normal_equations(model, [_rows(x) for x in (x1, x2, x3)], weigh)
         P = model.double()
         G = frame_directions(P)
@@ -120,7 +98,7 @@ class TrifocalEstimator:
         moved: Tensor = model + delta.reshape(*delta.shape[:-1], 2, 3, 4)
         return moved
 
-    def rivals(
+    def alternative_models(
         self,
         model: Float[Tensor, "p 2 3 4"],
         x1: Float[Tensor, "p n 2"],
@@ -134,7 +112,7 @@ class TrifocalEstimator:
         """Where most inliers are in a plane, the best cameras of that plane and two points off it."""
         return rivals_of_plane(self, model, (x1, x2, x3), inside, threshold, seed)
 
-    def suspect(
+    def may_be_degenerate(
         self,
         model: Float[Tensor, "p 2 3 4"],
         x1: Float[Tensor, "p n 2"],
@@ -179,14 +157,7 @@ def estimate_trifocal(
     x: Float[Tensor, "*#batch 3 n 2"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 3 4"]]:
     """Three projective cameras for each triplet of images, from correspondences of which many may be wrong.
 
@@ -200,34 +171,23 @@ def estimate_trifocal(
         threshold: Largest distance of an inlier, in the unit of the points: the root of the sum of squared distances in the
             three images to those of one point in space. None where it is not known: more than half of the correspondences must
             then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of the entries of the cameras, camera by camera and row by row.
+        **options: See `RansacOptions`.
 
     Returns:
-        Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, score, iterations, status, degeneracy
-        (PLANAR: homographies relate all inliers but so few as chance explains; COLLINEAR: so many are on a line in an image;
+        Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, support, iterations, status,
+        degeneracy (PLANAR: homographies relate all inliers but so few as chance explains; COLLINEAR: so many are on a line in an image;
         the cameras are then some of many), covariance
         (36 x 36, of rank 18). The cameras carry their derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    request.check(x=(x, "3 n 2"))
-    y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), mask)
+    check_door({"x": (x, "3 n 2")}, threshold, options)
+    y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), options.get("mask"))
     S_inverse = inverse_similarity(torch.stack(S, -3))
 
     def back(model: Tensor) -> Tensor:
         first = torch.eye(3, 4, dtype=model.dtype, device=model.device).expand(*model.shape[:-3], 1, 3, 4)
         return canonical_cameras(S_inverse @ torch.cat((first, model), -3))
 
-    return request.answer(TrifocalEstimator(), *y, dtype=x.dtype, scale=scale, back=back)
+    return estimate_robustly(TrifocalEstimator(), *y, threshold=threshold, dtype=x.dtype, scale=scale, back=back, **options)

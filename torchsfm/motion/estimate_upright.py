@@ -1,7 +1,7 @@
 """The relative pose of two cameras that know the vertical, from corresponding rays of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,8 +14,7 @@ from torchsfm.motion.estimate_essential import RelativePoseEstimator, pose_slack
 from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
 from torchsfm.motion.sampson_sphere import pose_step, step_equations, turned
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import Request, RobustResult, Score
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
 
 @dataclass(frozen=True)
@@ -57,28 +56,11 @@ class UprightPoseEstimator:
         """Squared angular Sampson distance; infinite behind a camera."""
         return RelativePoseEstimator(self.slack).squared_residual(model, d1, d2)
 
-    def residual(
-        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Sampson distance in radians."""
-        return self.squared_residual(model, d1, d2).sqrt()
-
     def degenerate(self, d1: Float[Tensor, "*#batch 3 3"], d2: Float[Tensor, "*#batch 3 3"]) -> Bool[Tensor, "*batch"]:
         """Whether the first two rays coincide in an image."""
         return ((d1[..., 0, :] == d1[..., 1, :]).all(-1)) | ((d2[..., 0, :] == d2[..., 1, :]).all(-1))
 
-    def refine(
-        self,
-        model: Float[Tensor, "*#batch 3 4"],
-        d1: Float[Tensor, "*#batch n 3"],
-        d2: Float[Tensor, "*#batch n 3"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on Sampson's distance: R turned about the vertical, and t along the unit sphere."""
-        return self.reweighted_step(model, d1, d2, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         d1: Float[Tensor, "*#batch n 3"],
@@ -86,7 +68,7 @@ class UprightPoseEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
-        """The step of `refine` with weights that follow from the distances."""
+        """A Gauss-Newton step on Sampson's distance: R turned about the vertical, and t along the unit sphere."""
         A, b = step_equations(model, d1, d2, self.slack, weigh)
         R, t, up = model[..., :3].double(), model[..., 3].double(), self.gravity2.double()
         # Of all turns the one about the vertical.
@@ -116,14 +98,7 @@ def estimate_upright(
     gravity2: Float[Tensor, "*#batch 3"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The relative pose of each pair of calibrated cameras that know the vertical, from rays of which many may be wrong.
 
@@ -137,28 +112,22 @@ def estimate_upright(
         gravity2: The vertical in the second camera.
         threshold: Largest Sampson distance of an inlier in radians, at most 0.1: pixels divided by the focal length.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite or of length 0 are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of the entries of [R | t], row by row.
+        **options: See `RansacOptions`.
 
     Returns:
-        [R | t] with |t| = 1; inliers, score, iterations, status (NOT_FINITE also where a vertical has no direction), covariance
-        (12 x 12, of rank 3). The pose carries its derivatives with respect to the inliers and the verticals (see `ransac`).
+        [R | t] with |t| = 1; inliers, support, iterations, status (NOT_FINITE also where a vertical has no direction),
+        covariance (12 x 12, of rank 3). The pose carries its derivatives with respect to the inliers and the verticals
+        (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    batch = request.check(d1=(d1, "n 3"), d2=(d2, "n 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"))
-    request.check_radians()
+    batch = check_door(
+        {"d1": (d1, "n 3"), "d2": (d2, "n 3"), "gravity1": (gravity1, "3"), "gravity2": (gravity2, "3")},
+        threshold,
+        options,
+        radians=True,
+    )
     up1, up2 = (unit_rays(g[..., None, :])[..., 0, :].expand(*batch, 3) for g in (gravity1, gravity2))
     known = torch.isfinite(up1 + up2).all(-1)[..., None]
     down = torch.eye(3, dtype=up1.dtype, device=up1.device)[2]
@@ -166,4 +135,4 @@ def estimate_upright(
     estimator = UprightPoseEstimator(up1, up2, pose_slack(threshold, d1).expand(batch))
     # Without verticals there are no data either.
     rays1 = torch.where(known[..., None], unit_rays(d1), torch.nan)
-    return request.answer(estimator, rays1, unit_rays(d2), dtype=d1.dtype)
+    return estimate_robustly(estimator, rays1, unit_rays(d2), threshold=threshold, dtype=d1.dtype, **options)

@@ -13,11 +13,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
+from torchsfm.linalg import damped_solve
 from torchsfm.motion.epipolar_fit import cross_rows, forms, plane_rows
 from torchsfm.motion.plane_glance import best_triple, plane_errors
-from torchsfm.robust import damped_solve
+from torchsfm.robust import constant_weights
+from torchsfm.robust.hypotheses import squared_residual
 from torchsfm.robust.sampling import draw_samples
-from torchsfm.robust.scoring import squared_residual
 
 _JUDGES = 256
 """How many data to judge planes by before all of them are looked at."""
@@ -116,7 +117,7 @@ def plane_rivals(
     y1, y2, there, bound = x1[row], x2[row], inside[row], limit[row]
     H, on, _ = _on_plane(estimator, model[row], y1, y2, there, bound)
     for _ in range(3):
-        H = plane_estimator.refine(H, y1, y2, weights=on.to(H.dtype))
+        H = plane_estimator.step(H, y1, y2, weigh=constant_weights(on.to(H.dtype)))
         on = there & (plane_estimator.squared_residual(H, y1, y2) < 4 * bound[:, None])
     aside = there & ~on
     count = aside.sum(-1)

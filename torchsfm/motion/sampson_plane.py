@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsfm.motion.epipolar_fit import apply_rows, cross_rows, matrices, one_data_set_for_many, sums_of_products
 from torchsfm.motion.forms_of_models import ONE, Forms, Term
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import Weigh
 
 _TINY = 1e-30
 MANY = 4

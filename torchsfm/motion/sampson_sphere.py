@@ -9,10 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.linalg import damped_solve
 from torchsfm.motion.epipolar_fit import apply_rows, one_data_set_for_many, sums_of_products
 from torchsfm.motion.forms_of_models import ONE, Forms, Term
 from torchsfm.motion.sampson_plane import MANY, infinite_where_positive
-from torchsfm.robust.local_optimisation import Weigh, damped_solve
+from torchsfm.robust import Weigh
 
 _TINY = 1e-30
 

@@ -16,8 +16,9 @@ from torchsfm.motion.epipolar_fit import forms, plane_rows
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.plane_and_parallax import dominant_plane, squared_transfer
 from torchsfm.motion.plane_glance import plane_suspected
+from torchsfm.robust import constant_weights
+from torchsfm.robust.hypotheses import squared_residual
 from torchsfm.robust.sampling import draw_samples
-from torchsfm.robust.scoring import squared_residual
 from torchsfm.tensors.canonical import canonical_frame
 
 _PAIRS, _OFF_PLANE, _RIVALS = 256, 256, 4
@@ -56,7 +57,7 @@ def rivals_of_plane(
     H = [h[row] for h in H]
     plane = HomographyEstimator()
     for _ in range(3):
-        H = [plane.refine(h, x[0], y, weights=on.to(h.dtype)) for h, y in zip(H, x[1:], strict=True)]
+        H = [plane.step(h, x[0], y, weigh=constant_weights(on.to(h.dtype))) for h, y in zip(H, x[1:], strict=True)]
         far = [plane.squared_residual(h, x[0], y) < 4 * limit[:, None] for h, y in zip(H, x[1:], strict=True)]
         on = inside & far[0] & far[1]
     # The points of the plane are in front.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchsfm._types import broadcast_shapes
 from torchsfm.motion.epipolar_fit import forms
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import Weigh
 
 Rows = Sequence[Tensor]
 _TINY = 1e-30

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchsfm._types import broadcast_shapes
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
+from torchsfm.linalg import damped_solve
 from torchsfm.linalg.constants import Constant
-from torchsfm.robust import damped_solve
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import Weigh
 
 _PRODUCTS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)]
 """Products of the coordinates of (X, 1); the last four are (X, 1) itself."""

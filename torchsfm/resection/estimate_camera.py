@@ -1,7 +1,7 @@
 """The pose of a calibrated camera from correspondences with known points, of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,8 +12,7 @@ from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import Request, RobustResult, Score
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.robust.moderation import moderate, moved_and_scaled, present
 
 
@@ -48,29 +47,12 @@ class CameraEstimator:
         """Squared reprojection error; infinite behind the camera."""
         return squared_reprojection(self.K @ model, x, X)
 
-    def residual(
-        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Reprojection error; infinite behind the camera."""
-        return self.squared_residual(model, x, X).sqrt()
-
     def degenerate(self, x: Float[Tensor, "*#batch 3 2"], X: Float[Tensor, "*#batch 3 3"]) -> Bool[Tensor, "*batch"]:
         """Whether two image points coincide."""
         a, b, c = x.unbind(-2)
         return (a == b).all(-1) | (b == c).all(-1) | (c == a).all(-1)
 
-    def refine(
-        self,
-        model: Float[Tensor, "*#batch 3 4"],
-        x: Float[Tensor, "*#batch n 2"],
-        X: Float[Tensor, "*#batch n 3"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on the reprojection error, along the rigid motions."""
-        return self.reweighted_step(model, x, X, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x: Float[Tensor, "*#batch n 2"],
@@ -78,7 +60,7 @@ class CameraEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
-        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        """A Gauss-Newton step on the reprojection error, along the rigid motions."""
         step, batch = camera_step(self.K @ model, 6, x, X, weigh)
         return moved_pose(model, step, batch).to(x.dtype)
 
@@ -87,7 +69,7 @@ class CameraEstimator:
         moved = rotation_exponential(step[..., :3]) @ model
         return torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:, None]), -1)
 
-    def suspect(
+    def may_be_degenerate(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x: Float[Tensor, "*#batch n 2"],
@@ -124,14 +106,7 @@ def estimate_camera(
     K: Float[Tensor, "*#batch 3 3"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The pose of each camera, from correspondences of image points with known points, of which many may be wrong.
 
@@ -144,17 +119,10 @@ def estimate_camera(
         K: Intrinsics, upper triangular with last row (0, 0, 1).
         threshold: Largest reprojection error of an inlier in pixels.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of the pose.
+        **options: See `RansacOptions`.
 
     Returns:
-        The pose `[R | t]`, `X_cam = R X + t`; inliers (in front of the camera), score, iterations, status, degeneracy
+        The pose `[R | t]`, `X_cam = R X + t`; inliers (in front of the camera), support, iterations, status, degeneracy
         (COLLINEAR: all inliers but so few as chance explains are on a line, and the pose may turn about it; PLANAR: they are in
         a plane, which determines the pose, though a second one may fit nearly as well), covariance (6 x 6, of a perturbation
         (w, v) in the camera's frame as in `Pose.retract`). The pose carries its derivatives with respect to the inliers and K
@@ -163,14 +131,10 @@ def estimate_camera(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    batch = request.check(x=(x, "n 2"), X=(X, "n 3"), K=(K, "3 3"))
+    batch = check_door({"x": (x, "n 2"), "X": (X, "n 3"), "K": (K, "3 3")}, threshold, options)
     dtype = x.dtype
     x, X, K = x.double(), X.double(), K.double()
-    Y, centre, size = moderate(X, present(mask, x, X))
+    Y, centre, size = moderate(X, present(options.get("mask"), x, X))
     focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt().detach()
     focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
     # Pixels from the principal point, in focal lengths.
@@ -186,7 +150,9 @@ def estimate_camera(
     # [R | t] <- exp(w) [R | t] + [0 | v] in the scaled world is the same in the world, with v scaled back.
     unit = torch.cat((torch.ones_like(centre), size[..., None].expand_as(centre)), -1)
     estimator = CameraEstimator(intrinsics.expand(*batch, 3, 3))
-    return request.answer(estimator, y, Y, dtype=dtype, scale=1 / focal, back=back, step_unit=unit)
+    return estimate_robustly(
+        estimator, y, Y, threshold=threshold, dtype=dtype, scale=1 / focal, back=back, step_unit=unit, **options
+    )  # fmt: skip
 
 
 def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:

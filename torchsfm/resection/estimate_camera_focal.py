@@ -1,7 +1,7 @@
 """Pose and focal length of a camera from correspondences with known points, of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,8 +13,7 @@ from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
 from torchsfm.resection.estimate_camera import world_pose
-from torchsfm.robust import Request, RobustResult, Score
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.robust.moderation import middle_and_size, moderate, moved_and_scaled, present
 
 
@@ -45,30 +44,13 @@ class FocalCameraEstimator:
         """Squared reprojection error; infinite behind the camera."""
         return squared_reprojection(model, x, X)
 
-    def residual(
-        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Reprojection error; infinite behind the camera."""
-        return self.squared_residual(model, x, X).sqrt()
-
     def degenerate(self, x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]) -> Bool[Tensor, "*batch"]:
         """Whether two image points coincide."""
         pairs = [(i, j) for i in range(4) for j in range(i)]
         same = torch.stack([(x[..., i, :] == x[..., j, :]).all(-1) for i, j in pairs])
         return same.any(0).expand(torch.broadcast_shapes(same.shape[1:], X.shape[:-2]))  # type: ignore[no-untyped-call]
 
-    def refine(
-        self,
-        model: Float[Tensor, "*#batch 3 4"],
-        x: Float[Tensor, "*#batch n 2"],
-        X: Float[Tensor, "*#batch n 3"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on the reprojection error over pose and logarithm of the focal length."""
-        return self.reweighted_step(model, x, X, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x: Float[Tensor, "*#batch n 2"],
@@ -76,7 +58,7 @@ class FocalCameraEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
-        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        """A Gauss-Newton step on the reprojection error over pose and logarithm of the focal length."""
         step, batch = camera_step(model, 7, x, X, weigh)
         f, pose = _split(model.double())
         zoomed = f * step[:, 6, 0].clamp(-1, 1).exp().view(batch)
@@ -89,7 +71,7 @@ class FocalCameraEstimator:
         moved = torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:6, None]), -1)
         return _join(f * step[..., 6].exp(), moved)
 
-    def suspect(
+    def may_be_degenerate(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x: Float[Tensor, "*#batch n 2"],
@@ -138,14 +120,7 @@ def estimate_camera_focal(
     c: Float[Tensor, "*#batch 2"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The camera of each image, its focal length included, from correspondences of which many may be wrong.
 
@@ -158,18 +133,11 @@ def estimate_camera_focal(
         c: Principal points in pixels (the middle of the image, if nothing better is known).
         threshold: Largest reprojection error of an inlier in pixels.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of pose and focal length.
+        **options: See `RansacOptions`.
 
     Returns:
         Cameras `P = K [R | t]` with `K = ((f, 0, c_x), (0, f, c_y), (0, 0, 1))`, which `krt_from_camera` takes apart; inliers
-        (in front of the camera), score, iterations, status, degeneracy (COLLINEAR; PLANAR: all inliers in a plane, which
+        (in front of the camera), support, iterations, status, degeneracy (COLLINEAR; PLANAR: all inliers in a plane, which
         determines the focal length the better the more it is tilted, and not at all where it faces the camera), covariance
         (7 x 7, of (w, v) in the camera's frame as in `Pose.retract` and log f). The cameras carry their derivatives with
         respect to the inliers and c (see `ransac`).
@@ -177,14 +145,10 @@ def estimate_camera_focal(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    request.check(x=(x, "n 2"), X=(X, "n 3"), c=(c, "2"))
+    check_door({"x": (x, "n 2"), "X": (X, "n 3"), "c": (c, "2")}, threshold, options)
     dtype = x.dtype
     x, X, c = x.double(), X.double(), c.double()
-    usable = present(mask, x, X)
+    usable = present(options.get("mask"), x, X)
     Y, centre, size = moderate(X, usable)
     offset = (x - c[..., None, :]).detach()
     both = None if usable is None else torch.cat((usable, usable), -1)
@@ -200,4 +164,6 @@ def estimate_camera_focal(
     y = moved_and_scaled(x, c, radius)
     # Where it is not finite there are no data, but the zeros in place of a camera are to stay finite.
     origin = torch.where(torch.isfinite(c), c, 0.0)
-    return request.answer(FocalCameraEstimator(), y, Y, dtype=dtype, scale=1 / radius, back=back, step_unit=unit)
+    return estimate_robustly(
+        FocalCameraEstimator(), y, Y, threshold=threshold, dtype=dtype, scale=1 / radius, back=back, step_unit=unit, **options
+    )  # fmt: skip

@@ -1,20 +1,19 @@
 """An uncalibrated camera from correspondences with known points, of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg import nullspace_rows
+from torchsfm.linalg import damped_solve, nullspace_rows
 from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._focal import incidence_rows
 from torchsfm.resection._reprojection_step import normal_equations, squared_reprojection
-from torchsfm.robust import Request, RobustResult, Score, damped_solve
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.robust.moderation import moderate, present
 
 _CHUNK = 4096
@@ -57,30 +56,13 @@ class ProjectiveCameraEstimator:
         """Squared reprojection error; infinite behind the camera."""
         return squared_reprojection(model, x, X)
 
-    def residual(
-        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Reprojection error; infinite behind the camera."""
-        return self.squared_residual(model, x, X).sqrt()
-
     def degenerate(self, x: Float[Tensor, "*#batch 6 2"], X: Float[Tensor, "*#batch 6 3"]) -> Bool[Tensor, "*batch"]:
         """Whether two image points coincide."""
         pairs = [(i, j) for i in range(6) for j in range(i)]
         same = torch.stack([(x[..., i, :] == x[..., j, :]).all(-1) for i, j in pairs])
         return same.any(0).expand(torch.broadcast_shapes(same.shape[1:], X.shape[:-2]))  # type: ignore[no-untyped-call]
 
-    def refine(
-        self,
-        model: Float[Tensor, "*#batch 3 4"],
-        x: Float[Tensor, "*#batch n 2"],
-        X: Float[Tensor, "*#batch n 3"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on the reprojection error over the entries of P, across P itself."""
-        return self.reweighted_step(model, x, X, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x: Float[Tensor, "*#batch n 2"],
@@ -88,7 +70,7 @@ class ProjectiveCameraEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
-        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        """A Gauss-Newton step on the reprojection error over the entries of P, across P itself."""
         S, batch = normal_equations(model, x, X, weigh)
         A, p = S[..., :12], model.double().expand(*batch, 3, 4).reshape(-1, 12, 1)
         # The scale is free: hold it, in units of the rest.
@@ -102,7 +84,7 @@ class ProjectiveCameraEstimator:
         moved = UnitSphere(12).retract(model.flatten(-2), step)
         return moved.reshape(*moved.shape[:-1], 3, 4)
 
-    def suspect(
+    def may_be_degenerate(
         self,
         model: Float[Tensor, "*#batch 3 4"],
         x: Float[Tensor, "*#batch n 2"],
@@ -171,14 +153,7 @@ def estimate_camera_projective(
     X: Float[Tensor, "*#batch n 3"],
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
-    mask: Bool[Tensor, "*#batch n"] | None = None,
-    scores: Float[Tensor, "*#batch n"] | None = None,
-    weights: Float[Tensor, "*#batch n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 10_000,
-    covariance: bool = False,
+    **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
     """The uncalibrated 3x4 camera of each image, from correspondences of which many may be wrong.
 
@@ -190,29 +165,18 @@ def estimate_camera_projective(
         X: The points in the world.
         threshold: Largest reprojection error of an inlier in pixels.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
-        mask: Which correspondences exist. Rows that are not finite are left out too.
-        scores: How much each correspondence can be trusted, the larger the more, in any unit: the samples then favour the best.
-        weights: For how many correspondences each one counts, 0 for absent.
-        score: How models are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having drawn a sample without outliers.
-        max_iterations: Most samples to draw.
-        covariance: Compute the covariance of the entries of P, row by row.
+        **options: See `RansacOptions`.
 
     Returns:
-        Cameras with `|P[2, :3]| = 1` and inliers at positive third coordinates; inliers, score, iterations, status, degeneracy
-        (COLLINEAR, PLANAR: neither determines the camera), covariance (12 x 12, of rank 11). The cameras carry their
+        Cameras with `|P[2, :3]| = 1` and inliers at positive third coordinates; inliers, support, iterations, status,
+        degeneracy (COLLINEAR, PLANAR: neither determines the camera), covariance (12 x 12, of rank 11). The cameras carry their
         derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    request = Request(
-        threshold=threshold, mask=mask, scores=scores, weights=weights, score=score, generator=generator,
-        confidence=confidence, max_iterations=max_iterations, covariance=covariance,
-    )  # fmt: skip
-    request.check(x=(x, "n 2"), X=(X, "n 3"))
-    usable = present(mask, x, X)
+    check_door({"x": (x, "n 2"), "X": (X, "n 3")}, threshold, options)
+    usable = present(options.get("mask"), x, X)
     y, middle, radius = moderate(x.double(), usable)
     Y, centre, size = moderate(X.double(), usable)
 
@@ -222,4 +186,6 @@ def estimate_camera_projective(
         third = torch.linalg.vector_norm(P[..., 2:, :3], dim=-1, keepdim=True)
         return P / torch.where(third > 0, third, 1.0)
 
-    return request.answer(ProjectiveCameraEstimator(), y, Y, dtype=x.dtype, scale=1 / radius, back=back)
+    return estimate_robustly(
+        ProjectiveCameraEstimator(), y, Y, threshold=threshold, dtype=x.dtype, scale=1 / radius, back=back, **options
+    )  # fmt: skip

@@ -13,6 +13,7 @@ from torchsfm.resection.camera_pnp import camera_pnp
 from torchsfm.resection.estimate_camera import estimate_camera
 from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
 from torchsfm.resection.refine_camera import refine_camera
+from torchsfm.robust import constant_weights
 from torchsfm.robust.moderation import middle_and_size
 
 _STEPS = 8
@@ -129,7 +130,7 @@ def _uncalibrated(x: Tensor, X: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
 
     value = cost(P)
     for _ in range(_STEPS):
-        new = estimator.refine(P, y, Y, weights=use.to(y.dtype))
+        new = estimator.step(P, y, Y, weigh=constant_weights(use.to(y.dtype)))
         after = cost(new)
         better = after <= value * (1 + 1e-12)
         P, value = torch.where(better[..., None, None], new, P), torch.where(better, after, value)

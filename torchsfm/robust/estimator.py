@@ -1,13 +1,30 @@
-"""What robust estimation needs to know of a problem, and nothing more."""
+"""What robust estimation needs to know of a problem, and nothing more.
 
+`Estimator` is all that a problem must bring. `NeverZero`, `Differentiable`, `Diagnosed` and `WithAlternatives` say what it may
+bring besides, each by a few members; an estimator that has them is asked.
+"""
+
+from collections.abc import Callable
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
 
 M = TypeVar("M")
+
+Weigh = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""From squared distances `(*batch, n)` to the weights of the data and to the curvature of their losses.
+
+For a loss rho(r^2) the weight is rho' and the curvature the mean over the directions of r of rho' + 2 rho'' r r', at least 0:
+the gradient takes the one, the Hessian the other. A step that takes the weights for both goes the same way, more slowly.
+"""
+
+
+def constant_weights(weights: Float[Tensor, "*#batch n"]) -> Weigh:
+    """The weights of a step of least squares: they do not depend on the distances; 0 for data to leave out."""
+    return lambda _: (weights, weights)
 
 
 @runtime_checkable
@@ -19,33 +36,9 @@ class Estimator(Protocol[M]):
     problems at hand. A model is one tensor or a frozen dataclass of tensors.
 
     All methods work on any leading batch dimensions, which broadcast between models, data and fields, and treat each element on
-    its own. Nothing here may raise on bad values.
+    its own. Nothing here may raise on bad values. Data and models come in float64, and in the type of scoring.
 
     The signatures below are as wide as they are so that implementations can name their data.
-
-    An implementation may also define
-
-    - `never_zero: ClassVar[bool]`: True if a model of zeros alone is none, as for what is homogeneous or holds a rotation. Such
-      models, as those that are not finite, agree with no data, whatever the residual makes of them;
-    - `squared_residual(model, *data)`: the square of `residual`, where that is cheaper;
-    - `reweighted_step(model, *data, weigh)`: a step as `refine` does it, with weights that follow from the distances:
-      `weigh(squared) -> (weights, curvature)`, all `(*batch, n)`. The weights belong in the gradient, the curvature stands in
-      their place in the Hessian (see `local_optimisation.Weigh`). Distances and step have most of their arithmetic in common,
-      and the curvature saves steps;
-    - `traceable: ClassVar[bool]`: False if distances and steps cannot be traced with symbolic sizes, and so not be compiled
-      (`compile_kernels`): if they look at the values of tensors, take Python integers of sizes, or call what is no operation of
-      PyTorch. Constant tensors may be kept from one call to the next;
-    - `dimension: ClassVar[int]` and `retract(model, step)`: the model moved by a step `(*batch, dimension)` along its manifold,
-      smooth in the step, `retract(model, 0) == model`. They give refined models derivatives and covariance, for which
-      `residual` (or its square) must be differentiable with respect to the model and the data;
-    - `rivals(model, *data, inside, threshold, seed)`: `Solutions` `(*batch, k)` that samples are unlikely to lead to, given the
-      best model `(*batch, ...)`, from the data where `inside (*batch, n)` (the others of a plane that won, ...);
-    - `degeneracy(model, *data, inliers, threshold, chance)`: a `Degeneracy` `(*batch)` as int8 for models `(*batch, ...)` with
-      their `inliers (*batch, n)`, `threshold (*batch)`, and how many inliers `chance (*batch)` explains. Where no sample
-      determined a model, `inliers` are all data and the model is zero;
-    - `suspect(model, *data, inliers, threshold, chance)`: `(*batch)`, from some of the data that are spread over all, whether
-      `degeneracy` or `rivals` could find anything, for models that samples determined: they are asked about no others. Most
-      problems should be clear at a glance.
     """
 
     sample_size: ClassVar[int]
@@ -59,17 +52,93 @@ class Estimator(Protocol[M]):
         """The models through minimal samples: tensors `(*batch, m, d)` -> `(*batch, slots, ...)`."""
         ...
 
-    def residual(self, model: M, *data: Any, **options: Any) -> Float[Tensor, "*batch n"]:
-        """The distance of every datum to the model: unsquared, in the unit of the threshold."""
-        ...
-
     def degenerate(self, *sample: Any, **options: Any) -> Bool[Tensor, "*batch"]:
         """Whether a sample is not worth solving: it determines no model, or none that could be right."""
         ...
 
-    def refine(self, model: M, *data: Any, **weights: Any) -> M:
-        """One Gauss-Newton step from a model on the sum of `weights` times squared residuals, along the model's own manifold.
+    def squared_residual(self, model: M, *data: Any, **options: Any) -> Float[Tensor, "*batch n"]:
+        """The squared distance of every datum to the model, in the squared unit of the threshold."""
+        ...
 
-        Called as `refine(model, *data, weights=weights)` with weights `(*batch, n)`, 0 for data to leave out.
+    def step(self, model: M, *data: Any, **options: Any) -> M:
+        """One Gauss-Newton step from a model on the sum of robust losses, along the model's own manifold.
+
+        Called as `step(model, *data, weigh=weigh)`: `weigh(squared_residual)` says what the data count (see `Weigh`). Distances
+        and step have most of their arithmetic in common, so the step asks for the weights when it has the distances.
         """
         ...
+
+
+@runtime_checkable
+class NeverZero(Protocol):
+    """An estimator of which a model of zeros alone is none, as of what is homogeneous or holds a rotation.
+
+    Such models, as those that are not finite, agree with no data, whatever the residual makes of them.
+    """
+
+    never_zero: ClassVar[bool]
+    """True."""
+
+
+@runtime_checkable
+class Differentiable(Protocol):
+    """An estimator that says how its models move: refined models then carry derivatives, and a covariance if asked for.
+
+    The squared residual must be differentiable with respect to the model and the data.
+    """
+
+    dimension: ClassVar[int]
+    """Of the manifold of the models."""
+
+    def retract(self, model: Any, step: Any, /) -> Any:
+        """The model moved by a step `(*batch, dimension)` along its manifold, smooth in the step; by 0 it stays."""
+        ...
+
+
+@runtime_checkable
+class Diagnosed(Protocol):
+    """An estimator that can tell when data agree on a model and yet leave it open."""
+
+    def may_be_degenerate(self, model: Any, *data: Any, **options: Any) -> Bool[Tensor, "*batch"]:
+        """Whether a closer look could find anything, judging by a part of the data that is spread over all.
+
+        Called as `degeneracy` is, for models that samples determined. Most problems should be clear at a glance: those it calls
+        clear are not looked at again, neither for degeneracy nor for alternatives.
+        """
+        ...
+
+    def degeneracy(self, model: Any, *data: Any, **options: Any) -> Int[Tensor, "*batch"]:
+        """A `Degeneracy` as int8 for each model.
+
+        Called as `degeneracy(model, *data, inliers=, threshold=, chance=)` with models `(*batch, ...)`, their inliers
+        `(*batch, n)`, thresholds `(*batch)`, and how many inliers `chance (*batch)` explains. Where no sample determined a
+        model, the inliers are all data and the model is zero.
+        """
+        ...
+
+
+@runtime_checkable
+class WithAlternatives(Diagnosed, Protocol):
+    """An estimator that knows better models where samples are unlikely to lead, as those of data mostly in a plane."""
+
+    def alternative_models(self, model: Any, *data: Any, **options: Any) -> Solutions[Any]:
+        """Such models, `(*batch, k)`, given the best one so far, `(*batch, ...)`.
+
+        Called as `alternative_models(model, *data, inside=, threshold=, seed=)`; data that exist are `inside (*batch, n)`.
+        """
+        ...
+
+
+def check_estimator(estimator: object) -> None:
+    """Refuse what lacks a member that every estimator must have.
+
+    Raises:
+        ValueError: It names all that is missing.
+    """
+    if isinstance(estimator, Estimator) and not isinstance(estimator, type):
+        return
+    wanted = ("sample_size", "max_solutions", "codimension", "minimal", "degenerate", "squared_residual", "step")
+    missing = [name for name in wanted if name not in dir(estimator)]
+    if isinstance(estimator, type):
+        raise ValueError(f"estimator: wanted an object, got the class {estimator.__name__}")
+    raise ValueError(f"estimator: {type(estimator).__name__} lacks {', '.join(missing)} (see `Estimator`)")

@@ -1,58 +1,53 @@
-"""Hypotheses: models through random samples, and the few of them that more and more of the data support."""
+"""Hypotheses: models through samples of the data, and the few of them that more and more of the data support."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
-from torchsfm.robust.models import cast, take_slots
+from torchsfm.linalg.fused import fused
+from torchsfm.robust.estimator import Estimator, NeverZero
+from torchsfm.robust.models import cast, take_slots, tensors_of
 from torchsfm.robust.problems import Problems
-from torchsfm.robust.sampling import draw_samples, draw_weighted, prosac_pools
-from torchsfm.robust.scores import Score, counted
-from torchsfm.robust.scoring import gather_valid, losses, smallest, stages
+from torchsfm.robust.samplers import Sampler
+from torchsfm.robust.scoring import Scoring
 
-OPTIMISED = 2
-"""Hypotheses of a round that are optimised locally."""
+M = TypeVar("M")
+
+NUMBERS = {True: 1 << 17, False: 1 << 24}
+"""How many distances to compute at a time, on a CPU and elsewhere."""
+PREFIXES = (64, 256, 1024)
+"""Numbers of data on which hypotheses are judged before all data are looked at."""
+KEPT = (16, 8, 4)
+"""The fewest hypotheses that are kept after each."""
+SHARE = 64
+"""Of how many hypotheses one is kept after the first."""
 
 
-def hypotheses(
-    fine: Problems,
-    part: Int[Tensor, "g"],
-    drawn: Int[Tensor, "g"],
-    size: int,
-    seed: int,
-    among: tuple[Int[Tensor, "g width"], Int[Tensor, "g size"]] | None = None,
-) -> tuple[Any, Bool[Tensor, "g size slots"]]:
-    """The models through random samples of some of the problems.
+def solve_samples(
+    fine: Problems, part: Int[Tensor, "g"], drawn: Int[Tensor, "g"], number: int, seed: int, sampler: Sampler
+) -> tuple[Any, Bool[Tensor, "g number slots"]]:
+    """The models through samples of some of the problems, and which slots hold any.
 
     Args:
         fine: All problems.
         part: Which of them to draw for.
         drawn: How many samples each had before.
-        size: How many to draw.
-        seed: The seed.
-        among: An order of the data, and from how many of the first to draw each sample; as the problems want it if not given.
+        number: How many to draw.
+        seed: Seed of the whole call.
+        sampler: Draws.
     """
-    m, count, newest = fine.estimator.sample_size, fine.count[part], None
-    if among is None and fine.ranking is not None and fine.growth is not None:
-        pool, newest = prosac_pools(count, fine.growth[part], drawn, size, m)
-        among = fine.ranking[part], pool
-    if among is not None:
-        index = draw_samples(seed, count, drawn, size, m, among[1], newest)
-        index = among[0].gather(1, index.flatten(1)).view_as(index)
-    elif fine.weight is not None:
-        index = draw_weighted(seed, fine.weight[part], count, drawn, size, m)
-    else:
-        index = draw_samples(seed, count, drawn, size, m)
+    index = sampler.draw(fine, part, drawn, number, seed)
+    m = fine.estimator.sample_size
     # Coordinate, position in the sample, problem, sample: as solvers want it, who have the batch last.
     flat = (index + part[:, None, None] * fine.width).transpose(0, 1).flatten()
     sample = []
     for d in fine.data:
         picked = d.permute(2, 0, 1).flatten(1).index_select(1, flat)
-        sample.append(picked.view(-1, m, len(part), size).permute(2, 3, 1, 0))
+        sample.append(picked.view(-1, m, len(part), number).permute(2, 3, 1, 0))
     estimator = tensor_map(lambda t: t[part, None], fine.estimator)
     solutions = estimator.minimal(*sample)
     return solutions.model, solutions.valid & ~estimator.degenerate(*sample)[..., None]
@@ -61,35 +56,122 @@ def hypotheses(
 def sift(
     coarse: Problems,
     models: Any,
-    valid: Bool[Tensor, "g size slots"],
-    score: Score,
-    dtype: torch.dtype,
-    plan: Sequence[tuple[int, int]] | None = None,
+    valid: Bool[Tensor, "g number slots"],
+    scoring: Scoring,
+    plan: Sequence[tuple[int, int]],
+    kept: int,
 ) -> tuple[Any, Float[Tensor, "g kept"], Bool[Tensor, "g"]]:
-    """The best models and their losses, best first, found by way of ever larger parts of the data.
+    """The best models and their losses, best first, found by way of ever larger parts of the data; and whether there was any.
 
     Args:
         coarse: The problems.
         models: Their hypotheses.
         valid: Which of these are any.
-        score: How to compare.
-        dtype: In which precision.
-        plan: On how many data to compare, and how many to keep, stage by stage; all data at last, and the few to be optimised,
-            if not given.
+        scoring: How to compare.
+        plan: On how many data to compare, and how many to keep, stage by stage.
+        kept: How many to keep in the end.
     """
     wide, slots = coarse.spread(), valid.shape[-1]
-    kept = OPTIMISED if plan is None else plan[-1][1]
-    plan = plan or stages(coarse.width, valid.shape[1] * slots)
     index, there = gather_valid(valid.flatten(1), kept)
     row = torch.arange(len(index), device=index.device)[:, None]
-    models = cast(tensor_map(lambda t: t[row, index // slots, index % slots], models), dtype)
+    models = cast(tensor_map(lambda t: t[row, index // slots, index % slots], models), coarse.limit.dtype)
     loss = there
     for number, keep in plan:
         data = [d[:, :, :number] for d in wide.data]
-        counts = counted(coarse.inside, coarse.weight, number)
-        loss = losses(wide.estimator, models, data, coarse.limit, counts, score)
+        counts = coarse.counts[:, :number] if coarse.weight is not None or number == coarse.width else None
+        loss = losses(wide.estimator, models, data, coarse.limit, counts, scoring)
         loss = torch.where(there, loss, torch.inf)
         chosen = smallest(loss, keep)
         loss = loss.gather(1, chosen)
         models, there = take_slots(models, chosen), there.gather(1, chosen)
     return tensor_map(lambda t: t[:, :kept], models), loss[:, :kept], there[:, 0]
+
+
+def stages(width: int, slots: int) -> list[tuple[int, int]]:
+    """On how many data `slots` models are scored, stage by stage, and how many of the models are kept each time."""
+    plan = []
+    for level, (prefix, fewest) in enumerate(zip(PREFIXES, KEPT, strict=True)):
+        keep = max(fewest, slots // SHARE) if level == 0 else fewest
+        if 2 * prefix <= width and keep < slots:
+            plan.append((prefix, keep))
+            slots = keep
+    return [*plan, (width, KEPT[-1])]
+
+
+def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#batch n _"]) -> Float[Tensor, "*batch n"]:
+    """The squared distance of data to models of as many batch dimensions: infinite or no number where a model is none."""
+    return estimator.squared_residual(_no_numbers_for_none(estimator, model, data[0].ndim - 2), *data)
+
+
+def _no_numbers_for_none(estimator: Estimator[M], model: M, dims: int) -> M:
+    """NaN in the place of what is no model: not finite, or zero where the estimator says that this is none."""
+    with torch.no_grad():
+        parts = [
+            torch.linalg.vector_norm(t.flatten(dims) if t.ndim > dims else t[..., None], dim=-1) for t in tensors_of(model)
+        ]
+        size = parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
+        # 1, but 0 / 0 or inf / inf; or 0, but inf - inf.
+        one = size / size if isinstance(estimator, NeverZero) else size - size + 1
+    return tensor_map(lambda t: t * one.reshape(one.shape + (1,) * (t.ndim - dims)), model)
+
+
+def losses(
+    estimator: Estimator[M],
+    models: M,
+    data: Sequence[Tensor],
+    limit: Float[Tensor, "g"],
+    counts: Tensor | None,
+    scoring: Scoring,
+) -> Float[Tensor, "g s"]:
+    """The cost of `s` models of each problem, computed in portions that stay in the cache.
+
+    Args:
+        estimator: The problem, with a dimension of size 1 for the models.
+        models: `(g, s, ...)`.
+        data: `(g, 1, n, d)` each.
+        limit: Squared threshold.
+        counts: What the data count, `(g, n)`: a boolean or a weight; all alike if not given.
+        scoring: How models are compared.
+    """
+    (first, *_) = tensors_of(models)
+    g, s = first.shape[:2]
+    each = s * data[0].shape[-2]
+    portion = max(1, NUMBERS[first.device.type == "cpu"] // max(each, 1))
+    if portion >= g > 0 or _costs.compiles(estimator):
+        return _costs(estimator, models, data, limit, counts, scoring)
+    rows = []
+    for i in range(0, g, portion):
+        some = slice(i, i + portion)
+        own, of, at, edge, part = tensor_map(lambda t: t[some], (estimator, models, tuple(data), limit, counts))  # noqa: B023
+        rows.append(_costs(own, of, at, edge, part, scoring))
+    return torch.cat(rows) if rows else limit.new_zeros(g, s)
+
+
+@fused("g 1", "g s", "g 1 n", "g", "g n")
+def _costs(
+    estimator: Estimator[Any], models: Any, data: Sequence[Tensor], limit: Tensor, counts: Tensor | None, scoring: Scoring
+) -> Tensor:
+    return scoring.cost(squared_residual(estimator, models, *data), limit, counts, estimator.codimension)
+
+
+def smallest(loss: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]:
+    """The models with the smallest losses, best first.
+
+    Of models that are equal but for rounding the first: else the number of columns, which is that of the fullest row, decides,
+    and nonsense, of which nothing agrees with anything, feels its neighbours.
+    """
+    columns = loss.shape[-1]
+    later = torch.arange(columns, device=loss.device, dtype=loss.dtype).mul_(torch.finfo(loss.dtype).eps).add_(1)
+    return (loss * later).topk(min(number, columns), dim=-1, largest=False).indices
+
+
+def gather_valid(valid: Bool[Tensor, "g s"], least: int) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:
+    """Where the valid slots of each row are, in as few columns as the fullest row needs or `least`, and which are filled."""
+    g, slots = valid.shape
+    rank = valid.cumsum(-1)
+    columns = max(int(rank[:, -1].max()) if valid.numel() else 0, least)
+    index = torch.zeros(g, columns + 1, dtype=torch.long, device=valid.device)
+    position = torch.where(valid, rank - 1, columns)
+    index.scatter_(1, position, torch.arange(slots, device=valid.device).expand(g, slots))
+    filled = torch.arange(columns, device=valid.device) < rank[:, -1:]
+    return index[:, :columns], filled

@@ -14,11 +14,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_options, check_tensors, tensor_map
-from torchsfm.robust.estimator import Estimator
+from torchsfm._types import Status, check_options, tensor_map
+from torchsfm.robust.estimator import Estimator, constant_weights
+from torchsfm.robust.hypotheses import solve_samples, squared_residual
 from torchsfm.robust.models import cast, join, tensors_of
-from torchsfm.robust.scoring import squared_residual
-from torchsfm.robust.soft_selection import uniform_numbers
+from torchsfm.robust.problems import Flat, Problems, pack
+from torchsfm.robust.samplers import Neighbours
+from torchsfm.robust.sampling import draw_seed
 
 M = TypeVar("M")
 
@@ -92,9 +94,7 @@ def find_structures(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    if not data:
-        raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
-    check_options(estimator=(estimator, Estimator))
+    flat = Flat.of(estimator, data, threshold, mask)
     m = estimator.sample_size
     smallest = m + 4 if smallest is None else smallest
     check_options(
@@ -103,75 +103,51 @@ def find_structures(
         hypotheses=(hypotheses, "int >= 1"),
         kept=(kept, "int >= 1"),
     )
-    known = {f"data[{i}]": (d, f"n d{i}") for i, d in enumerate(data)}
-    limit = threshold if isinstance(threshold, Tensor) else None
-    if limit is None:
-        check_options(threshold=(threshold, "float > 0"))
-    batch = check_tensors(**known, threshold=(limit, "?"), mask=(mask, "?n: bool"))
-    limit = data[0].new_tensor(threshold) if limit is None else limit
-    dtype, device, n, p = data[0].dtype, data[0].device, data[0].shape[-2], batch.numel()
-    seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
+    dtype, seed = data[0].dtype, draw_seed(generator)
     with torch.no_grad():
-        flat = [d.detach().double().expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
-        own = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
-        own = cast(own, torch.float64)
-        bound = limit.double().expand(batch).reshape(p)
-        exists = torch.ones(p, n, dtype=torch.bool, device=device)
-        exists = exists if mask is None else mask.expand(*batch, n).reshape(p, n)
-        usable = exists
-        for d in flat:
-            usable = usable & torch.isfinite(d).all(-1)
-        enough = (usable.sum(-1) >= m) & torch.isfinite(bound) & (bound > 0)
-        status = torch.full((p,), int(Status.NOT_FINITE), dtype=torch.int8, device=device)
-        status[exists.sum(-1) < m] = int(Status.TOO_FEW)
-        label = torch.full((p, n), -1, dtype=torch.long, device=device)
-        found = torch.zeros(p, dtype=torch.long, device=device)
-        model = _empty(own, flat, p, slots)
-        for i in enough.nonzero()[:, 0].tolist():
-            inside = usable[i]
-            fields = tensor_map(lambda t: t[i : i + 1], own)  # noqa: B023
-            problem = _Problem(fields, [d[i][inside][None] for d in flat], bound[i : i + 1] ** 2)
-            groups, models, solved = problem.solve(seed, hypotheses, kept, smallest)
-            number = 0 if models is None else int(groups.max()) + 1
-            label[i, inside] = torch.where(groups < slots, groups, -1)
-            found[i] = number
-            status[i] = int(Status.OK if number else Status.NO_CONSENSUS if solved else Status.DEGENERATE)
-            if models is not None:
-                at = torch.arange(slots, device=device).clamp(max=number - 1)
-                for all_, own_ in zip(tensors_of(model), tensors_of(models), strict=True):
-                    all_[i] = own_[at]
-        valid = torch.arange(slots, device=device) < found[:, None]
-        return Structures(
-            tensor_map(lambda t: t.to(dtype).reshape(batch + t.shape[1:]), model),
-            valid.reshape(*batch, slots), label.reshape(*batch, n), found.reshape(batch), status.reshape(batch),
-        )  # fmt: skip
-
-
-def _empty(estimator: Estimator[M], data: list[Tensor], p: int, slots: int) -> M:
-    """Zero models of the right shape."""
-    sample = [d.new_zeros(1, estimator.sample_size, d.shape[-1]) for d in data]
-    fields = tensor_map(lambda t: t[:1] if p else t.new_ones(1, *t.shape[1:]), estimator)
-    shape = fields.minimal(*sample).model
-    return tensor_map(lambda t: t.new_zeros(p, slots, *t.shape[2:]), shape)
+        flat = cast(tensor_map(Tensor.detach, flat), torch.float64)
+        p, n = flat.shape
+        usable = flat.usable()
+        enough = torch.isfinite(flat.bound) & (flat.bound > 0)
+        enough = enough & (n >= m if usable is None else usable.sum(-1) >= m)
+        model, status = flat.no_models(slots), flat.refused()
+        label = torch.full((p, n), -1, device=flat.bound.device)
+        found = torch.zeros_like(label[:, 0])
+        for problems in pack(flat, usable, enough):
+            for i, member in enumerate(problems.member.tolist()):
+                one = problems.take(torch.tensor([i], device=label.device))
+                one = one.narrowed(int(one.count))
+                groups, models, solved = _Problem(one).solve(seed, hypotheses, kept, smallest)
+                number = 0 if models is None else int(groups.max()) + 1
+                label[member] = one.scatter(torch.where(groups < slots, groups, -1)[None], n, -1)[0]
+                found[member] = number
+                status[member] = int(Status.OK if number else Status.NO_CONSENSUS if solved else Status.DEGENERATE)
+                if models is not None:
+                    at = torch.arange(slots, device=label.device).clamp(max=number - 1)
+                    for all_, own in zip(tensors_of(model), tensors_of(models), strict=True):
+                        all_[member] = own[at]
+        valid = torch.arange(slots, device=label.device) < found[:, None]
+        return flat.unflatten(cast(Structures(model, valid, label, found, status), dtype))
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """One problem, with a batch dimension of size 1: estimator, data (1, n, d), squared threshold (1)."""
+    """One problem, its data in as many slots."""
 
-    estimator: Any
-    data: list[Tensor]
-    limit: Tensor
+    problems: Problems
 
     @property
     def count(self) -> int:
-        return self.data[0].shape[1]
+        return self.problems.width
 
     def solve(self, seed: int, hypotheses: int, kept: int, smallest: int) -> tuple[Tensor, Any, bool]:
         """The group of each datum, largest first, -1 for none; the groups' models, if any; whether samples had solutions."""
-        nothing = torch.full((self.count,), -1, dtype=torch.long, device=self.limit.device)
-        models = self.hypotheses(seed, hypotheses)
-        if len(tensors_of(models)[0]) == 0:
+        device = self.problems.count.device
+        nothing = torch.full((self.count,), -1, device=device)
+        zero = torch.zeros(1, dtype=torch.long, device=device)
+        models, valid = solve_samples(self.problems, zero, zero, hypotheses, seed, Neighbours(_NEIGHBOURS))
+        models = tensor_map(lambda t: t[valid], models)
+        if not bool(valid.any()):
             return nothing, None, False
         models = self.best(models, kept)
         ratio = self.ratios(models)
@@ -187,57 +163,20 @@ class _Problem:
         models = self.refined(models, ratio, inside)
         return self.joined(models, inside)
 
-    def hypotheses(self, seed: int, number: int) -> Any:
-        """Models through samples of neighbours and of all data."""
-        n, m, device = self.count, self.estimator.sample_size, self.limit.device
-        parts = []
-        for d in self.data:
-            spread = d[0].std(0, correction=0).norm()
-            parts.append(d[0] / torch.where(spread > 0, spread, 1))
-        place = torch.cat(parts, -1)
-        most = min(max(_NEIGHBOURS), n - 1)
-        near = []
-        for i in range(0, n, 512):
-            # The datum itself is its own nearest neighbour, or as near as any.
-            gap = torch.cdist(place[i : i + 512], place, compute_mode="donot_use_mm_for_euclid_dist")
-            row = torch.arange(len(gap), device=device)
-            gap[row, row + i] = torch.inf
-            near.append(gap.topk(most, largest=False).indices)
-        nearest = torch.cat(near)
-        samples = []
-        share = -(-number // (len(_NEIGHBOURS) + 1))
-        for level, k in enumerate((*_NEIGHBOURS, n - 1)):
-            random = uniform_numbers(seed + level, share, min(k, n - 1) + 1, device)
-            first = (random[:, 0] * n).long()
-            if k >= n - 1:
-                # Anything but the first.
-                others = random[:, 1:].topk(m - 1, dim=-1).indices
-                others = others + (others >= first[:, None])
-            else:
-                order = random[:, 1 : max(k, m - 1) + 1].topk(m - 1, dim=-1).indices
-                others = nearest[first[:, None], order]
-            samples.append(torch.cat((first[:, None], others), -1))
-        index = torch.cat(samples)
-        wide = tensor_map(lambda t: t[:, None], self.estimator)
-        sample = [d[:, index] for d in self.data]
-        solutions = wide.minimal(*sample)
-        valid = solutions.valid & ~wide.degenerate(*sample)[..., None]
-        return tensor_map(lambda t: t[valid], solutions.model)
-
     def ratios(self, models: Any) -> Float[Tensor, "h n"]:
         """Squared distances in units of the squared threshold."""
-        wide = tensor_map(lambda t: t[:, None], self.estimator)
+        wide = self.problems.spread()
         total, step = len(tensors_of(models)[0]), max(1, _NUMBERS // self.count)
         rows = []
         for i in range(0, total, step):
             some = tensor_map(lambda t: t[None, i : i + step], models)  # noqa: B023
-            rows.append(squared_residual(wide, some, *(d[:, None] for d in self.data))[0] / self.limit)
+            rows.append(squared_residual(wide.estimator, some, *wide.data)[0] / wide.limit)
         return torch.cat(rows).nan_to_num(nan=torch.inf)
 
     def best(self, models: Any, kept: int) -> Any:
         """The best supported, locally optimised."""
-        score = (1 - self.ratios(models).clamp(max=1)).sum(-1)
-        chosen = score.argsort(descending=True, stable=True)[:kept]
+        support = (1 - self.ratios(models).clamp(max=1)).sum(-1)
+        chosen = support.argsort(descending=True, stable=True)[:kept]
         step, done = max(1, _NUMBERS // self.count), []
         for i in range(0, len(chosen), step):
             some = tensor_map(lambda t: t[chosen[i : i + step]], models)  # noqa: B023
@@ -248,9 +187,9 @@ class _Problem:
 
     def step(self, models: Any, weights: Float[Tensor, "h n"]) -> Any:
         """A step of weighted refinement of each model."""
-        wide = tensor_map(lambda t: t[:, None], self.estimator)
+        wide = self.problems.spread()
         some = tensor_map(lambda t: t[None], models)
-        moved = wide.refine(some, *(d[:, None] for d in self.data), weights=weights[None])
+        moved = wide.estimator.step(some, *wide.data, weigh=constant_weights(weights[None]))
         return tensor_map(lambda t: t[0], moved)
 
     def refined(self, models: Any, ratio: Tensor, inside: Bool[Tensor, "g n"]) -> Any:

@@ -14,15 +14,10 @@ from torch import Tensor
 from torchsfm._types import tensor_map
 from torchsfm.optim import attach_optimum, wants_derivative
 from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.hypotheses import squared_residual
 from torchsfm.robust.models import tensors_of, zip_map
-from torchsfm.robust.scoring import squared_residual
 
 M = TypeVar("M")
-
-
-def has_manifold(estimator: Estimator[Any]) -> bool:
-    """Whether the estimator says how to move along the manifold of its models."""
-    return hasattr(estimator, "retract") and hasattr(estimator, "dimension")
 
 
 def attach_derivative(
@@ -44,7 +39,7 @@ def attach_derivative(
         reach: The squared distance at which weights vanish.
     """
     fields = tensors_of(estimator)
-    if not has_manifold(estimator) or not wants_derivative(*data, weights, *fields):
+    if not wants_derivative(*data, weights, *fields):
         return model
     with torch.no_grad():
         tangent = _zero_step(estimator, reach)

@@ -27,6 +27,19 @@ def hash_integers(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
     return x ^ ((x >> 31) & ((1 << 33) - 1))
 
 
+def draw_seed(generator: torch.Generator | None) -> int:
+    """The seed of a call, from a generator or PyTorch's global one."""
+    return int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
+
+
+def uniform_numbers(seed: int, rows: int, columns: int, device: torch.device, first: int = 0) -> Float[Tensor, "rows columns"]:
+    """Random numbers between 0 and 1 that are a hash of the seed, the row, counted from the first, and the column."""
+    counter = (first + torch.arange(rows, device=device))[:, None] * (1 << 32) + torch.arange(columns, device=device)
+    key = hash_integers(torch.tensor(seed, device=device))
+    random = (hash_integers(hash_integers(counter + 1) ^ key) >> 11) & ((1 << 53) - 1)
+    return (random.double() + 0.5) * 2.0**-53
+
+
 def draw_samples(
     seed: int,
     count: Int[Tensor, "g"],

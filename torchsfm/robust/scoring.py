@@ -1,161 +1,186 @@
-"""How well models are supported, judged on more and more data for fewer and fewer models."""
+"""What a datum at some distance from a model costs, and what it weighs in local optimisation.
+
+Distances come squared. A scoring says which of two models is better; the final refinement weighs the data by the noise it finds
+(`noise.scale_of_noise`), whatever the scoring.
+"""
 
 import math
-from collections.abc import Sequence
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm._types import tensor_map
-from torchsfm.linalg.fused import fused
-from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.models import tensors_of
-from torchsfm.robust.scores import Score
-
-M = TypeVar("M")
-
-NUMBERS = {True: 1 << 17, False: 1 << 24}
-"""How many distances to compute at a time, on a CPU and elsewhere."""
-PREFIXES = (64, 256, 1024)
-"""Numbers of data on which hypotheses are judged before all data are looked at."""
-KEPT = (16, 8, 4)
-"""The fewest hypotheses that are kept after each."""
-SHARE = 64
-"""Of how many hypotheses one is kept after the first."""
+MEDIANS = {1: 0.45494, 2: 1.38629, 3: 2.36597}
+"""The median of chi-squared with so many degrees of freedom."""
+EDGES = {1: 6.2, 2: 9.2, 3: 11.3}
+"""Squared distance in units of the variance that nearly all inliers are nearer than (quantiles of about 0.99)."""
+BLUNT = {2: 9.2103, 3: 11.3449, 4: 13.2767}
+"""The quantile 0.99 of chi-squared."""
 
 
-def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#batch n _"]) -> Float[Tensor, "*batch n"]:
-    """The squared distance of data to models of as many batch dimensions: infinite or no number where a model is none."""
-    model = _no_numbers_for_none(estimator, model, data[0].ndim - 2)
-    direct = getattr(estimator, "squared_residual", None)
-    if direct is None:
-        residual = estimator.residual(model, *data)
-        squared = residual * residual
-    else:
-        squared = direct(model, *data)
-    return squared
+@runtime_checkable
+class Scoring(Protocol):
+    """How models are compared. Small frozen objects; `Msac()`, `Magsac()`, `InlierCount()`, `LeastMedian()`."""
+
+    needs_threshold: ClassVar[bool]
+    """Whether the largest distance of an inlier must be known; otherwise `limit` estimates it."""
+
+    def cost(
+        self, squared: Float[Tensor, "g s n"], limit: Float[Tensor, "g"], weight: Tensor | None, codimension: int
+    ) -> Float[Tensor, "g s"]:
+        """The cost of models with such squared distances; weight (g, n) counts the data, None for all alike."""
+        ...
+
+    def weigh(self, ratio: Float[Tensor, "*batch n"], codimension: int) -> Float[Tensor, "*batch n"]:
+        """The weight of data in local optimisation, by their squared distance over the squared threshold."""
+        ...
 
 
-def _no_numbers_for_none(estimator: Estimator[M], model: M, dims: int) -> M:
-    """NaN in the place of what is no model: not finite, or zero where the estimator says that this is none."""
-    with torch.no_grad():
-        parts = [
-            torch.linalg.vector_norm(t.flatten(dims) if t.ndim > dims else t[..., None], dim=-1) for t in tensors_of(model)
-        ]
-        size = parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
-        # 1, but 0 / 0 or inf / inf; or 0, but inf - inf.
-        one = size / size if getattr(estimator, "never_zero", False) else size - size + 1
-    return tensor_map(lambda t: t * one.reshape(one.shape + (1,) * (t.ndim - dims)), model)
+def _total(loss: Tensor, weight: Tensor | None) -> Tensor:
+    """The sum over the data; infinite with a distance that is not a number."""
+    if weight is not None:
+        loss = loss * weight[:, None]
+    return loss.sum(-1).nan_to_num_(nan=torch.inf)
 
 
-def losses(
-    estimator: Estimator[M],
-    models: M,
-    data: Sequence[Tensor],
+@dataclass(frozen=True)
+class Msac:
+    """The squared distance, at most the squared threshold (Torr & Zisserman 2000)."""
+
+    needs_threshold: ClassVar[bool] = True
+
+    def cost(self, squared: Tensor, limit: Tensor, weight: Tensor | None, codimension: int) -> Tensor:
+        """The sum of truncated squared distances, in units of the squared threshold."""
+        return _total((squared * (1 / limit)[:, None, None]).clamp_(max=1), weight)
+
+    def weigh(self, ratio: Tensor, codimension: int) -> Tensor:
+        """1 within the threshold."""
+        return (ratio < 1).to(ratio.dtype)
+
+
+@dataclass(frozen=True)
+class InlierCount:
+    """The number of data beyond the threshold (Fischler & Bolles 1981)."""
+
+    needs_threshold: ClassVar[bool] = True
+
+    def cost(self, squared: Tensor, limit: Tensor, weight: Tensor | None, codimension: int) -> Tensor:
+        """The number of outliers, and a millionth of the sum of truncated distances to decide between equals."""
+        ratio = squared * (1 / limit)[:, None, None]
+        return _total((ratio >= 1).to(ratio.dtype) + 1e-6 * ratio.clamp(max=1), weight)
+
+    def weigh(self, ratio: Tensor, codimension: int) -> Tensor:
+        """1 within the threshold."""
+        return (ratio < 1).to(ratio.dtype)
+
+
+@dataclass(frozen=True)
+class Magsac:
+    """MAGSAC++: marginalised over the scale of the noise, evenly spread up to a largest one (Barath et al. 2020).
+
+    The threshold is the distance beyond which not even the largest noise takes an inlier (quantile 0.99). With the squared
+    distance y in units of twice the largest variance, K its value at the threshold and a = (dof - 1) / 2, the weight is
+    Gamma(a, y) - Gamma(a, K) (upper incomplete) and the loss its integral.
+
+    Attributes:
+        dof: Degrees of freedom of the squared distance, 2, 3 or 4; 4 as published, for the coordinates of two points.
+    """
+
+    dof: int = 4
+
+    needs_threshold: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.dof not in BLUNT:
+            raise ValueError(f"dof: wanted 2, 3 or 4, got {self.dof}")
+
+    def cost(self, squared: Tensor, limit: Tensor, weight: Tensor | None, codimension: int) -> Tensor:
+        """The sum of the losses, each in units of the loss at the threshold."""
+        end = BLUNT[self.dof] / 2
+        y = (squared * (end / limit)[:, None, None]).clamp(max=end)
+        upper, lower = self._gammas(y)
+        edge, most = _at_threshold(self.dof)
+        return _total((y * (upper - edge) + lower) * (1 / most), weight)
+
+    def weigh(self, ratio: Tensor, codimension: int) -> Tensor:
+        """Falling from 1 to 0 at the threshold."""
+        end = BLUNT[self.dof] / 2
+        edge, _ = _at_threshold(self.dof)
+        top = math.gamma((self.dof - 1) / 2)
+        upper, _ = self._gammas((ratio * end).clamp(max=end))
+        return ((upper - edge) / (top - edge)).clamp(min=0).nan_to_num(nan=0.0)
+
+    def _gammas(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Gamma(a, y), and the lower incomplete gamma function of a + 1."""
+        decay = torch.exp(-y)
+        if self.dof == 3:
+            return decay, 1 - (1 + y) * decay
+        root = y.sqrt()
+        half = math.sqrt(math.pi) * torch.erfc(root)
+        three = 0.5 * half + root * decay
+        lower_three = 0.5 * math.sqrt(math.pi) - three
+        if self.dof == 2:
+            return half, lower_three
+        return three, 1.5 * lower_three - y * root * decay
+
+
+@cache
+def _at_threshold(dof: int) -> tuple[float, float]:
+    upper, lower = Magsac(dof)._gammas(torch.tensor(BLUNT[dof] / 2, dtype=torch.float64))
+    return float(upper), float(lower)
+
+
+@dataclass(frozen=True)
+class LeastMedian:
+    """The median of the squared distances: needs no threshold, but more good data than bad (Rousseeuw 1984).
+
+    The threshold follows from the median as the distance that nearly all inliers of Gaussian noise are nearer than.
+    """
+
+    needs_threshold: ClassVar[bool] = False
+
+    def cost(self, squared: Tensor, limit: Tensor, weight: Tensor | None, codimension: int) -> Tensor:
+        """The median over the data."""
+        n = squared.shape[-1]
+        if weight is None:
+            return squared.nan_to_num(nan=torch.inf).kthvalue(n // 2 + 1, dim=-1).values
+        there = weight > 0
+        ordered, order = torch.where(there[:, None], squared, torch.inf).nan_to_num(nan=torch.inf).sort(dim=-1)
+        if weight.dtype == torch.bool:
+            rank = (there.sum(-1) // 2)[:, None, None].expand(-1, squared.shape[1], 1)
+        else:
+            # The first before which and with which there is more than half of the weight.
+            below = weight[:, None].expand_as(squared).gather(-1, order).cumsum(-1)
+            rank = (below <= 0.5 * weight.sum(-1)[:, None, None]).sum(-1, keepdim=True)
+        return ordered.gather(-1, rank.clamp(max=n - 1))[..., 0]
+
+    def weigh(self, ratio: Tensor, codimension: int) -> Tensor:
+        """1 within the threshold."""
+        return (ratio < 1).to(ratio.dtype)
+
+    def limit(self, cost: Float[Tensor, "g s"], count: Int[Tensor, "g"], size: int, codimension: int) -> Float[Tensor, "g s"]:
+        """The squared threshold that follows from the median of a model through a sample of `size` of `count` data.
+
+        With the correction for few data of Rousseeuw & Leroy (1987, 5.1).
+        """
+        small = 1 + 5 / (count - size).clamp(min=1).to(cost.dtype)
+        return cost * (small * small)[:, None] * (EDGES[codimension] / MEDIANS[codimension])
+
+
+def limits(
+    scoring: Scoring,
+    cost: Float[Tensor, "g s"],
     limit: Float[Tensor, "g"],
-    counts: Tensor | None,
-    score: Score,
+    count: Int[Tensor, "g"],
+    size: int,
+    codimension: int,
 ) -> Float[Tensor, "g s"]:
-    """The cost of `s` models of each problem, computed in portions that stay in the cache.
-
-    Args:
-        estimator: The problem, with a dimension of size 1 for the models.
-        models: `(g, s, ...)`.
-        data: `(g, 1, n, d)` each.
-        limit: Squared threshold.
-        counts: What the data count, `(g, n)`: a boolean or a weight; all alike if not given.
-        score: How models are compared.
-    """
-    (first, *_) = tensors_of(models)
-    g, s = first.shape[:2]
-    each = s * data[0].shape[-2]
-    portion = max(1, NUMBERS[first.device.type == "cpu"] // max(each, 1))
-    if portion >= g > 0 or _costs.compiles(estimator):
-        return _costs(estimator, models, data, limit, counts, score)
-    rows = []
-    for i in range(0, g, portion):
-        some = slice(i, i + portion)
-        own, of, at, edge, part = tensor_map(lambda t: t[some], (estimator, models, tuple(data), limit, counts))  # noqa: B023
-        rows.append(_costs(own, of, at, edge, part, score))
-    return torch.cat(rows) if rows else limit.new_zeros(g, s)
-
-
-@fused("g 1", "g s", "g 1 n", "g", "g n")
-def _costs(
-    estimator: Estimator[Any], models: Any, data: Sequence[Tensor], limit: Tensor, counts: Tensor | None, score: Score
-) -> Tensor:
-    return score.cost(squared_residual(estimator, models, *data), limit, counts, estimator.codimension)
-
-
-def stages(width: int, slots: int) -> list[tuple[int, int]]:
-    """On how many data `slots` models are scored, stage by stage, and how many of the models are kept each time."""
-    plan = []
-    for level, (prefix, fewest) in enumerate(zip(PREFIXES, KEPT, strict=True)):
-        keep = max(fewest, slots // SHARE) if level == 0 else fewest
-        if 2 * prefix <= width and keep < slots:
-            plan.append((prefix, keep))
-            slots = keep
-    return [*plan, (width, KEPT[-1])]
-
-
-def smallest(score: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]:
-    """The models with the smallest scores, best first.
-
-    Of models that are equal but for rounding the first: else the number of columns, which is that of the fullest row, decides,
-    and nonsense, of which nothing agrees with anything, feels its neighbours.
-    """
-    columns = score.shape[-1]
-    later = torch.arange(columns, device=score.device, dtype=score.dtype).mul_(torch.finfo(score.dtype).eps).add_(1)
-    return (score * later).topk(min(number, columns), dim=-1, largest=False).indices
-
-
-def gather_valid(valid: Bool[Tensor, "g s"], least: int) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:
-    """Where the valid slots of each row are, in as few columns as the fullest row needs or `least`, and which are filled."""
-    g, slots = valid.shape
-    rank = valid.cumsum(-1)
-    columns = max(int(rank[:, -1].max()) if valid.numel() else 0, least)
-    index = torch.zeros(g, columns + 1, dtype=torch.long, device=valid.device)
-    position = torch.where(valid, rank - 1, columns)
-    index.scatter_(1, position, torch.arange(slots, device=valid.device).expand(g, slots))
-    filled = torch.arange(columns, device=valid.device) < rank[:, -1:]
-    return index[:, :columns], filled
-
-
-def around_model(
-    ratio: Float[Tensor, "*batch n"], counts: Shaped[Tensor, "*#batch n"], codimension: int
-) -> Float[Tensor, "*batch"]:
-    """How many data the threshold would take in if they were as dense there as between two and six thresholds from the model.
-
-    Args:
-        ratio: Squared distances in units of the squared threshold.
-        counts: What the data count: a boolean or a weight.
-        codimension: The number of dimensions across the model.
-    """
-    between = ((ratio > 4) & (ratio < 36)).mul(counts).sum(-1)
-    expected: Tensor = (between + 0.5) / (6**codimension - 2**codimension)
-    return expected
-
-
-def beyond_chance(
-    support: Float[Tensor, "p"], count: Shaped[Tensor, "p"], expected: Float[Tensor, "p"], size: int
-) -> Bool[Tensor, "p"]:
-    """Whether so much support is more than the best of all samples finds by chance (Moisan & Stival 2004, bounded by entropy).
-
-    If a datum fits with probability p, a share q of n data does with probability exp(-n KL(q || p)) at most (Sanov's bound),
-    and there are (n over size) samples to choose from.
-
-    Args:
-        support: Soft number of inliers.
-        count: Number of data.
-        expected: How many data would fit by chance.
-        size: Number of data in a sample.
-    """
-    n = (count - size).to(support.dtype)
-    q = ((support - size) / n.clamp(min=1)).clamp(1e-9, 1 - 1e-9)
-    p = (expected / count).to(support.dtype).clamp(1e-4, 1 - 1e-9)
-    entropy = torch.where(q > p, q * (q / p).log() + (1 - q) * ((1 - q) / (1 - p)).log(), 0)
-    samples = torch.lgamma(n + size + 1.0) - torch.lgamma(n + 1.0) - math.lgamma(size + 1)
-    # Where nearly all data agree, there is no other explanation, however few they are.
-    return (n * entropy > samples) | (q > 0.9)
+    """The squared threshold for each of some models: the one given, or the one that follows from their cost."""
+    if scoring.needs_threshold:
+        return limit[:, None].expand_as(cost)
+    found: Float[Tensor, "g s"] = scoring.limit(cost, count, size, codimension)  # type: ignore[attr-defined]
+    # Exact data have no noise: the smallest threshold that is one.
+    return found.nan_to_num(nan=0.0, posinf=1e30).clamp(min=1e-12)

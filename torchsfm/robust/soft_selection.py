@@ -17,8 +17,9 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.sampling import hash_integers
-from torchsfm.robust.scoring import squared_residual
+from torchsfm.robust.hypotheses import squared_residual
+from torchsfm.robust.problems import Flat
+from torchsfm.robust.sampling import draw_seed, uniform_numbers
 
 M = TypeVar("M")
 
@@ -35,7 +36,7 @@ class SoftSelection(Generic[M]):
     Attributes:
         model: The models of `h` samples with `k` solution slots each; empty slots hold finite numbers without meaning.
         probability: With which each is chosen: sums to 1, or is 0 everywhere where no sample has a solution. Differentiable.
-        score: The soft number of inliers of each; 0 in empty slots. Differentiable.
+        support: The soft number of inliers of each; 0 in empty slots. Differentiable.
         valid: Which slots hold models.
         sample: The numbers of the data that each sample consists of, in the order in which they were drawn.
         log_sampling: The logarithm of the probability of drawing each sample in its order. Differentiable in the logits.
@@ -45,7 +46,7 @@ class SoftSelection(Generic[M]):
 
     model: M
     probability: Float[Tensor, "*batch h k"]
-    score: Float[Tensor, "*batch h k"]
+    support: Float[Tensor, "*batch h k"]
     valid: Bool[Tensor, "*batch h k"]
     sample: Int[Tensor, "*batch h m"]
     log_sampling: Float[Tensor, "*batch h"]
@@ -83,10 +84,10 @@ class SoftSelection(Generic[M]):
         return mean + change
 
     def best(self) -> M:
-        """The model of the highest score of each problem."""
-        h, k = self.score.shape[-2:]
-        batch = self.score.shape[:-2]
-        slot = torch.where(self.valid, self.score.detach(), -1).flatten(-2).argmax(-1)
+        """The model of the most support of each problem."""
+        h, k = self.support.shape[-2:]
+        batch = self.support.shape[:-2]
+        slot = torch.where(self.valid, self.support.detach(), -1).flatten(-2).argmax(-1)
 
         def pick(t: Tensor) -> Tensor:
             flat = t.reshape(batch.numel(), h * k, *t.shape[len(batch) + 2 :])
@@ -118,7 +119,7 @@ def soft_ransac(
     """Draw hypotheses, score them softly, and choose softly among them, so that everything has a derivative.
 
     For training: a network gives `logits`, or moves the data, and `SoftSelection.expectation` of a loss leads back to it. To
-    estimate, use `ransac`, which refines, stops, and takes logits as `scores`.
+    estimate, use `ransac`, which refines, stops, and takes logits as `quality`.
 
     A datum at squared distance r^2 counts as sigmoid(sharpness (1 - r^2 / threshold^2)) of an inlier. Data without finite
     numbers are left out. The result for a problem is the same whatever else is in the batch.
@@ -130,87 +131,58 @@ def soft_ransac(
         logits: Logarithm of each datum's share in the samples, up to a constant. None: all alike.
         mask: Which data exist; all of them if not given.
         hypotheses: Number of samples for each problem.
-        temperature: The score that makes a hypothesis e times as probable, as a share of the problem's number of data. Towards
-            0 the best hypothesis is chosen; larger values let more of them learn.
+        temperature: The support that makes a hypothesis e times as probable, as a share of the problem's number of data.
+            Towards 0 the best hypothesis is chosen; larger values let more of them learn.
         sharpness: How fast a datum's count falls at the threshold.
         generator: Source of randomness; PyTorch's global one if not given.
 
     Returns:
-        Hypotheses, their probabilities and scores. Models are differentiable in the data where the solver is; where a solution
+        Hypotheses, their probabilities and support. Models are differentiable in the data where the solver is; where a solution
         is degenerate its derivative is zero.
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    if not data:
-        raise ValueError("data: wanted at least one tensor of shape (*batch, n, d), got none")
+    flat = Flat.of(estimator, data, threshold, mask, logits=logits)
     check_options(
-        estimator=(estimator, Estimator),
-        temperature=(temperature, "float > 0"),
-        sharpness=(sharpness, "float > 0"),
-        hypotheses=(hypotheses, "int >= 1"),
+        temperature=(temperature, "float > 0"), sharpness=(sharpness, "float > 0"), hypotheses=(hypotheses, "int >= 1")
     )
-    known = {f"data[{i}]": (d, f"n d{i}") for i, d in enumerate(data)}
-    limit = threshold if isinstance(threshold, Tensor) else None
-    if limit is None:
-        check_options(threshold=(threshold, "float > 0"))
-    batch = check_tensors(**known, threshold=(limit, "?"), logits=(logits, "?n"), mask=(mask, "?n: bool"))
-    limit = data[0].new_tensor(threshold) if limit is None else limit
-    n, m, p = data[0].shape[-2], estimator.sample_size, batch.numel()
+    (p, n), m = flat.shape, estimator.sample_size
     if n < m:
         raise ValueError(f"data: wanted n >= {m}, the size of a sample, got {n}")
-    seed = int(torch.randint(1 << 62, (), generator=generator, device=None if generator is None else generator.device))
-    flat = [d.expand(*batch, n, d.shape[-1]).reshape(p, n, d.shape[-1]) for d in data]
-    own = tensor_map(lambda t: t.expand(batch + t.shape[len(batch) :]).reshape(p, *t.shape[len(batch) :]), estimator)
-    exists = torch.ones(p, n, dtype=torch.bool, device=flat[0].device)
-    exists = exists if mask is None else mask.expand(*batch, n).reshape(p, n)
-    usable = exists
-    for d in flat:
+    seed = draw_seed(generator)
+    weights = flat.of_data.get("logits", torch.zeros_like(flat.data[0][..., 0]))
+    usable = torch.isfinite(weights) if flat.exists is None else torch.isfinite(weights) & flat.exists
+    for d in flat.data:
         usable = usable & torch.isfinite(d).all(-1)
-    weights = torch.zeros_like(flat[0][..., 0]) if logits is None else logits.expand(*batch, n).reshape(p, n)
-    usable = usable & torch.isfinite(weights)
-    flat = [torch.where(usable[..., None], d, 0) for d in flat]
+    rows = [torch.where(usable[..., None], d, 0) for d in flat.data]
     enough = usable.sum(-1) >= m
     index, log_sampling = _draw(weights, usable, hypotheses, m, seed)
 
     row = torch.arange(p, device=index.device)[:, None, None]
-    wide = tensor_map(lambda t: t[:, None], own)
-    sample = [d[row, index] for d in flat]
+    wide = tensor_map(lambda t: t[:, None], flat.estimator)
+    sample = [d[row, index] for d in rows]
     solutions = wide.minimal(*sample)
     k = solutions.valid.shape[-1]
     with torch.no_grad():
         bad = wide.degenerate(*(s.detach() for s in sample))
     valid = solutions.valid & ~bad[..., None] & enough[:, None, None]
     models = tensor_map(lambda t: t.flatten(1, 2), solutions.model)
-    square = (limit * limit).expand(batch).reshape(p, 1, 1)
-    ratio = squared_residual(wide, models, *(d[:, None] for d in flat)) / square
+    square = (flat.bound * flat.bound)[:, None, None]
+    ratio = squared_residual(wide, models, *(d[:, None] for d in rows)) / square
     near = ratio < _FAR
     count = torch.sigmoid(sharpness * (1 - torch.where(near, ratio, _FAR)))
-    score = torch.where(valid, (count * usable[:, None]).sum(-1).reshape(p, hypotheses, k), 0)
+    support = torch.where(valid, (count * usable[:, None]).sum(-1).reshape(p, hypotheses, k), 0)
     # A softmax in which empty slots take no part.
     number = usable.sum(-1).clamp(min=1)[:, None]
-    energy = torch.where(valid, score, -torch.inf).flatten(1) / (temperature * number)
+    energy = torch.where(valid, support, -torch.inf).flatten(1) / (temperature * number)
     some = valid.flatten(1).any(-1, keepdim=True)
-    probability = torch.where(some, torch.softmax(torch.where(some, energy, 0), -1), 0).reshape(score.shape)
+    probability = torch.where(some, torch.softmax(torch.where(some, energy, 0), -1), 0).reshape(support.shape)
 
     status = torch.where(some[:, 0], int(Status.OK), int(Status.DEGENERATE))
-    status = torch.where(enough, status, torch.where(exists.sum(-1) < m, int(Status.TOO_FEW), int(Status.NOT_FINITE)))
-
-    def shaped(t: Tensor) -> Tensor:
-        return t.reshape(*batch, *t.shape[1:])
-
-    return SoftSelection(
-        tensor_map(shaped, solutions.model), shaped(probability), shaped(score), shaped(valid), shaped(index),
-        shaped(log_sampling), status.to(torch.int8).reshape(batch),
-    )  # fmt: skip
-
-
-def uniform_numbers(seed: int, rows: int, columns: int, device: torch.device) -> Float[Tensor, "rows columns"]:
-    """Random numbers between 0 and 1 that are a hash of the seed, the row and the column."""
-    counter = torch.arange(rows, device=device)[:, None] * (1 << 32) + torch.arange(columns, device=device)
-    key = hash_integers(torch.tensor(seed, device=device))
-    random = (hash_integers(hash_integers(counter + 1) ^ key) >> 11) & ((1 << 53) - 1)
-    return (random.double() + 0.5) * 2.0**-53
+    status = torch.where(enough, status, flat.refused()).to(torch.int8)
+    found = SoftSelection(solutions.model, probability, support, valid, index, log_sampling, status)
+    return flat.unflatten(found)
 
 
 def _draw(

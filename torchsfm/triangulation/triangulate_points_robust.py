@@ -2,16 +2,16 @@
 
 from dataclasses import dataclass
 from math import prod
-from typing import ClassVar
+from typing import Any, ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, Status, broadcast_shapes, check_options, check_tensors
+from torchsfm._types import Solutions, Status, broadcast_shapes
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
-from torchsfm.robust import Score, damped_solve, ransac
-from torchsfm.robust.local_optimisation import Weigh
+from torchsfm.linalg import damped_solve
+from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
 from torchsfm.triangulation.triangulate_points import triangulate_points
 
 
@@ -68,28 +68,11 @@ class PointEstimator:
         u, v = torch.addcmul(views.x, views.image, views.inverse).unbind(-3)
         return squared_in_front(u, v, views.depth, views.z).view(*views.batch, x.shape[-2])
 
-    def residual(
-        self, X: Float[Tensor, "*#batch 3"], x: Float[Tensor, "*#batch n 2"], P: Float[Tensor, "*#batch n 12"]
-    ) -> Float[Tensor, "*batch n"]:
-        """Reprojection error; infinite behind the camera."""
-        return self.squared_residual(X, x, P).sqrt()
-
     def degenerate(self, x: Float[Tensor, "*#batch 2 2"], P: Float[Tensor, "*#batch 2 12"]) -> Bool[Tensor, "*batch"]:
         """Whether both data are of one camera."""
         return (P[..., 0, :] == P[..., 1, :]).all(-1) & torch.isfinite(x).all(-1).all(-1)
 
-    def refine(
-        self,
-        X: Float[Tensor, "*#batch 3"],
-        x: Float[Tensor, "*#batch n 2"],
-        P: Float[Tensor, "*#batch n 12"],
-        *,
-        weights: Float[Tensor, "*#batch n"],
-    ) -> Float[Tensor, "*batch 3"]:
-        """A Gauss-Newton step on the reprojection error."""
-        return self.reweighted_step(X, x, P, weigh=lambda _: (weights, weights))
-
-    def reweighted_step(
+    def step(
         self,
         X: Float[Tensor, "*#batch 3"],
         x: Float[Tensor, "*#batch n 2"],
@@ -97,7 +80,7 @@ class PointEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3"]:
-        """Such a step with weights that follow from the distances (see `Estimator`)."""
+        """A Gauss-Newton step on the reprojection error."""
         views, n = _Views(X, x, P), x.shape[-2]
         m = views.image * views.inverse
         r = views.x + m
@@ -156,7 +139,7 @@ class RobustTriangulation:
     """The points, finite always; where `status` is not OK they may mean little."""
     inliers: Bool[Tensor, "*batch v n"]
     """Which observations are nearer to the image of the point than the threshold."""
-    score: Float[Tensor, "*batch n"]
+    support: Float[Tensor, "*batch n"]
     """Sum over the views of max(0, 1 - squared distance / squared threshold)."""
     threshold: Float[Tensor, "*batch n"]
     """The largest distance of an inlier, given or estimated."""
@@ -182,12 +165,7 @@ def triangulate_points_robust(
     *,
     threshold: float | Float[Tensor, "*#batch n"] | None,
     visible: Bool[Tensor, "*#batch v n"] | None = None,
-    scores: Float[Tensor, "*#batch v n"] | None = None,
-    weights: Float[Tensor, "*#batch v n"] | None = None,
-    score: Score | None = None,
-    generator: torch.Generator | None = None,
-    confidence: float = 0.9999,
-    max_iterations: int = 256,
+    **options: Unpack[SearchOptions],
 ) -> RobustTriangulation:
     """Points from their images in known views, of which some may be wrong.
 
@@ -203,31 +181,18 @@ def triangulate_points_robust(
         threshold: Largest reprojection error of an inlier, in pixels. None where it is not known: more than half of the
             observations of each point must then be right (`LeastMedian`), and there should be many.
         visible: Which views see which point; all by default. Observations that are not finite are left out too.
-        scores: How much each observation can be trusted, the larger the more, in any unit: the pairs then favour the best.
-        weights: For how many observations each one counts (its inverse variance), 0 for absent.
-        score: How points are compared (see `ransac`).
-        generator: Source of randomness.
-        confidence: Wanted probability of having tried a pair without wrong observations.
-        max_iterations: Most pairs to try for a point.
+        **options: See `SearchOptions`; a datum is an observation, and there are at most 256 pairs for a point.
 
     Returns:
-        The points with their inliers, score, iterations, status, parallax, covariance and error. The points carry their
+        The points with their inliers, support, iterations, status, parallax, covariance and error. The points carry their
         derivatives with respect to the inliers, their weights and the cameras: those of the least squares over the inliers.
         They are zero where the status is not OK.
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
     """
-    limit = threshold if isinstance(threshold, Tensor) else None
-    if limit is None:
-        check_options(threshold=(threshold, "?float > 0"))
-    check_options(
-        confidence=(confidence, "0 < float < 1"), max_iterations=(max_iterations, "int >= 1"), score=(score, Score | None)
-    )
-    batch = check_tensors(
-        x=(x, "v n 2"), P=(P, "v 3 4"), threshold=(limit, "?n"), visible=(visible, "?v n: bool"), scores=(scores, "?v n"),
-        weights=(weights, "?v n"),
-    )  # fmt: skip
+    own = {"x": (x, "v n 2"), "P": (P, "v 3 4"), "visible": (visible, "?v n: bool")}
+    batch = check_door(own, threshold, options, SearchOptions, of_problem="n", of_datum="v n")
     dtype, (v, n) = x.dtype, x.shape[-3:-1]
     x, P = x.double(), P.double()
     sign = torch.where(torch.linalg.det(P[..., :3]) < 0, -1.0, 1.0).to(P.dtype)
@@ -237,15 +202,15 @@ def triangulate_points_robust(
     def by_point(t: Tensor | None) -> Tensor | None:
         return None if t is None else t.detach().expand(*batch, v, n).mT
 
-    if scores is not None:
-        scores = scores.double()
-    if weights is not None:
-        weights = weights.double()
+    weights = options.get("weights")
+    weights = None if weights is None else weights.double()
+    quality = options.get("quality")
+    of_data = {"mask": visible, "weights": weights, "quality": None if quality is None else quality.double()}
+    every: Any = {"max_iterations": 256} | options | {name: by_point(t) for name, t in of_data.items()}
+    limit = threshold.double().expand(*batch, n) if isinstance(threshold, Tensor) else threshold
     found = ransac(
         PointEstimator(), x.detach().expand(*batch, v, n, 2).transpose(-3, -2), data[..., None, :, :].expand(*batch, n, v, 12),
-        threshold=threshold if limit is None else limit.double().expand(*batch, n), mask=by_point(visible),
-        scores=by_point(scores), weights=by_point(weights), score=score, generator=generator, confidence=confidence,
-        min_iterations=16, max_iterations=max_iterations,
+        threshold=limit, min_iterations=16, **every,
     )  # fmt: skip
     inliers = found.inliers.mT
     number = inliers.sum(-2)
@@ -263,7 +228,7 @@ def triangulate_points_robust(
     return RobustTriangulation(
         model=torch.where(settled[..., None], final.model, found.model).to(dtype),
         inliers=inliers,
-        score=found.score.to(dtype),
+        support=found.support.to(dtype),
         threshold=found.threshold.to(dtype),
         iterations=found.iterations,
         status=status,

@@ -1,0 +1,270 @@
+"""What makes the best model of a search better: optimised hypotheses, samples of its inliers, alternatives, refinement.
+
+Each function takes the best models so far and gives back better ones; the loop that calls them is in `ransac`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import tensor_map
+from torchsfm.robust.diagnosis import glance
+from torchsfm.robust.estimator import WithAlternatives
+from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
+from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally, optimise_within
+from torchsfm.robust.models import cast, join, put, select, take_slots
+from torchsfm.robust.noise import SCALE_DATA, scale_of_noise
+from torchsfm.robust.problems import Problems
+from torchsfm.robust.samplers import Among, Sampler, draws
+from torchsfm.robust.scoring import Msac, Scoring, limits
+from torchsfm.robust.stopping import around_model
+
+OPTIMISED = 2
+"""Hypotheses of a round that are optimised locally."""
+STARTS = (2, 4, 8, 16, 32, 64)
+"""From how many samples of the inliers the best model may be sought once more."""
+EXPLORED_DATA = 512
+"""How many data that looks at."""
+_PER_START, _AMBIGUOUS = 128, 0.5
+"""One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers."""
+_SUPPORT = 0.6
+"""How much of its support within the threshold a model may lose by refinement."""
+_SAMPLES, _NUMBERS = 1 << 13, 1 << 15
+"""Samples to solve at a time, and numbers in one row of all data of several models, on a CPU: what fits its cache."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """When to stop, how to sample and to compare, and in which precision."""
+
+    seed: int
+    confidence: float
+    min_iterations: int
+    max_iterations: int
+    dtype: torch.dtype
+    scoring: Scoring
+    sampler: Sampler
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best model found for each problem.
+
+    Attributes:
+        model: The model; zeros where no sample had a solution, None before the first round.
+        loss: Its cost over all data; infinite where there is none.
+        limit: Its squared threshold.
+        needed: How many samples would do, judging by its inliers.
+        minimal_loss: The least cost of a model straight from a sample.
+        solved: Whether any sample had a solution.
+        iterations: Number of samples drawn.
+        reach: The squared distance at which weights vanish in the loss of which the model is the optimum; 0 if it is none.
+        doubtful: Where a glance left open that the inliers are degenerate; None where nobody looked.
+    """
+
+    model: Any
+    loss: Float[Tensor, "p"]
+    limit: Float[Tensor, "p"]
+    needed: Float[Tensor, "p"]
+    minimal_loss: Float[Tensor, "p"]
+    solved: Bool[Tensor, "p"]
+    iterations: Int[Tensor, "p"]
+    reach: Float[Tensor, "p"]
+    doubtful: Bool[Tensor, "p"] | None = None
+
+    @classmethod
+    def none(cls, coarse: Problems) -> "Best":
+        """Before the first sample."""
+        infinite = torch.full_like(coarse.limit, torch.inf)
+        drawn = torch.zeros_like(coarse.count)
+        return cls(
+            None, infinite, coarse.limit, infinite.double(), infinite, drawn > 0, drawn, torch.zeros_like(infinite)
+        )  # fmt: skip
+
+    def take(self, index: Tensor) -> "Best":
+        """Those of some problems."""
+        return tensor_map(lambda t: t[index], self)
+
+
+def propose(
+    fine: Problems, coarse: Problems, best: Best, part: Int[Tensor, "g"], number: int, options: Options
+) -> tuple[Best, Any, Float[Tensor, "g kept"]]:
+    """Draw so many samples for some of the problems, and keep the hypotheses that the data support best.
+
+    Returns:
+        The best models, with what is known of the samples; the hypotheses, `(g, kept, ...)`; and their losses.
+    """
+    parts = []
+    for some in _portions(part, number, _SAMPLES):
+        models, valid = solve_samples(fine, some, best.iterations[some], number, options.seed, options.sampler)
+        plan = stages(coarse.width, number * valid.shape[-1])
+        parts.append(sift(coarse.take(some), models, valid, options.scoring, plan, OPTIMISED))
+    models = join([one[0] for one in parts])
+    loss, solved = (torch.cat([one[i] for one in parts]) if len(parts) > 1 else parts[0][i] for i in (1, 2))
+    if best.model is None:
+        best = replace(best, model=tensor_map(lambda t: t.new_zeros(len(best.loss), *t.shape[2:]), models))
+    best = replace(
+        best,
+        solved=best.solved.index_put((part,), best.solved[part] | solved),
+        iterations=best.iterations.index_add(0, part, torch.full_like(part, number)),
+    )
+    return best, models, loss
+
+
+def optimise(coarse: Problems, best: Best, part: Int[Tensor, "g"], models: Any, loss: Tensor, options: Options) -> Best:
+    """Optimise the proposed hypotheses locally where one of them is better than all before."""
+    improved = (loss[:, 0] < best.minimal_loss[part]).nonzero()[:, 0]
+    for row in _portions(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), _NUMBERS):
+        best = _optimised(coarse.take(part[row]), best, part[row], _rows(models, row), loss[row], options)
+    return best
+
+
+def _optimised(
+    coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, loss: Tensor, options: Options, looked_at: int = LOCAL_DATA
+) -> Best:
+    """Update the best models of some problems with what local optimisation makes of hypotheses.
+
+    Args:
+        coarse: The problems.
+        best: The best models of all problems.
+        index: Which problems these are.
+        top: Hypotheses, the best first.
+        loss: The costs of the hypotheses.
+        options: How to compare.
+        looked_at: How many data to optimise on.
+    """
+    wide, size, k = coarse.spread(), coarse.estimator.sample_size, coarse.estimator.codimension
+    scoring, counts = options.scoring, coarse.counts
+    prefix = [d[:, :, :looked_at] for d in wide.data]
+    limit = limits(scoring, loss, coarse.limit, coarse.count, size, k)
+    better = optimise_locally(wide.estimator, top, prefix, limit, counts[:, :looked_at], scoring)
+    candidates = join([better, tensor_map(lambda t: t[:, :1], top)], 1)
+    squared = squared_residual(wide.estimator, candidates, *wide.data)
+    candidate_loss = scoring.cost(squared, coarse.limit, counts, k)
+    new_loss, winner = candidate_loss.min(-1, keepdim=True)
+    new_limit = limits(scoring, new_loss, coarse.limit, coarse.count, size, k)[:, 0]
+    squared = squared.gather(1, winner[..., None].expand(-1, -1, squared.shape[-1]))[:, 0]
+    needed = options.sampler.needed(coarse, (squared < new_limit[:, None]) & coarse.inside, options.confidence)
+    if not scoring.needs_threshold:
+        # The threshold follows from the model: a wrong one would vouch for itself. The median takes half of the data for good.
+        needed = torch.maximum(needed, draws(torch.full_like(needed, 0.5**size), options.confidence))
+    old = best.take(index)
+    gain = new_loss[:, 0] < old.loss
+    new = replace(
+        old,
+        model=select(gain, tensor_map(lambda t: t[:, 0], take_slots(candidates, winner)), old.model),
+        loss=torch.where(gain, new_loss[:, 0], old.loss),
+        limit=torch.where(gain, new_limit, old.limit),
+        needed=torch.where(gain, needed, old.needed),
+        minimal_loss=torch.minimum(loss[:, 0], old.minimal_loss),
+    )
+    return put(best, index, new)
+
+
+def search_inliers(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
+    """Optimise locally from many samples of the inliers alone, where wrong data may pass for inliers.
+
+    Each of these is in or out: the cost has many minima, and a model straight from a sample leads to one of them. The effort
+    is a part of that of the search.
+    """
+    near, number = [], []
+    for part in _portions(_all(fine), fine.width, _NUMBERS):
+        some, old = coarse.take(part), best.take(part)
+        ratio = squared_residual(some.estimator, old.model, *some.data) / old.limit[:, None]
+        near.append((ratio < 1) & some.inside)
+        chance = around_model(ratio, some.inside, fine.estimator.codimension)
+        worthwhile = (chance >= _AMBIGUOUS) & (near[-1].sum(-1) > 2 * fine.estimator.sample_size)
+        number.append(torch.where(worthwhile & old.solved, old.iterations // _PER_START, 0))
+    sizes = torch.tensor((0, *STARTS), device=fine.count.device)
+    starts, sampler = sizes[torch.searchsorted(sizes, torch.cat(number), right=True) - 1], Among(torch.cat(near))
+    plan = [(min(LOCAL_DATA, coarse.width), 0)]
+    for size in sorted(set(starts.tolist()) - {0}):
+        drawn = max(4 * size, 64)
+        for part in _portions((starts == size).nonzero()[:, 0], drawn, _SAMPLES):
+            models, valid = solve_samples(fine, part, best.iterations[part], drawn, options.seed, sampler)
+            some, plan = coarse.take(part), [(plan[0][0], size)]
+            models, loss, _ = sift(some, models, valid, options.scoring, plan, size)
+            for row in _portions(_all(some), size * EXPLORED_DATA, _NUMBERS):
+                best = _optimised(some.take(row), best, part[row], _rows(models, row), loss[row], options, EXPLORED_DATA)
+    return best
+
+
+def try_alternatives(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
+    """Look for better models in places that samples do not lead to, where the estimator knows such."""
+    if not isinstance(fine.estimator, WithAlternatives):
+        return best
+    doubtful = glance(fine, cast(best.model, torch.float64), best.limit.double())
+    best = replace(best, doubtful=doubtful)
+    for part in _portions(doubtful.nonzero()[:, 0], fine.width, _NUMBERS):
+        some = fine.take(part)
+        estimator: Any = some.estimator
+        model, threshold = cast(_rows(best.model, part), torch.float64), best.limit[part].double().sqrt()
+        found = estimator.alternative_models(model, *some.data, inside=some.inside, threshold=threshold, seed=options.seed)
+        row = (found.valid.any(-1) & best.solved[part]).nonzero()[:, 0]
+        if not len(row):
+            continue
+        chosen, others = coarse.take(part[row]), cast(_rows(found.model, row), options.dtype)
+        wide = chosen.spread()
+        loss = losses(wide.estimator, others, wide.data, chosen.limit, chosen.counts, options.scoring)
+        loss = torch.where(found.valid[row], loss, torch.inf)
+        order = smallest(loss, OPTIMISED)
+        best = _optimised(chosen, best, part[row], take_slots(others, order), loss.gather(1, order), options)
+    return best
+
+
+def refine_finally(fine: Problems, coarse: Problems, best: Best) -> tuple[Best, Float[Tensor, "p width"]]:
+    """Refine the best models on all data, to the end in float64, and keep what does not lose support; and their distances.
+
+    The loss is that of the noise found in the data, whatever the scoring.
+    """
+    parts, distances, score, k = [], [], Msac(), fine.estimator.codimension
+    for part in _portions(_all(fine), fine.width, _NUMBERS):
+        some, rough, old = fine.take(part), coarse.take(part).spread(), best.take(part)
+        counts = rough.counts
+        start = tensor_map(lambda t: t[:, None], old.model)
+        model, reach = scale_of_noise(
+            rough.estimator, start, [d[:, :, :SCALE_DATA] for d in rough.data], old.limit, counts[:, :SCALE_DATA]
+        )
+        model = optimise_within(rough.estimator, model, rough.data, reach * old.limit, counts, 1)
+        old, reach = cast(old, torch.float64), reach.double() * old.limit
+        wide, counts = some.spread(), some.counts
+        model, settled = optimise_fully(wide.estimator, cast(model, torch.float64), wide.data, reach, counts)
+        squared = squared_residual(wide.estimator, model, *wide.data)
+        # A threshold smaller than the noise would blame the better model.
+        judged = torch.maximum(old.limit, reach)
+        loss = score.cost(squared, judged, counts, k)[:, 0]
+        before = squared_residual(rough.estimator, start, *rough.data)
+        before_loss = score.cost(before, judged, counts, k)[:, 0].double()
+        # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
+        won = (loss <= 1.02 * before_loss + 1) & (loss < torch.inf)
+        # Noise that leaves the threshold so much less support is none: the model is not quite that of the data.
+        within, within_before = (((d < old.limit[:, None, None]) * counts[:, None]).sum(-1)[:, 0] for d in (squared, before))
+        won &= within >= _SUPPORT * within_before
+        distances.append(torch.where(won[:, None], squared[:, 0], before[:, 0]))
+        parts.append(
+            replace(
+                old,
+                model=select(won, tensor_map(lambda t: t[:, 0], model), old.model),
+                loss=torch.where(won, loss, before_loss),
+                reach=torch.where(won & settled, reach, 0),
+            )
+        )
+    return join(parts), torch.cat(distances)
+
+
+def _portions(index: Int[Tensor, "g"], each: int, budget: int) -> Iterator[Int[Tensor, "_"]]:
+    """A list of problems in portions that need no more than a budget at a time, of which devices other than CPUs have more."""
+    size = max(1, (budget if index.device.type == "cpu" else 256 * budget) // each)
+    return (index[i : i + size] for i in range(0, len(index), size))
+
+
+def _all(problems: Problems) -> Int[Tensor, "p"]:
+    return torch.arange(len(problems.count), device=problems.count.device)
+
+
+def _rows(models: Any, index: Tensor) -> Any:
+    return tensor_map(lambda t: t[index], models)

@@ -1,0 +1,179 @@
+"""How large the noise is: the scale of Gaussian inliers among even outliers, and the reach of the loss that fits it."""
+
+import math
+from collections.abc import Sequence
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import tensor_map
+from torchsfm.linalg.fused import fused
+from torchsfm.robust.estimator import Estimator
+from torchsfm.robust.hypotheses import squared_residual
+from torchsfm.robust.local_optimisation import LOCAL_DATA, falling, optimise_within
+from torchsfm.robust.models import join, take_slots, zip_map
+
+M = TypeVar("M")
+T = TypeVar("T")
+
+SCALE_DATA = 512
+"""The estimation of the scale looks at so many data at most."""
+_GLANCE = 128
+"""And its first guess at so many."""
+_LEAST, _MOST = 1e-6, 16.0
+"""Smallest and largest variance of the noise in units of the squared threshold."""
+_VARIANCES, _SHARE_STEPS = tuple(4.0**i for i in range(-4, 3)), 2
+"""Variances of which the estimation of the scale starts with the likeliest, and rounds that find the share of inliers."""
+_WINDOW = 16.0
+"""How far from the model its noise is looked for, in thresholds."""
+_WIDE_STEPS = (16.0, 8.0, 4.0)
+"""Reaches, in thresholds, of the steps that look for a model of more noise than the threshold says."""
+_CROWD = 0.1
+"""How many data beyond the threshold, for one within, make that worth while."""
+_MARGIN = 3.0
+"""How much larger the logarithm of the likelihood of what they find must be: rounding must not decide on nonsense."""
+_SCALE_STEPS = 3
+"""Rounds of reweighted least squares that estimate the scale."""
+
+
+def scale_of_noise(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    limit: Float[Tensor, "g"],
+    counts: Tensor,
+) -> tuple[M, Float[Tensor, "g"]]:
+    """Reweighted least squares out to the distance where an outlier is as likely as an inlier, and that distance.
+
+    The weights fall as 1 - (distance / reach)^2. The reach follows from the scale of the noise, that of Gaussian inliers among
+    evenly spread outliers within many thresholds: the likeliest of a few at first, then by expectation maximisation, one step
+    for each round of weights. So the answer depends little on how well the threshold was chosen. Where many data are beyond
+    the threshold but not far from it, a model through the best of them may be wrong: then that from all of them is tried too.
+
+    Args:
+        estimator: The problem.
+        model: One model of each problem, `(g, 1, ...)`.
+        data: The data, each `(g, 1, n, d)`.
+        limit: Squared threshold.
+        counts: What the data count, `(g, n)`: a boolean or a weight.
+
+    Returns:
+        The model, and the square of its reach in units of the squared threshold, rounded to a coarse grid: so the model that
+        `optimise_within` makes is the optimum of one fixed loss, also when the data move a little, and has a derivative.
+    """
+    _, noise, crowd = _first_noise(estimator, model, [d[:, :, :_GLANCE] for d in data], limit, counts[:, :_GLANCE])
+    rows = crowd.nonzero()[:, 0]
+    if len(rows):
+
+        def take(tree: T) -> T:
+            return tensor_map(lambda t: t[rows], tree)
+
+        found, own = _widened(take(estimator), take(model), take(data), limit[rows], counts[rows])
+        model, noise = zip_map(lambda t, new: t.index_copy(0, rows, new), (model, noise), (found, own))
+    for _ in range(_SCALE_STEPS):
+        model, noise = _scale_step(estimator, model, data, limit, counts, noise)
+    return model, _reach_at(estimator, model, data, limit, counts, noise)
+
+
+def _widened(
+    estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Float[Tensor, "g"], counts: Tensor
+) -> tuple[M, tuple[Tensor, Tensor]]:
+    """The likelier of a model and what becomes of it with far larger thresholds, and the noise."""
+    data, counts, wide = [d[:, :, :LOCAL_DATA] for d in data], counts[:, :LOCAL_DATA], model
+    for factor in _WIDE_STEPS:
+        wide = optimise_within(estimator, wide, data, factor**2 * limit, counts, 1)
+    both = join([model, wide], 1)
+    evidence, noise, _ = _first_noise(estimator, both, data, limit, counts)
+    winner = (evidence[:, 1:] > evidence[:, :1] + _MARGIN).long()
+    variance, share = (t.gather(1, winner[..., None]) for t in noise)
+    return take_slots(both, winner), (variance, share)
+
+
+@fused("g 1", "g k", "g 1 n", "g", "g n")
+def _first_noise(
+    estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Tensor, counts: Tensor
+) -> tuple[Tensor, tuple[Tensor, Tensor], Tensor]:
+    """The likeliest scale of Gaussian noise among evenly spread outliers within the window.
+
+    Returns:
+        The logarithm of the likelihood `(g, k)` against that of outliers alone; the variance and the share of inliers among
+        the data in the window, `(g, k, 1)`; and whether there are many data beyond the threshold of the first model, `(g)`.
+    """
+    k = estimator.codimension
+    ratio, there, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
+    core = ((ratio < 1) * there).sum(-1)
+    crowd = ((total[..., 0] - core) > _CROWD * core)[:, 0]
+    variance = torch.tensor(_VARIANCES, dtype=ratio.dtype, device=ratio.device)[:, None]
+    # The density of an inlier in units of that of an outlier.
+    density = torch.exp(ratio[..., None, :] * (-0.5 / variance)) * (_peak(k) * _WINDOW**k * variance ** (-k / 2))
+    gain, there, some = density - 1, there[..., None, :], total[..., None].clamp(min=1)
+    share = torch.full_like(gain[..., :1], 0.5)
+    for _ in range(_SHARE_STEPS):
+        share = ((there * share * density / (1 + share * gain)).sum(-1, keepdim=True) / some).clamp(max=0.999)
+    evidence, index = (there * torch.log1p(share * gain)).sum(-1).max(-1, keepdim=True)
+    return evidence[..., 0], (variance[:, 0][index], share[..., 0].gather(-1, index)), crowd
+
+
+@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
+def _scale_step(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    limit: Tensor,
+    counts: Tensor,
+    noise: tuple[Tensor, Tensor],
+) -> tuple[M, tuple[Tensor, Tensor]]:
+    """A step, and the noise by the distances before it: its variance and the share of inliers in the window, `(g, 1, 1)`."""
+    k, found = estimator.codimension, noise
+
+    def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
+        nonlocal found
+        ratio, there, total = _within_window(squared, limit, counts)
+        odds, reach = _odds_and_reach(total, *noise, k)
+        likely = there / (1 + odds * torch.exp((0.5 * ratio / noise[0]).clamp(max=60)))
+        number = likely.sum(-1, keepdim=True).clamp(min=1)
+        variance = ((likely * ratio).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, _MOST)
+        found = variance, number / total.clamp(min=1)
+        return falling(ratio * (1 / reach), counts, k)
+
+    model = estimator.step(model, *data, weigh=weigh)
+    return model, found
+
+
+@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
+def _reach_at(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    limit: Tensor,
+    counts: Tensor,
+    noise: tuple[Tensor, Tensor],
+) -> Tensor:
+    """The squared reach `(g)` in units of the squared threshold, rounded."""
+    _, _, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
+    _, reach = _odds_and_reach(total, *noise, estimator.codimension)
+    return torch.exp2((4 * reach[:, 0, 0].log2()).round() / 4)
+
+
+def _within_window(squared: Tensor, limit: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Squared distances in units of the squared threshold, at most those of the window, what is within counts, and its sum."""
+    ratio = squared * (1 / limit)[:, None, None]
+    near = ratio < _WINDOW**2
+    there = (near * counts[:, None]).to(ratio.dtype)
+    return torch.where(near, ratio, _WINDOW**2), there, there.sum(-1, keepdim=True)
+
+
+def _odds_and_reach(total: Tensor, variance: Tensor, share: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The odds of an outlier where a model is, and the squared distance at which they are even."""
+    number = (share * total).clamp(min=1)
+    # Never less than half an outlier between two and six thresholds.
+    outlying = (total - number).clamp(min=0) / _WINDOW**k + 0.5 / (6**k - 2**k)
+    odds = outlying / (number * _peak(k) * variance ** (-k / 2))
+    return odds, (1.6 * k * variance * (1 / odds).clamp(min=3).log()).clamp(max=_WINDOW**2)
+
+
+def _peak(k: int) -> float:
+    """The standard Gaussian at 0 in k dimensions, for a unit of volume in which the ball of radius 1 is 1."""
+    return float((2 * math.pi) ** (-k / 2) * math.pi ** (k / 2) / math.gamma(k / 2 + 1))

@@ -1,0 +1,73 @@
+"""When enough samples are drawn, and whether what they found is more than chance."""
+
+import math
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor
+
+ROUNDS = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
+"""How many samples a round may draw for a problem."""
+
+
+def rounds(
+    active: Int[Tensor, "a"], drawn: Int[Tensor, "p"], needed: Float[Tensor, "p"], least: int, most: int
+) -> Iterator[tuple[int, Int[Tensor, "g"]]]:
+    """How many samples to draw next, and for which of the active problems; none for problems that have had enough.
+
+    So many that there are four times as many, or the rest.
+
+    Args:
+        active: Which problems are still looked at.
+        drawn: How many samples each problem has had.
+        needed: How many would do.
+        least: Fewest samples of a problem.
+        most: Most samples of a problem.
+    """
+    drawn, needed = drawn[active], needed[active]
+    rest = torch.maximum(needed, torch.full_like(needed, least)).clamp(max=most) - drawn
+    wanted = torch.minimum(rest, (3 * drawn).clamp(min=least).to(rest.dtype))
+    sizes = torch.tensor(ROUNDS, device=drawn.device)
+    size = sizes[torch.searchsorted(sizes, wanted.ceil().long()).clamp(max=len(ROUNDS) - 1)]
+    size = torch.where(rest > 0, size, 0)
+    for number in sorted(set(size.tolist()) - {0}):
+        yield number, active[size == number]
+
+
+def around_model(
+    ratio: Float[Tensor, "*batch n"], counts: Shaped[Tensor, "*#batch n"], codimension: int
+) -> Float[Tensor, "*batch"]:
+    """How many data the threshold would take in if they were as dense there as between two and six thresholds from the model.
+
+    Args:
+        ratio: Squared distances in units of the squared threshold.
+        counts: What the data count: a boolean or a weight.
+        codimension: The number of dimensions across the model.
+    """
+    between = ((ratio > 4) & (ratio < 36)).mul(counts).sum(-1)
+    expected: Tensor = (between + 0.5) / (6**codimension - 2**codimension)
+    return expected
+
+
+def beyond_chance(
+    support: Float[Tensor, "p"], count: Shaped[Tensor, "p"], expected: Float[Tensor, "p"], size: int
+) -> Bool[Tensor, "p"]:
+    """Whether so much support is more than the best of all samples finds by chance (Moisan & Stival 2004, bounded by entropy).
+
+    If a datum fits with probability p, a share q of n data does with probability exp(-n KL(q || p)) at most (Sanov's bound),
+    and there are (n over size) samples to choose from.
+
+    Args:
+        support: Soft number of inliers.
+        count: Number of data.
+        expected: How many data would fit by chance.
+        size: Number of data in a sample.
+    """
+    n = (count - size).to(support.dtype)
+    q = ((support - size) / n.clamp(min=1)).clamp(1e-9, 1 - 1e-9)
+    p = (expected / count).to(support.dtype).clamp(1e-4, 1 - 1e-9)
+    entropy = torch.where(q > p, q * (q / p).log() + (1 - q) * ((1 - q) / (1 - p)).log(), 0)
+    samples = torch.lgamma(n + size + 1.0) - torch.lgamma(n + 1.0) - math.lgamma(size + 1)
+    # Where nearly all data agree, there is no other explanation, however few they are.
+    return (n * entropy > samples) | (q > 0.9)
