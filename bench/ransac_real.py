@@ -91,7 +91,7 @@ def ours(pair: Pair, threshold: float) -> Tensor:
 def distances(pair: Pair, model: Tensor, a: Tensor, b: Tensor) -> Tensor:
     """Sampson or reprojection distance in pixels, the same for everybody."""
     if pair.model == "H":
-        return HomographyEstimator().residual(model, a, b)
+        return HomographyEstimator().squared_residual(model, a, b).sqrt()
     if pair.model == "P":
         return reprojection_distance(pair.K @ model, a, b)
     if pair.model == "E":

@@ -99,20 +99,20 @@ compare(
     "sampling", "Scores of matches save samples", "share of wrong matches", shares, "samples drawn", {
         "uniform": lambda s: estimate_fundamental(*scenes[s][0], threshold=1.5, generator=seeded()).iterations,
         "guided by scores": lambda s: estimate_fundamental(
-            *scenes[s][0], threshold=1.5, scores=hints(s), generator=seeded()
+            *scenes[s][0], threshold=1.5, quality=hints(s), generator=seeded()
         ).iterations,
     },
 )  # fmt: skip
 
 # %% Scores of models: what is best when the threshold fits, and when it does not
 x, exact, _ = pairs(0.5)
-scores = {type(score).__name__: score for score in (InlierCount(), Msac(), Magsac())}
-blind = error(estimate_fundamental(*x, threshold=None, score=LeastMedian(), generator=seeded()).model, exact)
+scorings = {type(score).__name__: score for score in (InlierCount(), Msac(), Magsac())}
+blind = error(estimate_fundamental(*x, threshold=None, scoring=LeastMedian(), generator=seeded()).model, exact)
 compare(
     "scores", "Magsac forgives a wrong threshold most", f"threshold in pixels (noise {NOISE})", [0.5, 1, 2, 4, 8, 16],
     "error in pixels", {
-        name: lambda t, score=score: error(estimate_fundamental(*x, threshold=t, score=score, generator=seeded()).model, exact)
-        for name, score in scores.items()
+        name: lambda t, s=scoring: error(estimate_fundamental(*x, threshold=t, scoring=s, generator=seeded()).model, exact)
+        for name, scoring in scorings.items()
     } | {"LeastMedian (none)": lambda _: blind},
 )  # fmt: skip
 

@@ -79,7 +79,7 @@ def main(steps: int = 60, seed: int = 0) -> None:
         print(f"best of 32 hypotheses, {name}: median error {error(few, y1, y2).median().item():.2f} px")
     for name, scores in {"without scores": None, "with learned scores": learned}.items():
         result = estimate_fundamental(
-            x1, x2, threshold=2 / SCALE, scores=scores, max_iterations=64, generator=torch.Generator().manual_seed(1)
+            x1, x2, threshold=2 / SCALE, quality=scores, max_iterations=64, generator=torch.Generator().manual_seed(1)
         )
         print(f"ransac with 64 samples, {name}: median error {error(result.model, y1, y2).median().item():.2f} px")
 

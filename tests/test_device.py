@@ -97,7 +97,7 @@ def test_estimators(kind: type, device: Device) -> None:
     sample = tuple(d[:, : kind.sample_size] for d in scene.data)  # type: ignore[attr-defined]
     options = {"threshold": 3e-3, "max_iterations": 200}
     arguments = scene.estimator, scene.model, scene.data, sample
-    device.compare(lambda a: (a[0].minimal(*a[3]), a[0].degenerate(*a[3]), a[0].residual(a[1], *a[2])), arguments)
+    device.compare(lambda a: (a[0].minimal(*a[3]), a[0].degenerate(*a[3]), a[0].squared_residual(a[1], *a[2])), arguments)
     device.compare(lambda a: ransac(a[0], *a[2], generator=seeded(1), **options), arguments)
     device.compare(lambda a: soft_ransac(a[0], *a[2], threshold=3e-3, hypotheses=8, generator=seeded(1)), arguments)
 

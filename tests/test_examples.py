@@ -65,6 +65,13 @@ def test_train_match_weights(tmp_path: Path) -> None:
     assert number(r"with learned scores: median error ([\d.]+) px", text) < 1
 
 
+def test_own_estimator(tmp_path: Path) -> None:
+    text = run("own_estimator.py", tmp_path)
+    assert number(r"lines: .* are ([\d.]+) off", text) < 0.03
+    assert number(r"similarities: ([\d.]+) off", text) < 6e-4
+    assert "Unfinished lacks max_solutions, codimension, degenerate, squared_residual, step" in text
+
+
 def test_ransac_variants(tmp_path: Path) -> None:
     text = run("ransac_variants.py", tmp_path)
     guided, uniform = (number(rf"{name} +[\d.]+ +[\d.]+ +([\d.]+)", text) for name in ("guided by scores", "uniform"))

@@ -47,7 +47,7 @@ def test_distance_is_the_reprojection_error(generator: torch.Generator) -> None:
     # The same cameras in the frame of the first.
     H = torch.linalg.inv(torch.cat((P[:, 0], torch.tensor([[[0.0, 0, 0, 1]]], dtype=F64).expand(5, 1, 4)), 1))
     model = P[:, 1:] @ H[:, None]
-    found = TrifocalEstimator().residual(model, *x.unbind(1))
+    found = TrifocalEstimator().squared_residual(model, *x.unbind(1)).sqrt()
     assert (found >= optimum * (1 - 1e-6)).all()
     torch.testing.assert_close(found, optimum, rtol=1e-3, atol=1e-9)
 

@@ -4,11 +4,11 @@ import pytest
 import torch
 from chance import assert_share
 from torch import Tensor
-from torchsfm.robust.glance import GLANCE
 
 from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import cross_rows
 from torchsfm.motion.plane_glance import plane_suspected
+from torchsfm.robust.diagnosis import GLANCE
 
 F64 = torch.float64
 

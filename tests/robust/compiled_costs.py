@@ -15,7 +15,7 @@ import torchsfm
 from torchsfm import compile_kernels
 from torchsfm._types import tensor_map
 from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac
-from torchsfm.robust.scoring import _costs, losses
+from torchsfm.robust.hypotheses import _costs, losses
 
 seed, wanted = int(sys.argv[1]), sys.argv[2:]
 rooms = [importlib.import_module(f"torchsfm.{room.name}") for room in pkgutil.iter_modules(torchsfm.__path__) if room.ispkg]

@@ -149,7 +149,7 @@ def _triangulate(scene: Scene, unit: float, *, threshold: Any, mask: Tensor | No
     x, P = scene.data
     S = torch.tensor([unit, unit, 1.0], dtype=x.dtype)[:, None]
     options.pop("covariance", None)
-    for name in ("scores", "weights"):
+    for name in ("quality", "weights"):
         if options.get(name) is not None:
             options[name] = options[name][..., None]
     limit = threshold[..., None] if isinstance(threshold, Tensor) else threshold
@@ -159,7 +159,7 @@ def _triangulate(scene: Scene, unit: float, *, threshold: Any, mask: Tensor | No
     )  # fmt: skip
     none = torch.zeros_like(r.status[..., 0])
     return RobustResult(
-        r.model[..., 0, :], r.inliers[..., 0], r.score[..., 0], r.threshold[..., 0], r.iterations[..., 0], r.status[..., 0],
+        r.model[..., 0, :], r.inliers[..., 0], r.support[..., 0], r.threshold[..., 0], r.iterations[..., 0], r.status[..., 0],
         none, r.covariance[..., 0, :, :],
     )  # fmt: skip
 

@@ -20,7 +20,7 @@ def test_the_unit_of_the_data_is_free(door: Door, generator: torch.Generator) ->
     plain, scaled = door(scene, 1.5), door(scene, 1.5, unit=1000.0)
     assert torch.equal(plain.inliers, scaled.inliers)
     assert torch.equal(plain.degeneracy, scaled.degeneracy)
-    torch.testing.assert_close(plain.score, scaled.score, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(plain.support, scaled.support, rtol=1e-6, atol=1e-6)
 
 
 @every_door
@@ -50,7 +50,7 @@ def test_extremes_in_one_batch(door: Door, generator: torch.Generator) -> None:
             assert torch.equal(getattr(alone, result), getattr(batch, result)[i]), (name, result)
         assert torch.equal(alone.inliers, batch.inliers[i, :size]), name
         assert not batch.inliers[i, size:].any(), name
-        for result in ("model", "score", "threshold"):
+        for result in ("model", "support", "threshold"):
             value = getattr(batch, result)[i]
             assert torch.isfinite(value).all(), (name, result)
             far = (getattr(alone, result) - value).abs().max()
@@ -74,11 +74,11 @@ def test_extremes_in_one_batch(door: Door, generator: torch.Generator) -> None:
 
 @every_door
 def test_what_is_given_once_holds_for_all(door: Door, generator: torch.Generator) -> None:
-    """Mask, weights, scores and thresholds without batch dimensions, and several of them for one problem."""
+    """Mask, weights, quality and thresholds without batch dimensions, and several of them for one problem."""
     n = 400
     scene = door.make(2, n, generator)
     mask, some = torch.rand(n, generator=generator) < 0.9, torch.rand(n, generator=generator, dtype=F64)
-    for option, value in (("mask", mask), ("weights", some), ("scores", some), ("threshold", torch.tensor(2.0, dtype=F64))):
+    for option, value in (("mask", mask), ("weights", some), ("quality", some), ("threshold", torch.tensor(2.0, dtype=F64))):
         once = door(scene, **{option: value})
         each = door(scene, **{option: value.expand(2, *value.shape)})
         assert torch.equal(once.inliers, each.inliers), option

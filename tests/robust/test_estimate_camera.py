@@ -11,6 +11,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.geometry import random_rotation, rotation_angle
 from torchsfm.resection import CameraEstimator, estimate_camera
+from torchsfm.robust import constant_weights
 
 K = torch.tensor([[800.0, 0, 500], [0, 820, 400], [0, 0, 1]], dtype=torch.float64)
 
@@ -52,7 +53,7 @@ def test_refinement_reaches_the_bound(generator: torch.Generator) -> None:
     model = torch.cat((R, t[..., None]), -1)
     estimator = CameraEstimator(K.expand(100, 3, 3))
     for _ in range(4):
-        model = estimator.refine(model, x, X, weights=(~wrong).double())
+        model = estimator.step(model, x, X, weigh=constant_weights((~wrong).double()))
     for threshold in (2.0, 5.0):
         found = estimate_camera(x, X, K, threshold=threshold, generator=seeded()).model
         ratio = turn(found, R) / turn(model, R)

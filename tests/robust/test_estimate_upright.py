@@ -6,6 +6,7 @@ from scenes import make_scene
 
 from torchsfm._types import Status
 from torchsfm.motion import RelativePoseEstimator, UprightPoseEstimator, estimate_essential, estimate_upright
+from torchsfm.robust import constant_weights
 from torchsfm.tensors import essential_from_pose
 
 
@@ -36,7 +37,7 @@ def test_a_wrong_vertical_is_corrected_by_refinement(generator: torch.Generator)
     model = found.model
     free = RelativePoseEstimator(torch.full((8,), 5e-3, dtype=torch.float64))
     for _ in range(5):
-        model = free.refine(model, *scene.data, weights=found.inliers.double())
+        model = free.step(model, *scene.data, weigh=constant_weights(found.inliers.double()))
     assert scene.error(model, scene.model).median() < 0.5 * scene.error(found.model, scene.model).median()
 
 

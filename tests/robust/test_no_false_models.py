@@ -9,11 +9,12 @@ from scenes import make_scene
 
 from torchsfm import motion, resection
 from torchsfm._types import Status
+from torchsfm.linalg import damped_solve
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography, estimate_upright
 from torchsfm.resection import estimate_camera
-from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac, damped_solve
+from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac, NeverZero
+from torchsfm.robust.hypotheses import losses, squared_residual
 from torchsfm.robust.local_optimisation import optimise_fully, optimise_within
-from torchsfm.robust.scoring import losses, squared_residual
 from torchsfm.triangulation import ESTIMATORS as OF_POINTS
 
 OF_RAYS = ("essential", "upright")
@@ -31,7 +32,7 @@ def test_what_is_no_model_has_no_score(kind: type, dtype: torch.dtype, generator
     estimator = type(scene.estimator)(*(v.to(dtype)[:, None] for v in vars(scene.estimator).values()))
     good = scene.model.to(dtype)
     bad = [torch.nan, torch.inf, -torch.inf, 1e37 if dtype == torch.float32 else 1e300]
-    if getattr(kind, "never_zero", False):
+    if isinstance(scene.estimator, NeverZero):
         bad.append(0.0)
     models = torch.stack([good, *(good * 0 + x if x else torch.zeros_like(good) for x in bad)], 1)
     partly = good.clone()
@@ -147,10 +148,10 @@ def test_pixels_are_not_radians(generator: torch.Generator) -> None:
         assert estimate_essential(d1, d2, threshold=right, max_iterations=64).status.shape == (2,)
 
 
-@pytest.mark.parametrize("score", [Msac(), LeastMedian()])
-def test_thresholds_as_wide_as_the_data_find_nothing(score: object, generator: torch.Generator) -> None:
+@pytest.mark.parametrize("scoring", [Msac(), LeastMedian()])
+def test_thresholds_as_wide_as_the_data_find_nothing(scoring: object, generator: torch.Generator) -> None:
     """In pixels, for points in focal lengths: any model would do."""
-    options = {"threshold": 2.0, "score": score, "max_iterations": 64, "generator": generator}
+    options = {"threshold": 2.0, "scoring": scoring, "max_iterations": 64, "generator": generator}
     a, b = torch.rand(2, 8, 60, 2, generator=generator, dtype=F64)
     X = torch.randn(8, 60, 3, generator=generator, dtype=F64)
     eye = torch.eye(3, dtype=F64)

@@ -9,7 +9,7 @@ from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Solutions, Status
-from torchsfm.robust import Estimator, ransac
+from torchsfm.robust import Estimator, Weigh, constant_weights, find_structures, ransac, soft_ransac
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,15 @@ class LineEstimator:
         offset = angle.cos() * x[..., 0, 0] + angle.sin() * x[..., 0, 1]
         return Solutions(Line(angle[..., None], offset[..., None]), (d != 0).any(-1)[..., None])
 
-    def residual(self, model: Line, x: Tensor) -> Tensor:
+    def squared_residual(self, model: Line, x: Tensor) -> Tensor:
         distance = model.angle.cos()[..., None] * x[..., 0] + model.angle.sin()[..., None] * x[..., 1]
-        return (distance - model.offset[..., None]).abs() * self.scale[..., None]
+        return ((distance - model.offset[..., None]) * self.scale[..., None]).square()
 
     def degenerate(self, x: Tensor) -> Tensor:
         return (x[..., 0, :] == x[..., 1, :]).all(-1)
 
-    def refine(self, model: Line, x: Tensor, *, weights: Tensor) -> Line:
+    def step(self, model: Line, x: Tensor, *, weigh: Weigh) -> Line:
+        weights, _ = weigh(self.squared_residual(model, x))
         w = weights[..., None]
         total = w.sum(-2).clamp(min=1e-12)
         c = (w * x).sum(-2) / total
@@ -86,8 +87,8 @@ def test_lines_are_found(inliers: float, generator: torch.Generator) -> None:
     assert (result.status == Status.OK).all()
     assert (line_error(result.model, truth) < 0.02).all()
     assert ((result.inliers == ~wrong).double().mean(-1) > 0.95).all()
-    soft = (1 - (unit(30).residual(result.model, x) / 0.3) ** 2).clamp(min=0).sum(-1)
-    torch.testing.assert_close(result.score, soft)
+    soft = (1 - (unit(30).squared_residual(result.model, x).sqrt() / 0.3) ** 2).clamp(min=0).sum(-1)
+    torch.testing.assert_close(result.support, soft)
 
 
 def test_fields_and_thresholds_belong_to_their_problem(generator: torch.Generator) -> None:
@@ -160,7 +161,7 @@ def test_trusted_data_are_found_sooner(generator: torch.Generator) -> None:
     scores = torch.where(wrong, 0.0, 1.0).double() + 0.3 * torch.randn(20, 3000, generator=generator)
     options = {"threshold": 0.3, "max_iterations": 128}
     blind = ransac(unit(20), x, generator=seeded(), **options)
-    guided = ransac(unit(20), x, generator=seeded(), scores=scores, **options)
+    guided = ransac(unit(20), x, generator=seeded(), quality=scores, **options)
     hits = lambda r: int((line_error(r.model, truth) < 0.05).sum())  # noqa: E731
     assert hits(guided) >= 18
     assert hits(blind) <= 10
@@ -170,7 +171,7 @@ def test_refinement_ignores_what_the_threshold_lets_in(generator: torch.Generato
     """With a threshold ten times the noise, the estimate is nearly as good as from the true inliers alone."""
     x, truth, wrong = lines(200, 300, 0.6, generator)
     result = ransac(unit(200), x, threshold=1.0, generator=generator)
-    ideal = unit(200).refine(truth, x, weights=(~wrong).double())
+    ideal = unit(200).step(truth, x, weigh=constant_weights((~wrong).double()))
     ours, best = line_error(result.model, truth), line_error(ideal, truth)
     assert (ours**2).mean().sqrt() < 1.15 * (best**2).mean().sqrt()
 
@@ -199,7 +200,7 @@ def test_senseless_thresholds_are_data_failures(value: float, generator: torch.G
         ({"max_iterations": 0}, "max_iterations"),
         ({"mask": torch.ones(3, 7, dtype=torch.bool)}, "mask"),
         ({"mask": torch.ones(3, 20)}, "mask"),
-        ({"scores": torch.ones(3, 19, dtype=torch.float64)}, "scores"),
+        ({"quality": torch.ones(3, 19, dtype=torch.float64)}, "quality"),
         ({"threshold": torch.ones(2, dtype=torch.float64)}, "batch"),
     ],
 )
@@ -212,3 +213,18 @@ def test_wrong_arguments_raise(change: dict[str, object], message: str) -> None:
         ransac(unit(3), threshold=1.0)
     with pytest.raises(ValueError, match="data"):
         ransac(replace(unit(3)), x, x[:, :5], threshold=1.0)
+
+
+def test_an_incomplete_estimator_is_refused_with_all_that_it_lacks(generator: torch.Generator) -> None:
+    class Half:
+        sample_size = 2
+
+        def minimal(self, x: Tensor) -> Solutions[Tensor]:
+            raise AssertionError
+
+    x = torch.rand(20, 2, generator=generator)
+    for door in (ransac, soft_ransac, find_structures):
+        with pytest.raises(ValueError, match="Half lacks max_solutions, codimension, degenerate, squared_residual, step"):
+            door(Half(), x, threshold=0.1)  # type: ignore[operator]
+        with pytest.raises(ValueError, match="estimator: wanted an object, got the class LineEstimator"):
+            door(LineEstimator, x, threshold=0.1)  # type: ignore[operator]

@@ -178,7 +178,7 @@ def test_float32_and_thresholds(generator: torch.Generator) -> None:
     threshold = torch.tensor([1e-3, 3e-3, 1e-2, 1e-1])
     found = soft_ransac(scene.estimator, *(d.float() for d in scene.data), threshold=threshold, generator=generator)
     assert found.probability.dtype == found.model.dtype == torch.float32
-    assert (found.score.amax((-2, -1)).diff() > 0).all()
+    assert (found.support.amax((-2, -1)).diff() > 0).all()
 
 
 def test_wrong_arguments(unchecked: None) -> None:

@@ -34,8 +34,8 @@ class SearchOptions(TypedDict, total=False):
         max_iterations: Most samples to draw for a problem; 10,000 if nothing else is said where the model is estimated.
     """
 
-    quality: Float[Tensor, "..."] | None
-    weights: Float[Tensor, "..."] | None
+    quality: Float[Tensor, "*#batch n"] | None
+    weights: Float[Tensor, "*#batch n"] | None
     scoring: Scoring | None
     sampler: Sampler | None
     generator: torch.Generator | None
@@ -52,7 +52,7 @@ class RansacOptions(SearchOptions, total=False):
         covariance: Compute the covariance of the model, from the scatter of the data around it; not if not given.
     """
 
-    mask: Bool[Tensor, "..."] | None
+    mask: Bool[Tensor, "*#batch n"] | None
     covariance: bool
 
 

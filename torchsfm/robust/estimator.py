@@ -6,6 +6,7 @@ bring besides, each by a few members; an estimator that has them is asked.
 
 from collections.abc import Callable
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from weakref import WeakKeyDictionary
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -78,6 +79,17 @@ class NeverZero(Protocol):
 
     never_zero: ClassVar[bool]
     """True."""
+
+
+def is_never_zero(estimator: object) -> bool:
+    """Whether an estimator is `NeverZero`: its class decides, and is asked once."""
+    kind = type(estimator)
+    if kind not in _NEVER_ZERO:
+        _NEVER_ZERO[kind] = isinstance(estimator, NeverZero)
+    return _NEVER_ZERO[kind]
+
+
+_NEVER_ZERO: WeakKeyDictionary[type, bool] = WeakKeyDictionary()
 
 
 @runtime_checkable

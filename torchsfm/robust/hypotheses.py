@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.linalg.fused import fused
-from torchsfm.robust.estimator import Estimator, NeverZero
+from torchsfm.robust.estimator import Estimator, is_never_zero
 from torchsfm.robust.models import cast, take_slots, tensors_of
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.samplers import Sampler
@@ -111,7 +111,7 @@ def _no_numbers_for_none(estimator: Estimator[M], model: M, dims: int) -> M:
         ]
         size = parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
         # 1, but 0 / 0 or inf / inf; or 0, but inf - inf.
-        one = size / size if isinstance(estimator, NeverZero) else size - size + 1
+        one = size / size if is_never_zero(estimator) else size - size + 1
     return tensor_map(lambda t: t * one.reshape(one.shape + (1,) * (t.ndim - dims)), model)
 
 

@@ -33,7 +33,7 @@ class Flat:
         of_data: What else the caller knows of each datum, `(p, n)`, by name.
     """
 
-    batch: torch.Size
+    batch: tuple[int, ...]
     estimator: Any
     data: tuple[Float[Tensor, "p n _"], ...]
     bound: Float[Tensor, "p"]

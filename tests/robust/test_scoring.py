@@ -10,12 +10,12 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.geometry import rotation_angle, rotation_from_rotvec
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography
-from torchsfm.robust import Degeneracy, InlierCount, LeastMedian, Magsac, Msac, Score
+from torchsfm.robust import Degeneracy, InlierCount, LeastMedian, Magsac, Msac, Scoring
 from torchsfm.tensors import essential_from_fundamental, pose_from_essential
 
 FOCAL, CENTRE = 800.0, 500.0
 K = torch.tensor([[FOCAL, 0, CENTRE], [0, FOCAL, CENTRE], [0, 0, 1]], dtype=torch.float64)
-SCORES = [Msac(), Magsac(), Magsac(2), Magsac(3), InlierCount(), LeastMedian()]
+SCORINGS = [Msac(), Magsac(), Magsac(2), Magsac(3), InlierCount(), LeastMedian()]
 
 
 def pixels(X: Tensor) -> Tensor:
@@ -49,30 +49,30 @@ def pose_error(E: Tensor, x1: Tensor, x2: Tensor, wrong: Tensor, R: Tensor, t: T
     return torch.rad2deg(torch.maximum(turn, torch.arccos((pose[..., 3] * t).sum(-1).clamp(-1, 1))))
 
 
-# ---- scores by themselves ----
+# ---- scorings by themselves ----
 
 
-@pytest.mark.parametrize("score", SCORES, ids=repr)
-def test_scores_rise_with_distance_and_count_weights(score: Score, generator: torch.Generator) -> None:
-    assert isinstance(score, Score)
+@pytest.mark.parametrize("scoring", SCORINGS, ids=repr)
+def test_scorings_rise_with_distance_and_count_weights(scoring: Scoring, generator: torch.Generator) -> None:
+    assert isinstance(scoring, Scoring)
     squared = torch.rand(5, 3, 41, generator=generator, dtype=torch.float64) * 2
     limit = torch.full((5,), 1.5, dtype=torch.float64)
-    cost = score.cost(squared.clone(), limit, None, 1)
+    cost = scoring.cost(squared.clone(), limit, None, 1)
     assert cost.shape == (5, 3)
-    assert (score.cost(squared * 1.2, limit, None, 1) >= cost).all()
+    assert (scoring.cost(squared * 1.2, limit, None, 1) >= cost).all()
     # Data of weight 0 do not count, whatever they are.
     weight = torch.ones(5, 51, dtype=torch.float64)
     weight[:, 41:] = 0
     padded = torch.cat((squared, torch.full((5, 3, 10), 0.1, dtype=torch.float64)), -1)
-    torch.testing.assert_close(score.cost(padded.clone(), limit, weight, 1), cost)
+    torch.testing.assert_close(scoring.cost(padded.clone(), limit, weight, 1), cost)
     squared[0, 0, 0] = torch.nan
-    assert torch.isinf(score.cost(squared.clone(), limit, None, 1)[0, 0]) or not score.needs_threshold
+    assert torch.isinf(scoring.cost(squared.clone(), limit, None, 1)[0, 0]) or not scoring.needs_threshold
 
 
 @pytest.mark.parametrize("dof", [2, 3, 4])
 def test_magsac_is_the_marginal_over_the_noise(dof: int) -> None:
     """The weight against the integral over sigma of the density of a chi-distribution, on a fine grid."""
-    score = Magsac(dof)
+    scoring = Magsac(dof)
     quantile = {2: 9.2103, 3: 11.3449, 4: 13.2767}[dof]
     r = torch.linspace(0.05, 0.95, 7, dtype=torch.float64)
     largest = 1 / quantile**0.5  # of sigma, for a threshold of 1
@@ -80,28 +80,28 @@ def test_magsac_is_the_marginal_over_the_noise(dof: int) -> None:
     # d rho / d (r^2 / 2): densities of inliers within their own quantile, evenly spread over sigma.
     density = sigma ** (-dof) * torch.exp(-(r[:, None] ** 2) / (2 * sigma**2)) * (r[:, None] < sigma * quantile**0.5)
     weight = density.mean(-1) * r ** (dof - 1)
-    found = score.weigh(r**2, 1)
+    found = scoring.weigh(r**2, 1)
     torch.testing.assert_close(found / found[0], weight / weight[0], rtol=1e-3, atol=1e-4)
     # The loss is the integral of the weight, 1 at the threshold.
     u = torch.linspace(0, 1, 20_001, dtype=torch.float64)
-    weights = score.weigh(u, 1)
+    weights = scoring.weigh(u, 1)
     integral = torch.cat((u.new_zeros(1), ((weights[1:] + weights[:-1]) / 2).cumsum(0)))
-    loss = score.cost(u[:, None, None], torch.ones(20_001, dtype=torch.float64), None, 1)[:, 0]
+    loss = scoring.cost(u[:, None, None], torch.ones(20_001, dtype=torch.float64), None, 1)[:, 0]
     torch.testing.assert_close(loss, integral / integral[-1], rtol=1e-3, atol=1e-3)
     assert loss[-1] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("score", SCORES, ids=repr)
-def test_every_score_finds_the_pose(score: Score, generator: torch.Generator) -> None:
+@pytest.mark.parametrize("scoring", SCORINGS, ids=repr)
+def test_every_scoring_finds_the_pose(scoring: Scoring, generator: torch.Generator) -> None:
     x1, x2, wrong, R, t = scene(16, 200, 0.7, generator)
-    threshold = 1.5 if score.needs_threshold else None
-    result = estimate_fundamental(x1, x2, threshold=threshold, score=score, generator=seeded())
+    threshold = 1.5 if scoring.needs_threshold else None
+    result = estimate_fundamental(x1, x2, threshold=threshold, scoring=scoring, generator=seeded())
     assert (result.status == Status.OK).all()
     error = pose_error(essential_from_fundamental(result.model, K, K), x1, x2, wrong, R, t)
     assert error.median() < 0.9
     assert ((result.inliers == ~wrong).double().mean(-1) > 0.93).all()
     turned = estimate_essential(
-        rays(x1), rays(x2), threshold=None if threshold is None else 1.5 / FOCAL, score=score, generator=seeded()
+        rays(x1), rays(x2), threshold=None if threshold is None else 1.5 / FOCAL, scoring=scoring, generator=seeded()
     )
     assert pose_error(turned.model, x1, x2, wrong, R, t).median() < 0.5
 
@@ -120,7 +120,7 @@ def test_the_threshold_is_found_where_none_is_given(generator: torch.Generator) 
 def test_a_threshold_that_is_wanted_must_be_given(generator: torch.Generator) -> None:
     x1, x2, *_ = scene(1, 20, 1.0, generator)
     with pytest.raises(ValueError, match="threshold: Msac wants one"):
-        estimate_fundamental(x1, x2, threshold=None, score=Msac())
+        estimate_fundamental(x1, x2, threshold=None, scoring=Msac())
     with pytest.raises(ValueError, match="dof"):
         Magsac(7)
 
@@ -132,13 +132,13 @@ def test_trusted_data_end_the_search_early(generator: torch.Generator) -> None:
     x1, x2, wrong, R, t = scene(6, 400, 0.4, generator)
     order = torch.rand(6, 400, generator=generator, dtype=torch.float64) + 0.8 * (~wrong)
     plain = estimate_fundamental(x1, x2, threshold=1.5, generator=seeded(), max_iterations=30_000)
-    guided = estimate_fundamental(x1, x2, threshold=1.5, scores=order, generator=seeded(), max_iterations=30_000)
+    guided = estimate_fundamental(x1, x2, threshold=1.5, quality=order, generator=seeded(), max_iterations=30_000)
     assert (guided.status == Status.OK).all()
     assert guided.iterations.double().mean() < 0.2 * plain.iterations.double().mean()
     errors = [pose_error(essential_from_fundamental(r.model, K, K), x1, x2, wrong, R, t) for r in (plain, guided)]
     assert errors[1].median() < 1.2 * errors[0].median() + 0.1
     # An order that means nothing costs time at most.
-    lost = estimate_fundamental(x1, x2, threshold=1.5, scores=-order, generator=seeded(), max_iterations=30_000)
+    lost = estimate_fundamental(x1, x2, threshold=1.5, quality=-order, generator=seeded(), max_iterations=30_000)
     assert (lost.status == Status.OK).all()
 
 
@@ -155,7 +155,7 @@ def test_a_weight_counts_as_so_many_data(generator: torch.Generator) -> None:
     first = estimate_homography(x1, x2, threshold=1.5, weights=twice, generator=seeded())
     second = estimate_homography(*double, threshold=1.5, generator=seeded())
     torch.testing.assert_close(first.model, second.model, rtol=2e-2, atol=1e-5)
-    torch.testing.assert_close(first.score, second.score, rtol=2e-2, atol=0.5)
+    torch.testing.assert_close(first.support, second.support, rtol=2e-2, atol=0.5)
     y1, y2, bad, _, _ = scene(4, 400, 0.35, generator)
     likely = torch.where(bad, 0.2, 1.0).double()
     plain = estimate_fundamental(y1, y2, threshold=1.5, generator=seeded(), max_iterations=30_000)
