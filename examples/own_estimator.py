@@ -94,9 +94,7 @@ wrong = random(64, 200, 1) < 0.5
 x = torch.where(wrong, 100 * (random(64, 200, 2) - 0.5), on + noise)
 found = ransac(LineEstimator(), x, threshold=0.4, generator=generator)
 off = (found.model[:, None, :2] * on).sum(-1) + found.model[:, None, 2]
-print(
-    f"lines: points of the true line are {off.abs().median():.3f} off (noise 0.1), {int(found.iterations.max())} samples at most"
-)
+print(f"lines: true points are {off.abs().median():.3f} off (noise 0.1), at most {int(found.iterations.max())} samples")
 
 # %% Similarities: 64 problems, 70 % of the pairs wrong
 scale, R, t = 0.5 + random(64, 1, 1), random_rotation(64, generator=generator, dtype=torch.float64), random(64, 1, 3)
@@ -106,7 +104,7 @@ noise = 0.002 * torch.randn(64, 300, 3, generator=generator, dtype=torch.float64
 Y = torch.where(random(64, 300, 1) < 0.7, 3 * random(64, 300, 3) - 1, exact + noise)
 similar = ransac(SimilarityEstimator(), X, Y, threshold=0.01, generator=generator)
 error = (X @ similar.model[..., :3].mT + similar.model[:, None, :, 3] - exact).norm(dim=-1)
-print(f"similarities: {error.median():.5f} off (noise 0.002), {int(similar.iterations.max())} samples at most")
+print(f"similarities: {error.median():.5f} off (noise 0.002), at most {int(similar.iterations.max())} samples")
 
 # %% What is missing is said at once
 

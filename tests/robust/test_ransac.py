@@ -215,6 +215,7 @@ def test_wrong_arguments_raise(change: dict[str, object], message: str) -> None:
         ransac(replace(unit(3)), x, x[:, :5], threshold=1.0)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_an_incomplete_estimator_is_refused_with_all_that_it_lacks(generator: torch.Generator) -> None:
     class Half:
         sample_size = 2

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, Status
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator, RelativePoseEstimator
-from torchsfm.robust import SoftSelection, soft_ransac
+from torchsfm.robust import SoftSelection, Weigh, soft_ransac
 
 F64 = torch.float64
 
@@ -29,14 +29,15 @@ class Mean:
         model = (0.7 * x[..., 0, :] + 0.3 * x[..., 1, :])[..., None, :]
         return Solutions(model, torch.ones(model.shape[:-1], dtype=torch.bool))
 
-    def residual(self, model: Tensor, x: Tensor) -> Tensor:
-        return (x[..., 0] - model).abs()
+    def squared_residual(self, model: Tensor, x: Tensor) -> Tensor:
+        return (x[..., 0] - model).square()
 
     def degenerate(self, x: Tensor) -> Tensor:
         return x[..., 0, 0] == x[..., 1, 0]
 
-    def refine(self, model: Tensor, x: Tensor, *, weights: Tensor) -> Tensor:
-        return model + 0 * (weights * x[..., 0]).sum(-1, keepdim=True)
+    def step(self, model: Tensor, x: Tensor, *, weigh: Weigh) -> Tensor:
+        weights, _ = weigh(self.squared_residual(model, x))
+        return (weights * x[..., 0]).sum(-1, keepdim=True) / weights.sum(-1, keepdim=True)
 
 
 X = torch.tensor([[0.0], [0.3], [1.0], [2.5]], dtype=F64)

@@ -14,7 +14,7 @@ from torchsfm.motion.epipolar_fit import cofactors, cross_rows, matrices, plane_
 from torchsfm.motion.estimate_homography import HomographyEstimator
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.oriented_7pt import oriented_7pt
-from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_rivals
+from torchsfm.motion.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_alternatives
 from torchsfm.motion.plane_glance import plane_suspected
 from torchsfm.motion.sampson_plane import squared_distance, step_equations
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
@@ -95,7 +95,7 @@ class FundamentalEstimator:
         seed: int,
     ) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
         """Where a plane holds most inliers: F of its homography and of two points off it (Chum, Werner & Matas 2005)."""
-        return plane_rivals(self, HomographyEstimator(), model, x1, x2, inside=inside, threshold=threshold, seed=seed)
+        return plane_alternatives(self, HomographyEstimator(), model, x1, x2, inside=inside, threshold=threshold, seed=seed)
 
     def may_be_degenerate(
         self,

@@ -13,7 +13,7 @@ from torchsfm.motion.collinear import collinear, collinear_suspected
 from torchsfm.motion.multilinear_fit import frame_directions, free_directions, inverse_similarity
 from torchsfm.motion.normalization import common_scale_of_views
 from torchsfm.motion.plane_and_parallax import more_than_chance, most_by_chance
-from torchsfm.motion.three_view_parallax import planar, planar_suspected, rivals_of_plane
+from torchsfm.motion.three_view_parallax import alternatives_of_plane, planar, planar_suspected
 from torchsfm.motion.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.trifocal_reprojection import linear_depths, normal_equations, squared_distance
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
@@ -110,7 +110,7 @@ class TrifocalEstimator:
         seed: int,
     ) -> Solutions[Float[Tensor, "p k 2 3 4"]]:
         """Where most inliers are in a plane, the best cameras of that plane and two points off it."""
-        return rivals_of_plane(self, model, (x1, x2, x3), inside, threshold, seed)
+        return alternatives_of_plane(self, model, (x1, x2, x3), inside, threshold, seed)
 
     def may_be_degenerate(
         self,

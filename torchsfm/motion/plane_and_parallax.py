@@ -22,7 +22,7 @@ from torchsfm.robust.sampling import draw_samples
 
 _JUDGES = 256
 """How many data to judge planes by before all of them are looked at."""
-_PAIRS, _OFF_PLANE, _RIVALS = 1024, 256, 4
+_PAIRS, _OFF_PLANE, _ALTERNATIVES = 1024, 256, 4
 """Pairs of points off a plane, points off it to judge them by, and how many of the best to return."""
 
 
@@ -80,7 +80,7 @@ def dominant_plane(
     return H, inliers & (squared_transfer(H, h1, h2, sphere) < limit[:, None])
 
 
-def plane_rivals(
+def plane_alternatives(
     estimator: Any,
     plane_estimator: Any,
     model: Float[Tensor, "p 3 4"],
@@ -105,8 +105,8 @@ def plane_rivals(
         threshold: Largest distance of an inlier.
         seed: Seed for the pairs.
     """
-    out = model[:, None].expand(-1, _RIVALS, -1, -1).clone()
-    valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
+    out = model[:, None].expand(-1, _ALTERNATIVES, -1, -1).clone()
+    valid = torch.zeros(len(model), _ALTERNATIVES, dtype=torch.bool, device=model.device)
     limit = threshold * threshold
     # First a look at a part, spread over all.
     some = slice(2 * _OFF_PLANE)
@@ -139,7 +139,7 @@ def plane_rivals(
         squared = squared_residual(estimator, both[i : i + 1], z1[i : i + 1, None], z2[i : i + 1, None])
         ratio = (squared / bound[i]).clamp(max=1).nan_to_num(nan=1.0)
         loss.append((ratio * counts[i]).sum(-1))
-    least = torch.cat(loss).topk(_RIVALS, dim=-1, largest=False)
+    least = torch.cat(loss).topk(_ALTERNATIVES, dim=-1, largest=False)
     out[row] = both.gather(1, least.indices[..., None, None].expand(-1, -1, 3, 4))
     valid[row] = (least.values < counts.sum(-1, keepdim=True)) & (count >= 2)[:, None]
     return Solutions(out, valid)

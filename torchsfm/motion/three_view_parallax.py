@@ -21,11 +21,11 @@ from torchsfm.robust.hypotheses import squared_residual
 from torchsfm.robust.sampling import draw_samples
 from torchsfm.tensors.canonical import canonical_frame
 
-_PAIRS, _OFF_PLANE, _RIVALS = 256, 256, 4
+_PAIRS, _OFF_PLANE, _ALTERNATIVES = 256, 256, 4
 """Pairs of points off the plane, points off it to judge them by, and how many of the best to return."""
 
 
-def rivals_of_plane(
+def alternatives_of_plane(
     estimator: Any,
     model: Float[Tensor, "p 2 3 4"],
     x: Sequence[Float[Tensor, "p n 2"]],
@@ -45,8 +45,8 @@ def rivals_of_plane(
         threshold: Largest distance of an inlier.
         seed: Seed for the pairs.
     """
-    out = model[:, None].expand(-1, _RIVALS, -1, -1, -1).clone()
-    valid = torch.zeros(len(model), _RIVALS, dtype=torch.bool, device=model.device)
+    out = model[:, None].expand(-1, _ALTERNATIVES, -1, -1, -1).clone()
+    valid = torch.zeros(len(model), _ALTERNATIVES, dtype=torch.bool, device=model.device)
     limit = threshold * threshold
     near = (squared_residual(estimator, model, *x) < limit[:, None]) & inside
     H, on = _planes(model, x, near, limit)
@@ -79,7 +79,7 @@ def rivals_of_plane(
         squared = squared_residual(estimator, found[i : i + 1], *(y[i : i + 1, None] for y in z))
         ratio = (squared / limit[i]).clamp(max=1).nan_to_num(nan=1.0)
         loss.append((ratio * counts[i]).sum(-1))
-    least = torch.cat(loss).topk(_RIVALS, dim=-1, largest=False)
+    least = torch.cat(loss).topk(_ALTERNATIVES, dim=-1, largest=False)
     out[row] = found.gather(1, least.indices[..., None, None, None].expand(-1, -1, 2, 3, 4))
     valid[row] = (least.values < counts.sum(-1, keepdim=True)) & (count >= 2)[:, None]
     valid &= torch.isfinite(out).flatten(2).all(-1)

@@ -184,7 +184,7 @@ class Problems:
         """With estimator, data and thresholds of another type."""
         return cast(self, dtype)
 
-    def scatter(self, values: Tensor, n: int, fill: float = 0) -> Tensor:
+    def scatter(self, values: Tensor, n: int, fill: int = 0) -> Tensor:
         """Bring a property of the slots, `(p, width)`, back into the caller's order, `(p, n)`."""
         out = torch.full((len(values), n + 1), fill, dtype=values.dtype, device=values.device)
         return out.scatter_(1, torch.where(self.inside, self.source, n), values)[:, :n]
