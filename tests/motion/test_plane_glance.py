@@ -8,7 +8,7 @@ from torch import Tensor
 from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.motion.epipolar_fit import cross_rows
 from torchsfm.motion.plane_glance import plane_suspected
-from torchsfm.robust.diagnosis import GLANCE
+from torchsfm.robust.degeneracy import GLANCE
 
 F64 = torch.float64
 

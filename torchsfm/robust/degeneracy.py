@@ -1,6 +1,23 @@
-"""Why the data, although they agree on a model, may not determine it."""
+"""Why the data, although they agree on a model, may not determine it; asked of estimators that can tell.
+
+A glance at a part of the data comes first, to look no further where it already shows that nothing is degenerate.
+"""
 
 from enum import IntEnum
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import tensor_map
+from torchsfm.robust.estimator import Diagnosed
+from torchsfm.robust.hypotheses import squared_residual
+from torchsfm.robust.problems import Problems
+from torchsfm.robust.stopping import around_model
+
+GLANCE = 128
+"""How many data to look at: any part of packed data is spread over all."""
 
 
 class Degeneracy(IntEnum):
@@ -21,3 +38,69 @@ class Degeneracy(IntEnum):
     """The camera only turned: there is no parallax."""
     UNDETERMINED = 5
     """No sample determined a model, for a reason that is none of the others."""
+
+
+def glance(
+    problems: Problems,
+    model: Any,
+    limit: Float[Tensor, "p"],
+    inliers: Bool[Tensor, "p _"] | None = None,
+    chance: Float[Tensor, "p"] | None = None,
+) -> Bool[Tensor, "p"]:
+    """Where the inliers may be degenerate, judging by a part of the data.
+
+    Args:
+        problems: The problems, of an estimator that is `Diagnosed`.
+        model: The model of each.
+        limit: Squared thresholds.
+        inliers: Which of the first data or more agree with the model; found out if not given.
+        chance: How many data agree by chance; estimated if not given.
+    """
+    estimator: Any = problems.estimator
+    data = [d[:, :GLANCE] for d in problems.data]
+    if inliers is None or chance is None:
+        inside = problems.inside[:, :GLANCE]
+        ratio = squared_residual(estimator, model, *data) / limit[:, None]
+        inliers = (ratio < 1) & inside
+        chance = around_model(ratio, inside, estimator.codimension) * (problems.width / inside.shape[-1])
+    found: Bool[Tensor, "p"] = estimator.may_be_degenerate(
+        model, *data, inliers=inliers[:, :GLANCE], threshold=limit.sqrt(), chance=chance
+    )
+    return found
+
+
+def diagnose(
+    problems: Problems,
+    model: Any,
+    solved: Bool[Tensor, "p"],
+    doubtful: Bool[Tensor, "p"] | None,
+    near: Bool[Tensor, "p width"],
+    chance: Float[Tensor, "p"],
+) -> Int[Tensor, "p"]:
+    """What the inliers lack, or all data where no sample determined a model: a `Degeneracy` each, as int8.
+
+    Args:
+        problems: The problems, with the thresholds by which the data were judged.
+        model: The best model of each.
+        solved: Whether any sample had a solution.
+        doubtful: What a glance has left open; None if there was none yet.
+        near: Which data agree with the model.
+        chance: How many data agree by chance.
+    """
+    code = torch.where(solved, int(Degeneracy.NONE), int(Degeneracy.UNDETERMINED)).to(torch.int8)
+    if isinstance(problems.estimator, Diagnosed):
+        if doubtful is None:
+            doubtful = glance(problems, model, problems.limit, near, chance)
+        index = (doubtful | ~solved).nonzero()[:, 0]
+        if len(index):
+            some, known, looked_at = problems.take(index), solved[index], near[index]
+            estimator: Any = some.estimator
+            found = estimator.degeneracy(
+                tensor_map(lambda t: t[index], model), *some.data,
+                inliers=torch.where(known[:, None], looked_at, some.inside), threshold=some.limit.sqrt(), chance=chance[index],
+            )  # fmt: skip
+            found = torch.where(known | (found != Degeneracy.NONE), found, int(Degeneracy.UNDETERMINED))
+            code = code.index_copy(0, index, found.to(torch.int8))
+    size = problems.estimator.sample_size
+    few = (solved & (near.sum(-1) <= size)) | (problems.count <= size)
+    return torch.where(few, int(Degeneracy.TOO_FEW), code).to(torch.int8)

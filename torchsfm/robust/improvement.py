@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
-from torchsfm.robust.diagnosis import glance
+from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
 from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally, optimise_within

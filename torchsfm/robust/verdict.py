@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.robust.degeneracy import Degeneracy
-from torchsfm.robust.diagnosis import diagnose
+from torchsfm.robust.degeneracy import Degeneracy, diagnose
 from torchsfm.robust.improvement import Best
 from torchsfm.robust.problems import Flat, Problems
 from torchsfm.robust.stopping import around_model, beyond_chance
