@@ -8,7 +8,7 @@ they get without bad neighbours. Wrong arguments must raise a `ValueError` that 
 import inspect
 import re
 from collections.abc import Callable, Iterator
-from typing import Any, get_args
+from typing import Any, get_args, get_type_hints, is_typeddict
 
 import numpy as np
 import torch
@@ -58,7 +58,7 @@ def good_arguments(call: Call, how: Function, scene: Scene) -> Arguments:
     arguments: Arguments = {}
     left_out = {name for group in how.together if torch.rand((), generator=scene.generator) > OPTIONAL for name in group}
     together = {name for group in how.together for name in group} - left_out
-    for name, parameter in inspect.signature(call).parameters.items():
+    for name, parameter in parameters_of(call).items():
         if name in how.given:
             value = how.given[name]
             arguments[name] = value(scene) if inspect.isfunction(value) else value
@@ -78,11 +78,24 @@ def good_arguments(call: Call, how: Function, scene: Scene) -> Arguments:
     return arguments
 
 
+def parameters_of(call: Call) -> dict[str, inspect.Parameter]:
+    """The parameters by name; options that a typed dictionary describes are parameters of their own."""
+    found: dict[str, inspect.Parameter] = {}
+    for name, parameter in inspect.signature(call).parameters.items():
+        options = [kind for kind in get_args(parameter.annotation) if is_typeddict(kind)]
+        if parameter.kind is parameter.VAR_KEYWORD and options:
+            for option, annotation in get_type_hints(options[0]).items():
+                found[option] = inspect.Parameter(option, parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+        else:
+            found[name] = parameter
+    return found
+
+
 def apply(call: Call, arguments: Arguments) -> Any:
     """Call with arguments by name, also those that signatures take as `*args`; every generator starts anew."""
     positional: list[Any] = []
     keywords: Arguments = {}
-    parameters = inspect.signature(call).parameters
+    parameters = parameters_of(call)
     several = any(p.kind is p.VAR_POSITIONAL for p in parameters.values())
     for name, parameter in parameters.items():
         if name not in arguments:
@@ -152,7 +165,7 @@ def _wrong_arguments(call: Call, how: Function, seed: int) -> Trial:
     generator = torch.Generator().manual_seed(seed)
     batch: tuple[int, ...] = ((), (2,), (0,))[int(torch.randint(3, (), generator=generator))]
     arguments = good_arguments(call, how, _scene(how, generator, batch))
-    parameters = inspect.signature(call).parameters
+    parameters = parameters_of(call)
     several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     names = [n for n, p in parameters.items() if p.kind not in several and n not in JUDGED_BY_TORCH]
     names = [n for n in names if not callable(arguments.get(n, parameters[n].default))]

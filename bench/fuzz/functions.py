@@ -53,6 +53,10 @@ def _generator(_: Scene) -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+def _of_observations(s: Scene) -> Tensor:
+    return s.rand(s.size("v"), s.size("n"), low=0.2, high=1.0)
+
+
 def _poses(s: Scene) -> Pose:
     _, R, t = s.parameters(4)
     return Pose(R, t)
@@ -223,7 +227,9 @@ FUNCTIONS: dict[str, Function] = {
     "simulation.random_poses": Function({"shape": (2,), "generator": _generator}),
     "simulation.simulate_images": Function({"poses": _poses, "cameras": _lenses, "generator": _generator}),
     "tensors.reordered_trifocal": Function({"views": (1, 0, 2)}),
-    "triangulation.triangulate_points_robust": Function({"threshold": 2.0, "generator": _generator}),
+    "triangulation.triangulate_points_robust": Function(
+        {"threshold": 2.0, "generator": _generator, "weights": _of_observations, "quality": _of_observations}
+    ),
 }  # fmt: skip
 """The others are called with what the scene knows."""
 

@@ -280,6 +280,7 @@ _VALUES: dict[str, Callable[[Scene, tuple[int, ...]], Tensor]] = {
     "p": lambda s, _: 0.1 * s.randn(3),
     "present": _mask,
     "q": lambda s, _: quaternion_wxyz_from_rotation(s.parameters(2)[1][..., 1, :, :]),
+    "quality": _weights,
     "scores": _weights,
     "skew": lambda s, _: s.rand(low=-0.1, high=0.1),
     "t": lambda s, _: s.parameters(2)[2][..., 1, :],

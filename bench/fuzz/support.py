@@ -107,14 +107,14 @@ def _sampson_of_pose(pose: Tensor, a: Arguments) -> Tensor:
 
 
 def _sampson_of_homography(H: Tensor, a: Arguments) -> Tensor:
-    return HomographyEstimator().residual(H, a["x1"], a["x2"])
+    return HomographyEstimator().squared_residual(H, a["x1"], a["x2"]).sqrt()
 
 
 def _three_views(P: Tensor, a: Arguments) -> Tensor:
     """Whatever the signs of the cameras, which the frame of `canonical_cameras` does not keep."""
     signs = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]], dtype=P.dtype)[..., None, None]
     x = [v[..., None, :, :] for v in a["x"].unbind(-3)]
-    return TrifocalEstimator().residual(signs * P[..., None, 1:, :, :], *x).amin(-2)
+    return TrifocalEstimator().squared_residual(signs * P[..., None, 1:, :, :], *x).amin(-2).sqrt()
 
 
 def _projections(P: Tensor, a: Arguments) -> Tensor:

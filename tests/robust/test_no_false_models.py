@@ -187,4 +187,4 @@ def test_weights_near_the_largest_number_leave_a_finite_score(dtype: torch.dtype
     weights = torch.full((30,), torch.finfo(dtype).max, dtype=dtype)
     found = estimate_homography(x, x + 1, threshold=1.0, weights=weights, max_iterations=64, generator=generator)
     assert found.status == Status.OK
-    assert torch.isfinite(found.score)
+    assert torch.isfinite(found.support)

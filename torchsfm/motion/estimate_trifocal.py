@@ -174,10 +174,10 @@ def estimate_trifocal(
         **options: See `RansacOptions`.
 
     Returns:
-        Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, support, iterations, status,
-        degeneracy (PLANAR: homographies relate all inliers but so few as chance explains; COLLINEAR: so many are on a line in an image;
-        the cameras are then some of many), covariance
-        (36 x 36, of rank 18). The cameras carry their derivatives with respect to the inliers (see `ransac`).
+        Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, support, iterations, status, degeneracy
+        (PLANAR: homographies relate all inliers but so few as chance explains; COLLINEAR: so many are on a line in an image;
+        the cameras are then some of many), covariance (36 x 36, of rank 18). The cameras carry their derivatives with respect
+        to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
