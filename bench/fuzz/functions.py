@@ -244,6 +244,7 @@ EXCEPTIONS: dict[str, str] = {
     "linalg.compile_kernels": "a switch",
     "optim.wants_derivative": "a question about tensors, not their values",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
+    **{f"robust.{name}": "what doors have in common; each door is tried" for name in ("check_door", "estimate_robustly")},
     "simulation.courtyard_scene": "takes no data, and seconds",
     "simulation.render_sequence": "takes no data, and seconds",
     **{f"plot.plot_{name}": "draws" for name in (
