@@ -134,8 +134,8 @@ class _SchurJacobi:
 
 def solve_reduced(
     squares: Squares, coupling: RowCoupling | None, clusters: Clusters, L: Triangle, z: Tensor, weight: Tensor
-) -> tuple[Tensor, int]:
-    """The step of the retained variables for a damping `weight`, to the accuracy of `FORCING`, and the iterations it took.
+) -> tuple[Tensor, bool]:
+    """The step of the retained variables for a damping `weight`, to the accuracy of `FORCING`, and whether there is one.
 
     Args:
         squares: U and the gradient.
@@ -163,25 +163,25 @@ def solve_reduced(
     return conjugate_gradients(apply, precondition, -right, FORCING)
 
 
-def conjugate_gradients(apply: Apply, precondition: Apply, b: Tensor, forcing: float) -> tuple[Tensor, int]:
-    """Solve `A x = b` for a positive (semi-)definite A from zero; return x and the number of iterations."""
+def conjugate_gradients(apply: Apply, precondition: Apply, b: Tensor, forcing: float) -> tuple[Tensor, bool]:
+    """Solve `A x = b` from zero; return x and whether A was found to be positive on the way."""
     x, r = torch.zeros_like(b), b
     z = precondition(r)
     p, rz = z, float(r @ z)
     first, model = rz, 0.0
     for iteration in range(1, ITERATIONS + 1):
         if not rz > 1e-30 * first:
-            return x, iteration - 1
+            return x, True
         product = apply(p)
         curvature = float(p @ product)
         if not curvature > 0:
-            return x, iteration - 1
+            return x, False
         alpha = rz / curvature
         x, r = x + alpha * p, r - alpha * product
         before, model = model, float(x @ (b + r))
         z = precondition(r)
         last, rz = rz, float(r @ z)
         if rz <= forcing**2 * first and iteration * (model - before) <= forcing * model:
-            return x, iteration
+            return x, True
         p = z + rz / last * p
-    return x, ITERATIONS
+    return x, True

@@ -77,8 +77,8 @@ class NormalEquations:
         size = self.layout.size
         if self.clusters is not None:
             assert self.coupling is None or isinstance(self.coupling, RowCoupling), "made so by Elimination"
-            kept, _ = solve_reduced(self.squares, self.coupling, self.clusters, L, z, weight)
-            return kept, kept.isfinite().all()
+            kept, positive = solve_reduced(self.squares, self.coupling, self.clusters, L, z, weight)
+            return kept, kept.isfinite().all() & (positive | (self.V is self.metric))
         if not size:
             return weight, torch.ones_like(weight, dtype=torch.bool).all()
         S = self.squares.dense()
@@ -158,6 +158,11 @@ class NormalEquations:
     def gradient(self) -> Tensor:
         """Largest absolute derivative of the cost."""
         return torch.cat((self.slope, self.point_gradient().flatten())).abs().amax()
+
+    def along(self, step: dict[str, Tensor]) -> Tensor:
+        """The derivative of the cost along a step."""
+        kept, point = self.join(step)
+        return self.slope @ kept + (self.point_gradient() * point).sum()
 
     def split(self, kept: Tensor, point: Tensor) -> dict[str, Tensor]:
         """A vector of the size of the system by blocks, (free variables, tangent)."""

@@ -109,10 +109,10 @@ class Elimination:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
 
         An eliminated variable between two minima of its own keeps its Gauss-Newton block: it must not hold back all others.
-        The system holds until the next call. Not for `pcg`.
+        The system holds until the next call.
         """
         if self._exact is None:
-            self._exact = Elimination(self.blocks, self.layout, "dense")
+            self._exact = Elimination(self.blocks, self.layout, "dense" if self.clusters is None else "pcg")
         exact, q = self._exact, self.layout.point_size
         exact.squares.clear()
         exact.V.zero_()
