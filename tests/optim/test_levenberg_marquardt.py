@@ -4,11 +4,21 @@ import importlib
 import numpy as np
 import pytest
 import torch
+from chance import assert_share
 from scipy.optimize import least_squares
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.optim import Cauchy, Huber, RigidMotion, SoftL1, UnitSphere, levenberg_marquardt, rotation_exponential
+from torchsfm.optim import (
+    Cauchy,
+    GemanMcClure,
+    Huber,
+    RigidMotion,
+    SoftL1,
+    UnitSphere,
+    levenberg_marquardt,
+    rotation_exponential,
+)
 
 F64 = torch.float64
 
@@ -29,7 +39,7 @@ def decay_data(generator: torch.Generator, *batch: int, noise: float = 0.05) -> 
 @pytest.mark.parametrize("loss", [None, SoftL1(0.1), Huber(0.1), Cauchy(0.1)])
 def test_minimum_is_scipys(generator: torch.Generator, loss: object) -> None:
     _, t, y = decay_data(generator, 20)
-    y[:, 4] += 3
+    y[:, 4] += 1
     result = levenberg_marquardt(decay, torch.ones(20, 3, dtype=F64), t, y, loss=loss)
     assert (result.status == Status.OK).all()
     names = {"NoneType": "linear", "SoftL1": "soft_l1", "Huber": "huber", "Cauchy": "cauchy"}
@@ -183,6 +193,61 @@ def test_derivative_of_the_minimum(generator: torch.Generator, loss: object) -> 
         torch.testing.assert_close((gradient * step).sum(), numeric, rtol=1e-4, atol=1e-12)
     assert not fit(t, y, weights).requires_grad
     assert torch.equal(fit(*inputs), fit(t, y, weights))
+
+
+def outlying_data(generator: torch.Generator, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Few measurements, three in ten of them wrong by about one."""
+    truth, t, y = decay_data(generator, count)
+    t, y = t[:, ::2], y[:, ::2]
+    wrong = torch.rand(y.shape, generator=generator) < 0.3
+    return truth, t, torch.where(wrong, y + torch.randn(y.shape, generator=generator, dtype=F64), y)
+
+
+@pytest.mark.parametrize("loss", [Cauchy(0.1), GemanMcClure(0.2)])
+def test_thirty_steps_to_the_last_digit(generator: torch.Generator, loss: object) -> None:
+    """Wrong data make Gauss-Newton crawl; the last ten digits cost a few Newton steps all the same."""
+    truth, t, y = outlying_data(generator, 400)
+    first = levenberg_marquardt(decay, truth, t, y, loss=loss, max_iterations=200)
+    rest = levenberg_marquardt(
+        decay, first.x, t, y, loss=loss, max_iterations=200, function_tolerance=1e-20, step_tolerance=0.0
+    )
+    assert_share(first.iterations + rest.iterations <= 30, 0.97)
+    # The default call promised that no more than its tolerance is left to gain.
+    ok = first.status == Status.OK
+    assert (rest.cost >= first.cost * (1 - 1e-9))[ok].all()
+
+
+@pytest.mark.parametrize("loss", [Cauchy(0.1), GemanMcClure(0.2)])
+def test_derivatives_with_wrong_data(generator: torch.Generator, loss: object) -> None:
+    """Those of the default call are within 1e-3 of central differences of the minimum, or are not said to be OK and zero."""
+    truth, t, y = outlying_data(generator, 50)
+    away = torch.randn(3, generator=generator, dtype=F64)
+    leaf = y.clone().requires_grad_()
+    result = levenberg_marquardt(decay, truth, t, leaf, loss=loss)
+    (gradient,) = torch.autograd.grad((result.x @ away).sum(), leaf)
+    ok = result.status == Status.OK
+    assert ok.sum() >= 40
+    assert (gradient[~ok] == 0).all()
+    step = 1e-7 * torch.randn(y.shape, generator=generator, dtype=F64)
+    options = {"function_tolerance": 1e-25, "step_tolerance": 0.0, "max_iterations": 200}
+    plus, minus = (
+        levenberg_marquardt(decay, result.x.detach(), t, y + sign * step, loss=loss, **options).x @ away for sign in (1, -1)
+    )
+    # A sum of many terms may come near zero by chance.
+    error = ((gradient * step).sum(-1) - (plus - minus) / 2).abs() / (gradient * step).norm(dim=-1)
+    assert (error[ok] < 1e-3).all()
+
+
+def test_no_derivative_where_there_is_no_minimum(generator: torch.Generator) -> None:
+    _, t, y = decay_data(generator, 6)
+    leaf = y.clone().requires_grad_()
+    start = torch.ones(6, 3, dtype=F64)
+    start[::2] = levenberg_marquardt(decay, start, t, y).x[::2]
+    result = levenberg_marquardt(decay, start, t, leaf, max_iterations=2)
+    assert result.status.tolist() == [Status.OK, Status.NOT_CONVERGED] * 3
+    (gradient,) = torch.autograd.grad(result.x.sum(), leaf)
+    assert (gradient[1::2] == 0).all()
+    assert (gradient[::2] != 0).any(-1).all()
 
 
 def test_statistical_efficiency(generator: torch.Generator) -> None:

@@ -19,18 +19,41 @@ class DenseProblem:
 
     residual: Callable[..., Tensor]
     retract: Callable[[Any, Tensor], Any]
-    size: int
+    tangent: int
     loss: Loss | None
     linearize: Linearize | None
 
     def cost(self, x: Any, data: Any, weights: Tensor | None) -> Tensor:
         """`sum w rho / 2`, (batch)."""
-        square = self.residual(x, *data).square().sum(-1).double()
-        rho = square if self.loss is None else self.loss(square)
+        residual = self.residual(x, *data)
         if weights is not None:
             # Left out means left out: a NaN there must not come through.
+            residual = torch.where((weights > 0)[..., None], residual, 0.0)
+        square = residual.square().sum(-1).double()
+        rho = square if self.loss is None else self.loss(square)
+        if weights is not None:
             rho = torch.where(weights > 0, rho * weights, 0.0)
         return rho.sum(-1) / 2
+
+    def hessian(self, x: Any, data: Any, weights: Tensor | None) -> Tensor:
+        """The exact second derivatives of the cost along the tangent directions, (batch, size, size); not always positive."""
+        first = leaves(x)[0]
+        with torch.enable_grad():
+            delta = first.new_zeros((first.shape[0], self.tangent)).requires_grad_()
+            cost = self.cost(self.retract(x, delta), data, weights)
+            (slope,) = torch.autograd.grad(cost.sum(), delta, create_graph=True, materialize_grads=True)
+            if not slope.requires_grad:
+                return delta.new_zeros((*delta.shape, self.tangent)).double()
+            rows = [torch.autograd.grad(s.sum(), delta, retain_graph=True, materialize_grads=True)[0] for s in slope.unbind(-1)]
+        return torch.stack(rows, -2).double()
+
+    def size(self, x: Any, data: Any, weights: Tensor | None) -> Tensor:
+        """What the cost would be if each residual were as large as the numbers in the data, (batch)."""
+        first = leaves(x)[0]
+        count = torch.full(first.shape[:1], self.residual(x, *data).shape[-2], dtype=torch.float64, device=first.device)
+        numbers = [d[..., None].flatten(1).double() for d in leaves(data) if d.is_floating_point() and d.numel()]
+        squares = [torch.where(d.isfinite(), d, 0.0).square().mean(1) for d in numbers]
+        return (count if weights is None else weights.double().sum(-1)) * sum(squares, torch.zeros_like(count)) / 2
 
     def normal_equations(self, x: Any, data: Any, weights: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Cost, gradient and Gauss-Newton matrix, in float64."""
@@ -58,14 +81,14 @@ class DenseProblem:
         """
         first = leaves(x)[0]
         with torch.enable_grad():
-            delta = first.new_zeros((first.shape[0], self.size)).requires_grad_()
+            delta = first.new_zeros((first.shape[0], self.tangent)).requires_grad_()
             value = self.residual(self.retract(x, delta), *data)
             seed = torch.zeros_like(value).requires_grad_()
             (pulled,) = torch.autograd.grad(value, delta, seed, create_graph=True, materialize_grads=True)
             ones = torch.ones_like(pulled[:, 0])
             columns = [
                 torch.autograd.grad(pulled[:, i], seed, ones, retain_graph=True, materialize_grads=True)[0]
-                for i in range(self.size)
+                for i in range(self.tangent)
             ]
         return value.detach(), torch.stack(columns, -1)
 
@@ -74,5 +97,5 @@ class DenseProblem:
         count, components = self.residual(x, *data).shape[-2:]
         first = leaves(x)[0]
         if weights is None:
-            return torch.full(first.shape[:1], count * components < self.size, device=first.device)
-        return (weights > 0).sum(-1) * components < self.size
+            return torch.full(first.shape[:1], count * components < self.tangent, device=first.device)
+        return (weights > 0).sum(-1) * components < self.tangent

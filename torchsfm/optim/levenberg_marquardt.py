@@ -15,6 +15,7 @@ from torch import Tensor
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.optim.damped_steps import Found, Options, minimise
 from torchsfm.optim.dense_problem import DenseProblem, Linearize
+from torchsfm.optim.descent import MINIMUM
 from torchsfm.optim.implicit import attach_optimum, wants_derivative
 from torchsfm.optim.loss import Loss
 from torchsfm.optim.trees import cut, flatten, join, leaves
@@ -29,9 +30,9 @@ class LeastSquaresResult(Generic[M]):
     """The minima of a batch of least-squares problems.
 
     `x` is what the parameters came as. `cost` and `initial_cost` are `sum w rho / 2`; `iterations` counts linear solves.
-    `status` is `Status.OK` where a tolerance was met or no step lowers the cost any more, `NOT_CONVERGED` where the iteration
-    limit came first. It is `TOO_FEW` where there are fewer residuals than parameters and `NOT_FINITE` where the cost or its
-    slope at the start is not finite: there `x` is the start, and a cost that is not a number is inf.
+    `status` is `Status.OK` where a tolerance was met, `NOT_CONVERGED` where the iteration limit came first or no step lowers
+    the cost though more is promised. It is `TOO_FEW` where there are fewer residuals than parameters and `NOT_FINITE` where the
+    cost or its slope at the start is not finite: there `x` is the start, and a cost that is not a number is inf.
     """
 
     x: M
@@ -58,8 +59,13 @@ def levenberg_marquardt(
     """Minimise many small nonlinear least-squares problems, all in one batch.
 
     The Jacobian comes from automatic differentiation of `residual` along the tangent directions, or from `linearize`. Where
-    `data` or `weights` require a gradient the minimum carries its derivative with respect to them, by the implicit function
-    theorem with the exact Hessian; otherwise nothing is spent on it.
+    Gauss-Newton steps become slow, as with robust losses and large residuals, Newton steps with the exact Hessian (automatic
+    differentiation of the cost) take over wherever it is positive definite, problem by problem.
+
+    Where `data` or `weights` require a gradient the minimum carries its derivative with respect to them, by the implicit
+    function theorem with the exact Hessian; otherwise nothing is spent on it. It is that of a minimum, so each problem is then
+    solved until hardly 1e-13 of its cost is left to gain, whatever `function_tolerance` says; where the status is not OK the
+    minimum was not reached, and the derivative is zero.
 
     Args:
         residual: `residual(x, *data) -> (*batch, n, d)`: n residuals of d components each, for any number of batch dimensions
@@ -73,8 +79,9 @@ def levenberg_marquardt(
         loss: `rho(s)` of squared norms, see `torchsfm.optim.loss`; `s` if not given.
         linearize: `linearize(x, *data) -> (residual (b, n, d), jacobian (b, n, d, size))`, where a hand-written one pays.
         max_iterations: Most linear solves per problem.
-        function_tolerance: A problem is done when a step lowers, or promises to lower, its cost by less than this fraction.
-        step_tolerance: A problem is done when the step is shorter than this fraction of `|x|`.
+        function_tolerance: A problem is done when no more than this fraction of its cost is left to gain, by the promise of a
+            step or by how fast gains fall; or no more than rounding of parameters and data makes of it.
+        step_tolerance: A problem is done when the step is shorter than this fraction of `|x|` and promises next to nothing.
         initial_damping: Damping relative to the diagonal of the normal equations, at the start.
 
     Returns:
@@ -96,6 +103,9 @@ def levenberg_marquardt(
         check_tensors(x0=(x0, "k>=1"))
         size = x0.shape[-1]
     followed = leaves((data, weights))
+    wanted = wants_derivative(*followed)
+    if wanted:
+        function_tolerance = min(function_tolerance, MINIMUM)
     options = Options(max_iterations, function_tolerance, step_tolerance, initial_damping)
     with torch.no_grad():
         shape = _residual_shape(residual, x0, data)
@@ -109,8 +119,8 @@ def levenberg_marquardt(
         step = max(1, PIECE // max(1, shape[-2] * shape[-1] * size))
         result = _minimise_in_pieces(problem, flat_x, flat_data, flat_weights, options, batch.numel(), step)
     x = result.x
-    if wants_derivative(*followed):
-        good = (result.status == Status.OK) | (result.status == Status.NOT_CONVERGED)
+    if wanted:
+        good = result.status == Status.OK
         x = _attach(problem, x, flatten(data, batch), None if weights is None else flatten(weights, batch), good)
     return LeastSquaresResult(
         tensor_map(lambda v: v.reshape(batch + v.shape[1:]), x),
@@ -133,7 +143,7 @@ def _attach(problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, go
     """The minimum with its derivatives with respect to all tensors in data and weights."""
     followed = leaves((data, weights))
     first = leaves(x)[0]
-    zero = first.new_zeros((first.shape[0], problem.size))
+    zero = first.new_zeros((first.shape[0], problem.tangent))
 
     def objective(delta: Tensor, *tensors: Tensor) -> Tensor:
         replaced = iter(tensors)
