@@ -125,6 +125,7 @@ def descend(engine: Elimination, state: Descent, options: Options, *, rounding: 
             rate, last = trial.gain / last, trial.gain
             if not step.exact:
                 # Steps that fall as a geometric series have this much still before them.
+                rate = min(rate, 1.0)
                 series = last * rate / (1 - rate) if rate < 1 else math.inf
                 done = done or max(last, left, series) <= least
                 dull = dull + 1 if rate > SLOW and last <= NEAR * state.cost else 0
