@@ -55,6 +55,15 @@ def test_forty_steps_to_the_minimum_in_fifty_problems(outliers: float, loss: Cau
     check_convergence(outliers, loss, 50, share)
 
 
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+def test_conjugate_gradients_end_with_newton_steps(outliers: float) -> None:
+    """They take some more steps than a dense factor, where Gauss-Newton alone takes twice as many."""
+    options = {"free": FREE, "loss": Cauchy(1.0), "tolerance": 1e-13, "max_iterations": 100}
+    found = [bundle_adjust_model(problem, linear_solver="pcg", **options).result for problem in problems(5, outliers)]
+    assert all(result.status == Status.OK for result in found)
+    assert sum(result.iterations for result in found) <= 5 * 30
+
+
 @pytest.mark.parametrize(("outliers", "loss"), [(0.0, None), (0.0, Cauchy(1.0)), (0.1, Cauchy(1.0))])
 def test_the_derivative_of_the_default_call(outliers: float, loss: Cauchy | None, generator: torch.Generator) -> None:
     """It is that of the minimum, by central differences, or is not said to be."""
