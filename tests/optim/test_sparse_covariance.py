@@ -14,7 +14,9 @@ def problem(generator: torch.Generator) -> tuple[dict[str, Block], list[Term]]:
     station = torch.randn(7, 2, generator=generator, dtype=F64) * 3
     mark = torch.randn(15, 2, generator=generator, dtype=F64) * 3
     i, j = torch.cartesian_prod(torch.arange(7), torch.arange(15)).T
-    keep = torch.rand(105, generator=generator) < 0.7
+    draw = torch.rand(7, 15, generator=generator)
+    # Four stations see every mark at least: one of them determines none, and two leave it on either side of their line.
+    keep = (draw < draw.sort(0).values[4].clamp(min=0.7)).flatten()
     i, j = i[keep], j[keep]
     d = (station[i] - mark[j]).norm(dim=1, keepdim=True)
 
@@ -127,7 +129,7 @@ class TestDerivative:
         value = function(*leaves)
         gradients = torch.autograd.grad(value, leaves)
         for k, gradient in enumerate(gradients):
-            step = 3e-5 * torch.randn(inputs[k].shape, generator=generator, dtype=F64) * inputs[k].abs().mean()
+            step = 1e-5 * torch.randn(inputs[k].shape, generator=generator, dtype=F64) * inputs[k].abs().mean()
             plus, minus = (function(*(v + s * step if k == n else v for n, v in enumerate(inputs))) for s in (1, -1))
             numeric = (plus - minus) / 2
             assert numeric.abs() > 0

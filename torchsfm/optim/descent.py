@@ -64,12 +64,16 @@ class Descent:
 
 @dataclass(frozen=True)
 class _Step:
-    """A step with the decrease that its model promises, the damping it took, and whether the model is the exact Hessian."""
+    """A step with the decrease that its model promises, and the damping it took.
+
+    The model may be the exact Hessian; where the cost is bent, and the step made as if it were not, that promises nothing.
+    """
 
     delta: dict[str, Tensor]
     promise: float
     damping: float
     exact: bool = False
+    bent: bool = False
 
 
 @dataclass(frozen=True)
@@ -112,11 +116,11 @@ def descend(engine: Elimination, state: Descent, options: Options, *, rounding: 
         step = _gauss_newton_step(system, damping) if step is None else step
         damping = step.damping
         least = max(options.function_tolerance, ROUNDING**2) * state.cost + rounding
-        left = step.promise
-        if left <= least and damping > LIGHT:
-            left = float((system if curved is None or not step.exact else curved).step(LIGHT)[1])
+        left, sure = step.promise, step.exact and not step.bent
+        if left <= least and (damping > LIGHT or step.bent):
+            left = _gauss_newton_step(curved if sure and curved is not None else system, LIGHT).promise
         # Gauss-Newton steps may promise too little.
-        done = left <= (least if step.exact else 1e-2 * least)
+        done = left <= (least if sure else 1e-2 * least)
         if left <= SETTLED * state.cost and damping <= LIGHT:
             done = done or _is_short(engine, state.x, step.delta, options.step_tolerance)
         trial = _try(engine, state, system, step)
@@ -156,7 +160,7 @@ def descend(engine: Elimination, state: Descent, options: Options, *, rounding: 
 
 def _gauss_newton_step(system: NormalEquations, damping: float) -> _Step:
     """A step that promises inf where the system could not be solved, so that it is not taken."""
-    delta, promise, solved = system.step(damping)
+    delta, promise, solved, _ = system.step(damping)
     return _Step(delta, float(promise) if bool(solved) else math.inf, damping)
 
 
@@ -166,9 +170,9 @@ def _newton_step(curved: NormalEquations, damping: float) -> _Step | None:
     None where the Hessian is so far from positive that the damping would be the greater part of it.
     """
     while True:
-        delta, promise, solved = curved.step(damping)
+        delta, promise, solved, bent = curved.step(damping)
         if bool(solved):
-            return _Step(delta, float(promise), damping, exact=True)
+            return _Step(delta, float(promise), damping, exact=True, bent=bent)
         damping *= 10
         if damping > STEEPEST:
             return None

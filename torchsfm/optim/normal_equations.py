@@ -4,6 +4,7 @@ See `schur` for the notation. Eliminated blocks are factored elementwise, all at
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,6 +23,18 @@ NULL = 1e-11
 
 LARGEST_BENT = 2000
 """Columns of the largest reduced system whose eigenvalues are found where it is not positive."""
+
+
+class Step(NamedTuple):
+    """A step of all free variables."""
+
+    delta: dict[str, Tensor]
+    promise: Tensor
+    """The decrease that the model promises."""
+    solved: Tensor
+    """Whether there is one."""
+    bent: bool
+    """Whether the cost bends down along some directions, in which the step then goes as far as were it up."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +61,8 @@ class NormalEquations:
     slope: Tensor
     """The gradient by retained variables."""
 
-    def step(self, damping: float) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-        """The step for `damping` times the diagonal, the decrease the model promises, and whether the system was solved.
+    def step(self, damping: float) -> "Step":
+        """The step for `damping` times the diagonal.
 
         The promise holds for steps of conjugate gradients too: their residual is orthogonal to the step.
         """
@@ -62,7 +75,7 @@ class NormalEquations:
         if q:
             L, positive = factor(self.V + metric, q)
             z = forward(L, h)
-        kept, solved = self._reduced(weight, L, z)
+        kept, solved, bent = self._reduced(weight, L, z)
         promise = kept @ (weight * kept - self.slope)
         point = h
         if q:
@@ -70,17 +83,17 @@ class NormalEquations:
                 z = z + forward(L, self.coupling.product(extend(kept)))
             point = -backward(L, z)
             promise = promise + (point * (product(metric, point) - h)).sum()
-        return self.split(kept, point), promise / 2, solved & (positive.all() | (self.V is self.metric))
+        return Step(self.split(kept, point), promise / 2, solved & (positive.all() | (self.V is self.metric)), bent)
 
-    def _reduced(self, weight: Tensor, L: Triangle, z: Tensor) -> tuple[Tensor, Tensor]:
-        """The step of the retained variables, and whether there is one."""
+    def _reduced(self, weight: Tensor, L: Triangle, z: Tensor) -> tuple[Tensor, Tensor, bool]:
+        """The step of the retained variables, whether there is one, and whether the cost bends down along some."""
         size = self.layout.size
         if self.clusters is not None:
             assert self.coupling is None or isinstance(self.coupling, RowCoupling), "made so by Elimination"
             kept, positive = solve_reduced(self.squares, self.coupling, self.clusters, L, z, weight)
-            return kept, kept.isfinite().all() & (positive | (self.V is self.metric))
+            return kept, kept.isfinite().all() & (positive | (self.V is self.metric)), False
         if not size:
-            return weight, torch.ones_like(weight, dtype=torch.bool).all()
+            return weight, torch.ones_like(weight, dtype=torch.bool).all(), False
         S = self.squares.dense()
         S.diagonal()[:size] += weight
         if self.coupling is not None:
@@ -88,10 +101,10 @@ class NormalEquations:
             self.coupling.reduce(S, L, z)
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
         if self.V is not self.metric and size <= LARGEST_BENT and bool(info):
-            return self._downhill(S[:size, :size], S[:size, size])
+            return *self._downhill(S[:size, :size], S[:size, size]), True
         half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
         kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
-        return kept, (info == 0) & kept.isfinite().all()
+        return kept, (info == 0) & kept.isfinite().all(), False
 
     def _downhill(self, S: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
         """The step of the retained variables where the cost bends down in some directions: as far as were it up.
