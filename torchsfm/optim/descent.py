@@ -116,9 +116,10 @@ def descend(engine: Elimination, state: Descent, options: Options, *, rounding: 
         step = _gauss_newton_step(system, damping) if step is None else step
         damping = step.damping
         least = max(options.function_tolerance, ROUNDING**2) * state.cost + rounding
-        left, sure = step.promise, step.exact and not step.bent
+        left, sure = step.promise, step.exact
         if left <= least and (damping > LIGHT or step.bent):
-            left = _gauss_newton_step(curved if sure and curved is not None else system, LIGHT).promise
+            # What a heavily damped step promises says nothing, nor what one along which the cost bends down does.
+            left, sure = _gauss_newton_step(system, LIGHT).promise, False
         # Gauss-Newton steps may promise too little.
         done = left <= (least if sure else 1e-2 * least)
         if left <= SETTLED * state.cost and damping <= LIGHT:
