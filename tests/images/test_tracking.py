@@ -129,6 +129,8 @@ def test_errors_name_the_argument() -> None:
         track_points(image, torch.zeros(1, 60, 50), x)
     with pytest.raises(ValueError, match="x1"):
         track_points(image, image, torch.zeros(3, 3))
+    with pytest.raises(ValueError, match="x1: wanted device"):
+        track_points(image, image, x.to("meta"))
     with pytest.raises(ValueError, match="window"):
         track_points(image, image, x, window=2)
     with pytest.raises(ValueError, match="frame 1 has size"):

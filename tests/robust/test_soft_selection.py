@@ -195,3 +195,12 @@ def test_wrong_arguments(unchecked: None) -> None:
     assert isinstance(selection, SoftSelection)
     with pytest.raises(ValueError, match="loss"):
         selection.expectation(torch.zeros(4, 1))
+
+
+@pytest.mark.parametrize("size", [1e30, 1e300])
+def test_samples_however_unlikely_have_finite_logarithms(size: float) -> None:
+    logits = (size * LOGITS).requires_grad_()
+    found = soft_ransac(Mean(), X, logits=logits, generator=seeded(), **OPTIONS)
+    assert torch.isfinite(found.log_sampling).all()
+    found.expectation(loss_of(found.model)).backward()
+    assert torch.isfinite(logits.grad).all()

@@ -72,6 +72,8 @@ def track_points(
     """
     places = check_tensors(x1=(x1, "n 2"), guess=(guess, "?n 2"))
     pictures = check_tensors(image1=(image1, "c h>=1 w>=1"), image2=(image2, "c h w"))
+    if x1.device != image1.device:
+        raise ValueError(f"x1: wanted device {image1.device} as image1 has, got {x1.device}")
     try:
         batch = broadcast_shapes(pictures, places)
     except ValueError:

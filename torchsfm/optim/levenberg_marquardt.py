@@ -113,8 +113,8 @@ def levenberg_marquardt(
         if weights is not None and weights.shape[-1:] != shape[-2:-1]:
             raise ValueError(f"weights: wanted shape (*batch, {shape[-2]}) of the residuals, got {tuple(weights.shape)}")
         flat_x = flatten(tensor_map(torch.Tensor.detach, x0), batch)
-        flat_data = flatten(tensor_map(torch.Tensor.detach, data), batch)
-        flat_weights = None if weights is None else flatten(weights.detach(), batch)
+        flat_data = flatten(tensor_map(torch.Tensor.detach, data), batch, "data")
+        flat_weights = None if weights is None else flatten(weights.detach(), batch, "weights")
         problem = DenseProblem(residual, move, size, loss, linearize)
         step = max(1, PIECE // max(1, shape[-2] * shape[-1] * size))
         result = _minimise_in_pieces(problem, flat_x, flat_data, flat_weights, options, batch.numel(), step)

@@ -50,11 +50,18 @@ def norm(tree: Any) -> Tensor:
     return torch.stack([v.double().flatten(1).square().sum(-1) for v in leaves(tree)]).sum(0).sqrt()
 
 
-def flatten(tree: Any, batch: torch.Size) -> Any:
-    """One batch dimension in front of every tensor."""
+def flatten(tree: Any, batch: torch.Size, name: str = "x0") -> Any:
+    """One batch dimension in front of every tensor.
+
+    Raises:
+        ValueError: A tensor of what the caller knows by this name has other dimensions in front.
+    """
 
     def one(v: Tensor) -> Tensor:
         rest = v.shape[len(batch) :]
+        front = v.shape[: len(batch)]
+        if len(front) < len(batch) or any(own not in (1, size) for own, size in zip(front, batch, strict=True)):
+            raise ValueError(f"{name}: wanted batch dimensions {tuple(batch)} of the residuals in front, got {tuple(v.shape)}")
         if len(batch) == 1:
             return v.expand(batch + rest)
         return v.expand(batch + rest).reshape(-1, *rest) if batch else v[None]

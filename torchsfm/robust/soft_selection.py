@@ -205,7 +205,8 @@ def _draw(
     masked = torch.where(usable, logits, -torch.inf)
     log_share = torch.log_softmax(torch.where(some, masked, 0), -1)
     chosen = log_share[:, None].expand(p, hypotheses, n).gather(-1, index)
-    chosen = torch.where(torch.isfinite(chosen), chosen, 0)
+    # So unlikely that no number says how much, in the sum either.
+    chosen = torch.where(torch.isfinite(chosen), chosen, 0).clamp(min=torch.finfo(chosen.dtype).min / (2 * size))
     taken = chosen.exp().cumsum(-1)
     left = torch.cat((torch.zeros_like(taken[..., :1]), taken[..., :-1]), -1)
     return index, (chosen - (1 - left).clamp(min=_REMAINS).log()).sum(-1)
