@@ -1,6 +1,6 @@
 """Solvers judged: recall, speed, number of solutions, derivatives, bad input, against PoseLib, OpenCV and kornia; one thread.
 
-`python -m bench.solvers` prints the tables, `--readme` writes the short one into README.md; `pytest bench/solvers.py` times the
+`python -m bench.solvers` prints the tables, `--write` writes the short one into RESULTS.md; `pytest bench/solvers.py` times the
 solvers with pytest-benchmark. PoseLib and OpenCV solve one sample a call, kornia and this library a batch; a call to a C++
 solver from Python costs a few microseconds by itself. Solvers are added in `bench/cases/`.
 """
@@ -17,13 +17,13 @@ from bench.cases import CASES, Case
 from bench.cases.case import nearest
 from bench.measures import bad_data, counts, gradients, recall, speed
 
-README = Path(__file__).parent.parent / "README.md"
-MARKERS = "<!-- solvers: made by `python -m bench.solvers --readme` -->", "<!-- end of solvers -->"
+RESULTS = Path(__file__).parent / "RESULTS.md"
+MARKERS = "<!-- solvers: made by `python -m bench.solvers --write` -->", "<!-- end of solvers -->"
 PARTS = ("recall", "speed", "counts", "gradients", "bad")
 
 
 def short_row(case: Case, options: argparse.Namespace) -> str:
-    """One solver's line of the README."""
+    """One solver's line of the short table."""
     double, single = (recall.recall(case, "random", options.samples, d).share for d in (torch.float64, torch.float32))
     hard = min((recall.recall(case, family, options.samples, torch.float64).share, family) for family in case.families)
     times = speed.speeds(case, options.batch, options.repeats, not options.no_compile)
@@ -39,19 +39,19 @@ def short_row(case: Case, options: argparse.Namespace) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def write_readme(rows: list[str]) -> None:
+def write_results(rows: list[str]) -> None:
     """Put the table between the markers."""
     table = [
         "| solver | data | solutions | recall f64 / f32 | least recall on hard scenes | µs | µs compiled | µs of others |",
         "|---|---|---|---|---|---|---|---|",
         *rows,
     ]
-    text = README.read_text()
+    text = RESULTS.read_text()
     pattern = re.compile(re.escape(MARKERS[0]) + ".*?" + re.escape(MARKERS[1]), re.DOTALL)
     if len(pattern.findall(text)) != 1:
-        raise SystemExit(f"{README} has no place for the table: {MARKERS}")
+        raise SystemExit(f"{RESULTS} has no place for the table: {MARKERS}")
     block = "\n".join((MARKERS[0], *table, MARKERS[1]))
-    README.write_text(pattern.sub(lambda _: block, text))
+    RESULTS.write_text(pattern.sub(lambda _: block, text))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -66,12 +66,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--batch", type=int, default=16384, help="samples for timing")
     parser.add_argument("--repeats", type=int, default=5, help="rounds of timing")
     parser.add_argument("--no-compile", action="store_true", help="leave out torch.compile, which takes minutes the first time")
-    parser.add_argument("--readme", action="store_true", help="write the short table into README.md and print nothing else")
+    parser.add_argument("--write", action="store_true", help="write the short table into RESULTS.md and print nothing else")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cases = [case for case in CASES if case.name in options.solvers]
-    if options.readme:
-        write_readme([short_row(case, options) for case in cases])
+    if options.write:
+        write_results([short_row(case, options) for case in cases])
         return
     for part in options.parts:
         module = {"recall": recall, "speed": speed, "counts": counts, "gradients": gradients, "bad": bad_data}[part]
