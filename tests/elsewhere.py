@@ -79,7 +79,14 @@ def compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     if func is torch.ops.aten._local_scalar_dense.default:
         return found
     known = {id(v.numbers): v for v in own}  # of operations in place
-    return tree_map(lambda v: known.get(id(v), v) if id(v) in known or not isinstance(v, Tensor) else ElsewhereTensor(v), found)
+
+    def brought(v: Any) -> Any:
+        if id(v) in known or not isinstance(v, Tensor):
+            return known.get(id(v), v)
+        # Derivatives that are zero have no memory, which operations below autograd do not expect.
+        return ElsewhereTensor(torch.zeros(v.shape, dtype=v.dtype) if v._is_zerotensor() else v)
+
+    return tree_map(brought, found)
 
 
 class _Factories(TorchDispatchMode):
