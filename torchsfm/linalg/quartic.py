@@ -84,4 +84,8 @@ def solve_quartic(c: Float[Tensor, "*batch 5"]) -> tuple[Float[Tensor, "*batch 4
     """
     with torch.no_grad():
         roots, real = (rows.movedim(0, -1) for rows in quartic_rows(c.detach().double().movedim(-1, 0)))
-    return attach_roots(c, roots.to(c.dtype), real), real
+        roots = roots.to(c.dtype)
+        # Numbers of this kind may be too small for them.
+        real = real & torch.isfinite(roots)
+        roots = torch.where(torch.isfinite(roots), roots, 0)
+    return attach_roots(c, roots, real), real

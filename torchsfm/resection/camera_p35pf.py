@@ -72,6 +72,9 @@ def camera_p35pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"
         parts = [_solve(image[..., i : i + _CHUNK], world[..., i : i + _CHUNK]) for i in starts]
         model, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         model, valid = model.reshape(*batch, _SLOTS, 3, 4).to(x.dtype), valid.reshape(*batch, _SLOTS)
+        # Numbers of this kind may be too small for them.
+        held = torch.isfinite(model).flatten(-2).all(-1)
+        valid, model = valid & held, torch.where(held[..., None, None], model, 0)
     if wants_derivative(x, X):
         model = attach_implicit(equations, model, x[..., None, :, :], X[..., None, :, :], dims=2, valid=valid)
     return Solutions(model, valid)

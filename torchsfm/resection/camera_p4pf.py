@@ -66,6 +66,9 @@ def camera_p4pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]
         parts = [_solve(image[..., i : i + _CHUNK], world[..., i : i + _CHUNK]) for i in starts]
         P, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         P, valid = P.reshape(*batch, 1, 3, 4), valid.reshape(*batch, 1)
+        # Numbers of the caller's kind may be too small for them.
+        held = torch.isfinite(P.to(x.dtype)).flatten(-2).all(-1)
+        valid, P = valid & held, torch.where(held[..., None, None], P, 0)
     model = P.to(x.dtype)
     if wants_derivative(x, X):
         zero = torch.zeros(*batch, 1, 7, dtype=torch.float64, device=x.device)
