@@ -181,12 +181,11 @@ def search_inliers(fine: Problems, coarse: Problems, best: Best, options: Option
         number.append(torch.where(worthwhile & old.solved, old.iterations // _PER_START, 0))
     sizes = torch.tensor((0, *STARTS), device=fine.count.device)
     starts, sampler = sizes[torch.searchsorted(sizes, torch.cat(number), right=True) - 1], Among(torch.cat(near))
-    plan = [(min(LOCAL_DATA, coarse.width), 0)]
     for size in sorted(set(starts.tolist()) - {0}):
         drawn = max(4 * size, 64)
         for part in _portions((starts == size).nonzero()[:, 0], drawn, _SAMPLES):
             models, valid = solve_samples(fine, part, best.iterations[part], drawn, options.seed, sampler)
-            some, plan = coarse.take(part), [(plan[0][0], size)]
+            some, plan = coarse.take(part), [(min(LOCAL_DATA, coarse.width), size)]
             models, loss, _ = sift(some, models, valid, options.scoring, plan, size)
             for row in _portions(_all(some), size * EXPLORED_DATA, _NUMBERS):
                 best = _optimised(some.take(row), best, part[row], _rows(models, row), loss[row], options, EXPLORED_DATA)

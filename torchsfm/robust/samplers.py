@@ -196,6 +196,6 @@ def nearest_neighbours(place: Float[Tensor, "n d"], number: int) -> Int[Tensor, 
 
 
 def _ranked(problems: Problems) -> tuple[Tensor, Tensor]:
-    if problems.ranking is None or problems.growth is None:
-        raise ValueError("sampler: Prosac() wants the quality of the data, got none")
+    assert problems.ranking is not None, "seen to by ransac"
+    assert problems.growth is not None, "made with it"
     return problems.ranking, problems.growth
