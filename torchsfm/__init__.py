@@ -101,6 +101,7 @@ from torchsfm.geometry import (
 )
 from torchsfm.images import (
     Corners,
+    Edges,
     Features,
     ImageError,
     LearnedDetector,
@@ -108,6 +109,7 @@ from torchsfm.images import (
     Photograph,
     Tracks,
     detect_corners,
+    detect_edges,
     detect_features,
     list_images,
     load_detector,
@@ -361,6 +363,7 @@ __all__ = [
     "Distortion",
     "DistortionModel",
     "DualQuadric",
+    "Edges",
     "Estimator",
     "Euclidean",
     "Factorization",
@@ -487,6 +490,7 @@ __all__ = [
     "cross_matrix",
     "depth_space",
     "detect_corners",
+    "detect_edges",
     "detect_features",
     "diagnose_motion",
     "dual_quadric_linear",

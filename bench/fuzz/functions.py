@@ -81,6 +81,13 @@ def _features(s: Scene) -> list[Features]:
     return [Features(s.rand(20, 2, high=100.0), *one, s.rand(20, 128)) for _ in range(3)]
 
 
+def _picture(s: Scene) -> Tensor:
+    """A bright rectangle with noise."""
+    image = s.rand(1, 32, 40, high=0.05)
+    image[..., 8:24, 10:30] += 0.6
+    return image
+
+
 def _bundle(name: str) -> Callable[[Scene], Any]:
     return lambda s: getattr(random_bundle_problem(4, 20, 60, generator=_generator(s)).problem, name)
 
@@ -147,6 +154,7 @@ FUNCTIONS: dict[str, Function] = {
     "geometry.random_rotation": Function({"shape": (2,), "generator": _generator}),
     "images.describe_images": Function({"features": _features, "words": 4, "generator": _generator}, batched=False),
     "images.detect_corners": Function({"image": lambda s: s.rand(1, 32, 40)}, {"h": 32, "w": 40}),
+    "images.detect_edges": Function({"image": lambda s: _picture(s), "max_edgels": 500}, {"h": 32, "w": 40}),
     "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
     "images.match_descriptors": Function({f"descriptors{i}": lambda s: s.rand(9, 16) for i in (1, 2)}, batched=False),
     "images.match_features": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),

@@ -1,6 +1,7 @@
 """What is in the image, and where? Files, features, corners, tracks and matches; the only room with OpenCV and kornia."""
 
 from torchsfm.images.corners import Corners, detect_corners
+from torchsfm.images.edges import Edges, detect_edges
 from torchsfm.images.exif import Exif, parse_exif
 from torchsfm.images.features import Features, detect_features
 from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
@@ -13,6 +14,7 @@ from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_
 __all__ = [
     "MAX_PIXELS",
     "Corners",
+    "Edges",
     "Exif",
     "Features",
     "ImageError",
@@ -23,6 +25,7 @@ __all__ = [
     "Tracks",
     "describe_images",
     "detect_corners",
+    "detect_edges",
     "detect_features",
     "list_images",
     "list_skipped",
