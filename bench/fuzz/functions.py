@@ -14,9 +14,12 @@ import torchsfm
 from bench.fuzz.scene import SIZE, Scene
 from torchsfm.geometry import (
     Camera,
+    Ellipse,
+    Ellipsoid,
     Pose,
     Radial,
     camera_from_krt,
+    conic_from_ellipse,
     project_points,
 )
 from torchsfm.images import Features
@@ -74,6 +77,26 @@ def _board(s: Scene) -> tuple[Tensor, Tensor]:
     space = torch.cat((X, torch.zeros_like(X[..., :1])), -1)
     far = torch.tensor([0.0, 0.0, 7.0], dtype=torch.float64)
     return X, project_points(camera_from_krt(K, R, t + far), space[..., None, :, :])
+
+
+def _ellipse(s: Scene) -> Ellipse:
+    """In the middle of the image."""
+    middle = torch.tensor([SIZE[0] / 2, SIZE[1] / 2], dtype=torch.float64)
+    axes = torch.stack((s.rand(low=60.0, high=100.0), s.rand(low=30.0, high=50.0)), -1)
+    return Ellipse(middle + s.rand(2, low=-30.0, high=30.0), axes, s.rand(low=-1.5, high=1.5))
+
+
+def _middle_lines(s: Scene) -> Tensor:
+    """Lines through the middle of the image."""
+    normal = s.randn(5, 2)
+    return torch.cat((normal, -normal[..., :1] * SIZE[0] / 2 - normal[..., 1:] * SIZE[1] / 2), -1)
+
+
+def _ellipsoid(s: Scene) -> Ellipsoid:
+    """Amid the points."""
+    _, R, _ = s.parameters(2)
+    lengths = torch.stack([s.rand(low=low, high=low + 0.2) for low in (0.8, 0.5, 0.2)], -1)
+    return Ellipsoid(s.points(1)[..., 0, :], lengths[..., None] * R[..., 1, :, :])
 
 
 def _features(s: Scene) -> list[Features]:
@@ -150,6 +173,12 @@ FUNCTIONS: dict[str, Function] = {
     "bundle.bundle_adjust_projective": Function(PROJECTIVE | {"max_iterations": 10}, BUNDLE_SIZES, batched=False),
     "bundle.bundle_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
     "bundle.intrinsics_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
+    "geometry.conic_distance": Function({"C": lambda s: conic_from_ellipse(_ellipse(s))}),
+    "geometry.conic_from_ellipse": Function({"ellipse": _ellipse}),
+    "geometry.dual_quadric_from_ellipsoid": Function({"ellipsoid": _ellipsoid}),
+    "geometry.ellipse_distance": Function({"ellipse": _ellipse}),
+    "geometry.intersect_conics": Function({f"C{i}": lambda s: conic_from_ellipse(_ellipse(s)) for i in (1, 2)}),
+    "geometry.intersect_line_conic": Function({"C": lambda s: conic_from_ellipse(_ellipse(s)), "l": _middle_lines}),
     "geometry.rotation_from_euler": Function({"axes": "xyz"}),
     "geometry.random_rotation": Function({"shape": (2,), "generator": _generator}),
     "images.describe_images": Function({"features": _features, "words": 4, "generator": _generator}, batched=False),

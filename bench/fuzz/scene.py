@@ -8,13 +8,18 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import (
+    Ellipsoid,
     camera_from_krt,
+    dual_conic,
+    dual_quadric_from_ellipsoid,
     project_points,
+    project_quadric,
     quaternion_wxyz_from_rotation,
     random_rotation,
     rotation_from_rotvec,
     to_homogeneous,
 )
+from torchsfm.linalg import adjugate_4x4
 from torchsfm.tensors import (
     essential_from_pose,
     fundamental_from_cameras,
@@ -188,6 +193,20 @@ def _intrinsics(view: int) -> Callable[[Scene, tuple[int, ...]], Tensor]:
     return lambda s, _: s.parameters(view + 1)[0][..., view, :, :]
 
 
+def _quadrics(s: Scene, n: int) -> Tensor:
+    """The duals of flat ellipsoids amid the points."""
+    _, R, _ = s._cameras
+    lengths = torch.tensor([0.8, 0.5, 0.0], dtype=F64)
+    axes = lengths[:, None] * R[..., None, 1, :, :]
+    X = s.points(n)
+    return dual_quadric_from_ellipsoid(Ellipsoid(X, axes.expand(*X.shape, 3)))
+
+
+def _conics(s: Scene, n: int) -> Tensor:
+    """Their images in the first view."""
+    return dual_conic(project_quadric(s.cameras(1), _quadrics(s, n)))
+
+
 def _index(s: Scene, shape: tuple[int, ...]) -> Tensor:
     return torch.stack([torch.randperm(4, generator=s.generator)[: shape[1]] for _ in range(shape[0])])
 
@@ -218,6 +237,7 @@ _VALUES: dict[str, Callable[[Scene, tuple[int, ...]], Tensor]] = {
     "A": lambda s, shape: _symmetric(s, shape[0]) if shape[0] == shape[1] else s.randn(*shape),
     "A k k": lambda s, shape: (lambda M: M @ M.mT)(s.randn(shape[0], shape[0] + 2)),
     "B": lambda s, shape: s.randn(*shape),
+    "C 3 3": lambda s, _: _conics(s, 1)[..., 0, :, :],
     "E": lambda s, _: essential_from_pose(s._cameras[1][..., 1, :, :], s._cameras[2][..., 1, :]),
     "F 3 3": lambda s, _: _fundamental(s, 0, 1),
     "F m 3 3": lambda s, shape: _pairs(s, shape[0], lambda j: _fundamental(s, 0, j)),
@@ -227,6 +247,7 @@ _VALUES: dict[str, Callable[[Scene, tuple[int, ...]], Tensor]] = {
     "F23": lambda s, _: _fundamental(s, 1, 2),
     "G": lambda s, _: torch.tensor([0.0, 1.0, 0.0], dtype=F64).expand(*s.batch, 3),
     "H 3 3": lambda s, _: s.homography(1),
+    "H 4 4": lambda s, _: torch.eye(4, dtype=F64) + 0.1 * s.randn(4, 4),
     "H h h": lambda s, shape: torch.eye(shape[0], dtype=F64) + 0.1 * s.randn(*shape),
     "H m 3 3": lambda s, shape: _pairs(s, shape[0], s.homography if s.planar else lambda j: _turn(s, j)),
     **{f"H{i}": lambda s, _: torch.eye(3, dtype=F64) + 0.1 * s.randn(3, 3) for i in range(1, 5)},
@@ -240,6 +261,8 @@ _VALUES: dict[str, Callable[[Scene, tuple[int, ...]], Tensor]] = {
     "P v 3 4": lambda s, shape: s.cameras(shape[0]),
     **{f"P{i + 1}": _camera(i) for i in range(4)},
     "Q": lambda s, _: quadrifocal_from_cameras(*s.cameras(4).unbind(-3)),
+    "Q 4 4": lambda s, _: adjugate_4x4(_quadrics(s, 1)[..., 0, :, :]),
+    "Q_dual 4 4": lambda s, _: _quadrics(s, 1)[..., 0, :, :],
     "R 3 3": lambda s, _: s.parameters(2)[1][..., 1, :, :],
     "R v 3 3": lambda s, shape: s.parameters(shape[0])[1],
     "T": lambda s, _: _trifocal(s, 0, 1, 2),

@@ -3,7 +3,7 @@
 from torchsfm.linalg.compilation import compile_kernels
 from torchsfm.linalg.damped_solve import damped_solve
 from torchsfm.linalg.decompositions import eigh, eigvals, eigvalsh, inverse, qr, solve, svd, svdvals, triangular_factor
-from torchsfm.linalg.elimination import adjugate_3x3, cross, determinant_3x3
+from torchsfm.linalg.elimination import adjugate_3x3, adjugate_4x4, cross, determinant_3x3
 from torchsfm.linalg.magnitude import unit_scale, usable
 from torchsfm.linalg.nullspace import null_vector, nullspace_rows, orthonormal_nullspace
 from torchsfm.linalg.polynomial import companion_roots, evaluate, solve_cubic, solve_quadratic
@@ -13,6 +13,7 @@ from torchsfm.linalg.real_roots import real_roots
 
 __all__ = [
     "adjugate_3x3",
+    "adjugate_4x4",
     "companion_roots",
     "compile_kernels",
     "cross",

@@ -26,6 +26,16 @@ def adjugate_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     return torch.stack((cross(r1, r2), cross(r2, r0), cross(r0, r1)), -1)
 
 
+def adjugate_4x4(A: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not."""
+    rest = [[k for k in range(4) if k != i] for i in range(4)]
+    rows = []
+    for i in range(4):
+        minors = [determinant_3x3(A[..., rest[j], :][..., :, rest[i]]) for j in range(4)]
+        rows.append(torch.stack([m if (i + j) % 2 == 0 else -m for j, m in enumerate(minors)], -1))
+    return torch.stack(rows, -2)
+
+
 def least_squares_rows(J: Float[Tensor, "m k batch"], r: Float[Tensor, "m batch"]) -> Float[Tensor, "k batch"]:
     """The x with the smallest `|J x - r|`, for a batch in the last dimension, by the normal equations with a unit diagonal.
 
