@@ -15,9 +15,9 @@ import numpy as np
 import torch
 
 from torchsfm.bundle import bundle_adjust_model
-from torchsfm.bundle.intrinsics import camera_from_rows, camera_rows
 from torchsfm.bundle.projection import Projection
 from torchsfm.geometry import BundleProblem, Pose
+from torchsfm.geometry.intrinsic_parameters import camera_from_row, row_from_camera
 from torchsfm.optim import Cauchy, Huber, RigidMotion
 
 FREE = ("focal", "k1", "k2")
@@ -169,7 +169,7 @@ def run_scipy(problem: BundleProblem, threads: int, loss: str) -> Run:
     from scipy.sparse import csr_matrix
 
     torch.set_num_threads(threads)
-    rows = camera_rows(problem.cameras)
+    rows = row_from_camera(problem.cameras)
     columns = (0, 5, 6)
     projection = Projection(type(problem.cameras.distortion), columns, skew=False)
     twelve = torch.cat((problem.poses.R.flatten(1), problem.poses.t), 1)
@@ -220,7 +220,7 @@ def in_front(problem: BundleProblem) -> BundleProblem:
     keep = problem.depths() > 0
     return BundleProblem(
         Pose(problem.poses.R, problem.poses.t),
-        camera_from_rows(camera_rows(problem.cameras), type(problem.cameras.distortion)),
+        camera_from_row(row_from_camera(problem.cameras), type(problem.cameras.distortion)),
         problem.camera_index,
         problem.X,
         problem.x[keep],

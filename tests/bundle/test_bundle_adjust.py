@@ -7,7 +7,6 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, bundle_adjust, bundle_adjust_model, bundle_covariance
-from torchsfm.bundle.intrinsics import camera_from_rows, camera_rows
 from torchsfm.bundle.projection import Projection
 from torchsfm.formats import read_bal
 from torchsfm.geometry import (
@@ -21,6 +20,7 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
     similarity_from_points,
 )
+from torchsfm.geometry.intrinsic_parameters import SKEW, camera_from_row, row_from_camera
 from torchsfm.optim import Cauchy, RigidMotion, Subset
 from torchsfm.optim.terms import Block, Term, Workspace, lift_of, linearize
 
@@ -76,8 +76,8 @@ def perturb(poses: Pose, X: Tensor, generator: torch.Generator, size: float = 0.
 def test_jacobians(model: str, generator: torch.Generator) -> None:
     """The written-out derivatives are those of the residual along the retractions."""
     poses, cameras, X, x, view, point, group = make_scene(generator, views=3, points=12, model=model)
-    rows = camera_rows(cameras)
-    rows[:, 4] = 0.7
+    rows = row_from_camera(cameras)
+    rows[:, SKEW] = 0.7
     columns = tuple(range(rows.shape[1]))
     projection = Projection(type(cameras.distortion), columns)
     blocks = {
@@ -114,17 +114,17 @@ def test_exact_data_are_recovered(model: str, generator: torch.Generator) -> Non
     start, X0 = perturb(poses, X, generator)
     R = torch.where(fixed[:, None, None], poses.R, start.R)
     start = Pose(R, torch.where(fixed[:, None], poses.t, start.t))
-    rows = camera_rows(cameras)
+    rows = row_from_camera(cameras)
     rows[:, 0] *= 1.05
     rows[:, 5:] = 0
-    guess = camera_from_rows(rows, type(cameras.distortion))
+    guess = camera_from_row(rows, type(cameras.distortion))
     free = ("focal", *cameras.distortion.parameter_names)
     result = bundle_adjust(start, guess, X0, x, view, point, free=free, fixed_poses=fixed, tolerance=1e-14)
     assert result.status == Status.OK
     assert result.cost < 1e-12
     torch.testing.assert_close(result.X, X, rtol=0, atol=1e-8)
     torch.testing.assert_close(result.poses.t, poses.t, rtol=0, atol=1e-8)
-    torch.testing.assert_close(camera_rows(result.cameras), camera_rows(cameras), rtol=1e-7, atol=1e-8)
+    torch.testing.assert_close(row_from_camera(result.cameras), row_from_camera(cameras), rtol=1e-7, atol=1e-8)
 
 
 def test_noise_and_free_gauge(generator: torch.Generator) -> None:
@@ -171,14 +171,14 @@ def test_efficiency(generator: torch.Generator) -> None:
 
 def test_shared_and_separate_intrinsics(generator: torch.Generator) -> None:
     poses, cameras, X, x, view, point, group = make_scene(generator, groups=2, noise=0.0, model="simple_radial")
-    rows = camera_rows(cameras)
+    rows = row_from_camera(cameras)
     rows[:, 0] *= torch.tensor([0.97, 1.04], dtype=F64)
-    guess = camera_from_rows(rows, type(cameras.distortion))
+    guess = camera_from_row(rows, type(cameras.distortion))
     start, X0 = perturb(poses, X, generator, 0.003)
     result = bundle_adjust(
         start, guess, X0, x, view, point, camera_index=group, free=("focal", "k1", "principal_point"), tolerance=1e-13
     )
-    torch.testing.assert_close(camera_rows(result.cameras), camera_rows(cameras), rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(row_from_camera(result.cameras), row_from_camera(cameras), rtol=1e-5, atol=1e-3)
     each = Camera(guess.K[group], type(cameras.distortion)(guess.distortion.k1[group]))
     apart = bundle_adjust(start, each, X0, x, view, point, free=("focal", "k1"), tolerance=1e-13)
     torch.testing.assert_close(apart.cameras.K[:, 0, 0], torch.full((8,), 800.0, dtype=F64), rtol=1e-5, atol=0)
@@ -204,7 +204,7 @@ def test_intrinsics_free_in_some_cameras(generator: torch.Generator) -> None:
     free = ("focal", "principal_point", "k1", "k2")
     fixed = {"focal": first, "principal_point": torch.tensor([True, True]), "k2": ~first}
     mixed = bundle_adjust(*args, free=free, fixed_intrinsics=fixed, **options)
-    before, after = camera_rows(cameras), camera_rows(mixed.cameras)
+    before, after = row_from_camera(cameras), row_from_camera(mixed.cameras)
     held = torch.tensor([[1, 1, 1, 1, 1, 0, 0], [0, 1, 1, 1, 1, 0, 1]], dtype=torch.bool)
     assert torch.equal(torch.isclose(after, before, rtol=1e-15, atol=0), held)
     assert torch.equal(mixed.cameras.K[0], cameras.K[0])

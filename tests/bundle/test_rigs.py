@@ -6,10 +6,10 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, Rig, bundle_adjust, bundle_covariance
-from torchsfm.bundle.intrinsics import camera_rows
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rig import RigProjection
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_angle, rotation_from_rotvec
+from torchsfm.geometry.intrinsic_parameters import row_from_camera
 from torchsfm.optim import RigidMotion, Subset
 from torchsfm.optim.terms import Block, Term, Workspace, lift_of, linearize
 
@@ -62,7 +62,7 @@ def run(scene: Scene, generator: torch.Generator, **options: object) -> BundleRe
 
 def test_jacobians(generator: torch.Generator) -> None:
     body, rig, cameras, X, x, view, point = make_scene(generator, frames=2, points=10)
-    rows = camera_rows(cameras)
+    rows = row_from_camera(cameras)
     columns = (0, 5, 6)
     through = RigProjection(Projection(Radial, columns))
 

@@ -7,12 +7,13 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options, check_tensors
-from torchsfm.bundle.intrinsics import Switched, camera_from_rows, camera_rows, free_columns, free_switches
+from torchsfm.bundle.intrinsics import Switched, free_columns, free_switches
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rays import RayPoint, ray_points
 from torchsfm.bundle.rig import Rig, RigProjection
 from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry.intrinsic_parameters import HEAD, SKEW, camera_from_row, row_from_camera
 from torchsfm.optim import Block, Loss, RigidMotion, Subset, Term
 
 
@@ -102,7 +103,7 @@ class Bundle:
         camera_index = self.camera_of_views()
         model = type(self.cameras.distortion)
         columns = free_columns(self.free, model)
-        rows = camera_rows(self.cameras)
+        rows = row_from_camera(self.cameras)
         manifold: Subset | Switched = Subset(rows.shape[1], columns)
         if self.fixed_intrinsics:
             manifold = Switched(rows.shape[1], columns)
@@ -117,7 +118,7 @@ class Bundle:
             "camera": Block(rows, manifold, self.fixed_cameras),
             "point": Block(ray_points(self.X, centres, self.view, self.point, counts), RayPoint(), self.fixed_points),
         }
-        skew = 4 in columns or self.cameras.K.requires_grad or bool((rows[:, 4] != 0).any())
+        skew = SKEW in columns or self.cameras.K.requires_grad or bool((rows[:, SKEW] != 0).any())
         projection = Projection(model, columns, skew, bool(self.fixed_intrinsics))
         camera = camera_index[self.view]
         data, options = (self.x,), (self.loss, self.weights)
@@ -161,8 +162,8 @@ def moved_poses(poses: Pose, start: Tensor, end: Tensor) -> Pose:
 
 def moved_cameras(cameras: Camera, start: Tensor, end: Tensor) -> Camera:
     """Cameras whose K did not change keep every bit of it."""
-    changed = (start[:, :5] != end[:, :5]).any(-1)
-    new = camera_from_rows(end, type(cameras.distortion))
+    changed = (start[:, :HEAD] != end[:, :HEAD]).any(-1)
+    new = camera_from_row(end, type(cameras.distortion))
     return Camera(torch.where(changed[:, None, None], new.K, cameras.K), new.distortion)
 
 

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_one_problem, check_options
 from torchsfm.bundle.blocks import check_index
-from torchsfm.bundle.projection import NEAREST
 from torchsfm.geometry import normalize_sphere
+from torchsfm.geometry.projection import camera_slopes, point_slopes
+from torchsfm.geometry.radial import flatten
 from torchsfm.linalg import eigh, inverse, svdvals
 from torchsfm.optim import Block, Loss, Term, UnitSphere, sparse_levenberg_marquardt
 from torchsfm.optim.sparse_derivative import Hessian
@@ -138,41 +139,37 @@ def bundle_adjust_projective(
 
 def _residual(camera: Tensor, point: Tensor, x: Tensor, scale: Tensor) -> Tensor:
     """Predicted minus measured image points, pixels; finite for all finite cameras and points."""
-    p, X = camera.mT.reshape(3, 4, -1), point.mT
-    y = torch.addcmul(torch.addcmul(torch.addcmul(p[:, 0] * X[0], p[:, 1], X[1]), p[:, 2], X[2]), p[:, 3], X[3])
-    return ((y[:2] * y[2].reciprocal().clamp(-NEAREST, NEAREST) - x.mT) * scale).mT
+    uv, _ = flatten(_seen(camera.mT.reshape(3, 4, -1), point.mT))
+    return ((uv - x.mT) * scale).mT
 
 
 def _linearize(camera: Tensor, point: Tensor, x: Tensor, scale: Tensor, out: list[Tensor | None]) -> Tensor:
     """Residuals; `out` gets their derivatives by steps on the spheres, in the tangent basis of `UnitSphere`."""
-    p, X = camera.mT.reshape(3, 4, -1), point.mT
-    y = torch.addcmul(torch.addcmul(torch.addcmul(p[:, 0] * X[0], p[:, 1], X[1]), p[:, 2], X[2]), p[:, 3], X[3])
-    inverse = y[2].reciprocal().clamp(-NEAREST, NEAREST)
-    uv = y[:2] * inverse
+    P, X = camera.mT.reshape(3, 4, -1), point.mT
+    uv, inverse = flatten(_seen(P, X))
     by_camera, by_point = (None if o is None else o.permute(1, 2, 0) for o in out)
     slope = inverse * scale
     if by_camera is not None:
-        head, turn = _basis(camera.mT)
-        ray = X * slope
-        for k in (0, 1):
-            torch.mul(head, uv[k] * ray[3] * turn, out=by_camera[k])
-            by_camera[k, 4 * k : 4 * k + 4] += ray
-            by_camera[k, 8:].addcmul_(ray[:3], uv[k], value=-1)
+        _on_sphere(camera.mT, camera_slopes(X, uv, slope).flatten(1, 2), by_camera)
     if by_point is not None:
-        head, turn = _basis(X)
-        for k in (0, 1):
-            gradient = torch.addcmul(p[k], p[2], uv[k], value=-1) * slope
-            torch.addcmul(gradient[:3], head, gradient[3] * turn, value=-1, out=by_point[k])
+        _on_sphere(X, point_slopes(P, uv, slope), by_point)
     return ((uv - x.mT) * scale).mT
 
 
-def _basis(unit: Tensor) -> tuple[Tensor, Tensor]:
-    """What takes a gradient (g, g_last) on the sphere of unit vectors (h, last) to tangent coordinates, `g - h g_last turn`.
+def _seen(P: Tensor, X: Tensor) -> Tensor:
+    """Homogeneous images (3, m) of points (4, m) in cameras (3, 4, m)."""
+    p0, p1, p2, p3 = P.unbind(1)
+    return torch.addcmul(torch.addcmul(torch.addcmul(p0 * X[0], p1, X[1]), p2, X[2]), p3, X[3])
 
-    This is the Householder basis of `UnitSphere`, for functions that do not change along the vector itself.
+
+def _on_sphere(unit: Tensor, slope: Tensor, out: Tensor) -> None:
+    """Derivatives `slope` (2, k, m) by unit vectors (k, m) in the Householder basis of `UnitSphere` there, into (2, k - 1, m).
+
+    For functions that do not change along the vector itself.
     """
     last = unit[-1]
-    return unit[:-1], torch.where(last < 0, -1.0, 1.0) / (1 + last.abs())
+    turn = torch.where(last < 0, -1.0, 1.0) / (1 + last.abs())
+    torch.addcmul(slope[:, :-1], unit[:-1], (slope[:, -1] * turn)[:, None], value=-1, out=out)
 
 
 def _is_vector(v: Tensor) -> Tensor:

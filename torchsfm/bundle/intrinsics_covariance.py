@@ -34,7 +34,7 @@ def intrinsics_covariance(
     many.
 
     Returns:
-        Covariances in the order focal (pixels along x), aspect, principal point, skew, distortion, for noise of one pixel in
+        Covariances in the order focal (pixels along x), aspect, skew, principal point, distortion, for noise of one pixel in
         each image coordinate; zero where a number is held, very large or NaN where nothing determines it.
 
     Raises:

@@ -7,8 +7,9 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchsfm._types import check_tensors
-from torchsfm.bundle.projection import Projection, transform, turn_back, turn_derivative
+from torchsfm.bundle.projection import Projection, transform, turn_back
 from torchsfm.geometry import Pose
+from torchsfm.geometry.projection import turn_slopes
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,12 @@ class RigProjection:
         residual = self.projection.linearize_at(moved, camera, x, by_camera, by_intrinsics)
         if by_sensor is not None:
             by_sensor[:, 3:] = by_camera
-            turn_derivative(moved, by_camera, by_sensor)
+            turn_slopes(moved, by_camera, by_sensor)
         by_rig = torch.empty_like(by_camera)
         turn_back(sensor, by_camera, by_rig)
         if by_pose is not None:
             by_pose[:, 3:] = by_rig
-            turn_derivative(in_rig, by_rig, by_pose)
+            turn_slopes(in_rig, by_rig, by_pose)
         if by_point is not None:
             turn_back(pose, by_rig, by_point)
         return residual

@@ -13,7 +13,8 @@ from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, bundle_adjust_model
 from torchsfm.cli.job import INTERRUPTED, NOTHING, Job, UserError, told
 from torchsfm.formats import read_bal, read_colmap, read_libmv, write_bal, write_colmap, write_ply
-from torchsfm.geometry import BundleProblem
+from torchsfm.geometry import BundleProblem, Radial
+from torchsfm.geometry.intrinsic_parameters import INTRINSICS
 from torchsfm.optim import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey
 from torchsfm.reconstruction import Reconstruction
 
@@ -144,7 +145,7 @@ def free_names(model: Model, wanted: str | None) -> tuple[str, ...]:
     names = tuple(name.strip().replace("-", "_") for name in wanted.split(",") if name.strip())
     if names in ((), ("none",)):
         return ()
-    known = ("focal", "aspect", "principal_point", "skew", *distortion)
+    known = (*INTRINSICS, *distortion)
     for name in names:
         if name not in known:
             raise UserError(f"--free: wanted names among {', '.join(known)}, got {name!r}")
@@ -183,7 +184,7 @@ def check_output(model: Model, out: Path | None) -> None:
         return
     if not out.absolute().parent.is_dir():
         raise UserError(f"{out.absolute().parent}: no such folder")
-    if is_bal(out) and (set(model.cameras.distortion.parameter_names) - {"k1", "k2"}):
+    if is_bal(out) and not Radial.includes(type(model.cameras.distortion)):
         raise UserError(f"{out}: BAL holds two radial coefficients, not {type(model.cameras.distortion).__name__}")
 
 

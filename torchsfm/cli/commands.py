@@ -14,6 +14,7 @@ from torchsfm.cli.inputs import photograph_folder, read_intrinsics, warn_about_i
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.results import VERSION, compare, finish
+from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS, save_image
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import printable
@@ -37,16 +38,6 @@ class Method(StrEnum):
     projective = "projective"
 
 
-class CameraModel(StrEnum):
-    """Lens distortion models of `--camera`."""
-
-    pinhole = "pinhole"
-    simple_radial = "simple_radial"
-    radial = "radial"
-    opencv = "opencv"
-    fisheye = "fisheye"
-
-
 Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
 
@@ -57,6 +48,17 @@ def print_version(wanted: bool) -> bool:
         typer.echo(f"torchsfm {VERSION}")
         raise typer.Exit
     return wanted
+
+
+def known_camera(name: str | None) -> str | None:
+    """See that there is a distortion model of this name.
+
+    Raises:
+        BadParameter: There is none.
+    """
+    if name is not None and name not in DISTORTION_MODELS:
+        raise typer.BadParameter(f"{name!r} is not one of {', '.join(map(repr, DISTORTION_MODELS))}.")
+    return name
 
 
 @app.callback()
@@ -78,7 +80,13 @@ def reconstruct(
     out: Annotated[Path, typer.Option(help="Folder for the model, the page, the report and the finished stages.")],
     sequence: Annotated[bool, typer.Option("--sequence", help="The images are frames of a video, in order.")] = False,
     camera: Annotated[
-        CameraModel | None, typer.Option(help="Lens distortion; radial, or pinhole with --intrinsics.", show_default=False)
+        str | None,
+        typer.Option(
+            callback=known_camera,
+            metavar=f"[{'|'.join(DISTORTION_MODELS)}]",
+            help="Lens distortion; radial, or pinhole with --intrinsics.",
+            show_default=False,
+        ),
     ] = None,
     intrinsics: Annotated[
         Path | None, typer.Option(help="Text file with the known 3x3 matrix K of all images, in pixels.", show_default=False)
@@ -113,7 +121,7 @@ def reconstruct(
         K = None if intrinsics is None else read_intrinsics(intrinsics)
         source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
         result = job.run(
-            source, threads, sequence=sequence, camera=camera.value if camera else None, K=K, shared_camera=shared_camera,
+            source, threads, sequence=sequence, camera=camera, K=K, shared_camera=shared_camera,
             free_principal_point=free_principal_point, method=method.value, max_features=max_features, max_pixels=max_pixels,
             seed=seed, resume=resume,
         )  # fmt: skip

@@ -22,10 +22,8 @@ from torch import Tensor
 from torchsfm.geometry import (
     BundleProblem,
     Camera,
-    NoDistortion,
     Pose,
     Radial,
-    SimpleRadial,
     intrinsics,
     rotation_from_rotvec,
     rotvec_from_rotation,
@@ -111,7 +109,7 @@ def write_bal(problem: BundleProblem, path: str | Path) -> None:
     """
     path = Path(path)
     cameras = problem.cameras
-    if not isinstance(cameras.distortion, NoDistortion | SimpleRadial | Radial):
+    if not Radial.includes(type(cameras.distortion)):
         raise ValueError(f"problem: BAL holds two radial coefficients, not {type(cameras.distortion).__name__}")
     K = cameras.K.detach().double().cpu()
     if bool((K[:, 0, 1] != 0).any()):

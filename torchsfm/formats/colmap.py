@@ -14,6 +14,7 @@ from torch import Tensor
 from torchsfm.formats import colmap_binary, colmap_text
 from torchsfm.formats.colmap_model import (
     NO_POINT,
+    PARAMETERS,
     STILL,
     ColmapCamera,
     ColmapFrame,
@@ -23,38 +24,13 @@ from torchsfm.formats.colmap_model import (
     check_model,
     poses,
 )
-from torchsfm.geometry import (
-    DISTORTION_MODELS,
-    BrownConrady,
-    Camera,
-    KannalaBrandt,
-    NoDistortion,
-    Radial,
-    SimpleRadial,
-    intrinsics,
-    quaternion_wxyz_from_rotation,
-)
+from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics, quaternion_wxyz_from_rotation
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 HALF_PIXEL = 0.5
 UNREGISTERED = "unregistered.txt"
 """COLMAP's files have no place for images without a pose: they are listed here, one `IMAGE_ID CAMERA_ID NAME` a line."""
-
-# COLMAP's model -> ours, number of focal lengths, and the names of the parameters after the principal point.
-MODELS: dict[str, tuple[str, int, tuple[str, ...]]] = {
-    "SIMPLE_PINHOLE": ("pinhole", 1, ()),
-    "PINHOLE": ("pinhole", 2, ()),
-    "SIMPLE_RADIAL": ("simple_radial", 1, ("k1",)),
-    "RADIAL": ("radial", 1, ("k1", "k2")),
-    "OPENCV": ("opencv", 2, ("k1", "k2", "p1", "p2")),
-    "FULL_OPENCV": ("opencv", 2, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
-    "OPENCV_FISHEYE": ("fisheye", 2, ("k1", "k2", "k3", "k4")),
-    "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, ("k1",)),
-    "RADIAL_FISHEYE": ("fisheye", 1, ("k1", "k2")),
-}
-# From special to general: each is the next one with some parameters zero.
-POLYNOMIALS = ("pinhole", "simple_radial", "radial", "opencv")
 
 
 def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
@@ -70,7 +46,7 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
         folder: Where to; made if it is not there. Files of an earlier model in it are replaced, all of them or none.
 
     Raises:
-        ValueError: A camera has skew, which no model of COLMAP has.
+        ValueError: A camera has skew, or a distortion, which no model of COLMAP has.
         OSError: The folder cannot be made or written.
     """
     folder = Path(folder)
@@ -207,51 +183,44 @@ def _colmap_parameters(camera: Camera, index: int, size: tuple[int, int]) -> tup
         raise ValueError(f"camera {index} has skew {skew:.3g}, which no camera model of COLMAP has")
     # Two focal lengths that differ by rounding only are one.
     equal = abs(fx - fy) <= 1e-12 * abs(fx)
-    values = camera.distortion.parameters().tolist()
-    match camera.distortion:
-        case NoDistortion():
-            name = "SIMPLE_PINHOLE" if equal else "PINHOLE"
-        case SimpleRadial() | Radial() if not equal:
-            name, values = "OPENCV", [*values, 0.0][:2] + [0.0] * 2
-        case SimpleRadial():
-            name = "SIMPLE_RADIAL"
-        case Radial():
-            name = "RADIAL"
-        case BrownConrady():
-            name, values = ("OPENCV", values[:4]) if values[4] == 0 else ("FULL_OPENCV", [*values, 0.0, 0.0, 0.0])
-        case KannalaBrandt():
-            name = "OPENCV_FISHEYE"
-    focal = [fx] if MODELS[name][1] == 1 else [fx, fy]
-    return name, *size, (*focal, cx + HALF_PIXEL, cy + HALF_PIXEL, *values)
+    lens = type(camera.distortion)
+    values = {name: float(getattr(camera.distortion, name)) for name in lens.parameter_names}
+    needed = {name for name, value in values.items() if value != 0}
+    for name in (name for model in DISTORTION_MODELS.values() if model.includes(lens) for name in model.colmap):
+        _, focals, held = PARAMETERS[name]
+        if needed <= set(held) and (equal or focals == 2):
+            head = (*(fx, fy)[:focals], cx + HALF_PIXEL, cy + HALF_PIXEL)
+            return name, *size, (*head, *(values.get(name, 0.0) for name in held))
+    raise ValueError(f"camera {index} has {lens.__name__} distortion, which no camera model of COLMAP has")
 
 
 def _cameras_from_colmap(cameras: dict[int, ColmapCamera]) -> Camera:
-    """Join cameras into one batch, of the simplest distortion model that holds them all."""
-    K, kinds, named = [], [], []
+    """Join cameras into one batch, of the first distortion model that holds them all."""
+    K, named, kinds = [], [], set()
     for camera_id, camera in cameras.items():
-        model = camera.model
-        if model not in MODELS:
-            raise ValueError(f"camera {camera_id} has COLMAP's model {model}, which has no equal here")
-        kind, focals, names = MODELS[model]
+        known = [model for model in DISTORTION_MODELS.values() if camera.model in model.colmap]
+        if not known:
+            raise ValueError(f"camera {camera_id} has COLMAP's model {camera.model}, which has no equal here")
+        _, focals, names = PARAMETERS[camera.model]
         fx, fy, cx, cy, *rest = camera.parameters[: 2 - focals] + camera.parameters
         values = dict(zip(names, rest, strict=True))
-        if model == "FULL_OPENCV" and [values.pop(name) for name in ("k4", "k5", "k6")] != [0, 0, 0]:
-            raise ValueError(f"camera {camera_id} is a FULL_OPENCV with k4, k5 or k6, which has no equal here")
+        if lost := [name for name, value in values.items() if value != 0 and name not in known[0].parameter_names]:
+            raise ValueError(f"camera {camera_id} is a {camera.model} with {' and '.join(lost)}, which has no equal here")
         f = torch.tensor(fx, dtype=torch.float64)
         c = torch.tensor([cx, cy], dtype=torch.float64) - HALF_PIXEL
         K.append(intrinsics(f, c, aspect=fy / fx))
-        kinds.append(kind)
+        kinds.add(known[0])
         named.append(values)
     if not K:
         return Camera(torch.zeros(0, 3, 3, dtype=torch.float64))
-    if "fisheye" in kinds and set(kinds) != {"fisheye"}:
-        raise ValueError("the model mixes fisheye cameras with others, which one batch of cameras cannot hold")
-    kind = "fisheye" if "fisheye" in kinds else max(kinds, key=POLYNOMIALS.index)
-    cls = DISTORTION_MODELS[kind]
+    common = [model for model in DISTORTION_MODELS.values() if all(model.includes(kind) for kind in kinds)]
+    if not common:
+        mixed = " and ".join(sorted(kind.__name__ for kind in kinds))
+        raise ValueError(f"the model mixes {mixed} cameras, which one batch of cameras cannot hold")
     rows: list[Tensor] = [
-        torch.tensor([values.get(name, 0.0) for name in cls.parameter_names], dtype=torch.float64) for values in named
+        torch.tensor([values.get(name, 0.0) for name in common[0].parameter_names], dtype=torch.float64) for values in named
     ]
-    return Camera(torch.stack(K), cls.from_parameters(torch.stack(rows)))
+    return Camera(torch.stack(K), common[0].from_parameters(torch.stack(rows)))
 
 
 def _read_unregistered(path: Path, camera_of: dict[int, int]) -> dict[int, tuple[int, str]]:

@@ -25,7 +25,7 @@ from torchsfm.formats.colmap_model import (
 
 OBSERVATION = np.dtype([("x", "<f8", 2), ("point", "<i8")])
 POINT = np.dtype([("id", "<i8"), ("X", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("length", "<u8")])
-MODELS = {number: name for name, (number, _, _) in PARAMETERS.items()}
+MODELS = {parameters.number: name for name, parameters in PARAMETERS.items()}
 
 
 class _Cursor:
@@ -89,7 +89,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         if number not in MODELS:
             raise file.fault(f"camera {camera_id} is of the model number {number}, which is unknown")
         name = MODELS[number]
-        parameters = file.take(f"{2 + sum(PARAMETERS[name][1:])}d", f"camera {camera_id}")
+        parameters = file.take(f"{PARAMETERS[name].size}d", f"camera {camera_id}")
         if camera_id in cameras:
             raise file.fault(f"camera {camera_id} occurs twice")
         cameras[camera_id] = ColmapCamera(name, width, height, parameters)
@@ -179,7 +179,7 @@ def write_files(model: ColmapModel) -> dict[str, bytes]:
     """The contents of all five files, by name."""
     return {
         "cameras.bin": _entries(
-            struct.pack("<IiQQ", i, PARAMETERS[camera.model][0], camera.width, camera.height)
+            struct.pack("<IiQQ", i, PARAMETERS[camera.model].number, camera.width, camera.height)
             + struct.pack(f"<{len(camera.parameters)}d", *camera.parameters)
             for i, camera in model.cameras.items()
         ),

@@ -7,7 +7,7 @@ https://colmap.github.io/format.html.
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,25 +23,41 @@ Motion = tuple[float, ...]
 """A rotation as quaternion w, x, y, z, then a translation."""
 STILL: Motion = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
-# The number in binary files, and the parameters after the two of the principal point: focal lengths and others.
-PARAMETERS: dict[str, tuple[int, int, int]] = {
-    "SIMPLE_PINHOLE": (0, 1, 0),
-    "PINHOLE": (1, 2, 0),
-    "SIMPLE_RADIAL": (2, 1, 1),
-    "RADIAL": (3, 1, 2),
-    "OPENCV": (4, 2, 4),
-    "OPENCV_FISHEYE": (5, 2, 4),
-    "FULL_OPENCV": (6, 2, 8),
-    "FOV": (7, 2, 1),
-    "SIMPLE_RADIAL_FISHEYE": (8, 1, 1),
-    "RADIAL_FISHEYE": (9, 1, 2),
-    "THIN_PRISM_FISHEYE": (10, 2, 8),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (11, 2, 12),
-    "SIMPLE_DIVISION": (12, 1, 1),
-    "DIVISION": (13, 2, 1),
-    "SIMPLE_FISHEYE": (14, 1, 0),
-    "FISHEYE": (15, 2, 0),
-    "EUCM": (16, 2, 2),
+
+class Parameters(NamedTuple):
+    """What a camera of COLMAP holds besides the principal point."""
+
+    number: int
+    """Of the model, in binary files."""
+    focals: int
+    """Focal lengths, in front of the principal point."""
+    lens: tuple[str, ...]
+    """Numbers behind it."""
+
+    @property
+    def size(self) -> int:
+        """All numbers."""
+        return self.focals + 2 + len(self.lens)
+
+
+PARAMETERS: dict[str, Parameters] = {
+    "SIMPLE_PINHOLE": Parameters(0, 1, ()),
+    "PINHOLE": Parameters(1, 2, ()),
+    "SIMPLE_RADIAL": Parameters(2, 1, ("k1",)),
+    "RADIAL": Parameters(3, 1, ("k1", "k2")),
+    "OPENCV": Parameters(4, 2, ("k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": Parameters(5, 2, ("k1", "k2", "k3", "k4")),
+    "FULL_OPENCV": Parameters(6, 2, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "FOV": Parameters(7, 2, ("omega",)),
+    "SIMPLE_RADIAL_FISHEYE": Parameters(8, 1, ("k1",)),
+    "RADIAL_FISHEYE": Parameters(9, 1, ("k1", "k2")),
+    "THIN_PRISM_FISHEYE": Parameters(10, 2, ("k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")),
+    "RAD_TAN_THIN_PRISM_FISHEYE": Parameters(11, 2, ("k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3")),
+    "SIMPLE_DIVISION": Parameters(12, 1, ("k",)),
+    "DIVISION": Parameters(13, 2, ("k",)),
+    "SIMPLE_FISHEYE": Parameters(14, 1, ()),
+    "FISHEYE": Parameters(15, 2, ()),
+    "EUCM": Parameters(16, 2, ("alpha", "beta")),
 }
 
 
@@ -114,7 +130,7 @@ def check_model(model: ColmapModel) -> None:
     if not np.isfinite(points.X).all():
         raise ValueError(f"the 3D point {points.point_id[~np.isfinite(points.X).all(1)][0]} is not finite")
     for camera_id, camera in model.cameras.items():
-        if not np.isfinite(camera.parameters).all() or min(camera.parameters[: PARAMETERS[camera.model][1]]) <= 0:
+        if not np.isfinite(camera.parameters).all() or min(camera.parameters[: PARAMETERS[camera.model].focals]) <= 0:
             raise ValueError(f"camera {camera_id} has a focal length that is not positive, or a parameter that is not finite")
         if not (0 <= camera.width < MAX_SIZE and 0 <= camera.height < MAX_SIZE):
             raise ValueError(f"camera {camera_id} has images of {camera.width} x {camera.height} pixels")

@@ -29,7 +29,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
         camera_id, model, width, height, *rest = words
         if model not in PARAMETERS:
             raise ValueError(f"camera {camera_id} is of the model {model!r}, which is unknown")
-        count = 2 + sum(PARAMETERS[model][1:])
+        count = PARAMETERS[model].size
         if len(rest) != count:
             raise ValueError(f"{model} has {count} parameters, got {len(rest)}")
         return int(camera_id), ColmapCamera(model, int(width), int(height), tuple(map(float, rest)))

@@ -25,13 +25,12 @@ from torchsfm.geometry.conics import (
 from torchsfm.geometry.distortion import (
     DISTORTION_MODELS,
     BrownConrady,
-    Distortion,
-    DistortionModel,
     KannalaBrandt,
     NoDistortion,
     Radial,
     SimpleRadial,
 )
+from torchsfm.geometry.distortion_model import Distortion
 from torchsfm.geometry.flatness import least_number_off, line_and_plane_distances
 from torchsfm.geometry.homogeneous import (
     from_homogeneous,
@@ -72,7 +71,6 @@ __all__ = [
     "BundleProblem",
     "Camera",
     "Distortion",
-    "DistortionModel",
     "Ellipse",
     "Ellipsoid",
     "KannalaBrandt",

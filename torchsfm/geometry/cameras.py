@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import broadcast_shapes, check_options, check_tensors, tensor_map
-from torchsfm.geometry.distortion import Distortion, NoDistortion
+from torchsfm.geometry.distortion import NoDistortion
+from torchsfm.geometry.distortion_model import Distortion
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.poses import Index, index_batch
 

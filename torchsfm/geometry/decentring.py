@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchsfm.geometry.radial import even_polynomial, finite_constants, in_blocks, polynomial, solve_radial
+from torchsfm.geometry.radial import even_polynomial, finite_constants, in_blocks, polynomial, powers, solve_radial
 
 RADIAL = 3
 """Newton steps on the radial function after the guarded ones; what they leave is far below the decentring terms."""
@@ -49,6 +49,28 @@ def brown_jacobian(
     jyy = torch.addcmul(L, y, torch.addcmul(4 * p1, bend, y))
     jxy = torch.addcmul(y * (bend_x + 2 * p2), p1, x, value=2)
     return L, jxx, jxy, jyy, torch.addcmul(jxx * jyy, jxy, jxy, value=-1)
+
+
+def brown_slopes(
+    uv: Tensor, inverse: Tensor, radial: Sequence[Tensor], p1: Tensor, p2: Tensor, out: Tensor
+) -> tuple[Tensor, list[Tensor], Tensor, Tensor]:
+    """Distort flat coordinates (2, ...); also return the derivatives (2, ...) by each radial coefficient, by p1 and by p2.
+
+    `out` (2, 3, ...) gets those by the ray.
+    """
+    x, y = uv
+    s = torch.addcmul(x * x, y, y)
+    L, jxx, jxy, jyy, _ = brown_jacobian(x, y, s, radial, p1, p2)
+    torch.mul(jxx, inverse, out=out[0, 0])
+    torch.mul(jyy, inverse, out=out[1, 1])
+    torch.mul(jxy, inverse, out=out[0, 1])
+    out[1, 0] = out[0, 1]
+    torch.mul(out[:, 0], -x, out=out[:, 2]).addcmul_(out[:, 1], y, value=-1)
+    both = 2 * x * y
+    along = torch.stack((both, torch.addcmul(s, y, y, value=2)))
+    across = torch.stack((torch.addcmul(s, x, x, value=2), both))
+    distorted = torch.stack((torch.addcmul(x * L, p2, s), torch.addcmul(y * L, p1, s)))
+    return distorted, powers(uv, s, len(radial)), along, across
 
 
 def _solve(u: Tensor, v: Tensor, limit: Tensor, p1: Tensor, p2: Tensor, *radial: Tensor) -> tuple[Tensor, ...]:

@@ -4,112 +4,61 @@ Each model is a frozen dataclass with one tensor per parameter, all of the camer
 inverse is found by Newton's method on the interval where the radial function still increases. Beyond that radius the formula
 folds back and two rays would have one image: such points are finite and masked.
 
-Every model also has `project_rows(X, Y, Z, *parameters)`, the same formula on separate coordinates, for optimisers that keep
-each coordinate as one long row.
+A model is one class here and one line in `DISTORTION_MODELS`; everything else asks it. It must say `project_rows`, its inverse
+and its valid radius; `linearize` may be written out where automatic differentiation is too slow, and `image` where the formula
+needs fewer passes without masks.
 """
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias, TypeVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
-from torchsfm.geometry.decentring import brown, brown_jacobian, invert_brown
-from torchsfm.geometry.fisheye import fisheye_from_tangent, tangent_from_fisheye
-from torchsfm.geometry.homogeneous import finite_or_zero
-from torchsfm.geometry.radial import even_polynomial, first_fold, flatten_ray, invert_radial
-
-D = TypeVar("D", bound="DistortionModel")
-
-
-class DistortionModel(ABC):
-    """What every distortion model offers; the models below are its only kinds."""
-
-    num_parameters: ClassVar[int]
-    parameter_names: ClassVar[tuple[str, ...]]
-
-    @staticmethod
-    @abstractmethod
-    def project_rows(X: Tensor, Y: Tensor, Z: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Project rays given as separate coordinates; everything broadcasts."""
-
-    @abstractmethod
-    def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Invert `project_rows`: X, Y, Z and validity of each point."""
-
-    @abstractmethod
-    def valid_radius(self) -> Float[Tensor, "*batch"]:
-        """Find how far from the axis the model can be trusted; inf where everywhere. Not differentiated.
-
-        It is the smallest radius where the radial function stops increasing: in undistorted normalised coordinates (the tangent
-        of the angle to the axis), or for fisheye models the angle itself in radians, at most pi.
-        """
-
-    def in_domain(self, d: Float[Tensor, "*#batch n 3"]) -> Bool[Tensor, "*#batch n"]:
-        """Tell which rays point forwards and lie within the valid radius, so that `unproject` finds them again."""
-        check_tensors(d=(d, "n 3"))
-        X, Y, Z = d.detach().unbind(-1)
-        return (Z > 0) & ((X * X + Y * Y).sqrt() < self.valid_radius()[..., None] * Z)
-
-    def project(self, d: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n 2"]:
-        """Project rays to distorted normalised coordinates.
-
-        Args:
-            d: Rays or points in camera coordinates, of any length.
-
-        Returns:
-            What multiplies K, finite always: a ray with no depth is sent very far away in its own direction, one with NaN or
-            inf to the centre. Rays behind the camera follow the formula (a pinhole shows them mirrored): see `in_domain`.
-        """
-        check_tensors(d=(d, "n 3"))
-        return torch.stack(self.project_rows(*finite_or_zero(d).unbind(-1), *self._columns()), -1)
-
-    def unproject(self, u: Float[Tensor, "*#batch n 2"]) -> tuple[Float[Tensor, "*#batch n 3"], Bool[Tensor, "*#batch n"]]:
-        """Find the ray of each distorted point, by Newton's method.
-
-        First derivatives, by the points and by the parameters, come from the implicit function theorem.
-
-        Args:
-            u: Distorted normalised coordinates.
-
-        Returns:
-            Rays with third coordinate 1 (fisheye: unit length beyond 89.9 degrees off the axis), and the mask of those that
-            were found within the valid radius. Others are finite numbers, with zero or finite gradients.
-        """
-        check_tensors(u=(u, "n 2"))
-        x, y, z, valid = self._unproject_rows(*u.unbind(-1))
-        return torch.stack([x, y, z.expand_as(x)], -1), valid
-
-    def parameters(self) -> Float[Tensor, "*batch p"]:
-        """Stack the parameters in the order of `parameter_names`."""
-        return torch.stack([getattr(self, name) for name in self.parameter_names], -1)
-
-    @classmethod
-    def from_parameters(cls: type[D], p: Float[Tensor, "*batch p"]) -> D:
-        """Make the model from its parameters in the order of `parameter_names`."""
-        if p.shape[-1] != cls.num_parameters:
-            raise ValueError(f"p: wanted shape (*batch, {cls.num_parameters}) for {cls.__name__}, got {tuple(p.shape)}")
-        return cls(*p.unbind(-1))
-
-    def _columns(self) -> list[Tensor]:
-        return [getattr(self, name)[..., None] for name in self.parameter_names]
+from torchsfm.geometry.decentring import brown, brown_jacobian, brown_slopes, invert_brown
+from torchsfm.geometry.distortion_model import Distortion
+from torchsfm.geometry.fisheye import fisheye_from_tangent, fisheye_slopes, tangent_from_fisheye
+from torchsfm.geometry.radial import (
+    even_polynomial,
+    first_fold,
+    flatten,
+    flatten_ray,
+    invert_radial,
+    radial_slopes,
+)
 
 
 @dataclass(frozen=True)
-class NoDistortion(DistortionModel):
+class NoDistortion(Distortion):
     """A pinhole: straight lines stay straight."""
 
     num_parameters: ClassVar[int] = 0
     parameter_names: ClassVar[tuple[str, ...]] = ()
+    colmap: ClassVar[tuple[str, ...]] = ("SIMPLE_PINHOLE", "PINHOLE")
 
     @staticmethod
     def project_rows(X: Tensor, Y: Tensor, Z: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Divide by the depth."""
         x, y, _ = flatten_ray(X, Y, Z)
         return x, y
+
+    @classmethod
+    def image(cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "0 *#n"]) -> Float[Tensor, "2 *n"]:
+        """Divide by the depth."""
+        return flatten(ray)[0]
+
+    @classmethod
+    def linearize(
+        cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "0 *#n"], out: Float[Tensor, "2 3 *n"]
+    ) -> tuple[Float[Tensor, "2 *n"], list[Float[Tensor, "2 *n"]]]:
+        """The derivative is (1, 0, -u; 0, 1, -v) / Z."""
+        uv, inverse = flatten(ray)
+        out[0, 1] = out[1, 0] = 0
+        out[0, 0] = out[1, 1] = inverse
+        torch.mul(uv, -inverse, out=out[:, 2])
+        return uv, []
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         u, v, valid = _finite_pairs(u, v)
@@ -128,7 +77,7 @@ class NoDistortion(DistortionModel):
         return torch.zeros(0)
 
 
-class _Polynomial(DistortionModel):
+class _Polynomial(Distortion):
     """What the radial polynomials in the tangent share."""
 
     @staticmethod
@@ -137,6 +86,20 @@ class _Polynomial(DistortionModel):
         x, y, s = flatten_ray(X, Y, Z)
         h = even_polynomial(s, parameters)
         return x * h, y * h
+
+    @classmethod
+    def image(cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "p *#n"]) -> Float[Tensor, "2 *n"]:
+        """Scale the flat coordinates by the radial polynomial."""
+        uv, _ = flatten(ray)
+        x, y = uv
+        return uv * even_polynomial(torch.addcmul(x * x, y, y), k.unbind(0))
+
+    @classmethod
+    def linearize(
+        cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "p *#n"], out: Float[Tensor, "2 3 *n"]
+    ) -> tuple[Float[Tensor, "2 *n"], list[Float[Tensor, "2 *n"]]]:
+        """See `radial_slopes`."""
+        return radial_slopes(*flatten(ray), k, out)
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         k = self._columns()
@@ -160,6 +123,8 @@ class SimpleRadial(_Polynomial):
 
     num_parameters: ClassVar[int] = 1
     parameter_names: ClassVar[tuple[str, ...]] = ("k1",)
+    generalises: ClassVar[type[Distortion] | None] = NoDistortion
+    colmap: ClassVar[tuple[str, ...]] = ("SIMPLE_RADIAL",)
 
 
 @dataclass(frozen=True)
@@ -171,10 +136,12 @@ class Radial(_Polynomial):
 
     num_parameters: ClassVar[int] = 2
     parameter_names: ClassVar[tuple[str, ...]] = ("k1", "k2")
+    generalises: ClassVar[type[Distortion] | None] = SimpleRadial
+    colmap: ClassVar[tuple[str, ...]] = ("RADIAL",)
 
 
 @dataclass(frozen=True)
-class BrownConrady(DistortionModel):
+class BrownConrady(Distortion):
     """Radial and decentring distortion with the five coefficients of OpenCV, in its order k1, k2, p1, p2, k3 (Brown 1966)."""
 
     k1: Float[Tensor, "*batch"]
@@ -185,6 +152,8 @@ class BrownConrady(DistortionModel):
 
     num_parameters: ClassVar[int] = 5
     parameter_names: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3")
+    generalises: ClassVar[type[Distortion] | None] = Radial
+    colmap: ClassVar[tuple[str, ...]] = ("OPENCV", "FULL_OPENCV")
 
     @staticmethod
     def project_rows(X: Tensor, Y: Tensor, Z: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -192,6 +161,22 @@ class BrownConrady(DistortionModel):
         k1, k2, p1, p2, k3 = parameters
         x, y, s = flatten_ray(X, Y, Z)
         return brown(x, y, s, (k1, k2, k3), p1, p2)
+
+    @classmethod
+    def image(cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "5 *#n"]) -> Float[Tensor, "2 *n"]:
+        """Scale the flat coordinates by the radial polynomial and add the decentring terms."""
+        k1, k2, p1, p2, k3 = k
+        x, y = flatten(ray)[0]
+        return torch.stack(brown(x, y, torch.addcmul(x * x, y, y), (k1, k2, k3), p1, p2))
+
+    @classmethod
+    def linearize(
+        cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "5 *#n"], out: Float[Tensor, "2 3 *n"]
+    ) -> tuple[Float[Tensor, "2 *n"], list[Float[Tensor, "2 *n"]]]:
+        """See `brown_slopes`."""
+        k1, k2, p1, p2, k3 = k
+        uv, (by_k1, by_k2, by_k3), by_p1, by_p2 = brown_slopes(*flatten(ray), (k1, k2, k3), p1, p2, out)
+        return uv, [by_k1, by_k2, by_p1, by_p2, by_k3]
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         k1, k2, p1, p2, k3 = self._columns()
@@ -212,7 +197,7 @@ class BrownConrady(DistortionModel):
 
 
 @dataclass(frozen=True)
-class KannalaBrandt(DistortionModel):
+class KannalaBrandt(Distortion):
     """Fisheye: the radius is theta (1 + k1 theta^2 + ... + k4 theta^8), theta the angle to the axis.
 
     OpenCV's fisheye model and COLMAP's OPENCV_FISHEYE (Kannala & Brandt 2006). Here rays may point backwards too, up to the
@@ -226,6 +211,8 @@ class KannalaBrandt(DistortionModel):
 
     num_parameters: ClassVar[int] = 4
     parameter_names: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+    colmap: ClassVar[tuple[str, ...]] = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+    straight_k1: ClassVar[float] = 1 / 3
 
     @staticmethod
     def project_rows(X: Tensor, Y: Tensor, Z: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -233,6 +220,13 @@ class KannalaBrandt(DistortionModel):
         ratio, s = fisheye_from_tangent(X, Y, Z)
         factor = ratio * even_polynomial(s, parameters)
         return X * factor, Y * factor
+
+    @classmethod
+    def linearize(
+        cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "4 *#n"], out: Float[Tensor, "2 3 *n"]
+    ) -> tuple[Float[Tensor, "2 *n"], list[Float[Tensor, "2 *n"]]]:
+        """See `fisheye_slopes`."""
+        return fisheye_slopes(ray, k, out)
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         k = self._columns()
@@ -255,7 +249,6 @@ class KannalaBrandt(DistortionModel):
         return torch.atan2((X * X + Y * Y).sqrt(), Z) < self.valid_radius()[..., None]
 
 
-Distortion: TypeAlias = NoDistortion | SimpleRadial | Radial | BrownConrady | KannalaBrandt
 DISTORTION_MODELS: dict[str, type[Distortion]] = {
     "pinhole": NoDistortion,
     "simple_radial": SimpleRadial,
@@ -263,7 +256,7 @@ DISTORTION_MODELS: dict[str, type[Distortion]] = {
     "opencv": BrownConrady,
     "fisheye": KannalaBrandt,
 }
-"""The models by the names used in files and on the command line."""
+"""The models by the names used in files and on the command line; of those that could hold a camera the first is taken."""
 
 
 def _finite_pairs(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from torchsfm.geometry.radial import even_polynomial, powers, slope_coefficients
+
 SERIES = 1e-3
 """Squared angle or tangent below which power series replace quotients."""
 
@@ -37,3 +39,26 @@ def tangent_from_fisheye(s: Tensor) -> tuple[Tensor, Tensor]:
     cosine = torch.where(small, 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56))), cosine)
     factor = torch.where(flat, sinc / torch.where(flat, cosine, 1.0), sinc)
     return factor, torch.where(flat, 1.0, cosine)
+
+
+def fisheye_slopes(ray: Tensor, k: Tensor, out: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Project rays (3, ...) with radius theta h(theta^2); also return the derivatives (2, ...) by each coefficient.
+
+    `out` (2, 3, ...) gets those by the ray. With the radius r across the axis, the image is (X, Y) g, g = theta h / r: it grows
+    by g in every direction, outwards by what the slope c Z of the image's radius is more or less, and by -c r along the axis.
+    """
+    X, Y, Z = ray
+    ratio, s = fisheye_from_tangent(X, Y, Z)
+    g = ratio * even_polynomial(s, k.unbind(0))
+    q = torch.addcmul(X * X, Y, Y)
+    square = torch.addcmul(q, Z, Z)
+    c = even_polynomial(s, slope_coefficients(k.unbind(0))) / torch.where(square > 0, square, 1.0)
+    # On the axis this is multiplied by zero.
+    bend = torch.addcmul(-g, c, Z) / torch.where(q > 0, q, 1.0)
+    bent = ray[:2] * bend
+    torch.addcmul(g, X, bent[0], out=out[0, 0])
+    torch.addcmul(g, Y, bent[1], out=out[1, 1])
+    torch.mul(X, bent[1], out=out[0, 1])
+    out[1, 0] = out[0, 1]
+    torch.mul(ray[:2], -c, out=out[:, 2])
+    return ray[:2] * g, powers(ray[:2] * ratio, s, len(k))

@@ -18,6 +18,8 @@ PLAIN = 7
 """Newton steps that only stay inside that bracket."""
 BLOCK = 32768
 """Points worked on at once on a CPU, so that the many passes over them stay in its cache."""
+NEAREST = 1e20
+"""Largest reciprocal of a depth in optimisers, which keeps values and slopes finite for points in the focal plane (float64)."""
 
 
 def in_blocks(function: Callable[..., tuple[Tensor, ...]], *arrays: Tensor) -> tuple[Tensor, ...]:
@@ -62,6 +64,40 @@ def flatten_ray(X: Tensor, Y: Tensor, Z: Tensor) -> tuple[Tensor, Tensor, Tensor
     x, y = X * inverse, Y * inverse
     # The bound keeps the eighth power of the radius finite in every dtype; no lens comes near it.
     return x, y, torch.addcmul(x * x, y, y).clamp(max=torch.finfo(Z.dtype).max ** (1 / 12))
+
+
+def flatten(ray: Tensor) -> tuple[Tensor, Tensor]:
+    """Divide by the depth as optimisers do, in few passes: rays (3, ...) to flat coordinates (2, ...) and 1 / Z."""
+    inverse = ray[2].reciprocal().clamp(-NEAREST, NEAREST)
+    return ray[:2] * inverse, inverse
+
+
+def radial_slopes(uv: Tensor, inverse: Tensor, k: Tensor, out: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Multiply flat coordinates by the radial polynomial h; also return the derivatives (2, ...) by each coefficient.
+
+    `out` (2, 3, ...) gets those by the ray: `h (x, y)` grows by h in every direction, and by 2 s h' more outwards, where depth
+    acts.
+    """
+    x, y = uv
+    s = torch.addcmul(x * x, y, y)
+    h = even_polynomial(s, k.unbind(0))
+    slope = polynomial(s, [2 * (i + 1) * c for i, c in enumerate(k.unbind(0))]) * inverse
+    along = h * inverse
+    bent = uv * slope
+    torch.addcmul(along, x, bent[0], out=out[0, 0])
+    torch.addcmul(along, y, bent[1], out=out[1, 1])
+    torch.mul(x, bent[1], out=out[0, 1])
+    out[1, 0] = out[0, 1]
+    torch.mul(uv, torch.addcmul(along, s, slope).neg_(), out=out[:, 2])
+    return uv * h, powers(uv, s, len(k))
+
+
+def powers(uv: Tensor, s: Tensor, count: int) -> list[Tensor]:
+    """Return `uv s`, `uv s^2`, ...: the derivatives by radial coefficients."""
+    found = [uv * s]
+    while len(found) < count:
+        found.append(found[-1] * s)
+    return found
 
 
 def first_fold(coefficients: Sequence[Tensor]) -> Tensor:

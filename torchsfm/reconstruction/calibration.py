@@ -15,8 +15,9 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import intrinsics_covariance
-from torchsfm.bundle.intrinsics import camera_from_rows, camera_rows, free_columns
-from torchsfm.geometry import Camera, DistortionModel
+from torchsfm.bundle.intrinsics import free_columns
+from torchsfm.geometry import Camera, Distortion
+from torchsfm.geometry.intrinsic_parameters import camera_from_row, intrinsic_labels, row_from_camera
 from torchsfm.optim import Cauchy, loss_slope
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
 
@@ -114,9 +115,9 @@ def calibration_of(mapping: Mapping, prior: CameraPrior, *, loss: Cauchy) -> Cal
         prior: What was expected of the cameras.
         loss: The loss of the adjustment.
     """
-    K, lens = mapping.cameras.K, mapping.cameras.distortion
-    values = torch.cat((K[:, [0, 0, 1], [0, 2, 2]], lens.parameters().reshape(len(K), -1)), -1)
-    names = ("focal", "cx", "cy", *lens.parameter_names)
+    labels = intrinsic_labels(type(mapping.cameras.distortion))
+    names = tuple(name for name in labels if name not in ("aspect", "skew"))
+    values = row_from_camera(mapping.cameras)[:, [labels.index(name) for name in names]]
     deviation, before, estimated = (
         torch.zeros_like(values),
         torch.zeros_like(values),
@@ -130,8 +131,7 @@ def calibration_of(mapping: Mapping, prior: CameraPrior, *, loss: Cauchy) -> Cal
         for name, mask in adjusted.free.items():
             chosen[:, known.places(name)] = mask[:, None]
         variance = known.covariance(chosen, open_ended=True).diagonal(dim1=-2, dim2=-1)
-        # A row of numbers has the aspect ratio behind the focal length, and skew before the distortion.
-        places = [{0: 0, 2: 1, 3: 2}.get(column, column - 2) for column in known.columns]
+        places = [names.index(labels[column]) for column in known.columns]
         before[:, places], estimated[:, places] = known.prior.sqrt(), chosen
         deviation[:, places] = torch.where(chosen, variance, known.prior).sqrt().nan_to_num(torch.inf, torch.inf)
     return Calibration(adjusted.status, adjusted.iterations, noise, names, values, estimated, deviation, before)
@@ -175,7 +175,7 @@ class _Information:
 
     names: tuple[str, ...]
     columns: tuple[int, ...]
-    model: type[DistortionModel]
+    model: type[Distortion]
     noise: float
     matrix: Float[Tensor, "g k k"]
     prior: Float[Tensor, "g k"]
@@ -270,11 +270,11 @@ def choose_free(
 def as_expected(mapping: Mapping, free: Free, prior: CameraPrior) -> Mapping:
     """The mapping with those numbers of its cameras that could be free, and are not, back where they were expected."""
     model = type(mapping.cameras.distortion)
-    rows, mean = camera_rows(mapping.cameras), camera_rows(prior.mean)
+    rows, mean = row_from_camera(mapping.cameras), row_from_camera(prior.mean)
     for name, mask in free.items():
         for column in free_columns((name,), model):
             rows[:, column] = torch.where(mask, rows[:, column], mean[:, column])
-    return replace(mapping, cameras=camera_from_rows(rows, model))
+    return replace(mapping, cameras=camera_from_row(rows, model))
 
 
 def images_of_cameras(mapping: Mapping) -> Int[Tensor, "g"]:

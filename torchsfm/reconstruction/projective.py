@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import Status, tensor_map
 from torchsfm.autocalibration import Assumption, Autocalibration, autocalibrate_points
 from torchsfm.bundle import bundle_adjust_projective
-from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, krt_from_camera
+from torchsfm.geometry import Camera, Pose, krt_from_camera
 from torchsfm.motion import factorize_points
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA
@@ -271,11 +271,12 @@ def _metric(empty: Mapping, problem: _Problem, found: Autocalibration, k: float)
     lens = torch.zeros(groups, len(names), dtype=K.dtype)
     if "k1" in names:
         # To first order the inverse of the change of radius, and what autocalibration found to be left of it, in units of the
-        # focal length; and what the fisheye formula lacks of a tangent.
+        # focal length; and what the formula lacks of a tangent.
         corner, side = size[first].norm(dim=-1) / 2, size[first].amax(-1)
-        fisheye = 1 / 3 if kind is DISTORTION_MODELS["fisheye"] else 0.0
         focal = K[:, 0, 0]
-        lens[:, names.index("k1")] = fisheye - k * (focal / corner).square() + found.distortion * (focal / side).square()
+        lens[:, names.index("k1")] = (
+            kind.straight_k1 - k * (focal / corner).square() + found.distortion * (focal / side).square()
+        )
     cameras = Camera(K, kind.from_parameters(lens))
     _, R, t = krt_from_camera(found.P)
     poses = Pose.identity(v, dtype=K.dtype)

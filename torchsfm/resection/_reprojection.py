@@ -16,7 +16,7 @@ INSIDE = ("focal", "aspect", "principal_point")
 
 
 def _changed(distortion: Distortion, parameters: dict[str, Tensor]) -> Distortion:
-    changed: Distortion = replace(distortion, **parameters)  # type: ignore[arg-type]
+    changed: Distortion = replace(distortion, **parameters)  # type: ignore[type-var]
     return changed
 
 
