@@ -1,12 +1,12 @@
 import pytest
 import torch
 
+from torchsfm.geometry import Line3D
 from torchsfm.optim import (
     Cauchy,
     Euclidean,
     GemanMcClure,
     Huber,
-    Line3D,
     Manifold,
     Positive,
     Product,

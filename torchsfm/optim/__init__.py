@@ -15,7 +15,6 @@ from torchsfm.optim.manifold import (
     UnitSphere,
     rotation_exponential,
 )
-from torchsfm.optim.manifold_line import Line3D
 from torchsfm.optim.sparse_levenberg_marquardt import SparseResult, sparse_levenberg_marquardt
 from torchsfm.optim.terms import Block, Term
 
@@ -26,7 +25,6 @@ __all__ = [
     "GemanMcClure",
     "Huber",
     "LeastSquaresResult",
-    "Line3D",
     "Loss",
     "Manifold",
     "Positive",

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.optim.manifold import rotation_exponential
+from torchsfm.geometry.rotations import rotation_from_rotvec
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Line3D:
         small = torch.where(tiny, torch.zeros_like(small), small)
         u1, u2 = torch.where(steep, v, u), torch.where(steep, u, v)
         cos, sin = torch.where(steep, small, moment), torch.where(steep, direction, small)
-        frame = torch.stack((u1, u2, torch.linalg.cross(u1, u2)), -1) @ rotation_exponential(delta[..., :3])
+        frame = torch.stack((u1, u2, torch.linalg.cross(u1, u2)), -1) @ rotation_from_rotvec(delta[..., :3])
         angle = delta[..., 3:]
         new_cos = cos * angle.cos() - sin * angle.sin()
         new_sin = sin * angle.cos() + cos * angle.sin()
