@@ -86,6 +86,11 @@ def _ellipse(s: Scene) -> Ellipse:
     return Ellipse(middle + s.rand(2, low=-30.0, high=30.0), axes, s.rand(low=-1.5, high=1.5))
 
 
+def _edge_points(s: Scene) -> Tensor:
+    """Around an ellipse."""
+    return _ellipse(s).points(s.rand(24, high=6.3)) + 0.3 * s.randn(24, 2)
+
+
 def _middle_lines(s: Scene) -> Tensor:
     """Lines through the middle of the image."""
     normal = s.randn(5, 2)
@@ -190,6 +195,7 @@ FUNCTIONS: dict[str, Function] = {
     "images.detect_corners": Function({"image": lambda s: s.rand(1, 32, 40)}, {"h": 32, "w": 40}),
     "images.detect_edges": Function({"image": lambda s: _picture(s), "max_edgels": 500}, {"h": 32, "w": 40}),
     "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
+    "images.fit_ellipse": Function({"x": _edge_points}, {"n": 24}),
     "images.match_descriptors": Function({f"descriptors{i}": lambda s: s.rand(9, 16) for i in (1, 2)}, batched=False),
     "images.match_features": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),
     "images.retrieve_pairs": Function(

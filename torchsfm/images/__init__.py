@@ -4,6 +4,7 @@ from torchsfm.images.corners import Corners, detect_corners
 from torchsfm.images.edges import Edges, detect_edges
 from torchsfm.images.exif import Exif, parse_exif
 from torchsfm.images.features import Features, detect_features
+from torchsfm.images.fit_ellipse import EllipseFit, fit_ellipse
 from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
 from torchsfm.images.listing import list_images, list_skipped
 from torchsfm.images.matching import match_descriptors, match_features
@@ -15,6 +16,7 @@ __all__ = [
     "MAX_PIXELS",
     "Corners",
     "Edges",
+    "EllipseFit",
     "Exif",
     "Features",
     "ImageError",
@@ -27,6 +29,7 @@ __all__ = [
     "detect_corners",
     "detect_edges",
     "detect_features",
+    "fit_ellipse",
     "list_images",
     "list_skipped",
     "load_detector",
