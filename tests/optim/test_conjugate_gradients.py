@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.optim import Block, Huber, Term, conjugate_gradients, layout, schur, sparse_levenberg_marquardt
+from torchsfm.optim import Block, Huber, Term, layout, schur, schur_matrix_free, sparse_levenberg_marquardt
 
 F64 = torch.float64
 
@@ -57,7 +57,7 @@ def test_solved_to_the_end_it_is_the_dense_step(
     found = layout.lay_out(blocks, terms, "mark")
     x = {name: b.x for name, b in blocks.items()}
     dense, promised, *_ = schur.Elimination(blocks, found, "dense").linearize(x).step(1e-4)
-    monkeypatch.setattr(conjugate_gradients, "FORCING", 0.0)
+    monkeypatch.setattr(schur_matrix_free, "FORCING", 0.0)
     iterative, model, solved, _ = schur.Elimination(blocks, found, "pcg").linearize(x).step(1e-4)
     assert solved
     torch.testing.assert_close(model, promised)

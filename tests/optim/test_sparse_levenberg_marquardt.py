@@ -15,11 +15,11 @@ from torchsfm.optim import (
     SoftL1,
     Term,
     UnitSphere,
-    coupling_groups,
-    coupling_pairs,
-    coupling_rows,
     layout,
     schur,
+    schur_grouped,
+    schur_matrix_free,
+    schur_pairwise,
     sparse_levenberg_marquardt,
 )
 from torchsfm.optim.manifold import rotation_exponential
@@ -103,7 +103,7 @@ def scipy_cost(scene: Scene, loss: str, scale: float, start: dict[str, Tensor]) 
 @pytest.mark.parametrize("loss", [None, Huber(0.5), SoftL1(0.5)])
 def test_no_minimum_of_scipys_is_lower(scene: Scene, loss: object, coupling: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(schur, "estimate_pairs", lambda layout: torch.inf if coupling == "groups" else 0.0)
-    monkeypatch.setattr(coupling_groups, "ATOM", 4)
+    monkeypatch.setattr(schur_grouped, "ATOM", 4)
     result = solve(scene.blocks(), [scene.term(loss=loss)])
     assert result.status == Status.OK
     name, scale = ("linear", 1.0) if loss is None else ({Huber: "huber", SoftL1: "soft_l1"}[type(loss)], loss.scale)
@@ -127,8 +127,8 @@ def test_both_couplings_and_no_elimination_agree(scene: Scene, monkeypatch: pyte
     expected = undamped_step(blocks, [scene.term()], None)
     for seconds in (0.0, torch.inf):
         monkeypatch.setattr(schur, "estimate_pairs", lambda layout, seconds=seconds: seconds)
-        monkeypatch.setattr(coupling_groups, "ATOM", 4)
-        monkeypatch.setattr(coupling_groups, "VISIT", 0.0)
+        monkeypatch.setattr(schur_grouped, "ATOM", 4)
+        monkeypatch.setattr(schur_grouped, "VISIT", 0.0)
         found = undamped_step(blocks, [scene.term()], "point")
         for name, x in expected.items():
             torch.testing.assert_close(found[name], x, rtol=1e-7, atol=1e-9)
@@ -138,9 +138,9 @@ def test_small_chunks_change_nothing(scene: Scene, monkeypatch: pytest.MonkeyPat
     whole = sparse_levenberg_marquardt(scene.blocks(), [scene.term(loss=Cauchy(1.0))], eliminate="point", max_iterations=4)
     for seconds in (0.0, torch.inf):
         monkeypatch.setattr(schur, "CHUNK", 7)
-        monkeypatch.setattr(coupling_groups, "CHUNK", 7)
-        monkeypatch.setattr(coupling_rows, "CHUNK", 7)
-        monkeypatch.setattr(coupling_pairs, "BATCH", 16)
+        monkeypatch.setattr(schur_grouped, "CHUNK", 7)
+        monkeypatch.setattr(schur_matrix_free, "CHUNK", 7)
+        monkeypatch.setattr(schur_pairwise, "BATCH", 16)
         monkeypatch.setattr(schur, "estimate_pairs", lambda layout, seconds=seconds: seconds)
         cut = sparse_levenberg_marquardt(scene.blocks(), [scene.term(loss=Cauchy(1.0))], eliminate="point", max_iterations=4)
         torch.testing.assert_close(cut.x["point"], whole.x["point"], rtol=1e-7, atol=1e-9)
@@ -150,7 +150,7 @@ def test_small_chunks_change_nothing(scene: Scene, monkeypatch: pytest.MonkeyPat
 def test_more_than_sixty_slots(generator: torch.Generator, seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Averages over a long chain: each point links two to four of a hundred one-number variables."""
     monkeypatch.setattr(schur, "estimate_pairs", lambda layout: seconds)
-    monkeypatch.setattr(coupling_groups, "ATOM", 8)
+    monkeypatch.setattr(schur_grouped, "ATOM", 8)
     links = [(p, (p * 37 + k * (1 + p % 5)) % 100) for p in range(300) for k in range(2 + p % 3)]
     point, camera = torch.tensor(links).T
     offset = torch.randn(len(links), 1, generator=generator, dtype=F64)

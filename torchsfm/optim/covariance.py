@@ -6,7 +6,7 @@ et al. 2000, 9): differences and shapes are meaningful, absolute positions only 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -16,7 +16,7 @@ from torchsfm._types import check_options
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.loss import loss_slope
 from torchsfm.optim.schur import Elimination
-from torchsfm.optim.terms import Block, Term, term_residual
+from torchsfm.optim.terms import Block, Term, prepare, term_residual
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,8 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
     """
     _check(blocks, terms, eliminate)
     with torch.no_grad():
-        double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
+        double, counted, _ = prepare(blocks, terms)
         x = {name: b.x for name, b in double.items()}
-        counted = [to_double(t) for t in terms]
-        counted = [t.select(usable(t, x).nonzero()[:, 0]) for t in counted]
         layout = lay_out(double, counted, eliminate)
         engine = Elimination(double, layout, "dense", spread=True)
         inverse = engine.linearize(x).invert()
@@ -100,10 +98,8 @@ def marginal_covariance(
     _check(blocks, terms, eliminate)
     check_options(name=(name, tuple(blocks)))
     with torch.no_grad():
-        double = {key: replace(b, x=b.x.detach().double().mT.contiguous().mT) for key, b in blocks.items()}
+        double, counted, _ = prepare(blocks, terms)
         x = {key: b.x for key, b in double.items()}
-        counted = [to_double(t) for t in terms]
-        counted = [t.select(usable(t, x).nonzero()[:, 0]) for t in counted]
         layout = lay_out(double, counted, eliminate)
         width, free = double[name].tangent, layout.free[name]
         out = double[name].x.new_zeros((double[name].x.shape[0], width, width))
@@ -126,20 +122,8 @@ def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | 
     check_options(eliminate=(eliminate, (None, *blocks)))
 
 
-def to_double(term: Term) -> Term:
-    """The term with all its numbers in float64, detached."""
-    data = tuple(d.detach().double() if d.is_floating_point() else d.detach() for d in term.data)
-    return replace(term, data=data, weights=None if term.weights is None else term.weights.detach().double())
-
-
 def _square_sum(term: Term, x: dict[str, Tensor]) -> float:
     square = term_residual(term, x).square().sum(-1)
     if term.loss is not None:
         square = square * loss_slope(term.loss, square)
     return float(square.sum() if term.weights is None else square @ term.weights)
-
-
-def usable(term: Term, x: dict[str, Tensor]) -> Tensor:
-    """Which residuals have weight and a finite share in the sum of squares."""
-    square = term_residual(term, x).square().sum(-1)
-    return square.isfinite() if term.weights is None else (square * term.weights).isfinite() & (term.weights > 0)

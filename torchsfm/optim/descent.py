@@ -1,44 +1,115 @@
 """One descent to a minimum: damped Gauss-Newton steps, and Newton steps where these are slow.
 
+Problems come in batches of any shape, each with its own damping, its own accepted and rejected steps and its own end; one large
+problem is a batch of none. What they are made of is behind two concepts: a `Problem` is linearised at a place, and the `System`
+found there gives a step for any damping. Two linear algebras serve it, `dense` for thousands of small problems and `schur` for
+one large sparse one; a room with a structure of its own brings a third.
+
 Near the minimum, differences of costs are rounding errors; what a step gains is then told by the slopes at its two ends (Hager
 & Zhang 2005), and the end by what the next step promises. The damping follows the trust-region rule of Nielsen (1999; Madsen,
 Nielsen & Tingleff 2004, 3.2).
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.optim.normal_equations import NormalEquations
-from torchsfm.optim.schur import Elimination, move
+from torchsfm.optim.pytree import Places, choose, pick, places, put
 
 SLOW = 0.25
 """Gauss-Newton steps of which each gains more than this fraction of what the last one gained give way to Newton steps."""
 NEAR = 1e-2
 """They do so only once they gain less than this fraction of the cost: before, the exact Hessian is rarely positive."""
-PATIENCE = 5
-"""A Newton step takes the time of about five others: when that many in a row were slow, or the end is near, and at their pace
-more than that many would be needed to the end."""
 MINIMUM = 1e-13
 """Relative decrease still promised at which a place is the minimum that a derivative belongs to."""
 LIGHT = 1e-6
 """Most damping of a step by which the end is told: more would hide what is left to gain where the cost is flat."""
 STEEPEST = 1e-6
 """Most damping that is tried to make the exact Hessian positive."""
-STRAIGHT = 0.75
-"""Steps that lower the cost by less than this part of what they promise left the linear model's reach."""
-POOR = 0.25
-"""Of a step that gains less than this fraction of its promise, each eliminated variable takes only what is good for it."""
 LEAST = 1e-3
 """Steps that gain less than this fraction of their promise are not taken."""
-SETTLED = 1e-8
-"""Promises of a smaller part of the cost come from near the minimum, where slopes tell what a step gains, not costs."""
-ROUNDING = 10 * torch.finfo(torch.float64).eps
-"""Of data and residuals, relative: no place is known better than to the square of this."""
+STRONGEST = 1e16
+"""Damping beyond which no step whatever lowers the cost."""
+WEAKEST = 1e-16
+"""Damping below which it is none."""
+_UNDER_WAY = -1
+"""The status of what has not ended."""
+
+
+class Step(NamedTuple):
+    """Steps, one for each element of the batch."""
+
+    delta: Any
+    """Tangent steps; of no account where there is none."""
+    promise: Tensor
+    """The decrease of the cost that the model promises; inf where there is no step, so that none is taken and nothing ends."""
+    solved: Tensor
+    """Where there is a step."""
+    bent: Tensor
+    """Where the cost bends down in some directions, in which the step goes as far as were it up: that promises nothing."""
+
+
+@runtime_checkable
+class System(Protocol):
+    """A problem linearised at a place. In a batch, a dataclass of tensors with the batch in front."""
+
+    @property
+    def x(self) -> Any:
+        """The place."""
+
+    @property
+    def cost(self) -> Tensor:
+        """The cost there, (*batch)."""
+
+    def steepest(self) -> Tensor:
+        """The largest absolute derivative, not finite where anything in the system is not, (*batch)."""
+
+    def along(self, delta: Any) -> Tensor:
+        """The derivative of the cost along a step, (*batch)."""
+
+    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
+        """The step for a damping (*batch), relative to the diagonal of the Gauss-Newton matrix.
+
+        Where `exact` is True it is one with the exact Hessian, which `Problem.curve` has put in.
+        """
+
+
+S = TypeVar("S", bound=System)
+
+
+@runtime_checkable
+class Problem(Protocol[S]):
+    """What is minimised. In a batch, a dataclass of tensors with the batch in front."""
+
+    @property
+    def epsilon(self) -> float:
+        """The relative rounding error of parameters and data."""
+
+    @property
+    def patience(self) -> int | None:
+        """About how many Gauss-Newton steps a Newton step takes the time of; None where there are no Newton steps."""
+
+    def linearize(self, x: Any) -> S:
+        """The system at x."""
+
+    def advance(self, here: S, step: Step) -> S:
+        """The system where a step leads; a cost that is not finite where there is nowhere to go."""
+
+    def curve(self, here: S, where: Tensor) -> S:
+        """The system with the exact Hessian in the elements `where`."""
+
+    def rounding(self, here: S) -> Tensor:
+        """The decrease of the cost that is nothing, whatever the tolerance, (*batch)."""
+
+    def is_short(self, here: S, delta: Any, tolerance: float) -> Tensor:
+        """Where a step is shorter than a fraction of what it moves, (*batch)."""
+
+    def pick(self, at: Places) -> "Problem[S]":
+        """The problems at some places, in a batch of one dimension; never asked of a batch of none."""
 
 
 @dataclass(frozen=True)
@@ -47,164 +118,220 @@ class Options:
 
     max_iterations: int
     function_tolerance: float
-    gradient_tolerance: float
-    step_tolerance: float
-    initial_damping: float
-    progress: Callable[[int, float], bool | None] | None
+    """End when no more than this fraction of the cost is left to gain."""
+    step_tolerance: float = 0.0
+    """End when a step is shorter than this fraction of what it moves, and promises next to nothing."""
+    gradient_tolerance: float = 0.0
+    """End when no derivative of the cost is larger."""
+    initial_damping: float = 1e-4
+    progress: Callable[[int, Tensor], bool | None] | None = None
+    """Called with the number of steps and the costs after each; False ends the descent."""
+    interruptible: bool = False
+    """Whether an interrupt (Ctrl-C) ends the descent with the best so far."""
 
 
-@dataclass
-class Descent:
-    """Where the minimisation stands, at any moment the best so far."""
+class Descent(NamedTuple):
+    """Where a descent ended.
 
-    x: dict[str, Tensor]
-    cost: float
-    iterations: int = 0
-
-
-@dataclass(frozen=True)
-class _Step:
-    """A step with the decrease that its model promises, and the damping it took.
-
-    The model may be the exact Hessian; where the cost is bent, and the step made as if it were not, that promises nothing.
+    `status` is OK at a minimum, `NOT_CONVERGED` where the limit of steps came first or no step lowers the cost though more is
+    promised, `NOT_FINITE` where the cost or its derivatives are not, at the start or at the best place so far, `TOO_FEW` where
+    there are too few data, and `INTERRUPTED` where it was stopped from outside. `x` is always the best place so far.
     """
 
-    delta: dict[str, Tensor]
-    promise: float
-    damping: float
-    exact: bool = False
-    bent: bool = False
+    x: Any
+    cost: Tensor
+    initial_cost: Tensor
+    iterations: Tensor
+    status: Tensor
 
 
 @dataclass(frozen=True)
-class _Trial:
-    """Where a step leads, what that gains, and the normal equations there if they told."""
+class _State:
+    """The elements still under way, and those that have ended since some were last left behind."""
 
-    x: dict[str, Tensor]
-    cost: float
-    gain: float
-    system: NormalEquations | None = None
+    at: Places
+    """Their places in the batch; none while that is all of it."""
+    here: Any
+    status: Tensor
+    iterations: Tensor
+    damping: Tensor
+    growth: Tensor
+    last: Tensor
+    """What the last step gained."""
+    dull: Tensor
+    """How many Gauss-Newton steps in a row were slow."""
+    slow: Tensor
+    """Where Newton steps are wanted,"""
+    curved: Tensor
+    """and where the exact Hessian is there for them."""
+
+    @property
+    def active(self) -> Tensor:
+        return self.status == _UNDER_WAY
 
 
-def descend(engine: Elimination, state: Descent, options: Options, *, rounding: float = 0.0, constant: float = 0.0) -> Status:
-    """Damped steps until a tolerance is met; a rejected step keeps the linearisation.
+def descend(problem: Problem[Any], x0: Any, options: Options, *, enough: Tensor | None = None) -> Descent:
+    """Minimise every problem of a batch; finished ones leave it when they are half of those under way.
 
     Args:
-        engine: The problem.
-        state: The start, and then the best so far, whatever ends it.
-        options: See `sparse_levenberg_marquardt`.
-        rounding: Decrease of the cost that is nothing, whatever the tolerance.
-        constant: What is added to the cost that is told.
+        problem: The problems.
+        x0: Where they start.
+        options: When to stop.
+        enough: Where there are data enough; the others come back as they were.
 
     Returns:
-        OK at a minimum; `NOT_CONVERGED`, `NOT_FINITE` or `INTERRUPTED` elsewhere.
+        The minima, with a status for each.
     """
-    system = engine.linearize(state.x)
-    curved: NormalEquations | None = None
-    damping, growth, last, slow, dull = options.initial_damping, 2.0, math.inf, False, 0
-    for iteration in range(1, options.max_iterations + 1):
-        slope = float(system.gradient())
-        if not math.isfinite(slope):
-            return Status.NOT_FINITE
-        if slope <= options.gradient_tolerance:
-            return Status.OK
-        step = None
-        if slow:
-            curved = engine.curve(state.x, system) if curved is None else curved
-            step = _newton_step(curved, damping)
-            slow = step is not None
-        step = _gauss_newton_step(system, damping) if step is None else step
-        damping = step.damping
-        least = max(options.function_tolerance, ROUNDING**2) * state.cost + rounding
-        left, sure = step.promise, step.exact
-        if left <= least and (damping > LIGHT or step.bent):
-            # What a heavily damped step promises says nothing, nor what one along which the cost bends down does.
-            left, sure = _gauss_newton_step(system, LIGHT).promise, False
-        # Gauss-Newton steps may promise too little.
-        done = left <= (least if sure else 1e-2 * least)
-        if left <= SETTLED * state.cost and damping <= LIGHT:
-            done = done or _is_short(engine, state.x, step.delta, options.step_tolerance)
-        trial = _try(engine, state, system, step)
-        accepted = trial.gain > LEAST * step.promise
-        if accepted:
-            rate, last = trial.gain / last, trial.gain
-            if not step.exact:
-                # Steps that fall as a geometric series have this much still before them.
-                rate = min(rate, 1.0)
-                series = last * rate / (1 - rate) if rate < 1 else math.inf
-                done = done or max(last, left, series) <= least
-                dull = dull + 1 if rate > SLOW and last <= NEAR * state.cost else 0
-                far = last * rate ** (PATIENCE + 1) > least * (1 - rate)
-                slow = far and (dull > PATIENCE or (dull > 0 and last <= 100 * least))
-            state.x, state.cost, curved = trial.x, trial.cost, None
-            damping = max(damping * max(1 / 3, 1 - (2 * min(last / step.promise, 1.0) - 1) ** 3), 1e-16)
-            growth = 2.0
-        else:
-            damping, growth = damping * growth, 2 * growth
-        state.iterations = iteration
-        if options.progress is not None and options.progress(iteration, state.cost + constant) is False:
-            return Status.OK if done else Status.INTERRUPTED
-        if done:
-            return Status.OK
-        if accepted and trial.system is not None:
-            system = trial.system
-        elif accepted or trial.system is not None:
-            system = engine.linearize(state.x)
-        if damping > 1e16:
-            # No step whatever lowers the cost: at a minimum, or where it is not smooth.
-            promise = _gauss_newton_step(system, LIGHT).promise
-            if not math.isfinite(promise):
-                return Status.NOT_FINITE
-            return Status.OK if promise <= least else Status.NOT_CONVERGED
-    return Status.NOT_CONVERGED
+    here = problem.linearize(x0)
+    cost = here.cost
+    status = torch.full(cost.shape, _UNDER_WAY, dtype=torch.int8, device=cost.device)
+    status = torch.where(cost.isfinite(), status, int(Status.NOT_FINITE))
+    if enough is not None:
+        status = torch.where(enough, status, int(Status.TOO_FEW))
+    ones, none = torch.ones_like(cost), torch.zeros_like(status, dtype=torch.bool)
+    count = torch.zeros_like(status, dtype=torch.int32)
+    damping, growth, last = options.initial_damping * ones, 2 * ones, torch.inf * ones
+    state = _State((), here, status, count, damping, growth, last, dull=count, slow=none, curved=none)
+    found = Descent(x0, cost, cost, count, status)
+    try:
+        for iteration in range(1, options.max_iterations + 1):
+            slope = state.here.steepest()
+            flat, wild = slope <= options.gradient_tolerance, ~(slope < torch.inf)
+            if bool((flat | wild).any()):
+                state = _end(_end(state, wild, Status.NOT_FINITE), flat, Status.OK)
+            active = state.active
+            if not bool(active.any()):
+                break
+            if active.ndim and 2 * int(active.sum()) <= active.numel():
+                found, state = _stored(found, state), replace(state, at=state.at or places(torch.ones_like(active)))
+                rest = places(active)
+                problem, state = problem.pick(rest), pick(rest, state)
+            state = _stepped(problem, state, options)
+            if options.progress is not None and options.progress(iteration, _stored(found, state).cost) is False:
+                state = _end(state, state.active, Status.INTERRUPTED)
+                break
+    except KeyboardInterrupt:
+        if not options.interruptible:
+            raise
+        state = _end(state, state.active, Status.INTERRUPTED)
+    found = _stored(found, state)
+    return found._replace(status=torch.where(found.status == _UNDER_WAY, int(Status.NOT_CONVERGED), found.status))
 
 
-def _gauss_newton_step(system: NormalEquations, damping: float) -> _Step:
-    """A step that promises inf where the system could not be solved, so that it is not taken."""
-    delta, promise, solved, _ = system.step(damping)
-    return _Step(delta, float(promise) if bool(solved) else math.inf, damping)
+def _stepped(problem: Problem[Any], state: _State, options: Options) -> _State:
+    """One step of every element under way; a rejected one keeps the linearisation."""
+    state, step, exact = _next_step(problem, state)
+    here, promise = state.here, step.promise
+    cost = here.cost
+    least = max(options.function_tolerance, (10 * problem.epsilon) ** 2) * cost + problem.rounding(here)
+    left, sure = _left(state, step, exact, least)
+    # Gauss-Newton steps may promise too little.
+    done = left <= torch.where(sure, least, 1e-2 * least)
+    # Promises of a smaller part of the cost come from near the minimum, where slopes tell what a step gains, not costs.
+    settled = problem.epsilon**0.5 * cost
+    near = state.active & (promise <= settled)
+    still = near & (state.damping <= LIGHT) & ~step.bent & ~done
+    if bool(still.any()):
+        done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
+    there = problem.advance(here, step)
+    gain = cost - there.cost
+    if bool(near.any()):
+        slopes = -(here.along(step.delta) + there.along(step.delta)) / 2
+        gain = torch.where(near & (gain >= -settled), slopes, gain)
+    accepted = state.active & (gain > LEAST * promise)
+    # Steps that fall as a geometric series have this much still before them.
+    rate = (gain / state.last).clamp_max(1)
+    series = torch.where(rate < 1, gain * rate / (1 - rate), torch.inf)
+    plain = accepted & ~exact
+    done = state.active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
+    dull, slow = state.dull, exact
+    if problem.patience is not None:
+        crawls = plain & (rate > SLOW) & (gain <= NEAR * cost)
+        dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
+        if bool(crawls.any()):
+            far = gain * rate ** (problem.patience + 1) > least * (1 - rate)
+            slow = slow | (crawls & far & ((dull > problem.patience) | (gain <= 100 * least)))
+    trust = (gain / promise.clamp_min(torch.finfo(cost.dtype).tiny)).clamp(0, 1)
+    shrink = (1 - (2 * trust - 1) ** 3).clamp_min(1 / 3)
+    state = replace(
+        state,
+        here=choose(accepted, there, here),
+        iterations=state.iterations + state.active,
+        damping=torch.where(accepted, state.damping * shrink, state.damping * state.growth).clamp_min(WEAKEST),
+        growth=torch.where(accepted, 2.0, 2 * state.growth),
+        last=torch.where(accepted, gain, state.last),
+        dull=dull,
+        slow=slow & ~done,
+        curved=state.curved & ~accepted,
+    )
+    if bool(done.any()):
+        state = _end(state, done, Status.OK)
+    stuck = state.active & (state.damping > STRONGEST)
+    if bool(stuck.any()):
+        # At a minimum, or where the cost is not smooth.
+        light = _light(state, stuck)
+        state = _end(state, stuck & (light <= least), Status.OK)
+        state = _end(state, stuck, Status.NOT_CONVERGED)
+    return state
 
 
-def _newton_step(curved: NormalEquations, damping: float) -> _Step | None:
-    """A step with the exact Hessian and at least the damping given.
+def _next_step(problem: Problem[Any], state: _State) -> tuple[_State, Step, Tensor]:
+    """A Newton step where Gauss-Newton steps are slow, and where these are; it may raise the damping.
 
-    None where the Hessian is so far from positive that the damping would be the greater part of it.
+    Where the Hessian is so far from positive that the damping would be the greater part of it, a Gauss-Newton step.
     """
-    while True:
-        delta, promise, solved, bent = curved.step(damping)
-        if bool(solved):
-            return _Step(delta, float(promise), damping, exact=True, bent=bent)
-        damping *= 10
-        if damping > STEEPEST:
-            return None
+    slow = state.slow
+    if not bool(slow.any()):
+        step = state.here.step(state.damping)
+        return state, step, slow
+    wanted = slow & ~state.curved
+    if bool(wanted.any()):
+        state = replace(state, here=problem.curve(state.here, wanted), curved=state.curved | wanted)
+    damping = state.damping
+    step = state.here.step(damping, slow)
+    while bool((again := slow & ~step.solved & (10 * damping <= STEEPEST)).any()):
+        damping = torch.where(again, 10 * damping, damping)
+        some = places(again)
+        step = put(some, step, pick(some, state.here).step(pick(some, damping), pick(some, slow)))
+    exact = slow & step.solved
+    bent = slow & ~exact
+    if bool(bent.any()):
+        damping = torch.where(bent, state.damping, damping)
+        some = places(bent)
+        step = put(some, step, pick(some, state.here).step(pick(some, damping)))
+    return replace(state, damping=damping), step, exact
 
 
-def _try(engine: Elimination, state: Descent, system: NormalEquations, step: _Step) -> _Trial:
-    """Take a step; where the model was good for a part of it only, for eliminated variables take that part."""
-    if not math.isfinite(step.promise):
-        return _Trial(state.x, state.cost, -math.inf)
-    x = move(engine.blocks, engine.layout, state.x, step.delta)
-    cost = float(engine.cost(x))
-    if not step.promise > SETTLED * state.cost:
-        if not cost <= (1 + SETTLED) * state.cost:
-            return _Trial(x, cost, -math.inf)
-        slope = float(system.along(step.delta))
-        there = engine.linearize(x)
-        return _Trial(x, cost, -(slope + float(there.along(step.delta))) / 2, there)
-    if not state.cost - cost > POOR * step.promise:
-        x = engine.shorten(state.x, step.delta, x)
-        cost = float(engine.cost(x))
-    if math.isfinite(cost) and state.cost - cost < STRAIGHT * step.promise:
-        # The linear model reaches no farther than this, but with the eliminated variables settled it may.
-        x = engine.settle(x)
-        cost = float(engine.cost(x))
-    return _Trial(x, cost, state.cost - cost if math.isfinite(cost) else -math.inf)
+def _left(state: _State, step: Step, exact: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+    """What is left to gain, and where that is by the exact Hessian.
+
+    What a heavily damped step promises says nothing, nor what one along which the cost bends down does.
+    """
+    hidden = state.active & (step.promise <= least) & ((state.damping > LIGHT) | step.bent)
+    if not bool(hidden.any()):
+        return step.promise, exact
+    return torch.where(hidden, _light(state, hidden), step.promise), exact & ~hidden
 
 
-def _is_short(engine: Elimination, x: dict[str, Tensor], delta: dict[str, Tensor], tolerance: float) -> bool:
-    """Whether no variable moves by more than a fraction of its own norm: one that is far away says nothing of the others."""
-    norm = torch.linalg.vector_norm
-    return all(
-        bool((norm(d, dim=1) <= tolerance * (norm(x[name][engine.layout.free[name]], dim=1) + tolerance)).all())
-        for name, d in delta.items()
+def _light(state: _State, where: Tensor) -> Tensor:
+    """What a Gauss-Newton step with hardly any damping promises, in some elements."""
+    some = places(where)
+    promise = torch.full_like(state.damping, torch.inf)
+    step: Step = pick(some, state.here).step(torch.full_like(pick(some, promise), LIGHT))
+    return put(some, promise, step.promise)
+
+
+def _end(state: _State, where: Tensor, status: Status) -> _State:
+    """Give elements under way a status."""
+    return replace(state, status=torch.where(where & state.active, int(status), state.status))
+
+
+def _stored(found: Descent, state: _State) -> Descent:
+    """What is known of all elements, with what those under way have reached."""
+    return Descent(
+        put(state.at, found.x, state.here.x),
+        put(state.at, found.cost, state.here.cost),
+        found.initial_cost,
+        put(state.at, found.iterations, state.iterations),
+        put(state.at, found.status, state.status),
     )

@@ -1,11 +1,12 @@
 """Levenberg-Marquardt for thousands of small dense least-squares problems at once.
 
 Minimises `sum_i w_i rho(|r_i(x)|^2) / 2` over `x` for every element of a batch. Each problem has its own damping, its own
-accepted and rejected steps and its own end (`damped_steps`).
+accepted and rejected steps and its own end (`descent`).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -13,12 +14,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
-from torchsfm.optim.damped_steps import Found, Options, minimise
-from torchsfm.optim.dense_problem import DenseProblem, Linearize
-from torchsfm.optim.descent import MINIMUM
+from torchsfm.optim.dense import DenseProblem, Linearize, dense_problem
+from torchsfm.optim.descent import MINIMUM, Options, descend
 from torchsfm.optim.implicit import attach_optimum, wants_derivative
 from torchsfm.optim.loss import Loss
-from torchsfm.optim.trees import cut, flatten, join, leaves
+from torchsfm.optim.pytree import cut, flatten, join, leaves
 
 M = TypeVar("M")
 PIECE = 600_000
@@ -106,40 +106,31 @@ def levenberg_marquardt(
     wanted = wants_derivative(*followed)
     if wanted:
         function_tolerance = min(function_tolerance, MINIMUM)
-    options = Options(max_iterations, function_tolerance, step_tolerance, initial_damping)
+    options = Options(max_iterations, function_tolerance, step_tolerance, initial_damping=initial_damping)
     with torch.no_grad():
         shape = _residual_shape(residual, x0, data)
         batch = shape[:-2]
         if weights is not None and weights.shape[-1:] != shape[-2:-1]:
             raise ValueError(f"weights: wanted shape (*batch, {shape[-2]}) of the residuals, got {tuple(weights.shape)}")
-        flat_x = flatten(tensor_map(torch.Tensor.detach, x0), batch)
+        start = flatten(tensor_map(torch.Tensor.detach, x0), batch)
         flat_data = flatten(tensor_map(torch.Tensor.detach, data), batch, "data")
         flat_weights = None if weights is None else flatten(weights.detach(), batch, "weights")
-        problem = DenseProblem(residual, move, size, loss, linearize)
+        problem = dense_problem(residual, move, size, loss, linearize, start, flat_data, flat_weights, shape[-2:])
         step = max(1, PIECE // max(1, shape[-2] * shape[-1] * size))
-        result = _minimise_in_pieces(problem, flat_x, flat_data, flat_weights, options, batch.numel(), step)
-    x = result.x
+        pieces = range(0, max(batch.numel(), 1), step)
+        parts = [(problem.over(partial(cut, start=i, end=i + step)), cut(start, i, i + step)) for i in pieces]
+        found = join([descend(part, x, options, enough=part.enough) for part, x in parts])
+    x = found.x
     if wanted:
-        good = result.status == Status.OK
-        x = _attach(problem, x, flatten(data, batch), None if weights is None else flatten(weights, batch), good)
+        x = _attach(problem, x, flatten(data, batch), None if weights is None else flatten(weights, batch), found.status)
+    costs = (cost.nan_to_num(nan=torch.inf) for cost in (found.cost, found.initial_cost))
     return LeastSquaresResult(
         tensor_map(lambda v: v.reshape(batch + v.shape[1:]), x),
-        *(v.reshape(batch) for v in result[1:]),
+        *(v.reshape(batch) for v in (*costs, found.iterations, found.status)),
     )
 
 
-def _minimise_in_pieces(
-    problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, options: Options, count: int, step: int
-) -> Found:
-    """Minimise `step` problems at a time."""
-    found = []
-    for start in range(0, max(count, 1), step):
-        some, its_data, its_weights = cut((x, data, weights), start, start + step)
-        found.append(minimise(problem, some, its_data, its_weights, options))
-    return Found(*(join(list(parts)) for parts in zip(*found, strict=True)))
-
-
-def _attach(problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, good: Tensor) -> Any:
+def _attach(problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, status: Tensor) -> Any:
     """The minimum with its derivatives with respect to all tensors in data and weights."""
     followed = leaves((data, weights))
     first = leaves(x)[0]
@@ -148,9 +139,9 @@ def _attach(problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, go
     def objective(delta: Tensor, *tensors: Tensor) -> Tensor:
         replaced = iter(tensors)
         new_data, new_weights = tensor_map(lambda _: next(replaced), (data, weights))
-        return problem.cost(problem.retract(x, delta), new_data, new_weights)
+        return replace(problem, data=new_data, weights=new_weights).cost(problem.retract(x, delta))
 
-    delta = attach_optimum(objective, zero, *followed, valid=good)
+    delta = attach_optimum(objective, zero, *followed, valid=status == Status.OK)
     moved = iter(leaves(problem.retract(x, delta)))
     # The value stays what it was, bit for bit.
     return tensor_map(lambda v: v + (m := next(moved)) - m.detach(), x)

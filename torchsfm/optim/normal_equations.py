@@ -4,37 +4,24 @@ See `schur` for the notation. Eliminated blocks are factored elementwise, all at
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsfm.linalg import eigh
-from torchsfm.optim.conjugate_gradients import Clusters, solve_reduced
-from torchsfm.optim.coupling_groups import GroupCoupling
-from torchsfm.optim.coupling_pairs import PairCoupling
-from torchsfm.optim.coupling_rows import RowCoupling
+from torchsfm.optim.batched_cholesky import Triangle, backward, diagonal, factor, floor, forward, measure, place, product
+from torchsfm.optim.descent import Step
 from torchsfm.optim.layout import Layout
-from torchsfm.optim.squares import Squares
-from torchsfm.optim.triangle import Triangle, backward, diagonal, factor, floor, forward, measure, place, product
+from torchsfm.optim.retained_blocks import RetainedBlocks
+from torchsfm.optim.schur_grouped import GroupCoupling
+from torchsfm.optim.schur_matrix_free import Clusters, RowCoupling, solve_reduced
+from torchsfm.optim.schur_pairwise import PairCoupling
 
 NULL = 1e-11
 """Eigenvalues of the reduced system, scaled to unit diagonal of U, that count as zero: directions of gauge."""
 
 LARGEST_BENT = 2000
 """Columns of the largest reduced system whose eigenvalues are found where it is not positive."""
-
-
-class Step(NamedTuple):
-    """A step of all free variables."""
-
-    delta: dict[str, Tensor]
-    promise: Tensor
-    """The decrease that the model promises."""
-    solved: Tensor
-    """Whether there is one."""
-    bent: bool
-    """Whether the cost bends down along some directions, in which the step then goes as far as were it up."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +37,7 @@ class NormalEquations:
 
     layout: Layout
     coupling: GroupCoupling | PairCoupling | RowCoupling | None
-    squares: Squares
+    squares: RetainedBlocks
     V: Tensor
     clusters: Clusters | None
     """The preconditioner's blocks where the reduced system is not formed."""
@@ -61,7 +48,7 @@ class NormalEquations:
     slope: Tensor
     """The gradient by retained variables."""
 
-    def step(self, damping: float) -> "Step":
+    def step(self, damping: float) -> Step:
         """The step for `damping` times the diagonal.
 
         The promise holds for steps of conjugate gradients too: their residual is orthogonal to the step.
@@ -83,7 +70,8 @@ class NormalEquations:
                 z = z + forward(L, self.coupling.product(extend(kept)))
             point = -backward(L, z)
             promise = promise + (point * (product(metric, point) - h)).sum()
-        return Step(self.split(kept, point), promise / 2, solved & (positive.all() | (self.V is self.metric)), bent)
+        solved = solved & (positive.all() | (self.V is self.metric))
+        return Step(self.split(kept, point), torch.where(solved, promise / 2, torch.inf), solved, torch.full_like(solved, bent))
 
     def _reduced(self, weight: Tensor, L: Triangle, z: Tensor) -> tuple[Tensor, Tensor, bool]:
         """The step of the retained variables, whether there is one, and whether the cost bends down along some."""

@@ -17,14 +17,13 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsfm.optim.conjugate_gradients import Clusters, find_clusters
-from torchsfm.optim.coupling_groups import GroupCoupling, plan_groups
-from torchsfm.optim.coupling_pairs import PairCoupling, estimate_pairs
-from torchsfm.optim.coupling_rows import RowCoupling
+from torchsfm.optim.batched_cholesky import backward, factor, forward, measure, place
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.normal_equations import NormalEquations
-from torchsfm.optim.runs import Runs, find_runs
-from torchsfm.optim.squares import Squares
+from torchsfm.optim.retained_blocks import RetainedBlocks, Runs, find_runs
+from torchsfm.optim.schur_grouped import GroupCoupling, plan_groups
+from torchsfm.optim.schur_matrix_free import Clusters, RowCoupling, find_clusters
+from torchsfm.optim.schur_pairwise import PairCoupling, estimate_pairs
 from torchsfm.optim.terms import (
     Block,
     Term,
@@ -37,7 +36,6 @@ from torchsfm.optim.terms import (
     term_cost,
     term_residual,
 )
-from torchsfm.optim.triangle import backward, factor, forward, measure, place
 
 LARGEST = 9000
 """Columns of the largest reduced system formed without being asked: its square and factor take 1.3 GB."""
@@ -90,11 +88,13 @@ class Elimination:
         self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, x)]
         some = next(iter(blocks.values())).x
         q, n = layout.point_size, layout.points
-        self.squares = Squares(layout, some)
+        self.squares = RetainedBlocks(layout, some)
         self.V = some.new_empty((q * (q + 3) // 2, n))
         self.work = Workspace(some)
         self.coupling: GroupCoupling | PairCoupling | RowCoupling | None = None
         self.clusters: Clusters | None = None
+        self.current: NormalEquations | None = None
+        """What the memory holds."""
         self._exact: Elimination | None = None
         coupled = any(piece.coupled for piece in layout.pieces)
         if solver == "pcg" or (solver == "auto" and too_large(layout)):
@@ -169,6 +169,7 @@ class Elimination:
 
     def linearize(self, x: dict[str, Tensor]) -> "NormalEquations":
         """The blocks of the normal equations at `x`; they are overwritten by the next call."""
+        self.current = None
         lifts = self._lifts(x)
         self.squares.clear()
         self.V.zero_()
@@ -177,9 +178,10 @@ class Elimination:
         for part in self.parts:
             self._add(part, x, lifts, self.V)
         squares = self.squares
-        return NormalEquations(
+        self.current = NormalEquations(
             self.layout, self.coupling, squares, self.V, self.clusters, squares.diagonal(), self.V, squares.gradient()
         )
+        return self.current
 
     def settle(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
         """`x` with every eliminated variable one Gauss-Newton step of its own further where that lowers its cost.

@@ -9,13 +9,19 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.optim.covariance import to_double, usable
-from torchsfm.optim.descent import MINIMUM, ROUNDING, Descent, Options, descend
+from torchsfm.optim.descent import MINIMUM, Descent, Options, Step, descend
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
-from torchsfm.optim.schur import Elimination, Solver
+from torchsfm.optim.normal_equations import NormalEquations
+from torchsfm.optim.pytree import Places
+from torchsfm.optim.schur import Elimination, Solver, move
 from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
-from torchsfm.optim.terms import Block, Term, term_cost, term_residual
+from torchsfm.optim.terms import Block, Term, prepare, term_cost, term_residual
+
+STRAIGHT = 0.75
+"""Steps that lower the cost by less than this part of what they promise left the linear model's reach."""
+POOR = 0.25
+"""Of a step that gains less than this fraction of its promise, each eliminated variable takes only what is good for it."""
 
 
 @dataclass(frozen=True)
@@ -98,42 +104,122 @@ def sparse_levenberg_marquardt(
     wanted = wants_derivative(*followed(dict(blocks), terms))
     if wanted:
         function_tolerance = min(function_tolerance, MINIMUM)
-    options = Options(max_iterations, function_tolerance, gradient_tolerance, step_tolerance, initial_damping, progress)
     with torch.no_grad():
-        double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
+        double, counted, used = prepare(blocks, terms)
         x = {name: b.x for name, b in double.items()}
-        plain = [to_double(term) for term in terms]
-        used = tuple(usable(term, x) for term in plain)
-        counted = [t if bool(u.all()) else t.select(u.nonzero()[:, 0]) for t, u in zip(plain, used, strict=True)]
         layout = lay_out(double, counted, eliminate)
         # A residual of fixed variables is a constant of the cost.
         constant = sum((float(term_cost(t, term_residual(t, x))) for t in layout.still), 0.0)
-        state = Descent(x, 0.0)
-        if layout.pieces:
-            engine = Elimination(double, layout, linear_solver)
-            state.cost = float(engine.cost(x))
-            initial = state.cost + constant
-            rounding = ROUNDING**2 * sum(_size(term) for term in counted)
-            status = _run(engine, state, options, rounding, constant) if math.isfinite(initial) else Status.NOT_FINITE
+        if not math.isfinite(constant) or (any(u.numel() for u in used) and not any(bool(u.any()) for u in used)):
+            found = _nothing_done(x, Status.NOT_FINITE)
+        elif not layout.pieces:
+            found = _nothing_done(x, Status.TOO_FEW)
         else:
-            initial = constant
-            none = any(u.numel() for u in used) and not any(bool(u.any()) for u in used)
-            status = Status.NOT_FINITE if none else Status.TOO_FEW
-    x = state.x
+            problem = _SparseProblem(Elimination(double, layout, linear_solver), sum(_size(term) for term in counted))
+            tell = None if progress is None else lambda k, cost: progress(k, float(cost) + constant)
+            limits = (max_iterations, function_tolerance, step_tolerance, gradient_tolerance, initial_damping)
+            found = descend(problem, x, Options(*limits, progress=tell, interruptible=True))
+    x = found.x
     if wanted:
         x = attach_sparse_optimum(dict(blocks), terms, x, used, eliminate, hessian)
-        plain = [replace(term, data=tuple(_double(d) for d in term.data)) for term in terms]
+    plain = [replace(term, data=tuple(_double(d) for d in term.data)) for term in terms]
     residuals = tuple(term_residual(t, x) for t in plain)
     out = {name: x[name].to(b.x.dtype).contiguous() for name, b in blocks.items()}
-    return SparseResult(out, state.cost + constant, initial, residuals, used, state.iterations, status)
+    cost, initial = (float(c) + constant for c in (found.cost, found.initial_cost))
+    return SparseResult(out, cost, initial, residuals, used, int(found.iterations), Status(int(found.status)))
 
 
-def _run(engine: Elimination, state: Descent, options: Options, rounding: float, constant: float) -> Status:
-    """Descend; an interrupt ends it where it is."""
-    try:
-        return descend(engine, state, options, rounding=rounding, constant=constant)
-    except KeyboardInterrupt:
-        return Status.INTERRUPTED
+def _nothing_done(x: dict[str, Tensor], status: Status) -> Descent:
+    zero = torch.zeros((), dtype=torch.float64)
+    return Descent(x, zero, zero, torch.tensor(0), torch.tensor(int(status)))
+
+
+class _Place:
+    """Where the variables are, linearised when that is asked for: the engine has memory for one linearisation."""
+
+    def __init__(self, engine: Elimination, x: dict[str, Tensor], cost: Tensor) -> None:
+        self.engine, self.x, self.cost = engine, x, cost
+        self.exact: NormalEquations | None = None
+        self._system: NormalEquations | None = None
+
+    @property
+    def system(self) -> NormalEquations:
+        """The normal equations; those of whatever place was asked last are overwritten."""
+        if self._system is None or self.engine.current is not self._system:
+            self._system = self.engine.linearize(self.x)
+        return self._system
+
+    def steepest(self) -> Tensor:
+        """The largest absolute derivative."""
+        return self.system.gradient()
+
+    def along(self, delta: dict[str, Tensor]) -> Tensor:
+        """The derivative of the cost along a step."""
+        return self.system.along(delta)
+
+    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
+        """The step for a damping, with the exact Hessian where that is wanted."""
+        system = self.system
+        if exact is not None and bool(exact):
+            assert self.exact is not None, "curved before"
+            system = self.exact
+        return system.step(float(damping))
+
+
+@dataclass(frozen=True)
+class _SparseProblem:
+    """A batch of none: one problem of terms over blocks."""
+
+    engine: Elimination
+    size: float
+    """What the cost would be if residuals were as large as data are."""
+    epsilon: float = torch.finfo(torch.float64).eps
+    patience: int = 5
+
+    def pick(self, at: Places) -> "_SparseProblem":
+        """There is but one."""
+        return self
+
+    def linearize(self, x: dict[str, Tensor]) -> _Place:
+        """The system at x."""
+        return _Place(self.engine, x, self.engine.cost(x))
+
+    def advance(self, here: _Place, step: Step) -> _Place:
+        """Where a step leads; where the model was good for a part of it only, eliminated variables take that part."""
+        if not bool(step.solved):
+            return here
+        engine = self.engine
+        x = move(engine.blocks, engine.layout, here.x, step.delta)
+        cost = engine.cost(x)
+        if bool(step.promise <= self.epsilon**0.5 * here.cost):
+            # Near the minimum there is nothing to mend, and nothing that costs could tell.
+            return _Place(engine, x, cost)
+        if not bool(here.cost - cost > POOR * step.promise):
+            x = engine.shorten(here.x, step.delta, x)
+            cost = engine.cost(x)
+        if bool(cost.isfinite()) and bool(here.cost - cost < STRAIGHT * step.promise):
+            # The linear model reaches no farther than this, but with the eliminated variables settled it may.
+            x = engine.settle(x)
+            cost = engine.cost(x)
+        return _Place(engine, x, cost)
+
+    def curve(self, here: _Place, where: Tensor) -> _Place:
+        """The system with exact second derivatives."""
+        here.exact = self.engine.curve(here.x, here.system)
+        return here
+
+    def rounding(self, here: _Place) -> Tensor:
+        """What rounding of the data makes of the cost."""
+        return torch.full_like(here.cost, (10 * self.epsilon) ** 2 * self.size)
+
+    def is_short(self, here: _Place, delta: dict[str, Tensor], tolerance: float) -> Tensor:
+        """Whether no variable moves by more than a fraction of its own norm: one far away says nothing of the others."""
+        norm, free = torch.linalg.vector_norm, self.engine.layout.free
+        short = [
+            (norm(d, dim=1) <= tolerance * (norm(here.x[name][free[name]], dim=1) + tolerance)).all()
+            for name, d in delta.items()
+        ]
+        return torch.stack(short).all()
 
 
 def _size(term: Term) -> float:

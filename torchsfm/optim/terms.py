@@ -4,7 +4,7 @@ A `Block` is a family of variables of one kind (all poses, all points); a `Term`
 depends on. The sum to be minimised is `sum_i w_i rho(|r_i|^2) / 2` over all residuals of all terms.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -64,6 +64,25 @@ class Term:
             data=tuple(_columns(d).index_select(-1, rows).movedim(-1, 0) for d in self.data),
             weights=None if self.weights is None else self.weights.index_select(0, rows),
         )
+
+
+def prepare(blocks: Mapping[str, Block], terms: Sequence[Term]) -> tuple[dict[str, Block], list[Term], tuple[Tensor, ...]]:
+    """A problem ready to be worked on: in float64, detached, blocks stored column by column, without what cannot count.
+
+    Returns:
+        The blocks; the terms with the residuals that have weight and a finite share in the sum of squares; and which these are.
+    """
+    double = {name: replace(b, x=b.x.detach().double().mT.contiguous().mT) for name, b in blocks.items()}
+    x = {name: b.x for name, b in double.items()}
+    counted, used = [], []
+    for term in terms:
+        data = tuple(d.detach().double() if d.is_floating_point() else d.detach() for d in term.data)
+        plain = replace(term, data=data, weights=None if term.weights is None else term.weights.detach().double())
+        square = term_residual(plain, x).square().sum(-1)
+        counts = square.isfinite() if plain.weights is None else (square * plain.weights).isfinite() & (plain.weights > 0)
+        counted.append(plain if bool(counts.all()) else plain.select(counts.nonzero()[:, 0]))
+        used.append(counts)
+    return double, counted, tuple(used)
 
 
 def _columns(x: Tensor) -> Tensor:

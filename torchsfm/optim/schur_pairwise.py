@@ -7,11 +7,11 @@ sums over a run. Best where each eliminated variable sees few of many retained o
 import torch
 from torch import Tensor
 
-from torchsfm.optim.coupling_rows import RowCoupling
+from torchsfm.optim.batched_cholesky import Triangle
 from torchsfm.optim.layout import Layout
-from torchsfm.optim.squares import add_squares
+from torchsfm.optim.retained_blocks import add_squares
+from torchsfm.optim.schur_matrix_free import RowCoupling
 from torchsfm.optim.terms import Workspace
-from torchsfm.optim.triangle import Triangle
 
 PAIR = 1.1e-7
 """Seconds per pair, on a usual core."""

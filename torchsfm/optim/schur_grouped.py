@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsfm.optim.batched_cholesky import Triangle
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.terms import Workspace
-from torchsfm.optim.triangle import Triangle
 
 CACHE = 100_000
 """Numbers worked on at once, to stay in the cache."""

@@ -1,0 +1,192 @@
+"""The linear algebra of thousands of small problems: normal equations as dense matrices, one for each element of a batch."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm.optim.descent import Step
+from torchsfm.optim.loss import Loss, loss_slope
+from torchsfm.optim.pytree import Places, leaves, norm, pick, places, put
+
+Linearize = Callable[..., tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class DenseSystem:
+    """Normal equations in float64, their damping scaled by the diagonal of the Gauss-Newton matrix (Marquardt 1963)."""
+
+    x: Any
+    cost: Float[Tensor, "*batch"]
+    gradient: Float[Tensor, "*batch k"]
+    metric: Float[Tensor, "*batch k k"]
+    """The Gauss-Newton matrix, by which steps are measured."""
+    hessian: Float[Tensor, "*batch k k"]
+    """The exact Hessian where that was wanted."""
+    slope: Float[Tensor, "*batch"]
+    """The largest absolute derivative, NaN where anything is not finite."""
+
+    def steepest(self) -> Tensor:
+        """The largest absolute derivative."""
+        return self.slope
+
+    def along(self, delta: Tensor) -> Tensor:
+        """The derivative of the cost along a step."""
+        return (self.gradient * delta).sum(-1)
+
+    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
+        """The step for a damping."""
+        diagonal = self.metric.diagonal(dim1=-2, dim2=-1)
+        # A direction that nothing depends on gets the damping of the others, and so does not move.
+        floor = 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(diagonal.dtype).tiny
+        damped = damping[..., None] * diagonal.clamp_min(floor)
+        matrix = self.metric if exact is None else torch.where(exact[..., None, None], self.hessian, self.metric)
+        factor, info = torch.linalg.cholesky_ex(matrix + torch.diag_embed(damped))
+        solved = info == 0
+        eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+        factor = torch.where(solved[..., None, None], factor, eye)
+        delta = -torch.cholesky_solve(self.gradient[..., None], factor)[..., 0]
+        solved = solved & delta.isfinite().all(-1)
+        delta = torch.where(solved[..., None], delta, torch.zeros_like(delta))
+        promise = torch.where(solved, (delta * (damped * delta - self.gradient)).sum(-1) / 2, torch.inf)
+        return Step(delta, promise, solved, torch.zeros_like(solved))
+
+
+def dense_system(x: Any, cost: Tensor, gradient: Tensor, metric: Tensor) -> DenseSystem:
+    """The system of a place, from its cost, gradient and Gauss-Newton matrix."""
+    # No entry of a matrix of products exceeds its trace.
+    finite = (metric.diagonal(dim1=-2, dim2=-1).sum(-1) + cost).isfinite()
+    return DenseSystem(x, cost, gradient, metric, metric, torch.where(finite, gradient.abs().amax(-1), torch.nan))
+
+
+@dataclass(frozen=True)
+class DenseProblem:
+    """Residuals as a function, derivatives by automatic differentiation unless they are written."""
+
+    residual: Callable[..., Tensor]
+    retract: Callable[[Any, Tensor], Any]
+    tangent: int
+    loss: Loss | None
+    written: Linearize | None
+    epsilon: float
+    data: Any
+    weights: Tensor | None
+    size: Tensor
+    """What the cost would be if residuals were as large as data are."""
+    enough: Tensor
+    """Where there are as many residuals as parameters."""
+    patience: int | None = 0
+
+    def over(self, change: Callable[[Any], Any]) -> "DenseProblem":
+        """The problems with another batch, given what makes it of this one."""
+        data, weights, size, enough = change((self.data, self.weights, self.size, self.enough))
+        return replace(self, data=data, weights=weights, size=size, enough=enough)
+
+    def pick(self, at: Places) -> "DenseProblem":
+        """The problems at some places."""
+        return self.over(partial(pick, at))
+
+    def cost(self, x: Any) -> Tensor:
+        """`sum w rho / 2`, (batch)."""
+        residual = self.residual(x, *self.data)
+        if self.weights is not None:
+            # Left out means left out: a NaN there must not come through.
+            residual = torch.where((self.weights > 0)[..., None], residual, 0.0)
+        square = residual.square().sum(-1).double()
+        rho = square if self.loss is None else self.loss(square)
+        if self.weights is not None:
+            rho = torch.where(self.weights > 0, rho * self.weights, 0.0)
+        return rho.sum(-1) / 2
+
+    def linearize(self, x: Any) -> DenseSystem:
+        """Cost, gradient and Gauss-Newton matrix."""
+        r, jacobian = self.written(x, *self.data) if self.written is not None else self._differentiate(x)
+        r, jacobian = r.double(), jacobian.double()
+        square = r.square().sum(-1)
+        scale = torch.ones_like(square) if self.loss is None else loss_slope(self.loss, square)
+        rho = square if self.loss is None else self.loss(square)
+        if self.weights is not None:
+            counts = self.weights > 0
+            rho = torch.where(counts, rho * self.weights, 0.0)
+            scale = torch.where(counts, scale * self.weights, 0.0)
+            r = torch.where(counts[..., None], r, 0.0)
+            jacobian = torch.where(counts[..., None, None], jacobian, 0.0)
+        flat = jacobian.flatten(1, 2)
+        weighted = (scale[..., None, None] * jacobian).flatten(1, 2)
+        gradient = (weighted * r.flatten(1)[..., None]).sum(1)
+        return dense_system(x, rho.sum(-1) / 2, gradient, weighted.mT @ flat)
+
+    def _differentiate(self, x: Any) -> tuple[Tensor, Tensor]:
+        """Residual and Jacobian, column by column.
+
+        The pullback is linear in what it pulls back, so its own pullbacks are the columns of the Jacobian. Forward mode would
+        do the same, but loading it takes PyTorch seconds.
+        """
+        first = leaves(x)[0]
+        with torch.enable_grad():
+            delta = first.new_zeros((first.shape[0], self.tangent)).requires_grad_()
+            value = self.residual(self.retract(x, delta), *self.data)
+            seed = torch.zeros_like(value).requires_grad_()
+            (pulled,) = torch.autograd.grad(value, delta, seed, create_graph=True, materialize_grads=True)
+            ones = torch.ones_like(pulled[:, 0])
+            columns = [
+                torch.autograd.grad(pulled[:, i], seed, ones, retain_graph=True, materialize_grads=True)[0]
+                for i in range(self.tangent)
+            ]
+        return value.detach(), torch.stack(columns, -1)
+
+    def advance(self, here: DenseSystem, step: Step) -> DenseSystem:
+        """The system where a step leads; where it is not finite is nowhere to go."""
+        there = self.linearize(self.retract(here.x, step.delta.to(leaves(here.x)[0].dtype)))
+        return replace(there, cost=torch.where(there.slope.isfinite(), there.cost, torch.inf))
+
+    def curve(self, here: DenseSystem, where: Tensor) -> DenseSystem:
+        """The exact second derivatives of the cost in some elements; not always positive."""
+        at = places(where)
+        some, x = self.pick(at), pick(at, here.x)
+        first = leaves(x)[0]
+        with torch.enable_grad():
+            delta = first.new_zeros((first.shape[0], self.tangent)).requires_grad_()
+            cost = some.cost(self.retract(x, delta))
+            (slope,) = torch.autograd.grad(cost.sum(), delta, create_graph=True, materialize_grads=True)
+            if slope.requires_grad:
+                sums = [s.sum() for s in slope.unbind(-1)]
+                rows = [torch.autograd.grad(s, delta, retain_graph=True, materialize_grads=True)[0] for s in sums]
+            else:
+                rows = [torch.zeros_like(delta)] * self.tangent
+        return replace(here, hessian=put(at, here.hessian, torch.stack(rows, -2).double()))
+
+    def rounding(self, here: DenseSystem) -> Tensor:
+        """What rounding of the parameters or of the data makes of the cost, whichever is less."""
+        moved = here.metric.diagonal(dim1=-2, dim2=-1).sum(-1) * norm(here.x).square() / 2
+        return (10 * self.epsilon) ** 2 * torch.minimum(moved, self.size).nan_to_num(posinf=0.0)
+
+    def is_short(self, here: DenseSystem, delta: Tensor, tolerance: float) -> Tensor:
+        """Where a step is shorter than a fraction of the parameters' length."""
+        return norm(delta) <= tolerance * (norm(here.x) + tolerance)
+
+
+def dense_problem(
+    residual: Callable[..., Tensor],
+    retract: Callable[[Any, Tensor], Any],
+    tangent: int,
+    loss: Loss | None,
+    written: Linearize | None,
+    x: Any,
+    data: Any,
+    weights: Tensor | None,
+    shape: tuple[int, ...],
+) -> DenseProblem:
+    """The problems of data and weights in one batch dimension, whose residuals at x are of a shape (n, d)."""
+    first = leaves(x)[0]
+    number = torch.full(first.shape[:1], shape[0], dtype=torch.float64, device=first.device)
+    enough = (number if weights is None else (weights > 0).sum(-1)) * shape[1] >= tangent
+    numbers = [d[..., None].flatten(1).double() for d in leaves(data) if d.is_floating_point() and d.numel()]
+    squares = [torch.where(d.isfinite(), d, 0.0).square().mean(1) for d in numbers]
+    size = (number if weights is None else weights.double().sum(-1)) * sum(squares, torch.zeros_like(number)) / 2
+    epsilon = torch.finfo(first.dtype).eps
+    return DenseProblem(residual, retract, tangent, loss, written, epsilon, data, weights, size, enough)
