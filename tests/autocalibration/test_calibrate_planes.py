@@ -55,6 +55,15 @@ def test_exact_views(generator, lens, model, v):
     assert found.rms.max() < 1e-6
 
 
+def test_what_is_not_free_stays(generator):
+    """The aspect at one, the principal point in the middle of the image, the skew at zero, though the truth is elsewhere."""
+    x, X, *_ = views(generator, 6, [0.0] * 5, batch=(3,))
+    K = calibrate_planes(x, X, image_size=SIZE, distortion=NoDistortion, free=("focal",)).camera.K
+    assert torch.equal(K[:, 0, 0], K[:, 1, 1])
+    assert torch.equal(K[:, 0, 1], torch.zeros(3, dtype=torch.float64))
+    assert torch.allclose(K[:, :2, 2], (torch.tensor(SIZE, dtype=torch.float64) - 1) / 2, rtol=0, atol=1e-9)
+
+
 def test_noise_stays_within_the_covariance(generator):
     x, X, K, _ = views(generator, 8, [-0.2, 0.1, 0, 0, 0], batch=(60,), noise=0.3)
     found = calibrate_planes(x, X)
@@ -122,7 +131,7 @@ def test_wrong_input(generator, unchecked):
     x, X, _, _ = views(generator, 3, [0.0] * 5)
     with pytest.raises(ValueError, match="X: wanted"):
         calibrate_planes(x, X[:-1])
-    with pytest.raises(ValueError, match="no intrinsic parameter"):
+    with pytest.raises(ValueError, match="free: wanted names among"):
         calibrate_planes(x, X, free=("focal", "zoom"))
 
 

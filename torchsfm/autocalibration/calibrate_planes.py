@@ -14,11 +14,22 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry import Camera, Distortion, Pose, Radial
+from torchsfm.geometry.intrinsic_parameters import (
+    ASPECT,
+    CX,
+    FOCAL,
+    HEAD,
+    SKEW,
+    camera_from_row,
+    intrinsic_columns,
+    intrinsic_labels,
+    intrinsic_matrix,
+)
+from torchsfm.geometry.projection import PixelProjection, turn_slopes
 from torchsfm.linalg import cross, eigvalsh, nearest_rotation, null_vector, usable
 from torchsfm.motion import homography_dlt
 from torchsfm.optim import levenberg_marquardt, rotation_exponential
 
-_COLUMNS = {"focal": 0, "aspect": 1, "skew": 2, "principal_point": 3}
 _PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Order of the six entries of a conic."""
 MAX_DEVIATION = 0.3
@@ -56,8 +67,8 @@ class PlaneCalibration:
 
 @dataclass(frozen=True)
 class _Unknowns:
-    intrinsics: Tensor
-    """fx, fy, skew, cx, cy and the distortion."""
+    row: Tensor
+    """Of the camera, see `intrinsic_parameters`."""
     R: Tensor
     t: Tensor
 
@@ -81,8 +92,7 @@ def calibrate_planes(
         x: Image points in pixels.
         X: Points on the plane, in any unit.
         image_size: Width and height in pixels, whose middle is the first guess of the principal point, and stays it where that
-        is not
-            free; the middle of the observations by default.
+            is not free; the middle of the observations by default.
         visible: Which points each view sees; all by default. What stands elsewhere is not looked at.
         distortion: The distortion model.
         free: Which of "focal" (always), "aspect", "skew", "principal_point" are estimated; all of the distortion is.
@@ -96,8 +106,7 @@ def calibrate_planes(
     """
     batch = check_tensors(x=(x, "v>=1 n>=4 2"), X=(X, "n 2"), visible=(visible, "?v n : bool"))
     check_options(image_size=(image_size, "?2 float > 0"), free=(free, Sequence), max_iterations=(max_iterations, "int >= 0"))
-    if wrong := set(free) - set(_COLUMNS):
-        raise ValueError(f"free: no intrinsic parameter {sorted(wrong)}; there are {', '.join(_COLUMNS)}")
+    columns = tuple(sorted(set(intrinsic_columns(free))))
     if "focal" not in free:
         raise ValueError("free: wanted 'focal' among the free parameters")
     v, n = x.shape[-3:-1]
@@ -110,11 +119,11 @@ def calibrate_planes(
     with torch.no_grad():
         used = (seen.sum(-1) >= 4) & _spread_out(X64, seen)
         seen = seen & used[..., None]
-        start = _start(x64, X64, seen, used, image_size, distortion.num_parameters)
-    tangent = _tangent(free, distortion, x64)
-    q = tangent.shape[0]
+        start = _start(x64, X64, seen, used, image_size, columns, distortion.num_parameters)
+    columns += tuple(range(HEAD, HEAD + distortion.num_parameters))
+    q = len(columns)
     weights = seen.double().flatten(-2)
-    problem = _Problem(distortion, tangent)
+    problem = _Problem(PixelProjection(distortion, columns, SKEW in columns))
     result = levenberg_marquardt(
         problem.residual,
         start,
@@ -137,21 +146,23 @@ def calibrate_planes(
         square = residual.square().sum(-1) * flat[3]
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
-        focal = settled.intrinsics[..., 0].abs().clamp_min(1e-12)
+        focal = settled.row[..., FOCAL].abs().clamp_min(1e-12)
         unsure = ~(covariance[..., 0, 0].reshape(batch).clamp_min(0).sqrt() <= MAX_DEVIATION * focal)
         measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
         status = torch.where(unsure, int(Status.DEGENERATE), result.status)
         status = torch.where((measured < unknowns) | ~used.any(-1), int(Status.TOO_FEW), status).to(torch.int8)
     dtype = x.dtype
-    K = _matrix(found.intrinsics[..., :5]).to(dtype)
-    camera = Camera(K, distortion.from_parameters(found.intrinsics[..., 5:].to(dtype)))
+    names = [intrinsic_labels(distortion)[column] for column in columns]
+    names[0] = "fx"
+    if ASPECT in columns:
+        names[1], covariance = "fy", _lengths(covariance, flat[0].row)
     return PlaneCalibration(
-        camera=camera,
+        camera=camera_from_row(found.row.to(dtype), distortion),
         poses=Pose(found.R.to(dtype), found.t.to(dtype)),
         rms=rms.to(dtype),
         view_rms=view_rms.to(dtype),
         used=used,
-        parameter_names=_names(free) + distortion.parameter_names,
+        parameter_names=tuple(names),
         covariance=covariance.reshape(*batch, q, q).to(dtype),
         pose_covariance=pose_covariance.reshape(*batch, v, 6, 6).to(dtype),
         iterations=result.iterations,
@@ -159,71 +170,52 @@ def calibrate_planes(
     )
 
 
-def _names(free: Sequence[str]) -> tuple[str, ...]:
-    names: tuple[str, ...] = ("fx", "fy") if "aspect" in free else ("fx",)
-    names += ("skew",) if "skew" in free else ()
-    return names + (("cx", "cy") if "principal_point" in free else ())
-
-
-def _tangent(free: Sequence[str], distortion: type[Distortion], like: Tensor) -> Tensor:
-    """The directions (q, 5 + d) in which fx, fy, skew, cx, cy and the distortion move."""
-    d = distortion.num_parameters
-    eye = torch.eye(5 + d, dtype=like.dtype, device=like.device)
-    rows = [eye[0], eye[1]] if "aspect" in free else [eye[0] + eye[1]]
-    rows += [eye[2]] if "skew" in free else []
-    rows += [eye[3], eye[4]] if "principal_point" in free else []
-    return torch.stack([*rows, *eye[5:]])
-
-
-def _matrix(intrinsics: Tensor) -> Tensor:
-    fx, fy, s, cx, cy = intrinsics.unbind(-1)
-    zero = torch.zeros_like(fx)
-    return torch.stack((fx, s, cx, zero, fy, cy, zero, zero, zero + 1), -1).reshape(*fx.shape, 3, 3)
+def _lengths(covariance: Tensor, found: Tensor) -> Tensor:
+    """The covariance of fx, fy, ... from that of focal length, aspect, ..."""
+    f, aspect = found[..., FOCAL], found[..., ASPECT]
+    J = torch.eye(covariance.shape[-1], dtype=f.dtype, device=f.device).repeat(*f.shape, 1, 1)
+    J[..., 1, 0], J[..., 1, 1] = aspect, f
+    return J @ covariance @ J.mT
 
 
 @dataclass(frozen=True)
 class _Problem:
     """Reprojection of the plane's points, and its derivatives."""
 
-    distortion: type[Distortion]
-    tangent: Tensor
+    projection: PixelProjection
 
     def retract(self, u: _Unknowns, delta: Tensor) -> _Unknowns:
-        q = self.tangent.shape[0]
+        free = self.projection.free
+        q = len(free)
         pose = delta[..., q:].reshape(*u.t.shape[:-1], 6)
         turn = rotation_exponential(pose[..., :3])
         moved = (turn @ u.t[..., None])[..., 0] + pose[..., 3:]
-        return _Unknowns(u.intrinsics + delta[..., :q] @ self.tangent, turn @ u.R, moved)
+        place = torch.tensor(free, device=delta.device)
+        row = u.row + torch.zeros_like(u.row).index_add(-1, place, delta[..., :q])
+        return _Unknowns(row, turn @ u.R, moved)
 
     def residual(self, u: _Unknowns, x: Tensor, X: Tensor) -> Tensor:
-        difference: Tensor = (self._project(u.intrinsics[..., None, :], u.R, u.t, X) - x).flatten(-3, -2)
-        return difference
-
-    def _project(self, intrinsics: Tensor, R: Tensor, t: Tensor, X: Tensor) -> Tensor:
-        Y = X[..., None, :, :] @ R[..., :2].mT + t[..., None, :]
-        fx, fy, s, cx, cy, *lens = (p[..., None] for p in intrinsics.unbind(-1))
-        a, b = self.distortion.project_rows(*Y.unbind(-1), *lens)
-        return torch.stack((fx * a + s * b + cx, fy * b + cy), -1)
+        pixels = self.projection.pixels(*_seen(u, X))
+        return (pixels.movedim(0, -1) - x).flatten(-3, -2)
 
     def linearize(self, u: _Unknowns, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
         """Residuals and Jacobian; every view depends on its own pose alone, so that all poses are differentiated at once."""
         b, v, n = x.shape[:3]
-        q = self.tangent.shape[0]
-        with torch.enable_grad():
-            delta = x.new_zeros(b, v, q + 6).requires_grad_()
-            turn = rotation_exponential(delta[..., q : q + 3])
-            moved = (turn @ u.t.detach()[..., None])[..., 0] + delta[..., q + 3 :]
-            intrinsics = u.intrinsics.detach()[:, None] + delta[..., :q] @ self.tangent
-            value = self._project(intrinsics, turn @ u.R.detach(), moved, X.detach()) - x.detach()
-            seed = torch.zeros_like(value).requires_grad_()
-            (pulled,) = torch.autograd.grad(value, delta, seed, create_graph=True)
-            columns = [torch.autograd.grad(pulled[..., i].sum(), seed, retain_graph=True)[0] for i in range(q + 6)]
-        local = torch.stack(columns, -1)
+        q = len(self.projection.free)
+        ray, row = _seen(u, X)
+        local = x.new_empty(2, 6 + q, b, v, n)
+        pixels = self.projection.linearize(ray, row, local[:, 3:6], local[:, 6:])
+        turn_slopes(ray, local[:, 3:6], local)
         J = x.new_zeros(b, v, n, 2, q + 6 * v)
-        J[..., :q] = local[..., :q]
-        for i in range(v):
-            J[:, i, :, :, q + 6 * i : q + 6 * i + 6] = local[:, i, :, :, q:]
-        return value.detach().flatten(1, 2), J.flatten(1, 2)
+        J[..., :q] = local[:, 6:].permute(2, 3, 4, 0, 1)
+        J[..., q:].view(b, v, n, 2, v, 6).diagonal(dim1=1, dim2=4).copy_(local[:, :6].permute(2, 4, 0, 1, 3))
+        return (pixels.movedim(0, -1) - x).flatten(1, 2), J.flatten(1, 2)
+
+
+def _seen(u: _Unknowns, X: Tensor) -> tuple[Tensor, Tensor]:
+    """The plane's points in the frames of the views (3, *batch, v, n), and the rows of the cameras (k, *batch, 1, 1)."""
+    Y = u.R[..., :2] @ X.mT[..., None, :, :] + u.t[..., None]
+    return Y.movedim(-2, 0), u.row.movedim(-1, 0)[..., None, None]
 
 
 def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
@@ -236,7 +228,15 @@ def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
     return spans
 
 
-def _start(x: Tensor, X: Tensor, seen: Tensor, used: Tensor, size: tuple[float, float] | None, lens: int) -> _Unknowns:
+def _start(
+    x: Tensor,
+    X: Tensor,
+    seen: Tensor,
+    used: Tensor,
+    size: tuple[float, float] | None,
+    columns: Sequence[int],
+    lens: int,
+) -> _Unknowns:
     """The better of two: Zhang's linear intrinsics, and a focal length alone with the principal point in the middle."""
     w = seen.to(x.dtype)
     low = torch.where(seen[..., None], x, torch.inf).flatten(-3, -2).amin(-2)
@@ -262,7 +262,7 @@ def _start(x: Tensor, X: Tensor, seen: Tensor, used: Tensor, size: tuple[float, 
     a = (A * r).sum(-1) / A.square().sum(-1).clamp_min(1e-300)
     f = torch.where(a > 1e-4, a, 1.0).rsqrt()
     zero = torch.zeros_like(f)
-    simple = torch.stack((f, f, zero, zero, zero), -1)
+    simple = torch.stack((f, torch.ones_like(f), zero, zero, zero), -1)
     # Without skew: w12 = 0.
     b, _ = null_vector(torch.nn.functional.pad(rows[..., [0, 2, 3, 4, 5]], (0, 0, 0, 5)))
     b = b * torch.where(b[..., :1] < 0, -1.0, 1.0)
@@ -273,13 +273,16 @@ def _start(x: Tensor, X: Tensor, seen: Tensor, used: Tensor, size: tuple[float, 
     rest = w33 - w13**2 / d1 - w23**2 / d2
     fine = fine & (rest > 0)
     rest = torch.where(fine, rest, 1.0)
-    full = torch.stack(((rest / d1).sqrt(), (rest / d2).sqrt(), zero, cx, cy), -1)
-    fine = fine & ((full[..., :2] > 0.05) & (full[..., :2] < 200)).all(-1) & (full[..., 3:].abs() < 5).all(-1)
-    full = torch.where(fine[..., None], full, simple)
+    lengths = torch.stack(((rest / d1).sqrt(), (rest / d2).sqrt()), -1)
+    full = torch.stack((lengths[..., 0], (d1 / d2).sqrt(), zero, cx, cy), -1)
+    fine = fine & ((lengths > 0.05) & (lengths < 200)).all(-1) & (full[..., CX:].abs() < 5).all(-1)
+    # What is not free stays where it is known to be.
+    free = torch.zeros(HEAD, dtype=torch.bool, device=x.device).index_fill(0, torch.tensor(columns, device=x.device), True)
+    full = torch.where(fine[..., None] & free, full, simple)
 
     candidates = []
     for intrinsics in (simple, full):
-        K = _matrix(intrinsics)
+        K = intrinsic_matrix(intrinsics)
         R, t = _poses(K, H)
         image = (X[..., None, :, :] @ R[..., :2].mT + t[..., None, :]) @ K[..., None, :, :].mT
         error = ((image[..., :2] / image[..., 2:] - y).square().sum(-1).clamp_max(1.0) * w).sum((-2, -1))
@@ -289,8 +292,10 @@ def _start(x: Tensor, X: Tensor, seen: Tensor, used: Tensor, size: tuple[float, 
     chosen, R, t = (
         torch.where(better.reshape(*better.shape, *[1] * (a.ndim - better.ndim)), b, a) for a, b in zip(one, two, strict=True)
     )
-    pixels = torch.cat((chosen[..., :3] * scale[..., None], chosen[..., 3:] * scale[..., None] + middle), -1)
-    return _Unknowns(torch.nn.functional.pad(pixels, (0, lens)), R, t)
+    pixel, ratio = scale[..., None], torch.ones_like(scale[..., None])
+    first_row = chosen * torch.cat((pixel, ratio, pixel, pixel, pixel), -1)
+    none = pixel.new_zeros(*pixel.shape[:-1], lens)
+    return _Unknowns(torch.cat((first_row[..., :CX], first_row[..., CX:] + middle, none), -1), R, t)
 
 
 def _poses(K: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:

@@ -61,11 +61,12 @@ def brown_slopes(
     x, y = uv
     s = torch.addcmul(x * x, y, y)
     L, jxx, jxy, jyy, _ = brown_jacobian(x, y, s, radial, p1, p2)
-    torch.mul(jxx, inverse, out=out[0, 0])
-    torch.mul(jyy, inverse, out=out[1, 1])
-    torch.mul(jxy, inverse, out=out[0, 1])
-    out[1, 0] = out[0, 1]
-    torch.mul(out[:, 0], -x, out=out[:, 2]).addcmul_(out[:, 1], y, value=-1)
+    (xx, xy, _), (yx, yy, _) = out
+    torch.mul(jxx, inverse, out=xx)
+    torch.mul(jyy, inverse, out=yy)
+    yx.copy_(torch.mul(jxy, inverse, out=xy))
+    by_x, by_y, by_depth = out.unbind(1)
+    torch.mul(by_x, -x, out=by_depth).addcmul_(by_y, y, value=-1)
     both = 2 * x * y
     along = torch.stack((both, torch.addcmul(s, y, y, value=2)))
     across = torch.stack((torch.addcmul(s, x, x, value=2), both))

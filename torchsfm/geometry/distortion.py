@@ -55,9 +55,13 @@ class NoDistortion(Distortion):
     ) -> tuple[Float[Tensor, "2 *n"], list[Float[Tensor, "2 *n"]]]:
         """The derivative is (1, 0, -u; 0, 1, -v) / Z."""
         uv, inverse = flatten(ray)
-        out[0, 1] = out[1, 0] = 0
-        out[0, 0] = out[1, 1] = inverse
-        torch.mul(uv, -inverse, out=out[:, 2])
+        by_x, by_y, by_depth = out.unbind(1)
+        (xx, yx), (xy, yy) = by_x, by_y
+        xx.copy_(inverse)
+        yy.copy_(inverse)
+        xy.zero_()
+        yx.zero_()
+        torch.mul(uv, -inverse, out=by_depth)
         return uv, []
 
     def _unproject_rows(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

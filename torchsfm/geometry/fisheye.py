@@ -55,10 +55,11 @@ def fisheye_slopes(ray: Tensor, k: Tensor, out: Tensor) -> tuple[Tensor, list[Te
     c = even_polynomial(s, slope_coefficients(k.unbind(0))) / torch.where(square > 0, square, 1.0)
     # On the axis this is multiplied by zero.
     bend = torch.addcmul(-g, c, Z) / torch.where(q > 0, q, 1.0)
-    bent = ray[:2] * bend
-    torch.addcmul(g, X, bent[0], out=out[0, 0])
-    torch.addcmul(g, Y, bent[1], out=out[1, 1])
-    torch.mul(X, bent[1], out=out[0, 1])
-    out[1, 0] = out[0, 1]
-    torch.mul(ray[:2], -c, out=out[:, 2])
-    return ray[:2] * g, powers(ray[:2] * ratio, s, len(k))
+    across = ray[:2]
+    bent_x, bent_y = across * bend
+    (xx, xy, _), (yx, yy, _), by_depth = *out, out[:, 2]
+    torch.addcmul(g, X, bent_x, out=xx)
+    torch.addcmul(g, Y, bent_y, out=yy)
+    yx.copy_(torch.mul(X, bent_y, out=xy))
+    torch.mul(across, -c, out=by_depth)
+    return across * g, powers(across * ratio, s, len(k))

@@ -7,7 +7,7 @@ A camera is a row `(f, aspect, skew, cx, cy, distortion...)`, so that "focal" is
   before. Steps then mean the same for all cameras.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -90,18 +90,40 @@ def intrinsic_matrix(row: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch 3 
     return torch.stack((f, skew, cx, zero, f * aspect, cy, zero, zero, one), -1).reshape(*f.shape, 3, 3)
 
 
-def move_relative(row: Float[Tensor, "*#batch k"], step: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
-    """Rows after relative steps. Steps along one line add up."""
-    f, aspect, skew = row[..., FOCAL], row[..., ASPECT], row[..., SKEW]
-    factor = step[..., FOCAL].exp()
-    scales = (f * factor, aspect * step[..., ASPECT].exp(), torch.addcmul(skew, f, step[..., SKEW]) * factor)
-    return torch.cat((torch.stack(scales, -1), row[..., CX:] + step[..., CX:]), -1)
+def move_intrinsics(K: Float[Tensor, "*batch 3 3"], step: Mapping[int, Float[Tensor, "*batch"]]) -> Float[Tensor, "*batch 3 3"]:
+    """K after relative steps of some of its numbers, by column; steps of one number add up. The others keep every bit."""
+    fx, fy, skew, cx, cy = K[..., 0, 0], K[..., 1, 1], K[..., 0, 1], K[..., 0, 2], K[..., 1, 2]
+    if SKEW in step:
+        skew = skew + fx * step[SKEW]
+    if FOCAL in step:
+        factor = step[FOCAL].exp()
+        fx, fy, skew = fx * factor, fy * factor, skew * factor
+    if ASPECT in step:
+        fy = fy * step[ASPECT].exp()
+    if CX in step:
+        cx = cx + step[CX]
+    if CY in step:
+        cy = cy + step[CY]
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    return torch.stack((fx, skew, cx, zero, fy, cy, zero, zero, one), -1).reshape(*fx.shape, 3, 3)
 
 
-def relative_derivative(row: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch 5 5"]:
-    """The derivatives of the first five numbers by a relative step, at none: row by number, column by step."""
-    f, aspect, skew = row[..., FOCAL], row[..., ASPECT], row[..., SKEW]
-    D = torch.zeros(*row.shape[:-1], HEAD, HEAD, dtype=row.dtype, device=row.device)
-    D[..., FOCAL, FOCAL], D[..., SKEW, FOCAL], D[..., ASPECT, ASPECT], D[..., SKEW, SKEW] = f, skew, aspect, f
-    D[..., CX, CX] = D[..., CY, CY] = 1
+def move_camera(camera: Camera, columns: Sequence[int], step: Float[Tensor, "*batch q"]) -> Camera:
+    """Cameras after relative steps of the numbers in `columns`."""
+    if not columns:
+        return camera
+    by = dict(zip(columns, step.unbind(-1), strict=True))
+    lens, model = camera.distortion, type(camera.distortion)
+    moved = [getattr(lens, name) + by.get(HEAD + i, 0.0) for i, name in enumerate(model.parameter_names)]
+    return Camera(move_intrinsics(camera.K, by), model(*moved))
+
+
+def intrinsics_slopes(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 5 3 3"]:
+    """The derivative of K by a relative step of each of its numbers."""
+    fx, skew, fy = K[..., 0, 0], K[..., 0, 1], K[..., 1, 1]
+    D = K.new_zeros(*K.shape[:-2], HEAD, 3, 3)
+    D[..., FOCAL, 0, 0], D[..., FOCAL, 0, 1], D[..., FOCAL, 1, 1] = fx, skew, fy
+    D[..., ASPECT, 1, 1] = fy
+    D[..., SKEW, 0, 1] = fx
+    D[..., CX, 0, 2] = D[..., CY, 1, 2] = 1
     return D

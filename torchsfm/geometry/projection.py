@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.geometry.distortion_model import Distortion
-from torchsfm.geometry.intrinsic_parameters import ASPECT, CX, FOCAL, HEAD, SKEW
+from torchsfm.geometry.intrinsic_parameters import ASPECT, CX, CY, FOCAL, HEAD, SKEW
 
 
 def quotient_slope(
@@ -46,8 +46,11 @@ def camera_slopes(
 
 def turn_slopes(ray: Float[Tensor, "3 *n"], by_ray: Float[Tensor, "d 3 *n"], out: Float[Tensor, "d k *n"]) -> None:
     """Fill the first three of `out` with the derivatives by a turn: w moves a point Y by w x Y, so g by it becomes Y x g."""
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        torch.mul(by_ray[:, k], ray[j], out=out[:, i]).addcmul_(by_ray[:, j], ray[k], value=-1)
+    (X, Y, Z), (by_X, by_Y, by_Z) = ray, by_ray.unbind(1)
+    by_x, by_y, by_z = out[:, :3].unbind(1)
+    torch.mul(by_Z, Y, out=by_x).addcmul_(by_Y, Z, value=-1)
+    torch.mul(by_X, Z, out=by_y).addcmul_(by_Z, X, value=-1)
+    torch.mul(by_Y, X, out=by_z).addcmul_(by_X, Y, value=-1)
 
 
 @dataclass(frozen=True)
@@ -95,28 +98,28 @@ class PixelProjection:
         return pixels
 
     def _by_free(self, pixels: Tensor, uv: Tensor, row: Tensor, focal: Tensor, by_lens: Sequence[Tensor], out: Tensor) -> None:
-        for place, column in enumerate(self.free):
-            here = out[:, place]
-            if column == FOCAL:
-                if self.relative:
-                    torch.sub(pixels, row[CX:HEAD], out=here)
-                else:
-                    here[0] = uv[0]
-                    torch.mul(row[ASPECT], uv[1], out=here[1])
+        u, v = uv
+        for here, column in zip(out.unbind(1), self.free, strict=True):
+            by_u, by_v = here
+            if column == FOCAL and self.relative:
+                torch.sub(pixels, row[CX:HEAD], out=here)
+            elif column == FOCAL:
+                by_u.copy_(u)
+                torch.mul(row[ASPECT], v, out=by_v)
             elif column == ASPECT:
-                here[0] = 0
-                torch.mul(focal[1] if self.relative else row[FOCAL], uv[1], out=here[1])
+                by_u.zero_()
+                torch.mul(focal[1] if self.relative else row[FOCAL], v, out=by_v)
             elif column == SKEW:
-                here[0] = row[FOCAL] * uv[1] if self.relative else uv[1]
-                here[1] = 0
+                by_u.copy_(row[FOCAL] * v if self.relative else v)
+                by_v.zero_()
             elif column < HEAD:
-                here[column - CX] = 1
-                here[CX + 1 - column] = 0
+                by_u.fill_(column == CX)
+                by_v.fill_(column == CY)
             else:
                 by = by_lens[column - HEAD]
                 torch.mul(focal, by, out=here)
                 if self.skew:
-                    here[0].addcmul_(row[SKEW], by[1])
+                    by_u.addcmul_(row[SKEW], by[1])
 
 
 def _focal(row: Tensor) -> Tensor:

@@ -79,16 +79,16 @@ def radial_slopes(uv: Tensor, inverse: Tensor, k: Tensor, out: Tensor) -> tuple[
     acts.
     """
     x, y = uv
+    (xx, xy, _), (yx, yy, _), by_depth = *out, out[:, 2]
     s = torch.addcmul(x * x, y, y)
     h = even_polynomial(s, k.unbind(0))
     slope = polynomial(s, [2 * (i + 1) * c for i, c in enumerate(k.unbind(0))]) * inverse
     along = h * inverse
-    bent = uv * slope
-    torch.addcmul(along, x, bent[0], out=out[0, 0])
-    torch.addcmul(along, y, bent[1], out=out[1, 1])
-    torch.mul(x, bent[1], out=out[0, 1])
-    out[1, 0] = out[0, 1]
-    torch.mul(uv, torch.addcmul(along, s, slope).neg_(), out=out[:, 2])
+    bent_x, bent_y = uv * slope
+    torch.addcmul(along, x, bent_x, out=xx)
+    torch.addcmul(along, y, bent_y, out=yy)
+    yx.copy_(torch.mul(x, bent_y, out=xy))
+    torch.mul(uv, torch.addcmul(along, s, slope).neg_(), out=by_depth)
     return uv * h, powers(uv, s, len(k))
 
 

@@ -1,4 +1,4 @@
-"""Least squares of reprojection errors for pinhole cameras, thousands of small problems at once.
+"""Least squares of reprojection errors, thousands of small problems at once.
 
 The same minimum as by `levenberg_marquardt`, with what makes it fast: coordinates in rows, residuals next to the Jacobian so
 that one product gives cost, gradient and normal matrix, and no pass over the points that is not needed.
@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import Camera, Pose, rotation_from_rotvec
-from torchsfm.resection._reprojection import Inside
+from torchsfm.geometry import Pose, rotation_from_rotvec
+from torchsfm.geometry.projection import turn_slopes
+from torchsfm.resection._reprojection import Inside, camera_frame
 
 _FLAT = 1e-14
 """A problem ends when a step promises to lower its cost by less than this fraction."""
@@ -35,13 +36,12 @@ def minimise_pinhole(
     pose: Pose, theta: Tensor, x: Tensor, X: Tensor, w: Tensor, inside: Inside, max_iterations: int
 ) -> PinholeFit:
     """Levenberg-Marquardt for poses (b), displacements theta (b, k) and points (b, n), all float64, weights >= 0."""
-    rows = X.mT.contiguous()
-    u, v = x[..., 0].contiguous(), x[..., 1].contiguous()
-    root = w.sqrt()
+    rows, columns = X.mT.contiguous(), x.movedim(-1, 0).contiguous()
+    root = None if bool((w == 1).all()) else w.sqrt()[:, None, None]
     R, t = pose.R, pose.t
     size = 6 + theta.shape[-1]
-    M = u.new_empty(*u.shape[:-1], size + 1, 2 * u.shape[-1])
-    moments = _moments(M, R, t, theta, u, v, rows, root, inside)
+    M = x.new_empty(len(x), size + 1, 2, x.shape[-2])
+    moments = _moments(M, R, t, theta, columns, rows, root, inside)
     cost = moments[:, size, size]
     count = cost.shape[0]
     status = torch.full((count,), int(Status.NOT_CONVERGED), dtype=torch.int8, device=cost.device)
@@ -71,7 +71,7 @@ def minimise_pinhole(
         turn = rotation_from_rotvec(step[:, :3])
         new_R, new_t = turn @ R, (turn @ t[..., None])[..., 0] + step[:, 3:6]
         new_theta = theta + step[:, 6:]
-        new = _moments(M, new_R, new_t, new_theta, u, v, rows, root, inside)
+        new = _moments(M, new_R, new_t, new_theta, columns, rows, root, inside)
         after = new[:, size, size]
         good = active & solved & torch.isfinite(new).all(-1).all(-1)
         # Below the rounding error of the cost a step is taken on its promise.
@@ -93,51 +93,18 @@ def minimise_pinhole(
 
 
 def _moments(
-    M: Tensor, R: Tensor, t: Tensor, theta: Tensor, u: Tensor, v: Tensor, X: Tensor, root: Tensor, inside: Inside
+    M: Tensor, R: Tensor, t: Tensor, theta: Tensor, x: Tensor, X: Tensor, root: Tensor | None, inside: Inside
 ) -> Tensor:
     """The products with each other of the Jacobian's columns and, last, the residual: (b, k + 1, k + 1).
 
-    They are written into M (b, k + 1, 2 n), which is there to be used again.
+    They are written into M (b, k + 1, 2, n), which is there to be used again.
     """
-    camera: Camera = inside.moved(theta)
-    K = camera.K
-    fx, skew, fy = K[:, 0, 0, None], K[:, 0, 1, None], K[:, 1, 1, None]
-    y0, y1, y2 = (R @ X + t[..., None]).unbind(1)
-    # As `Camera.project` does near the focal plane.
-    floor = torch.finfo(u.dtype).eps * torch.maximum(y0.abs(), y1.abs())
-    near = y2.abs() <= floor
-    d = 1 / torch.where(near, torch.where(floor > 0, floor, 1.0).copysign(y2), y2)
-    a, b = y0 * d, y1 * d
-    du, dv = torch.addcmul(fx * a, skew, b), fy * b
-    # Weights enter by the focal lengths.
-    fx, skew, fy = root * fx, root * skew, root * fy
-    wu, wv = root * du, root * dv
-    n = u.shape[-1]
-    first, second = M[..., :n].unbind(1), M[..., n:].unbind(1)
-    minus_b = -b
-    torch.addcmul(-skew, minus_b, wu, out=first[0])
-    torch.addcmul(fx, a, wu, out=first[1])
-    torch.addcmul(skew * a, minus_b, fx, out=first[2])
-    torch.mul(fx, d, out=first[3])
-    torch.mul(skew, d, out=first[4])
-    torch.mul(-wu, d, out=first[5])
-    torch.addcmul(-fy, minus_b, wv, out=second[0])
-    torch.mul(a, wv, out=second[1])
-    torch.mul(fy, a, out=second[2])
-    second[3].zero_()
-    torch.mul(fy, d, out=second[4])
-    torch.mul(-wv, d, out=second[5])
-    i = 6
-    for name in inside.free:
-        if name == "principal_point":
-            for row, value in ((first[i], root), (second[i], 0), (first[i + 1], 0), (second[i + 1], root)):
-                row[:] = value
-            i += 1
-        else:
-            first[i][:] = wu if name == "focal" else 0
-            second[i][:] = wv
-        i += 1
-    torch.mul(root, du + (K[:, 0, 2, None] - u), out=first[i])
-    torch.mul(root, dv + (K[:, 1, 2, None] - v), out=second[i])
-    product: Tensor = M @ M.mT
+    ray, out = camera_frame(Pose(R, t), X), M.permute(2, 1, 0, 3)
+    pixels = inside.projection.linearize(ray, inside.row(theta), out[:, 3:6], out[:, 6:-1])
+    turn_slopes(ray, out[:, 3:6], out)
+    torch.sub(pixels, x, out=out[:, -1])
+    if root is not None:
+        M *= root
+    rows = M.flatten(2)
+    product: Tensor = rows @ rows.mT
     return product

@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
-from torchsfm.geometry import Camera, NoDistortion, Pose
+from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry.intrinsic_parameters import SKEW, intrinsic_columns
 from torchsfm.optim import Loss, levenberg_marquardt
 from torchsfm.resection._pinhole import minimise_pinhole
-from torchsfm.resection._reprojection import INSIDE, Inside, Reprojection, inverse, like
+from torchsfm.resection._reprojection import Reprojection, inverse, like
 
 Data = tuple[Tensor, Tensor, Tensor, Camera]
 """Image points, points, weights, cameras."""
@@ -30,7 +31,8 @@ class CameraRefinement:
     """With the free parameters changed."""
     covariance: Float[Tensor, "*batch p p"]
     """Of the pose, as a perturbation (w, v) on the left in the camera's frame (`Pose.retract`), followed by the free
-    parameters in the order given: logarithms of focal length and aspect, principal point in pixels, distortion. For
+    parameters in the order given: logarithms of focal length and aspect, skew in focal lengths, principal point in pixels,
+    distortion. For
     independent noise of variance 1 / weight in every image coordinate; zero where not determined."""
     in_front: Bool[Tensor, "*batch n"]
     """Which points have positive depth."""
@@ -72,7 +74,7 @@ def refine_camera(
         X: The points in the world.
         pose: Starting poses.
         camera: The cameras.
-        free: Any of "focal" (one factor for both focal lengths), "aspect" (their ratio), "principal_point" and the
+        free: Any of "focal" (one factor for both focal lengths), "aspect" (their ratio), "skew", "principal_point" and the
             names of the distortion's parameters ("k1", ...).
         weights: Factors of the points' losses, 0 or False for absent.
         loss: A robust loss of squared distances in pixels (see `torchsfm.optim.loss`); squared error by default.
@@ -88,10 +90,9 @@ def refine_camera(
         pose=(pose, Pose), camera=(camera, Camera), free=(free, Sequence), loss=(loss, Callable | None),
         max_iterations=(max_iterations, "int >= 0"),
     )  # fmt: skip
-    names = (*INSIDE, *camera.distortion.parameter_names)
-    unknown = [name for name in free if name not in names]
-    if unknown or len(set(free)) != len(free):
-        raise ValueError(f"free: wanted distinct names out of {names}, got {tuple(free)}")
+    columns = intrinsic_columns(free, type(camera.distortion))
+    if len(set(free)) != len(free):
+        raise ValueError(f"free: wanted distinct names, got {tuple(free)}")
     kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
     batch = check_tensors(x=(x, "n 2"), X=(X, "n 3"), R=(pose.R, "3 3"), K=(camera.K, "3 3"), weights=(weights, kind))
     x, X = x.expand(*batch, *x.shape[-2:]), X.expand(*batch, *X.shape[-2:])
@@ -109,6 +110,8 @@ def refine_camera(
     use = wanted & finite & ~bad[..., None]
     w = torch.where(use, w, 0.0)
     x, X = torch.where(use[..., None], x, 0.0), torch.where(use[..., None], X, 0.0)
+    dtype = x.dtype
+    x, X, w, pose, camera = tensor_map(torch.Tensor.double, (x, X, w, pose, camera))
 
     # The origin of the world goes to the points: far coordinates must not cost digits.
     total = w.detach().sum(-1, keepdim=True)
@@ -116,13 +119,14 @@ def refine_camera(
     local = X - middle[..., None, :]
     t = (pose.R @ middle[..., None])[..., 0] + pose.t
     start = Pose(torch.where(bad[..., None, None], torch.eye(3, dtype=x.dtype, device=x.device), pose.R), t)
-    problem = Reprojection(tuple(free), loss)
+    skew = SKEW in columns or camera.K.requires_grad or bool((camera.K[..., 0, 1] != 0).any())
+    problem = Reprojection(tuple(free), loss, len(columns), skew)
     theta = torch.zeros(*batch, problem.size, dtype=x.dtype, device=x.device)
     data = (x, local, w, camera)
     with torch.no_grad():
         fit = _fit(problem, *tensor_map(torch.Tensor.detach, (start, theta, data)), max_iterations)
     refined, theta = problem.attach((fit.pose, fit.theta), data, (fit.status == Status.OK) & ~bad)
-    inside = Inside(camera, problem.free)
+    inside = problem.inside(camera)
     ahead = torch.where(fit.in_front, w, 0.0).sum(-1)
     status = fit.status
     for condition, code in (
@@ -136,12 +140,12 @@ def refine_camera(
     world = Pose(R, refined.t - (R @ middle[..., None])[..., 0])
     world = Pose(torch.where(bad[..., None, None], torch.eye(3, dtype=R.dtype, device=R.device), R), _or_zero(world.t, ~bad))
     return CameraRefinement(
-        world,
-        inside.moved(theta),
-        torch.where(known[..., None, None], fit.covariance, 0.0).to(x.dtype),
+        Pose(world.R.to(dtype), world.t.to(dtype)),
+        tensor_map(lambda v: v.to(dtype), inside.moved(theta)),
+        torch.where(known[..., None, None], fit.covariance, 0.0).to(dtype),
         fit.in_front & ~bad[..., None],
-        _or_zero(fit.error, ~bad).to(x.dtype),
-        _or_zero(fit.cost, ~bad).to(x.dtype),
+        _or_zero(fit.error, ~bad).to(dtype),
+        _or_zero(fit.cost, ~bad).to(dtype),
         fit.iterations,
         status,
     )
@@ -185,29 +189,26 @@ def _fit(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_iter
 def _minimum(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_iterations: int) -> _Fit:
     x, X, w, camera = data
     plain = problem.loss is None
-    if plain and isinstance(camera.distortion, NoDistortion):
-        inside = Inside(tensor_map(torch.Tensor.double, camera), problem.free)
-        exact = tensor_map(torch.Tensor.double, (start, theta, x, X, w))
-        fit = minimise_pinhole(*exact, inside, max_iterations)
-        pose, theta = tensor_map(lambda v: v.to(x.dtype), (fit.pose, fit.theta))
+    if plain:
+        fit = minimise_pinhole(start, theta, x, X, w, problem.inside(camera), max_iterations)
         covariance, determined = inverse(fit.normal)
-        total = exact[4].sum(-1)
+        total = w.sum(-1)
         error = (2 * fit.cost / torch.where(total > 0, total, 1.0)).clamp_min(0).sqrt()
-        in_front = pose.transform(X)[..., 2] > 0
-        return _Fit(pose, theta, fit.cost, fit.iterations, fit.status, covariance, determined, in_front, error)
+        in_front = fit.pose.transform(X)[..., 2] > 0
+        return _Fit(fit.pose, fit.theta, fit.cost, fit.iterations, fit.status, covariance, determined, in_front, error)
     result = levenberg_marquardt(
         problem.residual, (start, theta), x, X, camera, retract=problem.retract, size=6 + problem.size, weights=w,
         loss=problem.loss, linearize=problem.linearize, max_iterations=max_iterations, function_tolerance=1e-6,
         step_tolerance=1e-12,
     )  # fmt: skip
     pose, theta = result.x
-    for _ in range(2 if plain else 5):
+    for _ in range(5):
         pose, theta = problem.settle((pose, theta), x, X, w, camera)
     r, J = problem.linearize((pose, theta), x, X, camera)
     covariance, determined = inverse(problem.normal_matrix(J, problem.slopes(r, w)))
     total = w.sum(-1)
-    square = (w.double() * (r * r).sum(-1).double()).sum(-1)
-    error = (square / torch.where(total > 0, total, 1.0).double()).sqrt()
+    square = (w * (r * r).sum(-1)).sum(-1)
+    error = (square / torch.where(total > 0, total, 1.0)).sqrt()
     in_front = pose.transform(X)[..., 2] > 0
     return _Fit(pose, theta, result.cost, result.iterations, result.status, covariance, determined, in_front, error)
 
