@@ -1,6 +1,7 @@
-"""The cameras are known: where are the points? Photogrammetry calls it intersection."""
+"""The cameras are known: where are the points and lines? Photogrammetry calls it intersection."""
 
 from torchsfm.triangulation.optimal_correction import correct_matches
+from torchsfm.triangulation.triangulate_lines import LineFault, LineTriangulation, triangulate_lines
 from torchsfm.triangulation.triangulate_points import Triangulation, triangulate_points
 from torchsfm.triangulation.triangulate_points_dlt import triangulate_points_dlt
 from torchsfm.triangulation.triangulate_points_robust import (
@@ -14,10 +15,13 @@ ESTIMATORS = (PointEstimator,)
 
 __all__ = [
     "ESTIMATORS",
+    "LineFault",
+    "LineTriangulation",
     "PointEstimator",
     "RobustTriangulation",
     "Triangulation",
     "correct_matches",
+    "triangulate_lines",
     "triangulate_points",
     "triangulate_points_dlt",
     "triangulate_points_robust",

@@ -1,0 +1,235 @@
+"""Lines in their views, one problem a line: the data in double precision, a frame for each, the start and the residuals."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm.geometry import line_from_points, to_homogeneous
+from torchsfm.linalg import adjugate_3x3, cross, determinant_3x3, eigh, usable
+
+SAME = 1e-7
+"""Angle between planes, and distance of centres over their own size, below which they are one but for rounding."""
+
+_NOISE = 1.5
+"""Distances, in units of noise, that say nothing."""
+
+
+class LineViews(NamedTuple):
+    """Segments and cameras of lines, harmless numbers of weight 0 where there is none."""
+
+    ends: Float[Tensor, "n v 2 2"]
+    """Two image points of each segment."""
+    P: Float[Tensor, "n v 3 4"]
+    w: Float[Tensor, "n v"]
+    """Weights of the squared distances of both ends."""
+    broken: Bool[Tensor, " n"]
+    """Whether a wanted observation is not finite."""
+
+    @property
+    def used(self) -> Tensor:
+        """Which views count."""
+        return self.w > 0
+
+    def moved(self, origin: Tensor, unit: Tensor) -> "LineViews":
+        """The cameras for points `(X - origin) / unit`, of arbitrary scale 1."""
+        M, p = self.P[..., :3], self.P[..., 3:]
+        P = torch.cat((M * unit[:, None, None, None], M @ origin[:, None, :, None] + p), -1)
+        return self._replace(P=P / P.detach().abs().amax((-2, -1), keepdim=True).clamp_min(1e-300))
+
+    def projections(self) -> Tensor:
+        """The matrices (n, v, 3, 6) that take Pluecker vectors to image lines."""
+        M, p = self.P[..., :3], self.P[..., 3]
+        direct = torch.stack([cross(p, column) for column in M.unbind(-1)], -1)
+        return torch.cat((direct, adjugate_3x3(M).mT), -1)
+
+    def homogeneous_ends(self) -> Tensor:
+        """The ends (n, v, 2, 3)."""
+        return to_homogeneous(self.ends)
+
+    def centres(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Centres (n, v, 3), directions of centres at infinity; which are finite; and the sign of depths."""
+        M, p = self.P[..., :3], self.P[..., 3]
+        det = determinant_3x3(M)
+        size = torch.linalg.vector_norm(M, dim=-1).prod(-1)
+        finite = det.abs() > 1e-13 * size
+        centre = -(adjugate_3x3(M) @ p[..., None])[..., 0]
+        length = torch.linalg.vector_norm(centre, dim=-1).clamp_min(1e-300)
+        return centre / torch.where(finite, det, length)[..., None], finite, torch.where(finite, torch.sign(det), 0.0)
+
+
+def observe(l: Tensor, P: Tensor, visible: Tensor | None, weights: Tensor | None) -> LineViews:  # noqa: E741
+    """Lay out l (n, v, 3) or (n, v, 2, 2), P (n, v, 3, 4), visible and weights (n, v)."""
+    P, l = P.double(), l.double()  # noqa: E741
+    good = usable(P).flatten(-2).all(-1)
+    P = torch.where(good[..., None, None], P, torch.eye(3, 4, dtype=P.dtype, device=P.device))
+    size = P.detach().abs().amax((-2, -1), keepdim=True)
+    P = P / torch.where(size > 0, size, 1.0)
+    if l.shape[-1] == 3:
+        sound = usable(l).all(-1)
+        l = torch.where(sound[..., None], l, l.new_tensor([1.0, 0.0, 0.0]))  # noqa: E741
+        ends = _points_of(l, P)
+    else:
+        sound = usable(l).flatten(-2).all(-1)
+        ends = l
+    apart = (ends[..., 0, :] != ends[..., 1, :]).any(-1)
+    sound = good & sound
+    wanted = torch.ones_like(sound) if visible is None else visible
+    w = torch.ones_like(ends[..., 0, 0])
+    if weights is not None:
+        w = weights.double()
+        wanted = wanted & (w.detach() != 0)
+        sound = sound & usable(w) & (w.detach() >= 0)
+    use = wanted & sound
+    harmless = ends.new_tensor([[0.0, 0.0], [1.0, 0.0]])
+    ends = torch.where((use & apart)[..., None, None], ends, harmless)
+    # A segment of one point is a point on the line, and no line.
+    return LineViews(ends, P, torch.where(use & apart, w, torch.zeros_like(w)), (wanted & ~sound).any(-1))
+
+
+def _points_of(l: Tensor, P: Tensor) -> Tensor:  # noqa: E741
+    """Two points on image lines, a focal length to each side of the foot of the principal point."""
+    third = P[..., 2, :3].detach()
+    square = third.square().sum(-1, keepdim=True)
+    affine = square <= 1e-24
+    third = third / torch.where(affine, 1.0, square)
+    middle = torch.where(affine, 0.0, (P[..., :2, :3].detach() @ third[..., None])[..., 0])
+    across = P[..., :2, :3].detach() - middle[..., None] * P[..., 2:, :3].detach()
+    focal = (across.square().sum((-2, -1)) / torch.where(affine[..., 0], 2.0, 2 * square[..., 0])).sqrt()
+    size = l[..., :2].square().sum(-1, keepdim=True)
+    infinite = size.detach() <= 1e-24 * l.detach()[..., 2:].square()
+    size = torch.where(infinite, 1.0, size)
+    foot = middle - ((l[..., :2] * middle).sum(-1, keepdim=True) + l[..., 2:]) / size * l[..., :2]
+    along = torch.stack((l[..., 1], -l[..., 0]), -1) * size.rsqrt() * focal[..., None]
+    along = torch.where(infinite, 0.0, along)
+    return torch.stack((foot - along, foot + along), -2)
+
+
+def frame_of_centres(views: LineViews) -> tuple[Tensor, Tensor]:
+    """The mean (n, 3) of the centres and their root-mean-square distance (n) from it, 1 where they are one point."""
+    centre, finite, _ = views.centres()
+    counted = (finite & views.used)[..., None]
+    number = counted.sum(1).clamp_min(1)
+    mean = torch.where(counted, centre, 0.0).sum(1) / number
+    spread = torch.where(counted, (centre - mean[:, None]).square(), 0.0).sum((1, 2)).div(number[:, 0]).sqrt()
+    reach = torch.where(counted, centre.square(), 0.0).sum((1, 2)).div(number[:, 0]).sqrt()
+    return mean, torch.where(spread > 1e-11 * reach, spread, 1.0)
+
+
+def linear_lines(views: LineViews, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Lines (n, 6) through the two points that are least off the viewing planes, and the planes' singular values (n, 4).
+
+    The planes are scaled to unit normals; both points are right singular vectors, so that the line is one, always.
+    """
+    l = line_from_points(views.ends[..., 0, :], views.ends[..., 1, :])  # noqa: E741
+    planes = (l[..., None, :] @ views.P)[..., 0, :]
+    planes = planes / torch.linalg.vector_norm(planes[..., :3], dim=-1, keepdim=True).clamp_min(1e-300)
+    rows = planes * weight.sqrt()[..., None]
+    values, vectors, _ = eigh(rows.mT @ rows)
+    (a, wa), (b, wb) = ((v[..., :3], v[..., 3:]) for v in vectors[..., :2].unbind(-1))
+    return torch.cat((wa * b - wb * a, cross(a, b)), -1), values.clamp_min(0).sqrt()
+
+
+def one_plane(views: LineViews) -> Tensor:
+    """Whether all rays to the ends of segments lie in planes of one direction, but for noise of a unit (n).
+
+    Then the planes of sight are one, or parallel, as far as can be told, and meet anywhere.
+    """
+    finite = views.centres()[1]
+    cofactors = adjugate_3x3(views.P[..., :3]).mT
+    rays = _unit(views.homogeneous_ends() @ cofactors)
+    weighted = rays * torch.where(finite, views.w, 0.0)[..., None, None]
+    _, vectors, _ = eigh((weighted[..., None] * rays[..., None, :]).sum((1, 2)))
+    line = (cofactors @ vectors[:, None, :, :1])[..., 0]
+    away = (views.homogeneous_ends() * line[..., None, :]).sum(-1).square()
+    away = away / line[..., None, :2].square().sum(-1).clamp_min(1e-300)
+    square = torch.where(finite, views.w * away.mean(-1), 0.0).sum(-1)
+    number = (views.used & finite).sum(-1)
+    return (square <= _NOISE**2 * number) & (views.used <= finite).all(-1)
+
+
+def frame_of_line(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor]:
+    """An origin (n, 3) as far from the part of the line that is seen as the centres are, and that distance (n) as the unit.
+
+    There the direction and the moment of the line are of one length, which is where its manifold is best.
+    """
+    points, finite = seen_points(views, line)
+    counted = (finite & views.used[..., None])[..., None]
+    number = counted.sum((1, 2)).clamp_min(1)
+    middle = torch.where(counted, points, 0.0).sum((1, 2)) / number
+    centre, near, _ = views.centres()
+    near = near & views.used
+    away = torch.where(near[..., None], centre - middle[:, None], 0.0)
+    count = near.sum(1).clamp_min(1)
+    unit = (away.square().sum((1, 2)) / count).sqrt()
+    unit = torch.where((unit > 0) & (unit < 1e100), unit, 1.0)
+    d = _unit(line[:, :3])
+    mean = away.sum(1)
+    across = mean - (mean * d).sum(-1, keepdim=True) * d
+    thin = across.square().sum(-1, keepdim=True) <= 1e-6 * mean.square().sum(-1, keepdim=True)
+    axis = torch.nn.functional.one_hot(d.abs().argmin(-1), 3).to(d.dtype)
+    across = _unit(torch.where(thin, cross(d, axis), across))
+    return middle + unit[:, None] * across, unit
+
+
+def seen_points(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (n, v, 2, 3) of lines where the ends of their segments are seen, and which of them are finite."""
+    l = (views.projections() @ line[:, None, :, None])[..., 0]  # noqa: E741
+    normal = torch.cat((l[..., :2], torch.zeros_like(l[..., :1])), -1)
+    across = cross(views.homogeneous_ends(), normal[..., None, :])
+    planes = across @ views.P
+    d, m = line[:, None, None, :3], line[:, None, None, 3:]
+    n, w = planes[..., :3], planes[..., 3:]
+    weight = (n * d).sum(-1)
+    steep = weight.abs() > 1e-9 * torch.linalg.vector_norm(n, dim=-1) * torch.linalg.vector_norm(d, dim=-1)
+    points = (cross(n, m) - w * d) / torch.where(steep, weight, 1.0)[..., None]
+    return torch.where(steep[..., None], points, 0.0), steep
+
+
+def residuals(line: Tensor, projections: Tensor, ends: Tensor) -> Tensor:
+    """Signed distances (n, v, 2) of homogeneous ends from images of lines, in pixels."""
+    l = (projections @ line[..., None, :, None])[..., 0]  # noqa: E741
+    scale = l[..., :2].square().sum(-1, keepdim=True).clamp_min(1e-200).rsqrt()
+    return (ends * l[..., None, :]).sum(-1) * scale
+
+
+def linearize(line: Tensor, projections: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """The residuals and their derivatives (n, v, 2, 4) along the tangents of `Line3D`."""
+    l = (projections @ line[..., None, :, None])[..., 0]  # noqa: E741
+    moved = projections @ tangents(line)[..., None, :, :]
+    scale = l[..., :2].square().sum(-1, keepdim=True).clamp_min(1e-200).rsqrt()
+    r = (ends * l[..., None, :]).sum(-1) * scale
+    stretch = (l[..., :2, None] * moved[..., :2, :]).sum(-2) * scale.square()
+    return r, (ends @ moved) * scale[..., None] - r[..., None] * stretch[..., None, :]
+
+
+def tangents(line: Tensor) -> Tensor:
+    """The derivatives (*n, 6, 4) of lines along the steps of `Line3D`: columns orthogonal to each other and to the line."""
+    d, m = line[..., :3], line[..., 3:]
+    u1, u2 = _unit(m), _unit(d)
+    u3 = cross(u1, u2)
+    sin, cos = torch.linalg.vector_norm(d, dim=-1, keepdim=True), torch.linalg.vector_norm(m, dim=-1, keepdim=True)
+    zero = torch.zeros_like(d)
+    upper = torch.stack((sin * u3, zero, -sin * u1, cos * u2), -1)
+    lower = torch.stack((zero, -cos * u3, cos * u2, -sin * u1), -1)
+    return torch.cat((upper, lower), -2)
+
+
+def in_world(line: Tensor, origin: Tensor, unit: Tensor) -> Tensor:
+    """Lines (n, 6) of the frame as lines of the world, of unit direction."""
+    d = line[..., :3]
+    L = torch.cat((d, unit[..., None] * line[..., 3:] + cross(origin, d)), -1)
+    size = d.square().sum(-1, keepdim=True)
+    return L * torch.where(size > 0, torch.where(size > 0, size, 1.0).rsqrt(), 0.0)
+
+
+def in_frame(L: Tensor, origin: Tensor, unit: Tensor) -> Tensor:
+    """Lines of the world in the frame."""
+    d = L[..., :3]
+    return torch.cat((d, (L[..., 3:] - cross(origin, d)) / unit[..., None]), -1)
+
+
+def _unit(v: Tensor) -> Tensor:
+    unit: Tensor = v / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(1e-300)
+    return unit
