@@ -148,7 +148,7 @@ TRIPLETS = [
     ("merton1", [0, 1, 2], 0.8),
     ("library", [0, 1, 2], 0.8),
 ]
-QUADRUPLETS = [("model_house", [0, 1, 2, 3], 0.5), ("corridor", [0, 1, 2, 3], 0.4), ("corridor", [0, 2, 4, 6], 0.7)]
+QUADRUPLETS = [("model_house", [0, 1, 2, 3], 0.5), ("corridor", [0, 1, 2, 3], 0.4), ("corridor", [0, 2, 4, 6], 0.6)]
 
 
 def halves(x: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -195,12 +195,13 @@ def test_transfer_in_oxford_quadruplets(
     name: str, views: list[int], limit: float, data: Path, generator: torch.Generator
 ) -> None:
     x, _, P = read(data, name, views)
-    x, held = halves(x, generator)
+    # One half may be a bad one: many of them, judged together.
+    x, held = (torch.stack(part) for part in zip(*(halves(x, generator) for _ in range(20)), strict=True))
     fit = quadrifocal_6pt(x)
-    assert fit.status == Status.OK
+    assert (fit.status == Status.OK).all()
 
     def error(Q: Tensor) -> Tensor:
-        return (transfer_points_quadrifocal(Q, *held[:3].unbind(0)) - held[3]).norm(dim=-1).median()
+        return (transfer_points_quadrifocal(Q, *held[:, :3].unbind(1)) - held[:, 3]).norm(dim=-1).median(-1).values.median()
 
     assert error(fit.Q) < limit
     assert error(fit.Q) < error(quadrifocal_from_cameras(*P)) + 0.1

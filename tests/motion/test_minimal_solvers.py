@@ -275,21 +275,33 @@ def test_rays_all_around(generator: torch.Generator) -> None:
     assert_share(distance(solutions.model, solutions.valid, E) < 1e-8, 0.998)
 
 
+def gaps(a: Tensor, b: Tensor) -> Tensor:
+    """Between all matrices of the slots of one and of the other."""
+    return (a[:, :, None] - b[:, None]).flatten(-2).norm(dim=-1)
+
+
 @pytest.mark.parametrize("mode", ["reverse", "forward"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's own, where its forward derivatives are first used
 def test_derivatives_of_valid_slots(case: Case, mode: str, generator: torch.Generator) -> None:
     x1, x2, _ = case.sample("random", 1 if case.solve is essential_5pt else 2, generator)
     if case.solve is not essential_5pt:
         x1, x2 = x1 / 640 - 0.5, x2 / 640 - 0.5
-    valid = case.solve(x1, x2).valid
+    base = case.solve(x1, x2)
+    # Differences say nothing of a solution that moves much faster than the data, as where two solutions almost meet.
+    moved = case.solve(x1 + 1e-6 * torch.randn(x1.shape, dtype=F64, generator=generator), x2)
+    checked = base.valid & (gaps(base.model, moved.model).amin(-1) < 5e-4)
+    assert checked.any()
 
-    def signed(x1: Tensor, x2: Tensor) -> Tensor:
-        return case.solve(x1, x2).model[valid]
+    def following(x1: Tensor, x2: Tensor) -> Tensor:
+        # Slots have no order that small changes keep: each of the first solutions is followed to the nearest one.
+        model = case.solve(x1, x2).model
+        nearest = gaps(base.model, model.detach()).argmin(-1)
+        return model.gather(1, nearest[..., None, None].expand_as(model))[checked]
 
     inputs = (x1.requires_grad_(), x2.requires_grad_())
     forward = mode == "forward"
     assert torch.autograd.gradcheck(
-        signed, inputs, atol=1e-4, rtol=1e-3, check_forward_ad=forward, check_backward_ad=not forward
+        following, inputs, atol=1e-4, rtol=1e-3, check_forward_ad=forward, check_backward_ad=not forward
     )
 
 
