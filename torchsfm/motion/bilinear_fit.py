@@ -1,5 +1,7 @@
 """Rays, cameras and points with `depth a = P u`: the least-squares problems behind projective factorisation, many at once.
 
+Points have `r` coordinates: 4 in space; 3 and 2 fit points of a plane and of a line, and views that have one centre.
+
 Two measures of the misfit of a unit ray a and its prediction y = P u, both blind to rotations of the image's frame:
 
 - with a prior on the depths, `|(I - a a') y|^2 + prior (a' y - 1)^2`: bilinear in P and u, so that the points can be eliminated
@@ -36,8 +38,8 @@ class Rays:
 class Fit:
     """Cameras and points, and the misfit: the mean over the weights is 1 for a perfect miss."""
 
-    P: Float[Tensor, "p v 3 4"]
-    u: Float[Tensor, "p 4 n"]
+    P: Float[Tensor, "p v 3 r"]
+    u: Float[Tensor, "p r n"]
     cost: Float[Tensor, "p"]
 
 
@@ -64,18 +66,18 @@ def core(w: Float[Tensor, "p v n"], enough: int) -> tuple[Bool[Tensor, "p v"], B
         seen = rest
 
 
-def rank_four(rays: Rays) -> Float[Tensor, "p v 3 4"]:
-    """Cameras whose joint column space holds most of the rays: the start of everything."""
+def of_rank(rays: Rays, r: int) -> Float[Tensor, "p v 3 r"]:
+    """Cameras whose joint column space, of dimension r, holds most of the rays: the start of everything."""
     p, v, _, n = rays.a.shape
     M = (rays.a * rays.w[:, :, None]).reshape(p, 3 * v, n)
-    basis = eigh(M @ M.mT)[1][..., -4:]
-    P: Tensor = basis.reshape(p, v, 3, 4) * v**0.5
+    basis = eigh(M @ M.mT)[1][..., -r:]
+    P: Tensor = basis.reshape(p, v, 3, r) * v**0.5
     return P
 
 
 def fit_with_prior(
-    rays: Rays, P: Float[Tensor, "p v 3 4"], prior: float, steps: int, tolerance: float
-) -> tuple[Float[Tensor, "p v 3 4"], Float[Tensor, "p 4 n"], Bool[Tensor, "p"]]:
+    rays: Rays, P: Float[Tensor, "p v 3 r"], prior: float, steps: int, tolerance: float
+) -> tuple[Float[Tensor, "p v 3 r"], Float[Tensor, "p r n"], Bool[Tensor, "p"]]:
     """Minimise the misfit with a prior over cameras and points, from given cameras; also, which problems came to an end.
 
     With `prior = 1` the rays may be any vectors: what is minimised is the sum of `w |a - P u|^2`.
@@ -107,7 +109,7 @@ def fit_with_prior(
 
 
 def fit_angles(
-    rays: Rays, P: Float[Tensor, "p v 3 4"], u: Float[Tensor, "p 4 n"], steps: int
+    rays: Rays, P: Float[Tensor, "p v 3 r"], u: Float[Tensor, "p r n"], steps: int
 ) -> tuple[Fit, list[Tensor], Tensor]:
     """Minimise the squared sines over cameras and points; also the cost after each step, and which problems came to an end."""
     P, u = _unit(P, u)
@@ -203,12 +205,13 @@ def _best_points(rays: Rays, P: Tensor, prior: float) -> tuple[Tensor, Tensor]:
     return u, (rays.w * misfit).sum((-2, -1)) / _total(rays)
 
 
-def _point_hessians(P: Tensor, alpha: Tensor, m: Tensor) -> Float[Tensor, "p n 4 4"]:
-    """`sum_v alpha P'P - sum_vk m m'` for each point, with m (p, v, k 4, n) or (p, v, 4, n)."""
+def _point_hessians(P: Tensor, alpha: Tensor, m: Tensor) -> Float[Tensor, "p n r r"]:
+    """`sum_v alpha P'P - sum_vk m m'` for each point, with m (p, v, k r, n) or (p, v, r, n)."""
     p, v, _, n = m.shape
-    G = (P.mT @ P).reshape(p, v, 16)
-    H = (alpha.mT @ G).reshape(p, n, 4, 4)
-    rows = m.reshape(p, m.shape[1] * m.shape[2] // 4, 4, n).permute(0, 3, 2, 1).contiguous()
+    r = P.shape[-1]
+    G = (P.mT @ P).reshape(p, v, r * r)
+    H = (alpha.mT @ G).reshape(p, n, r, r)
+    rows = m.reshape(p, m.shape[1] * m.shape[2] // r, r, n).permute(0, 3, 2, 1).contiguous()
     return H - rows @ rows.mT
 
 
@@ -226,39 +229,40 @@ def _reduced(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Ten
     """
     P, u, alpha, q = system.P, system.u, system.alpha, system.q
     p, v, k, _, n = q.shape
+    r = P.shape[-1]
     m = P.mT[:, :, None] @ q
     H = _point_hessians(P, alpha, m.flatten(2, 3))
     size = H.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    eye4 = torch.eye(4, dtype=P.dtype, device=P.device)
+    eye = torch.eye(r, dtype=P.dtype, device=P.device)
     if points:
-        H = H + size * u.mT[..., :, None] * u.mT[..., None, :] + damping[:, None, None, None] * size * eye4
+        H = H + size * u.mT[..., :, None] * u.mT[..., None, :] + damping[:, None, None, None] * size * eye
     L = torch.linalg.cholesky_ex(_regular(H))[0]
-    inverse = torch.linalg.solve_triangular(L, eye4.expand_as(L), upper=False).permute(0, 2, 3, 1)
-    # B P, times L^-T over its last index, times u: half of the coupling (12 v, 4 n), in one contiguous array.
+    inverse = torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False).permute(0, 2, 3, 1)
+    # B P, times L^-T over its last index, times u: half of the coupling (3 r v, r n), in one contiguous array.
     BP = alpha[:, :, None, None] * P[..., None]
     for i in range(k):
         BP = BP - q[:, :, i, :, None] * m[:, :, i, None]
-    C = sum(BP[:, :, :, None, c] * inverse[:, None, None, :, c] for c in range(4))
+    C = sum(BP[:, :, :, None, c] * inverse[:, None, None, :, c] for c in range(r))
     assert isinstance(C, Tensor)
-    F = (C[:, :, :, None] * u[:, None, None, :, None]).reshape(p, 12 * v, 4 * n)
+    F = (C[:, :, :, None] * u[:, None, None, :, None]).reshape(p, 3 * r * v, r * n)
     B = alpha[:, :, None, None] * torch.eye(3, dtype=P.dtype, device=P.device)[..., None]
     for i in range(k):
         B = B - q[:, :, i, :, None] * q[:, :, i, None]
-    uu = (u[:, :, None] * u[:, None]).reshape(p, 16, n)
-    A = (B.reshape(p, 9 * v, n) @ uu.mT).reshape(p, v, 3, 3, 4, 4).transpose(3, 4).reshape(p, v, 12, 12)
+    uu = (u[:, :, None] * u[:, None]).reshape(p, r * r, n)
+    A = (B.reshape(p, 9 * v, n) @ uu.mT).reshape(p, v, 3, 3, r, r).transpose(3, 4).reshape(p, v, 3 * r, 3 * r)
     scale = A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
     if points:
-        flat = P.reshape(p, v, 12)
-        A = A + 12 * scale * flat[..., :, None] * flat[..., None, :]
-    A = A + damping[:, None, None, None] * scale.clamp_min(1e-100) * torch.eye(12, dtype=P.dtype, device=P.device)
+        flat = P.reshape(p, v, 3 * r)
+        A = A + 3 * r * scale * flat[..., :, None] * flat[..., None, :]
+    A = A + damping[:, None, None, None] * scale.clamp_min(1e-100) * torch.eye(3 * r, dtype=P.dtype, device=P.device)
     S = -(F @ F.mT)
-    S.view(p, v, 12, v, 12).diagonal(dim1=1, dim2=3).add_(A.permute(0, 2, 3, 1))
-    right = (system.slope @ u.mT[:, None]).reshape(p, 12 * v)
-    g = torch.zeros(p, 4, n, dtype=P.dtype, device=P.device)
+    S.view(p, v, 3 * r, v, 3 * r).diagonal(dim1=1, dim2=3).add_(A.permute(0, 2, 3, 1))
+    right = (system.slope @ u.mT[:, None]).reshape(p, 3 * r * v)
+    g = torch.zeros(p, r, n, dtype=P.dtype, device=P.device)
     if points:
         g = (P.mT @ system.slope).sum(1)
         g = (inverse * g[:, None]).sum(2)
-        right = right - (F @ g.reshape(p, 4 * n, 1))[..., 0]
+        right = right - (F @ g.reshape(p, r * n, 1))[..., 0]
     return S, right, F, torch.stack((g, *inverse.unbind(1)), 1)
 
 
@@ -273,10 +277,10 @@ def _step(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Tensor
     g, move = rest[:, 0], _back(F, rest, step)
     # The model: right' step + step' S step / 2 and what the points alone bring; twice that in units of the cost.
     promise = -(right * step[..., 0]).sum(-1) + g.square().sum((-2, -1))
-    return step.reshape(p, v, 3, 4), move, solved, promise.clamp_min(1e-300)
+    return step.reshape(p, v, 3, system.P.shape[-1]), move, solved, promise.clamp_min(1e-300)
 
 
-def _back(F: Tensor, rest: Tensor, step: Tensor) -> Float[Tensor, "p 4 n"]:
+def _back(F: Tensor, rest: Tensor, step: Tensor) -> Float[Tensor, "p r n"]:
     """The step of the points that goes with a step of the cameras."""
     g, inverse = rest[:, 0], rest[:, 1:]
     back = g + (F.mT @ step).reshape(g.shape)
@@ -293,15 +297,15 @@ def _next(damping: Tensor, growth: Tensor, better: Tensor, gain: Tensor) -> tupl
 def _balanced(P: Tensor) -> Tensor:
     """The same column space with orthonormal columns, of a norm that does not depend on the number of views."""
     p, v = P.shape[:2]
-    Q, _, _ = qr(P.reshape(p, 3 * v, 4))
-    balanced: Tensor = Q.reshape(p, v, 3, 4) * v**0.5
+    Q, _, _ = qr(P.reshape(p, 3 * v, P.shape[-1]))
+    balanced: Tensor = Q.reshape(p, v, 3, P.shape[-1]) * v**0.5
     return balanced
 
 
 def _unit(P: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """The frame in which the cameras' joint columns are orthonormal; then each camera and point of norm 1."""
     p, v = P.shape[:2]
-    Q, R, _ = qr(P.reshape(p, 3 * v, 4))
-    P, u = Q.reshape(p, v, 3, 4), R @ u
+    Q, R, _ = qr(P.reshape(p, 3 * v, P.shape[-1]))
+    P, u = Q.reshape(p, v, 3, P.shape[-1]), R @ u
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-100)
     return P, torch.nn.functional.normalize(u, dim=1)

@@ -22,7 +22,7 @@ from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import to_homogeneous
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.shape import balanced_frame
-from torchsfm.linalg import solve
+from torchsfm.linalg import eigh, solve
 from torchsfm.motion.bilinear_fit import (
     Fit,
     Rays,
@@ -30,7 +30,7 @@ from torchsfm.motion.bilinear_fit import (
     fit_angles,
     fit_with_prior,
     information,
-    rank_four,
+    of_rank,
     squared_sines,
     with_derivative,
 )
@@ -45,6 +45,8 @@ _SCALES = (8.0, 6.0, 4.0, 3.0)
 """Where the robust loss lets go, in medians of the sines, one after the other."""
 _UNDETERMINED = 0.3
 """Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined."""
+_FLAT_STEPS = 15
+"""Most steps of the homographies that are fitted for comparison: where they do not fit, their minimum does not matter."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,9 @@ def _factorize(x: Tensor, w: Tensor, robust: bool, steps: int) -> tuple[Tensor, 
         proximity = torch.stack(costs + [costs[-1]] * (steps + 1 - len(costs)), -1).sqrt()
         unknowns = 11 * view.sum(-1) + 3 * point.sum(-1) - 15
         enough = (view.sum(-1) >= 2) & (point.sum(-1) >= _ENOUGH) & (2 * counts.sum((-2, -1)) >= unknowns)
-        loose = _undetermined(Rays(rays.a, rays.w * trust), fit, view, unknowns) | ~(balanced | ~view).all(-1)
+        trusted = Rays(rays.a, rays.w * trust)
+        loose = _undetermined(trusted, fit, view, unknowns) | ~(balanced | ~view).all(-1)
+        loose = loose | _flat(trusted, fit, view.sum(-1), point.sum(-1))
         status = torch.where(done, int(Status.OK), int(Status.NOT_CONVERGED))
         status = torch.where(loose, int(Status.DEGENERATE), status)
         status = torch.where(enough, status, int(Status.TOO_FEW)).to(torch.int8)
@@ -166,7 +170,7 @@ def _rays(x: Tensor, w: Tensor, frame: Tensor) -> Rays:
 
 def _search(rays: Rays, robust: bool, steps: int, again: bool = True) -> tuple[Fit, list[Tensor], Tensor, Tensor]:
     """The fit, its cost after each step, whether it converged, and how far each observation is trusted."""
-    P, trust = rank_four(rays), torch.ones_like(rays.w)
+    P, trust = of_rank(rays, 4), torch.ones_like(rays.w)
     for prior in _PRIORS:
         P, u, _ = fit_with_prior(Rays(rays.a, rays.w * trust), P, prior, steps, 1e-5)
         if robust:
@@ -211,6 +215,25 @@ def _undetermined(rays: Rays, fit: Fit, view: Tensor, unknowns: Tensor) -> Tenso
     redundancy = (2 * (rays.w > 0).sum((-2, -1)) - unknowns).clamp(min=1)
     variance = fit.cost * rays.w.sum((-2, -1)) / redundancy
     return (least <= 1e-11 * values[:, -1]) | (variance > _UNDETERMINED**2 * least) | ~torch.isfinite(least)
+
+
+def _flat(rays: Rays, fit: Fit, v: Tensor, n: Tensor) -> Tensor:
+    """Whether space explains no more than noise beyond a plane: points in one, or views without baseline.
+
+    Homographies are fitted too. Of what they leave, a fourth dimension always takes some: of noise, the largest singular value
+    of a matrix of 3 v times n, more than the number of its parameters. Three times more must be gone.
+    """
+    u = fit.u * (rays.w.sum(1, keepdim=True) > 0)
+    plane = eigh(u @ u.mT)[1][..., 1:]
+    P, y, _ = fit_with_prior(rays, fit.P @ plane[:, None], _PRIORS[-1], _FLAT_STEPS, 1e-5)
+    homographies, _, _ = fit_angles(rays, P, y, _FLAT_STEPS)
+    v, n = v.double(), n.double()
+    equations = 2 * (rays.w > 0).sum((-2, -1)).double()
+    flat_redundancy = (equations - (8 * v + 2 * n - 8)).clamp(min=1)
+    redundancy = (equations - (11 * v + 3 * n - 15)).clamp(min=0)
+    beyond = ((3 * v).sqrt() + n.sqrt()).square() - (3 * v + n - 7)
+    of_noise = redundancy * redundancy / (redundancy + beyond).clamp(min=1) / flat_redundancy
+    return fit.cost > of_noise / 3 * homographies.cost
 
 
 def _signs(depths: Tensor) -> tuple[Tensor, Tensor]:
