@@ -194,6 +194,27 @@ def test_data_that_do_not_determine_the_answer_say_so() -> None:
         assert torch.isfinite(tensor).all()
 
 
+@pytest.mark.parametrize(("views", "n", "told"), [(2, 40, 0.95), (3, 10, 0.9), (3, 60, 0.98), (8, 30, 0.98)])
+def test_noise_is_not_taken_for_a_third_dimension(views: int, n: int, told: float, generator: torch.Generator) -> None:
+    """Planes and views from one centre: a fourth dimension always takes some of the noise."""
+    batch, kind = 20, {"generator": generator, "dtype": torch.float64}
+    x, _ = scene(batch, 1, n)
+    H = torch.eye(3, dtype=torch.float64) + 0.1 * torch.randn(batch, views, 3, 3, **kind)
+    flat = 500 * from_homogeneous(to_homogeneous((x - 500) / 500) @ H.mT)[0] + 500
+    noise = 10 ** (2 * torch.rand(batch, 1, 1, 1, **kind) - 1.5)
+    flat = flat + noise * torch.randn(flat.shape, **kind)
+    # Homographies must not move points to infinity, where noise is no more what it was.
+    near = (flat - 500).abs().amax((-3, -2, -1)) < 2000
+    assert_share((factorize_points(flat).status == Status.DEGENERATE)[near], told)
+    solid, _ = scene(batch, views, n, noise=0.3)
+    assert_share(factorize_points(solid).status == Status.OK, 0.98)
+    if views > 2:
+        thin = (x - 500) * torch.tensor([1.0, 0.5], dtype=torch.float64)
+        thin = torch.stack((thin[..., 0], 0.5 * thin[..., 0]), -1) * (1 + 0.2 * torch.rand(batch, views, 1, 1, **kind)) + 500
+        thin = thin + noise * torch.randn(thin.shape, **kind)
+        assert_share(factorize_points(thin).status == Status.DEGENERATE, told)
+
+
 def test_two_halves_that_share_nothing_are_degenerate() -> None:
     x, visible = scene(1, 8, 60)
     visible[:, :4, 30:] = False

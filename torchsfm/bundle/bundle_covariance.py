@@ -98,7 +98,7 @@ def bundle_covariance(
         poses, cameras, X, x, view, point, camera_index, free, rig, fixed_poses, fixed_points, fixed_cameras,
         fixed_intrinsics, fixed_sensors, weights, loss, priors,
     )  # fmt: skip
-    check_options(sigma=(sigma, "?float > 0"))
+    check_options(sigma=(sigma, "?float > 0"), intrinsics_sigma=(intrinsics_sigma, Mapping | None))
     with torch.no_grad():
         blocks, terms = bundle.problem()
         if intrinsics_sigma:

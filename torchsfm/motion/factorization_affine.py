@@ -42,7 +42,8 @@ class AffineFactorization:
         used_view: Views with at least four points that other views see too.
         used_point: Points in at least two used views.
         status: `OK`; `NOT_CONVERGED`; `TOO_FEW` points, or views (three are needed); `DEGENERATE`: planar scene, no turning, or
-            cameras that are not of the kind asked for (P and X are then some affine frame's, R and scale mean nothing).
+            cameras that are not of the kind asked for (P and X are then some affine frame's, R and scale mean nothing);
+            `NOT_FINITE`: numbers beyond what the dtype holds, all fields are zero.
     """
 
     P: Float[Tensor, "*batch v 3 4"]
@@ -121,9 +122,13 @@ def factorize_affine(
         last = torch.zeros(*M.shape[:2], 1, 4, dtype=M.dtype, device=M.device)
         last[..., 3] = 1
         P = torch.cat((torch.cat((M, t[..., None]), -1), last), -2) * view[..., None, None]
-        found = (P, X * point[..., None], R, scale * view, values, torch.where(seen, error, torch.inf), view, point, status)
-    floating = (f.to(x.dtype) if f.is_floating_point() else f for f in found)
-    return AffineFactorization(*(f.reshape(batch + f.shape[1:]) for f in floating))
+        error = torch.where(seen, error, 0)
+        numbers = [f.to(x.dtype) for f in (P, X * point[..., None], R, scale * view, values, error)]
+        held = torch.stack([torch.isfinite(f).flatten(1).all(-1) for f in numbers]).all(0)
+        status = torch.where(held, status, int(Status.NOT_FINITE)).to(torch.int8)
+        *numbers, error = (torch.where(held.reshape(-1, *(1,) * (f.ndim - 1)), f, 0) for f in numbers)
+        found = (*numbers, torch.where(seen, error, torch.inf), view, point, status)
+    return AffineFactorization(*(f.reshape(batch + f.shape[1:]) for f in found))
 
 
 def _affine(x: Tensor, w: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
