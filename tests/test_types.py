@@ -61,6 +61,8 @@ def test_wrong_arguments_are_named(arguments: dict[str, tuple[Tensor, str]], mes
         ("float > 0", (1e-300, 5, 1e300), (0, 0.0, -1.0, math.inf, math.nan, None, False, "2", [1.0], torch.ones(()))),
         ("0 <= float <= 1", (0, 0.5, 1), (-1e-9, 1.1, math.nan)),
         ("0 < float < 1", (1e-9, 0.5), (0, 1, math.nan)),
+        ("0 <= float <= 0.1 radians", (0, 0.1), (1.0, -1)),
+        ("2 float > 0 < 3.1416 radians", ((0.5, 1.0), [1, 2]), ((0.5, 60.0), (0.5,), 1.0)),
         ("?int >= 0", (None, 0, 3), (-1, 0.5, "none")),
         (("a", "b"), ("a", "b"), ("c", None, ["a"], torch.ones(3))),
         (bool, (True, False), (0, 1, None, "yes")),

@@ -164,7 +164,7 @@ def check_options(**arguments: tuple[object, Any]) -> None:
 
     Each argument comes as `(value, wanted)`: a tuple of the values there are, a type, or the range of a finite number as in
     `int >= 1`, `float > 0`, `0 <= float <= 1`. `2 float > 0` stands for a tuple of two; a range that begins with `?` is that
-    of an option which may be None.
+    of an option which may be None, and one may end with its unit, as in `0 < float < 3.14 radians`.
 
     Args:
         **arguments: The options under the names the caller knows them by.
@@ -209,6 +209,8 @@ class _Range(NamedTuple):
 def _range(words: str) -> _Range:
     """The range of `0 < float <= 1`, say; a `?` in front allows None."""
     tokens = words.removeprefix("?").split()
+    if tokens[-1].isalpha() and tokens[-1] not in _NUMBERS:
+        tokens.pop()  # the unit, for the reader
     length = int(tokens.pop(0)) if tokens[1:] and tokens[1] in _NUMBERS else 0
     i = next(i for i, token in enumerate(tokens) if token in _NUMBERS)
     below = [(_COMPARE[tokens[k + 1].replace("<", ">")], float(tokens[k])) for k in range(0, i, 2)]

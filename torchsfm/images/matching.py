@@ -127,7 +127,7 @@ def _single_threads() -> Iterator[int]:
 
 
 def _check(ratio: float, mutual: bool, max_distance: float) -> None:
-    check_options(ratio=(ratio, "float > 0"), mutual=(mutual, bool), max_distance=(max_distance, "float > 0"))
+    check_options(ratio=(ratio, "float > 0"), mutual=(mutual, bool), max_distance=(max_distance, "0 < float <= 3.15 radians"))
 
 
 def unit_descriptors(descriptors: Shaped[Tensor, "n d"]) -> Float[Tensor, "n d"]:

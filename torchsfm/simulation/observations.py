@@ -158,7 +158,8 @@ def random_intrinsics(
         device: Of the matrices.
     """
     options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
-    check_options(image_size=(image_size, "2 int >= 1"), view_angle=(view_angle, "2 float > 0"), wobble=(wobble, "float >= 0"))
+    angles = (view_angle, "2 float > 0 < 3.1416 radians")
+    check_options(image_size=(image_size, "2 int >= 1"), view_angle=angles, wobble=(wobble, "float >= 0"))
     low, high = view_angle
     angle = low + (high - low) * torch.rand(*shape, **options)  # type: ignore[call-overload]
     width, height = image_size

@@ -123,7 +123,7 @@ def pose_from_essential(
         ValueError: Wrong shape, dtype or device.
     """
     kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
-    check_options(parallax=(parallax, "float >= 0"))
+    check_options(parallax=(parallax, "0 <= float <= 0.1 radians"))
     batch = check_tensors(E=(E, "3 3"), d1=(d1, "n 3"), d2=(d2, "n 3"), weights=(weights, kind))
     shape = (*batch, d1.shape[-2])
     w = torch.ones_like(d1[..., 0]) if weights is None else weights.to(d1.dtype)
