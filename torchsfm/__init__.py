@@ -292,6 +292,7 @@ from torchsfm.robust import (
 from torchsfm.simulation import (
     RenderedSequence,
     SimulatedBundle,
+    SimulatedConics,
     SimulatedImages,
     TexturedScene,
     courtyard_scene,
@@ -302,6 +303,7 @@ from torchsfm.simulation import (
     random_points,
     random_poses,
     render_sequence,
+    simulate_conics,
     simulate_images,
 )
 from torchsfm.tensors import (
@@ -365,15 +367,19 @@ from torchsfm.tensors import (
     trifocal_tensors,
 )
 from torchsfm.triangulation import (
+    ConicTriangulation,
     LineFault,
     LineTriangulation,
     RobustTriangulation,
     Triangulation,
+    conics_2view,
     correct_matches,
+    triangulate_conics,
     triangulate_lines,
     triangulate_points,
     triangulate_points_dlt,
     triangulate_points_robust,
+    triangulate_quadrics,
 )
 
 __all__ = [
@@ -395,6 +401,7 @@ __all__ = [
     "CameraRefinement",
     "Cauchy",
     "CentrePrior",
+    "ConicTriangulation",
     "Corners",
     "Degeneracy",
     "Distortion",
@@ -474,6 +481,7 @@ __all__ = [
     "Similarity",
     "SimpleRadial",
     "SimulatedBundle",
+    "SimulatedConics",
     "SimulatedImages",
     "SoftL1",
     "SoftSelection",
@@ -528,6 +536,7 @@ __all__ = [
     "compile_kernels",
     "conic_distance",
     "conic_from_ellipse",
+    "conics_2view",
     "constant_intrinsics",
     "correct_matches",
     "courtyard_scene",
@@ -680,6 +689,7 @@ __all__ = [
     "show_image",
     "show_scaled",
     "similarity_from_points",
+    "simulate_conics",
     "simulate_images",
     "soft_ransac",
     "sparse_covariance",
@@ -700,10 +710,12 @@ __all__ = [
     "transform_quadric",
     "transform_quadrifocal",
     "transform_trifocal",
+    "triangulate_conics",
     "triangulate_lines",
     "triangulate_points",
     "triangulate_points_dlt",
     "triangulate_points_robust",
+    "triangulate_quadrics",
     "trifocal_6pt",
     "trifocal_7pt",
     "trifocal_constraints",

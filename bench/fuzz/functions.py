@@ -20,7 +20,9 @@ from torchsfm.geometry import (
     Radial,
     camera_from_krt,
     conic_from_ellipse,
+    dual_quadric_from_ellipsoid,
     project_points,
+    project_quadric,
 )
 from torchsfm.images import Features
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
@@ -84,6 +86,15 @@ def _ellipse(s: Scene) -> Ellipse:
     middle = torch.tensor([SIZE[0] / 2, SIZE[1] / 2], dtype=torch.float64)
     axes = torch.stack((s.rand(low=60.0, high=100.0), s.rand(low=30.0, high=50.0)), -1)
     return Ellipse(middle + s.rand(2, low=-30.0, high=30.0), axes, s.rand(low=-1.5, high=1.5))
+
+
+def _outlines(s: Scene) -> Tensor:
+    """Of two ellipsoids in four views."""
+    e = _ellipsoid(s)
+    two = Ellipsoid(torch.stack((e.centre, s.points(2)[..., 1, :]), -2), torch.stack((e.axes, e.axes), -3))
+    return s.noisy_conics(
+        project_quadric(s.cameras(4)[..., :, None, :, :], dual_quadric_from_ellipsoid(two)[..., None, :, :, :])
+    )
 
 
 def _edge_points(s: Scene) -> Tensor:
@@ -275,6 +286,9 @@ FUNCTIONS: dict[str, Function] = {
     "simulation.random_poses": Function({"shape": (2,), "generator": _generator}),
     "simulation.simulate_images": Function({"poses": _poses, "cameras": _lenses, "generator": _generator}),
     "tensors.reordered_trifocal": Function({"views": (1, 0, 2)}),
+    "simulation.simulate_conics": Function({"shape": (2,), "generator": _generator}),
+    "triangulation.triangulate_conics": Function(sizes={"n": 2, "k": 12}, together=(("x", "weights"),)),
+    "triangulation.triangulate_quadrics": Function({"C": _outlines}, {"n": 2, "k": 12}, together=(("x", "weights"),)),
     "triangulation.triangulate_points_robust": Function(
         {"threshold": 2.0, "generator": _generator, "weights": _of_observations, "quality": _of_observations}
     ),

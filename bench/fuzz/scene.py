@@ -8,10 +8,13 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import (
+    Ellipse,
     Ellipsoid,
     camera_from_krt,
+    conic_from_ellipse,
     dual_conic,
     dual_quadric_from_ellipsoid,
+    ellipse_from_conic,
     project_points,
     project_quadric,
     quaternion_wxyz_from_rotation,
@@ -133,6 +136,12 @@ class Scene:
         line = torch.linalg.cross(a, b)
         return line / line[..., :2].norm(dim=-1, keepdim=True)
 
+    def noisy_conics(self, dual: Tensor) -> Tensor:
+        """Ellipses given by their duals, fitted to a few edge points."""
+        e, _ = ellipse_from_conic(dual_conic(dual))
+        axes = e.semi_axes * (1 + 0.01 * self.randn(*e.semi_axes.shape[len(self.batch) :]))
+        return conic_from_ellipse(Ellipse(e.centre + 0.1 * self.randn(*e.centre.shape[len(self.batch) :]), axes, e.angle))
+
     def homography(self, view: int) -> Tensor:
         """From the first image to another, by the plane."""
         K, R, t = self._cameras
@@ -207,6 +216,18 @@ def _conics(s: Scene, n: int) -> Tensor:
     return dual_conic(project_quadric(s.cameras(1), _quadrics(s, n)))
 
 
+def _all_conics(s: Scene, shape: tuple[int, ...]) -> Tensor:
+    """In several views, a little noisy."""
+    return s.noisy_conics(project_quadric(s.cameras(shape[0])[..., :, None, :, :], _quadrics(s, shape[1])[..., None, :, :, :]))
+
+
+def _edge_points(s: Scene, shape: tuple[int, ...]) -> Tensor:
+    """On conics in several views, a little noisy."""
+    v, n, k, _ = shape
+    ellipses, _ = ellipse_from_conic(_all_conics(s, (v, n)))
+    return ellipses.points(torch.arange(k, dtype=F64) * 6.28 / k) + 0.3 * s.randn(v, n, k, 2)
+
+
 def _index(s: Scene, shape: tuple[int, ...]) -> Tensor:
     return torch.stack([torch.randperm(4, generator=s.generator)[: shape[1]] for _ in range(shape[0])])
 
@@ -237,6 +258,8 @@ _VALUES: dict[str, Callable[[Scene, tuple[int, ...]], Tensor]] = {
     "A": lambda s, shape: _symmetric(s, shape[0]) if shape[0] == shape[1] else s.randn(*shape),
     "A k k": lambda s, shape: (lambda M: M @ M.mT)(s.randn(shape[0], shape[0] + 2)),
     "B": lambda s, shape: s.randn(*shape),
+    "C v n 3 3": _all_conics,
+    **{f"C{i + 1}": lambda s, _, i=i: _all_conics(s, (2, 1))[..., i, 0, :, :] for i in range(2)},
     "C 3 3": lambda s, _: _conics(s, 1)[..., 0, :, :],
     "E": lambda s, _: essential_from_pose(s._cameras[1][..., 1, :, :], s._cameras[2][..., 1, :]),
     "F 3 3": lambda s, _: _fundamental(s, 0, 1),
@@ -321,6 +344,7 @@ _VALUES: dict[str, Callable[[Scene, tuple[int, ...]], Tensor]] = {
     "visible": _mask,
     "w": lambda s, _: s.randn(3),
     "weights": _weights,
+    "x v n k 2": _edge_points,
     "x n 2": lambda s, shape: s.images(1, shape[0])[..., 0, :, :],
     "x 4 2": lambda s, shape: s.images(1, 4)[..., 0, :, :],
     "x n d": lambda s, shape: s.points(shape[0])[..., : shape[1]],

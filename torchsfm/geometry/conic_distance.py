@@ -114,6 +114,13 @@ def foot_normal(D: Float[Tensor, "*#batch 2 2"], y: Float[Tensor, "*#batch n 2"]
     return n / length.clamp_min(tiny)
 
 
+def square_root(D: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
+    """The symmetric square root of positive definite 2x2 matrices."""
+    det = (D[..., 0, 0] * D[..., 1, 1] - D[..., 0, 1] * D[..., 1, 0]).clamp_min(0).sqrt()[..., None, None]
+    trace = D.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    return (D + det * torch.eye(2, dtype=D.dtype, device=D.device)) / (trace + 2 * det).sqrt()
+
+
 def _form(D: Tensor, p: Tensor, q: Tensor) -> Tensor:
     """P'Dq for many vectors."""
     return ((p @ D) * q).sum(-1)

@@ -136,7 +136,7 @@ def ellipsoid_from_dual_quadric(Q_dual: Float[Tensor, "*batch 4 4"]) -> tuple[El
     good = usable(Q_dual).all(-1).all(-1)
     Q = torch.where(good[..., None, None], Q_dual, torch.eye(4, dtype=Q_dual.dtype, device=Q_dual.device)).double()
     centre, D, finite = shape_of_dual_quadric(Q * unit_scale(Q))
-    squares, directions = _axes(D)
+    squares, directions = principal_axes(D)
     largest = squares[..., 0]
     # Far from the origin rounding counts by the distance.
     floor = _ROUNDING * largest + 64 * torch.finfo(Q.dtype).eps * centre.square().sum(-1)
@@ -163,7 +163,7 @@ def shape_of_dual_quadric(
     return torch.where(good[..., None], c, 0.0), torch.where(good[..., None, None], D, 0.0), good
 
 
-def _axes(D: Tensor) -> tuple[Tensor, Tensor]:
+def principal_axes(D: Float[Tensor, "*batch d d"]) -> tuple[Float[Tensor, "*batch d"], Float[Tensor, "*batch d d"]]:
     """Eigenvalues, descending, and unit eigenvectors as rows, with derivatives where they exist."""
     values, vectors, _ = eigh(D.detach())
     values, V = values.flip(-1), vectors.flip(-1)

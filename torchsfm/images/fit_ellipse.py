@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import Ellipse, normalizing_similarity, transform_points
-from torchsfm.geometry.conic_distance import foot_normal, signed_distance
+from torchsfm.geometry.conic_distance import foot_normal, signed_distance, square_root
 from torchsfm.geometry.conics import ellipse_of_shape, shape_of_dual_conic
 from torchsfm.linalg import adjugate_3x3, eigh, inverse
 from torchsfm.optim import levenberg_marquardt
@@ -86,7 +86,7 @@ def fit_ellipse(
         T = torch.where(apart[..., None, None], T, torch.eye(3, dtype=x.dtype, device=x.device))
         scale = T[..., 0, 0]
         centre, D, spread = _start(transform_points(T, x), w, seen)
-        root = _square_root(D)
+        root = square_root(D)
         start = torch.cat((centre, root[..., 0, :], root[..., 1, 1:]), -1)
     y = torch.where(seen[..., None], transform_points(T, x), 0.0)
     found = levenberg_marquardt(
@@ -136,13 +136,6 @@ def _root(p: Tensor) -> Tensor:
 
 def _shape(root: Tensor) -> Tensor:
     return root @ root
-
-
-def _square_root(D: Tensor) -> Tensor:
-    """The symmetric square root of positive definite 2x2 matrices."""
-    det = (D[..., 0, 0] * D[..., 1, 1] - D[..., 0, 1] * D[..., 1, 0]).clamp_min(0).sqrt()[..., None, None]
-    trace = D.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    return (D + det * torch.eye(2, dtype=D.dtype, device=D.device)) / (trace + 2 * det).sqrt()
 
 
 def _residual(p: Tensor, y: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """What would the cameras see? Synthetic scenes, viewpoints, observations and images, with the truth known."""
 
 from torchsfm.simulation.bundle_problems import SimulatedBundle, random_bundle_problem
+from torchsfm.simulation.conic_scenes import SimulatedConics, simulate_conics
 from torchsfm.simulation.observations import SimulatedImages, random_intrinsics, random_points, simulate_images
 from torchsfm.simulation.rendering import RenderedSequence, render_sequence
 from torchsfm.simulation.textured_scene import TexturedScene, courtyard_scene
@@ -9,6 +10,7 @@ from torchsfm.simulation.viewpoints import look_at, orbit_poses, random_poses
 __all__ = [
     "RenderedSequence",
     "SimulatedBundle",
+    "SimulatedConics",
     "SimulatedImages",
     "TexturedScene",
     "courtyard_scene",
@@ -19,5 +21,6 @@ __all__ = [
     "random_points",
     "random_poses",
     "render_sequence",
+    "simulate_conics",
     "simulate_images",
 ]

@@ -1,6 +1,8 @@
 """The cameras are known: where are the points and lines? Photogrammetry calls it intersection."""
 
+from torchsfm.triangulation.conics_2view import conics_2view
 from torchsfm.triangulation.optimal_correction import correct_matches
+from torchsfm.triangulation.triangulate_conics import ConicTriangulation, triangulate_conics, triangulate_quadrics
 from torchsfm.triangulation.triangulate_lines import LineFault, LineTriangulation, triangulate_lines
 from torchsfm.triangulation.triangulate_points import Triangulation, triangulate_points
 from torchsfm.triangulation.triangulate_points_dlt import triangulate_points_dlt
@@ -15,14 +17,18 @@ ESTIMATORS = (PointEstimator,)
 
 __all__ = [
     "ESTIMATORS",
+    "ConicTriangulation",
     "LineFault",
     "LineTriangulation",
     "PointEstimator",
     "RobustTriangulation",
     "Triangulation",
+    "conics_2view",
     "correct_matches",
+    "triangulate_conics",
     "triangulate_lines",
     "triangulate_points",
     "triangulate_points_dlt",
     "triangulate_points_robust",
+    "triangulate_quadrics",
 ]
