@@ -21,6 +21,7 @@ from torchsfm.geometry import (
     camera_from_krt,
     conic_from_ellipse,
     dual_quadric_from_ellipsoid,
+    pluecker_from_points,
     project_points,
     project_quadric,
 )
@@ -118,6 +119,12 @@ def _ellipsoid(s: Scene) -> Ellipsoid:
 def _features(s: Scene) -> list[Features]:
     one = [s.rand(20, high=9.0) for _ in range(3)]
     return [Features(s.rand(20, 2, high=100.0), *one, s.rand(20, 128)) for _ in range(3)]
+
+
+def _sight(s: Scene, n: int) -> tuple[Tensor, Tensor]:
+    """Normals of planes of sight of the first camera, and the lines in them, away from the first points."""
+    a, b = s.points(12)[..., 4 : 4 + n, :], s.points(12)[..., 8 : 8 + n, :]
+    return torch.linalg.cross(a, b), pluecker_from_points(a, b)
 
 
 def _picture(s: Scene) -> Tensor:
@@ -257,6 +264,9 @@ FUNCTIONS: dict[str, Function] = {
         batched=False,
         raises=(ReconstructionError,),
     ),
+    "resection.camera_1p2l": Function({"l": lambda s: _sight(s, 2)[0], "L": lambda s: _sight(s, 2)[1]}),
+    "resection.camera_2p1l": Function({"l": lambda s: _sight(s, 1)[0], "L": lambda s: _sight(s, 1)[1]}),
+    "resection.camera_3l": Function({"l": lambda s: _sight(s, 3)[0], "L": lambda s: _sight(s, 3)[1]}),
     "resection.camera_dlt": Function(together=(("l", "L", "line_weights"),)),
     "resection.camera_gp3p": Function({"p": lambda s: s.points(3) - 5 * s.rays(0, 3) - 0.1, "d": lambda s: s.rays(0, 3)}),
     "resection.camera_p4pf": Function(centred=True),

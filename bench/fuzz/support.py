@@ -207,6 +207,17 @@ def pose_sees_rays(pose: Tensor, a: Arguments) -> Tensor:
     return _seen(pose, a["X"], a["d"], a.get("p"))
 
 
+def pose_sees_lines(pose: Tensor, a: Arguments) -> Tensor:
+    """The direction R d, and the moment R m + t x R d, of each line: the latter along l, the former across it."""
+    R, t = pose[..., None, :, :3], pose[..., None, :, 3]
+    d, m = _unit(a["L"][..., :3]), a["L"][..., 3:] / a["L"][..., :3].norm(dim=-1, keepdim=True).clamp_min(1e-300)
+    turned = (R @ d[..., None, :, :, None])[..., 0]
+    l = _unit(a["l"])[..., None, :, :]  # noqa: E741
+    moment = (R @ m[..., None, :, :, None])[..., 0] + torch.linalg.cross(t.expand_as(turned), turned)
+    size = m.norm(dim=-1)[..., None, :] + t.norm(dim=-1)
+    return torch.stack(((turned * l).sum(-1).abs(), torch.linalg.cross(l.expand_as(moment), moment).norm(dim=-1) / size), -1)
+
+
 def vertical(pose: Tensor, a: Arguments) -> Tensor:
     """R G along g."""
     world, camera = (a["G"], a["g"]) if "G" in a else (a["gravity1"], a["gravity2"])
@@ -229,6 +240,9 @@ JUDGES: dict[str, Judge] = {
     "motion.relative_6pt_focal": solutions(focal_motion),
     "motion.relative_known_rotation_2pt": solutions(relative_pose),
     "motion.relative_upright_3pt": solutions(relative_pose, rotation, vertical),
+    "resection.camera_1p2l": solutions(pose_sees_rays, pose_sees_lines, rotation),
+    "resection.camera_2p1l": solutions(pose_sees_rays, pose_sees_lines, rotation),
+    "resection.camera_3l": solutions(pose_sees_lines, rotation),
     "resection.camera_gp3p": solutions(pose_sees_rays, rotation),
     "resection.camera_p3p": solutions(pose_sees_rays, rotation),
     "resection.camera_up2p": solutions(pose_sees_rays, rotation, vertical),

@@ -1,5 +1,8 @@
 """The structure is known: where is the camera? Absolute pose, PnP; resection in photogrammetry."""
 
+from torchsfm.resection.camera_1p2l import camera_1p2l
+from torchsfm.resection.camera_2p1l import camera_2p1l
+from torchsfm.resection.camera_3l import camera_3l
 from torchsfm.resection.camera_dlt import CameraEstimate, camera_dlt
 from torchsfm.resection.camera_gp3p import camera_gp3p
 from torchsfm.resection.camera_p3p import camera_p3p
@@ -27,6 +30,9 @@ __all__ = [
     "PoseEstimate",
     "ProjectiveCameraEstimator",
     "ResectedCameras",
+    "camera_1p2l",
+    "camera_2p1l",
+    "camera_3l",
     "camera_dlt",
     "camera_gp3p",
     "camera_p3p",

@@ -1,0 +1,85 @@
+"""Pose of a calibrated camera from a point and two lines: one quartic equation.
+
+The normals `g_i = R'l_i` of the planes of sight are across the lines' directions: with the foot F_i of the point X on line i,
+w_i the unit vector from X to F_i and `u_i = V_i x w_i`, `g_i = depth (a_i w_i + b_i u_i)`, of which the line's place gives
+`a_i = -l_i'x / |F_i - X|`. Unit normals at the angle of l_1 and l_2 leave two conics in (b_1, b_2), one of them a hyperbola: in
+the product form `(b_1 + b_2)(b_1 - b_2) = a_2^2 - a_1^2` one of the factors is the unknown of a quartic.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg import cross
+from torchsfm.linalg.real_roots import real_root_list
+from torchsfm.resection._points_and_lines import Sample, frame, solve_poses
+
+
+def camera_1p2l(
+    d: Float[Tensor, "*#batch 1 3"],
+    X: Float[Tensor, "*#batch 1 3"],
+    l: Float[Tensor, "*#batch 2 3"],  # noqa: E741
+    L: Float[Tensor, "*#batch 2 6"],
+) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
+    """The up to four poses `[R | t]` that see a point along a ray, with positive depth, and two lines in planes of sight.
+
+    Computed in float64 whatever comes in; derivatives by the implicit function theorem. Of the eight solutions of the
+    equations four lie behind the camera. No slot is valid where the point lies on one of the lines, the planes of sight are
+    one, or anything is not finite.
+
+    Args:
+        d: Ray in the camera frame, of any length, from the camera towards the point.
+        X: The point in the world.
+        l: Image lines as normals of their planes of sight in the camera frame, `K'l` of a line in pixels; of any scale.
+        L: The lines in the world, Pluecker vectors (d, m); what is no line (d'm is not 0) has no solution.
+
+    Returns:
+        Four slots of `cam_from_world` and which of them are solutions.
+
+    Raises:
+        ValueError: Shapes, dtypes or devices do not fit.
+    """
+    batch = check_tensors(d=(d, "1 3"), X=(X, "1 3"), l=(l, "2 3"), L=(L, "2 6"))
+    return solve_poses(_candidates, 4, batch, d, X, l, L)
+
+
+def _candidates(s: Sample) -> tuple[Tensor, Tensor]:
+    x, (l1, l2) = s.d[:, 0], s.l.unbind(1)
+    # The point is the origin.
+    distance = s.A.square().sum(-1).sqrt()
+    w = s.A / distance[..., None]
+    u = cross(s.V, w)
+    a1, a2 = (-(s.l * x[:, None]).sum(-1) / distance).unbind(-1)
+    (w1, w2), (u1, u2) = w.unbind(1), u.unbind(1)
+    k = (l1 * l2).sum(-1)
+    ww, uu = (w1 * w2).sum(-1), (u1 * u2).sum(-1)
+    by1, by2 = (u1 * w2).sum(-1) * a2, (w1 * u2).sum(-1) * a1
+    # In p = b1 + b2 and q = b1 - b2 = product / p; the unknown scaled to the size of the a's.
+    size = (a1 * a1 + a2 * a2).sqrt()
+    a1, a2, by1, by2 = (v / size for v in (a1, a2, by1, by2))
+    product = (a2 - a1) * (a2 + a1)
+    c = torch.stack(
+        (
+            -0.25 * (uu + k) * product * product,
+            0.5 * (by1 - by2) * product,
+            ww * a1 * a2 - 0.5 * k,
+            0.5 * (by1 + by2),
+            0.25 * (uu - k),
+        )
+    )
+    # Roots about 1 are told apart best.
+    scale = (c[0].abs() / c[4].abs().clamp_min(1e-300)).pow(0.25).clamp(1e-4, 1e4)
+    c = c * scale ** torch.arange(5, device=c.device)[:, None]
+    roots = real_root_list(torch.where(c.isfinite().all(0), c, torch.nan))
+    p = scale[roots.item] * roots.s / roots.t
+    q = product[roots.item] / p
+    b = c.new_full((2, 4, c.shape[1]), torch.nan)
+    slot = roots.slot().clamp_max(3)
+    b[0, slot, roots.item], b[1, slot, roots.item] = 0.5 * (p + q), 0.5 * (p - q)
+    b1, b2 = b
+    depth = (a1 * a1 + b1 * b1).rsqrt()
+    g1 = depth.T[..., None] * (a1[:, None, None] * w1[:, None] + b1.T[..., None] * u1[:, None])
+    g2 = depth.T[..., None] * (a2[:, None, None] * w2[:, None] + b2.T[..., None] * u2[:, None])
+    R = frame(l1, l2)[:, None] @ frame(g1, g2).mT
+    return R, (depth / size).T[..., None] * x[:, None]
