@@ -24,7 +24,9 @@ REAL = {
     "fisheye": [-0.02, 0.008, -0.006, 0.001],
 }
 """Parameters such as calibrations of real lenses find."""
-NAMES = list(REAL)
+NAMES = list(DISTORTION_MODELS)
+for name in NAMES:
+    REAL.setdefault(name, [-0.05 / 4**i for i in range(DISTORTION_MODELS[name].num_parameters)])
 
 
 def make(name, p=None, dtype=torch.float64):

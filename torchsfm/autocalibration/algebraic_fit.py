@@ -9,8 +9,9 @@ from jaxtyping import Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options
-from torchsfm.autocalibration.intrinsics_model import Assumption, intrinsics_from_parameters
+from torchsfm.autocalibration.intrinsics_model import Assumption
 from torchsfm.autocalibration.projective_input import image_scaling
+from torchsfm.geometry.intrinsic_parameters import intrinsics_from_relative
 from torchsfm.optim import levenberg_marquardt
 
 MAX_DEVIATION = 0.15
@@ -79,7 +80,7 @@ def fit_intrinsics(
     precision = assume.precision(1, starts) * _PRIOR
 
     def residual(x: Tensor, *tensors: Tensor) -> Tensor:
-        K = intrinsics_from_parameters(x[..., :q] @ spread.mT)
+        K = intrinsics_from_relative(x[..., :q] @ spread.mT)
         return torch.cat((constraints(K, x[..., q:], *tensors), x[..., :q] * precision), -1)[..., None]
 
     many = tuple(t[:, None].expand(b, k, *t.shape[1:]) for t in data)
@@ -113,7 +114,7 @@ def fit_intrinsics(
     first = next(i for i, (p, _) in enumerate(assume.columns(1)) if p == 0)
     deviation = torch.nan_to_num((inverse[:, first, first].clamp_min(0) * noise).sqrt(), 1.0).clamp_max(1.0)
     T = image_scaling(image_size)
-    K = torch.linalg.inv_ex(T).inverse @ intrinsics_from_parameters((x[:, :q] @ spread.mT).clamp(-20, 20))
+    K = torch.linalg.inv_ex(T).inverse @ intrinsics_from_relative((x[:, :q] @ spread.mT).clamp(-20, 20))
     K = K / K[:, 2:, 2:]
     status = torch.full((b,), int(Status.OK), dtype=torch.int8, device=x.device)
     outside = (x[:, first].abs() > 3.7) | (deviation > MAX_DEVIATION)

@@ -12,15 +12,10 @@ from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.autocalibration.assumption_fit import FINALISTS, STARTS, AssumptionFit, solve_assumption
 from torchsfm.autocalibration.diagnosis import Motion, diagnose_motion
 from torchsfm.autocalibration.evidence import weigh_assumptions
-from torchsfm.autocalibration.intrinsics_model import (
-    CONSTANT,
-    VARYING_FOCAL,
-    Assumption,
-    intrinsics_from_parameters,
-    parameters_from_intrinsics,
-)
+from torchsfm.autocalibration.intrinsics_model import CONSTANT, VARYING_FOCAL, Assumption
 from torchsfm.autocalibration.metric_cameras import metric_cameras
 from torchsfm.autocalibration.projective_input import MAX_COUPLED, prepare_cameras
+from torchsfm.geometry.intrinsic_parameters import intrinsics_from_relative, relative_from_intrinsics
 
 _DOUBLES = 12_000_000
 """Entries of covariances held at once; bounds memory, changes no result."""
@@ -239,7 +234,7 @@ def _solve(
     rows = torch.arange(b, device=P.device)[:, None]
     base = P.new_zeros(b, v, 5)
     if K is not None:
-        base = torch.nan_to_num(parameters_from_intrinsics(ready.image @ K[rows, ready.order]), 0.0, 0.0, 0.0)
+        base = torch.nan_to_num(relative_from_intrinsics(ready.image @ K[rows, ready.order]), 0.0, 0.0, 0.0)
         base[..., 0] = 0
     solved = [solve_assumption(ready, base, assumption, max_deviation) for assumption in assume]
     statuses = torch.stack([s.fit.status for s in solved])
@@ -253,7 +248,7 @@ def _solve(
     parameters, plane = pick([s.parameters for s in solved]), pick([s.plane for s in solved])
     status = pick([s.fit.status for s in solved])
     inverse = ready.order.argsort(-1)
-    K_ready = intrinsics_from_parameters(parameters)
+    K_ready = intrinsics_from_relative(parameters)
     metric = metric_cameras(ready, K_ready, plane)
     side = 1 / ready.image[..., 0, 0]
     unit = torch.stack((*[torch.ones_like(side)] * 3, side, side), -1)

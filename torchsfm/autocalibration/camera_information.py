@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.geometry.projection import camera_slopes, point_slopes
+
 _ENTRIES = 2_000_000
 """Entries of the matrix of couplings between cameras and points held at once; bounds memory, changes no result."""
 
@@ -53,21 +55,18 @@ def camera_information(
     for start in range(0, n, step):
         part = slice(start, start + step)
         Y, w = X[:, part], weights[:, :, part]
-        h = torch.einsum("bvij,bnj->bvni", P, Y)
-        z = torch.where((h[..., 2] != 0) & (w > 0), h[..., 2], 1.0)
-        inverse = w.sqrt() / z
-        D = torch.zeros(*h.shape[:-1], 2, 3, dtype=P.dtype, device=P.device)
-        D[..., 0, 0] = D[..., 1, 1] = inverse
-        D[..., 0, 2], D[..., 1, 2] = -inverse * h[..., 0] / z, -inverse * h[..., 1] / z
-        # Derivative of each image point with respect to its camera's twelve entries, rows first.
-        J = (D[..., None] * Y[:, None, :, None, None, :]).flatten(-2)
+        # Coordinates first: homogeneous images (3, b, v, n), and points (4, b, 1, n).
+        y, point = (P @ Y.mT[:, None]).movedim(2, 0), Y.movedim(-1, 0)[:, :, None]
+        z = torch.where((y[2] != 0) & (w > 0), y[2], 1.0)
+        uv, inverse = y[:2] / z, w.sqrt() / z
+        J = camera_slopes(point, uv, inverse).flatten(1, 2).movedim((0, 1), (-2, -1))
         blocks += torch.einsum("bvnri,bvnrj->bvij", J, J)
         field = fields[:, :, part] * w.sqrt()[..., None, None]
         right += torch.einsum("bvnri,bvnrk->bvik", J, field).flatten(1, 2)
         left_over += torch.einsum("bvnri,bvnrj->bij", field, field)
         if not coupled:
             continue
-        DP = D @ P[:, :, None]
+        DP = point_slopes(P.movedim((2, 3), (0, 1))[..., None], uv, inverse).movedim((0, 1), (-2, -1))
         V = torch.einsum("bvnri,bvnrj->bnij", DP, DP)
         size = V.diagonal(dim1=-2, dim2=-1).sum(-1)
         size = torch.where(size > 0, size, 1.0)[..., None, None]

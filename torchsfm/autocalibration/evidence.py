@@ -17,7 +17,7 @@ from torchsfm.autocalibration.intrinsics_model import Assumption
 from torchsfm.linalg import eigvalsh
 
 _VARIATION = (0.2, 0.02, 0.02, 0.02, 0.02)
-"""Standard deviations among views of what varies from view to view, in the order of `PARAMETERS`."""
+"""Standard deviations among views of what varies from view to view, in the order of `intrinsic_labels`."""
 _ODDS = 20.0
 """How many times as likely an assumption is as the one after it, before any image was seen."""
 _NOISE_KNOWN = 6.0

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.autocalibration.intrinsics_model import intrinsics_from_parameters
 from torchsfm.autocalibration.plane_at_infinity import plane_at_infinity_from_intrinsics
 from torchsfm.autocalibration.upgrade_residual import departure, metric_blocks
+from torchsfm.geometry.intrinsic_parameters import intrinsics_from_relative
 from torchsfm.linalg import determinant_3x3
 
 FOCAL_RANGE = (0.2, 12.0)
@@ -98,7 +98,7 @@ def _score(
 
     def at(parameters: Tensor, log_f: Tensor) -> Tensor:
         rest = parameters * torch.tensor([0.0, 1, 1, 1, 1], dtype=P.dtype, device=P.device)
-        return intrinsics_from_parameters(rest + torch.cat((log_f[..., None], zero.expand(*log_f.shape, 4)), -1))
+        return intrinsics_from_relative(rest + torch.cat((log_f[..., None], zero.expand(*log_f.shape, 4)), -1))
 
     K1 = at(base[:, None, 0].expand(b, k, 5), log1.expand(b, k))
     K2 = at(base[rows, other], log2.expand(b, k))

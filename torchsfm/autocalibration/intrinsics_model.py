@@ -1,4 +1,7 @@
-"""What is assumed of the intrinsics, and K as a function of what is left free."""
+"""What is assumed of the intrinsics: which are free, which differ from view to view.
+
+The unknowns of a view are its five relative numbers (`torchsfm.geometry.intrinsic_parameters`), in images of unit size.
+"""
 
 from dataclasses import dataclass
 
@@ -6,10 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-PARAMETERS = ("focal", "aspect", "skew", "cx", "cy")
-"""Per view: logarithm of the focal length, logarithm of the aspect, skew over focal length, principal point over image size."""
-
-_COLUMNS = {"focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4)}
+from torchsfm.geometry.intrinsic_parameters import HEAD, INTRINSICS, intrinsic_columns, intrinsic_labels
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,8 @@ class Assumption:
     principal_point_sigma: float | None = 0.02
 
     def __post_init__(self) -> None:
-        for name in (*self.free, *self.varying):
-            if name not in _COLUMNS:
-                raise ValueError(f"free, varying: no intrinsic parameter '{name}'; there are {', '.join(_COLUMNS)}")
+        for argument in ("free", "varying"):
+            intrinsic_columns(getattr(self, argument), argument=argument)
         if "focal" not in self.free:
             raise ValueError("free: wanted 'focal' among the free parameters")
         if not set(self.varying) <= set(self.free):
@@ -38,10 +37,9 @@ class Assumption:
 
     def __str__(self) -> str:
         """In words."""
-        words = {"focal": "focal length", "aspect": "aspect", "skew": "skew", "principal_point": "principal point"}
-        same = [words[name] for name in self.free if name not in self.varying]
-        differ = [words[name] for name in self.varying]
-        known = [words[name] for name in words if name not in self.free]
+        same = [INTRINSICS[name].words for name in self.free if name not in self.varying]
+        differ = [INTRINSICS[name].words for name in self.varying]
+        known = [intrinsic.words for name, intrinsic in INTRINSICS.items() if name not in self.free]
         parts = [
             (", ".join(same), "the same in all views"),
             (", ".join(differ), "different in each view"),
@@ -52,21 +50,20 @@ class Assumption:
     def columns(self, v: int) -> list[tuple[int, int | None]]:
         """The unknowns as (parameter, view), view None where they are common to all."""
         found: list[tuple[int, int | None]] = []
-        for name in _COLUMNS:
-            if name not in self.free:
-                continue
-            for parameter in _COLUMNS[name]:
+        for name in (name for name in INTRINSICS if name in self.free):
+            for parameter in INTRINSICS[name].columns:
                 found += [(parameter, i) for i in range(v)] if name in self.varying else [(parameter, None)]
         return found
 
     def names(self, v: int) -> tuple[str, ...]:
         """The unknowns in words."""
-        return tuple(PARAMETERS[p] + ("" if i is None else f" {i}") for p, i in self.columns(v))
+        labels = intrinsic_labels()
+        return tuple(labels[p] + ("" if i is None else f" {i}") for p, i in self.columns(v))
 
     def spread(self, v: int, like: Tensor) -> Float[Tensor, "v 5 q"]:
         """The matrix that takes the unknowns to the five parameters of every view."""
         columns = self.columns(v)
-        S = like.new_zeros(v, 5, len(columns))
+        S = like.new_zeros(v, HEAD, len(columns))
         for k, (parameter, view) in enumerate(columns):
             S[slice(None) if view is None else view, parameter, k] = 1
         return S
@@ -82,32 +79,6 @@ class Assumption:
 
 CONSTANT = Assumption()
 VARYING_FOCAL = Assumption(varying=("focal",))
-
-
-def intrinsics_from_parameters(parameters: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]:
-    """K of the five parameters of `PARAMETERS`."""
-    log_f, log_a, s, cx, cy = parameters.unbind(-1)
-    f, zero = log_f.exp(), torch.zeros_like(log_f)
-    rows = (f, f * s, cx, zero, (log_f + log_a).exp(), cy, zero, zero, zero + 1)
-    return torch.stack(rows, -1).reshape(*log_f.shape, 3, 3)
-
-
-def parameters_from_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 5"]:
-    """The inverse."""
-    f, fy = K[..., 0, 0], K[..., 1, 1]
-    return torch.stack((f.log(), (fy / f).log(), K[..., 0, 1] / f, K[..., 0, 2], K[..., 1, 2]), -1)
-
-
-def intrinsics_derivative(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 5 3 3"]:
-    """Derivative of K with respect to the five parameters."""
-    f, s, fy = K[..., 0, 0], K[..., 0, 1], K[..., 1, 1]
-    D = K.new_zeros(*K.shape[:-2], 5, 3, 3)
-    D[..., 0, 0, 0], D[..., 0, 0, 1], D[..., 0, 1, 1] = f, s, fy
-    D[..., 1, 1, 1] = fy
-    D[..., 2, 0, 1] = f
-    D[..., 3, 0, 2] = 1
-    D[..., 4, 1, 2] = 1
-    return D
 
 
 def inverse_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

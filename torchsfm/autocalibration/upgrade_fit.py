@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.autocalibration.intrinsics_model import intrinsics_from_parameters
 from torchsfm.autocalibration.upgrade_residual import departure_derivatives
+from torchsfm.geometry.intrinsic_parameters import intrinsics_from_relative
 from torchsfm.optim import levenberg_marquardt
 
 
@@ -36,7 +36,7 @@ class UpgradeProblem:
         """K of every view."""
         parameters = torch.einsum("vmq,...q->...vm", self.spread, unknowns)
         base = self.base.reshape(len(self.base), *([1] * (unknowns.ndim - 2)), *self.base.shape[1:])
-        return intrinsics_from_parameters(base + parameters)
+        return intrinsics_from_relative(base + parameters)
 
     def select(self, index: Tensor) -> "UpgradeProblem":
         """Some of the problems."""
@@ -133,7 +133,7 @@ def _linearization(spread: Tensor, coupled: bool) -> Callable[..., tuple[Tensor,
     ) -> tuple[Tensor, Tensor]:
         unknowns, p = x[:, :q], x[:, q:]
         b = len(x)
-        K = intrinsics_from_parameters(base + torch.einsum("vmq,bq->bvm", spread, unknowns))
+        K = intrinsics_from_relative(base + torch.einsum("vmq,bq->bvm", spread, unknowns))
         g, by_camera, own, reference, by_plane = departure_derivatives(P, K, K[:, 0], p)
         J = torch.cat((own @ spread + reference @ spread[0], by_plane), -1)
         # The first view is metric by the choice of frame; absent ones say nothing.

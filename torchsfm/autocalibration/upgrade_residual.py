@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.autocalibration.intrinsics_model import intrinsics_derivative, inverse_intrinsics
+from torchsfm.autocalibration.intrinsics_model import inverse_intrinsics
+from torchsfm.geometry.intrinsic_parameters import intrinsics_slopes
 
 _R2, _R6 = 1 / math.sqrt(2), 1 / math.sqrt(6)
 
@@ -72,9 +73,7 @@ def departure_derivatives(
     pulled = inverse.mT[..., None, :, :] @ Q
     R = pulled @ Kr[..., None, :, :].mT
     by_camera = torch.cat((R, -(R @ p[..., None, None, :, None])), -1).flatten(-2)
-    own = -torch.einsum("...mij,...kij->...mk", pulled @ M.mT[..., None, :, :], intrinsics_derivative(K))
-    reference = torch.einsum(
-        "...mij,...kij->...mk", left.mT[..., None, :, :] @ Q, intrinsics_derivative(K_ref)[..., None, :, :, :]
-    )
+    own = -torch.einsum("...mij,...kij->...mk", pulled @ M.mT[..., None, :, :], intrinsics_slopes(K))
+    reference = torch.einsum("...mij,...kij->...mk", left.mT[..., None, :, :] @ Q, intrinsics_slopes(K_ref)[..., None, :, :, :])
     by_plane = -(R.mT @ P[..., None, :, 3:])[..., 0]
     return g, by_camera, own, reference, by_plane

@@ -3,13 +3,11 @@
 import torch
 from torch import Tensor
 
-_MINUS = torch.tensor(-1.0, dtype=torch.float64)
-
 
 def positive_depth(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths, those that are not positive replaced by a tiny one, and -1 over them."""
+    """Depths, those that are not positive replaced by a tiny one, and 1 over them."""
     z = depth.clamp_min(torch.finfo(depth.dtype).tiny ** 0.4)
-    return z, torch.div(_MINUS, z)
+    return z, z.reciprocal()
 
 
 def squared_in_front(u: Tensor, v: Tensor, depth: Tensor, z: Tensor) -> Tensor:

@@ -127,3 +127,15 @@ def intrinsics_slopes(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 5
     D[..., SKEW, 0, 1] = fx
     D[..., CX, 0, 2] = D[..., CY, 1, 2] = 1
     return D
+
+
+def intrinsics_from_relative(theta: Float[Tensor, "*batch 5"]) -> Float[Tensor, "*batch 3 3"]:
+    """K of the relative numbers: the steps to it from the identity."""
+    eye = torch.eye(3, dtype=theta.dtype, device=theta.device).expand(*theta.shape[:-1], 3, 3)
+    return move_intrinsics(eye, dict(enumerate(theta.unbind(-1))))
+
+
+def relative_from_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 5"]:
+    """The relative numbers of K: logarithms of focal length and aspect, skew in focal lengths, principal point."""
+    f, fy = K[..., 0, 0], K[..., 1, 1]
+    return torch.stack((f.log(), (fy / f).log(), K[..., 0, 1] / f, K[..., 0, 2], K[..., 1, 2]), -1)

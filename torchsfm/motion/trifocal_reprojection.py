@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import broadcast_shapes
+from torchsfm.geometry.projection import quotient_slope
 from torchsfm.motion.epipolar_fit import forms
 from torchsfm.robust import Weigh
 
@@ -159,7 +160,7 @@ def _project(P: Tensor, X: Rows, x: Rows) -> Projection:
     u, v = p * s, q * s
     J: list[Rows] = []
     for i, w in ((0, u), (1, v)):
-        J.append([(P[..., i, j, None] - w * P[..., 2, j, None]) * s for j in (0, 1, 3)])
+        J.append([quotient_slope(P[..., i, j, None], P[..., 2, j, None], w, s) for j in (0, 1, 3)])
     return Projection((u - x[0], v - x[1]), J, (u, v), s)
 
 

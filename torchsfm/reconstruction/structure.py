@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchsfm.geometry.projection import quotient_slope
 from torchsfm.reconstruction.mapping import Mapping
 
 MAX_SLOTS = 32
@@ -143,7 +144,7 @@ def _gauss_newton(X: Tensor, R: Tensor, t: Tensor, rays: Tensor, inlier: Tensor)
     depth = X_cam[..., 2:].clamp(min=1e-9)
     u = X_cam[..., :2] / depth
     residual = u - rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
-    J = (R[..., :2, :] - u[..., None] * R[..., 2:, :]) / depth[..., None]
+    J = quotient_slope(R[..., :2, :], R[..., 2:, :], u[..., None], 1 / depth[..., None])
     weight = inlier.to(X.dtype)[..., None]
     J, residual = J * weight[..., None], residual * weight
     J, residual = J.flatten(1, 2), residual.flatten(1, 2)

@@ -1,8 +1,9 @@
 """Distances of image points to the images of known points, and Gauss-Newton steps on them: all data of many cameras at once.
 
 A camera P sees X at (u, v) = (p, q) / z. With h = (X, 1) / z the derivatives of u and v by the rows of P are (h, 0, -u h) and
-(0, h, -v h): the normal equations are moments of the products of (X, 1), which belong to the data, with 1, -u, -v and
-u^2 + v^2 over z^2, which belong to the camera. Those of a camera with fewer parameters follow from them.
+(0, h, -v h), see `torchsfm.geometry.projection.camera_slopes`. They need not be formed: the normal equations are moments of the
+products of (X, 1), which belong to the data, with 1, u, v and u^2 + v^2 over z^2, which belong to the camera. Those of a camera
+with fewer parameters follow from them.
 """
 
 from math import prod
@@ -24,7 +25,7 @@ _PRODUCTS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2), (0, 3), (1, 3), (2,
 def _table() -> tuple[Tensor, Tensor]:
     """Where the entries of (A | -g), 12 x 13, are among the moments, and their signs, 0 for those that are 0.
 
-    The moments: 1, -u, -v, u^2 + v^2 by ten products for A, and three by (X, 1) for g.
+    The moments: 1, u, v, u^2 + v^2 by ten products for A, and three by (X, 1) for g.
     """
     where, sign = torch.zeros(12, 13, dtype=torch.long), torch.ones(12, 13, dtype=torch.float64)
     factor = {(0, 0): 0, (1, 1): 0, (0, 2): 1, (1, 2): 2, (2, 2): 3}
@@ -34,8 +35,9 @@ def _table() -> tuple[Tensor, Tensor]:
             if blocks == [0, 1]:
                 sign[row, column] = 0
             else:
+                sign[row, column] = -1 if blocks in ([0, 2], [1, 2]) else 1
                 where[row, column] = 10 * factor[blocks[0], blocks[1]] + _PRODUCTS.index((pair[0], pair[1]))
-        where[row, 12], sign[row, 12] = 40 + row, -1
+        where[row, 12], sign[row, 12] = 40 + row, 1 if row < 8 else -1
     return where.flatten(), sign
 
 
@@ -89,7 +91,7 @@ class _Views:
         return torch.ones_like(self.X[:, :1])
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Homogeneous images (problem, camera, 2 and 1, n), the depths made positive, and -1 over them."""
+        """Homogeneous images (problem, camera, 2 and 1, n), the depths made positive, and 1 over them."""
         y = torch.bmm(self.P, points).view(points.shape[0], self.k, 3, self.n)
         image, depth = y[:, :, :2], y[:, :, 2:]
         return image, depth, *positive_depth(depth)
@@ -112,7 +114,7 @@ def squared_reprojection(
     """Squared reprojection error; infinite behind the camera."""
     views = _Views(P, x, X)
     image, depth, z, inverse = views.project(torch.cat((views.X, views.one()), 1))
-    return views.squares(torch.addcmul(views.x, image, inverse), depth, z)
+    return views.squares(torch.addcmul(views.x, image, inverse, value=-1), depth, z)
 
 
 def normal_equations(
@@ -127,14 +129,14 @@ def normal_equations(
     products[:, :3].mul_(X[:, :1])
     products[:, 3:5].mul_(X[:, 1:2])
     products[:, 5:6].mul_(X[:, 2:])
-    m = image * inverse
-    r = views.x + m
+    uv = image * inverse
+    r = views.x - uv
     slope, curvature = weigh(views.squares(r, depth, z))
     slope, curvature = (_flat(w, views.batch, 1, n) for w in (slope[..., None, :], curvature[..., None, :]))
     c, slope = curvature.view_as(z) * (inverse * inverse), slope.view_as(z) * inverse * r
-    first, m0, m1 = c * m, m[:, :, :1], m[:, :, 1:]
-    both = torch.addcmul(first[:, :, :1] * m0, first[:, :, 1:], m1)
-    last = torch.addcmul(slope[:, :, :1] * m0, slope[:, :, 1:], m1)
+    first, u, v = c * uv, uv[:, :, :1], uv[:, :, 1:]
+    both = torch.addcmul(first[:, :, :1] * u, first[:, :, 1:], v)
+    last = torch.addcmul(slope[:, :, :1] * u, slope[:, :, 1:], v)
     matrix = torch.bmm(torch.cat((c, first, both), 2).view(X.shape[0], 4 * k, n), products.mT)
     vector = torch.bmm(torch.cat((slope, last), 2).view(X.shape[0], 3 * k, n), points.mT)
     moments = torch.cat((matrix.view(X.shape[0] * k, 40), vector.view(X.shape[0] * k, 12)), 1).double()

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options
+from torchsfm.geometry.projection import quotient_slope
 from torchsfm.optim import wants_derivative
 from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
 from torchsfm.triangulation._symmetric import inverse, symmetric, tangent_step
@@ -171,8 +172,8 @@ class _System:
         u, v = row_dot(p1, X) * inverse_z, row_dot(p2, X) * inverse_z
         e, f = u - data.x[0], v - data.x[1]
         we, wf = data.w * e, data.w * f
-        ju = tuple(torch.addcmul(p, u, r, value=-1) * inverse_z for p, r in zip(p1, p3, strict=True))
-        jv = tuple(torch.addcmul(p, v, r, value=-1) * inverse_z for p, r in zip(p2, p3, strict=True))
+        ju = tuple(quotient_slope(p, r, u, inverse_z) for p, r in zip(p1, p3, strict=True))
+        jv = tuple(quotient_slope(p, r, v, inverse_z) for p, r in zip(p2, p3, strict=True))
         wju, wjv = tuple(data.w * j for j in ju), tuple(data.w * j for j in jv)
         pulled = tuple(torch.addcmul(we * j, wf, k) for j, k in zip(ju, jv, strict=True))
         self._pulled, self._inverse_z, self._p3 = pulled, inverse_z, p3

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, Status, broadcast_shapes
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
+from torchsfm.geometry.projection import quotient_slope
 from torchsfm.linalg import damped_solve
 from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
 from torchsfm.triangulation.triangulate_points import triangulate_points
@@ -65,7 +66,7 @@ class PointEstimator:
     ) -> Float[Tensor, "*batch n"]:
         """Squared reprojection error; infinite behind the camera."""
         views = _Views(X, x, P)
-        u, v = torch.addcmul(views.x, views.image, views.inverse).unbind(-3)
+        u, v = torch.addcmul(views.x, views.image, views.inverse, value=-1).unbind(-3)
         return squared_in_front(u, v, views.depth, views.z).view(*views.batch, x.shape[-2])
 
     def degenerate(self, x: Float[Tensor, "*#batch 2 2"], P: Float[Tensor, "*#batch 2 12"]) -> Bool[Tensor, "*batch"]:
@@ -82,19 +83,19 @@ class PointEstimator:
     ) -> Float[Tensor, "*batch 3"]:
         """A Gauss-Newton step on the reprojection error."""
         views, n = _Views(X, x, P), x.shape[-2]
-        m = views.image * views.inverse
-        r = views.x + m
+        uv = views.image * views.inverse
+        r = views.x - uv
         weights, curvature = weigh(squared_in_front(r[:, 0], r[:, 1], views.depth, views.z).view(*views.batch, n))
         shape = views.depth.shape
         weights, curvature = (w.expand(*views.batch, n).reshape(shape) for w in (weights, curvature))
-        # Derivatives of -u and -v by X: (problem, image coordinate, coordinate of X, point, n).
+        # (problem, image coordinate, coordinate of X, point, n)
         first, last = views.rows[:, :2, :3, None], views.rows[:, 2:, :3, None]
-        J = torch.addcmul(first, m[:, :, None], last) * views.inverse[:, None]
+        J = quotient_slope(first, last, uv[:, :, None], views.inverse[:, None])
         J = J.permute(0, 3, 2, 1, 4)
         flat, weighted = J.reshape(-1, 3, 2 * n), (J * curvature[:, :, None, None]).reshape(-1, 3, 2 * n)
         pull = (r * weights[:, None]).transpose(1, 2).reshape(-1, 2 * n, 1)
         A, g = torch.bmm(weighted, flat.mT).double(), torch.bmm(flat, pull).double()
-        return (X - damped_solve(A, g).view(*views.batch, 3)).to(x.dtype)
+        return (X + damped_solve(A, g).view(*views.batch, 3)).to(x.dtype)
 
 
 class _Views:
@@ -107,7 +108,7 @@ class _Views:
         image: The first two homogeneous coordinates of the images.
         depth: The third.
         z: The third made positive.
-        inverse: -1 over it.
+        inverse: 1 over it.
     """
 
     def __init__(self, X: Tensor, x: Tensor, P: Tensor) -> None:
