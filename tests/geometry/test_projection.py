@@ -6,7 +6,18 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Distortion, Pose
-from torchsfm.geometry.intrinsic_parameters import HEAD, row_from_camera
+from torchsfm.geometry.intrinsic_parameters import (
+    HEAD,
+    INTRINSICS,
+    camera_from_row,
+    intrinsic_columns,
+    intrinsic_labels,
+    intrinsics_from_relative,
+    intrinsics_slopes,
+    move_intrinsics,
+    relative_from_intrinsics,
+    row_from_camera,
+)
 from torchsfm.geometry.projection import PixelProjection, camera_slopes, point_slopes, quotient_slope, turn_slopes
 from torchsfm.geometry.radial import flatten
 
@@ -167,3 +178,32 @@ def test_quotient_has_no_layout(generator: torch.Generator) -> None:
     last = quotient_slope(P[:, :2], P[:, 2:], (y[:, :2] / y[:, 2:])[..., None], 1 / y[:, 2, None, None])
     uv, inverse = flatten(y.mT)
     assert torch.allclose(last.movedim(0, -1), point_slopes(P.movedim(0, -1), uv, inverse), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("name", INTRINSICS)
+def test_units_of_steps(name: str, generator: torch.Generator) -> None:
+    """A relative step of one number moves K as the table says of its unit, and adds up with the next."""
+    width = torch.tensor([0.3, 0.1, 0.02, 9.0, 9.0], dtype=F64)
+    theta = width * torch.randn(4, HEAD, generator=generator, dtype=F64)
+    theta[:, 0] += 6
+    K = intrinsics_from_relative(theta)
+    torch.testing.assert_close(relative_from_intrinsics(K), theta, rtol=1e-12, atol=1e-12)
+    intrinsic = INTRINSICS[name]
+    assert intrinsic_columns((name,)) == intrinsic.columns
+    assert tuple(intrinsic_labels()[column] for column in intrinsic.columns) == intrinsic.labels
+    camera = Camera(K)
+    row = row_from_camera(camera)
+    torch.testing.assert_close(camera_from_row(row, type(camera.distortion)).K, K, rtol=1e-14, atol=0)
+    a, b = (0.1 * torch.randn(2, 4, generator=generator, dtype=F64)).unbind(0)
+    for column in intrinsic.columns:
+        twice = move_intrinsics(move_intrinsics(K, {column: a}), {column: b})
+        torch.testing.assert_close(twice, move_intrinsics(K, {column: a + b}), rtol=1e-13, atol=1e-12)
+        moved = row_from_camera(Camera(move_intrinsics(K, {column: a})))
+        factor = {"logarithm": a.exp(), "focal lengths": 1.0, "pixels": 1.0}[intrinsic.relative]
+        shift = {"logarithm": 0.0, "focal lengths": a * row[:, 0], "pixels": a}[intrinsic.relative]
+        torch.testing.assert_close(moved[:, column], row[:, column] * factor + shift, rtol=1e-12, atol=1e-12)
+        # Of the other numbers only a skew in focal lengths follows the focal length.
+        rest = [i for i in range(HEAD) if i != column and not (column == 0 and i == 2)]
+        torch.testing.assert_close(moved[:, rest], row[:, rest], rtol=1e-14, atol=0)
+        slope = jacrev(lambda step, column=column: move_intrinsics(K[0], {column: step}))(torch.zeros((), dtype=F64))
+        torch.testing.assert_close(intrinsics_slopes(K)[0, column], slope, rtol=1e-14, atol=0)
