@@ -85,27 +85,27 @@ def solve_poses(
     L: Tensor,
 ) -> Solutions[Tensor]:
     """The poses that a solver's candidates lead to: (n, slots, 3, 4) in the frame of the sample, and which of them are real."""
-    data = [t.expand(*batch, *t.shape[-2:]) for t in (d, X, l, L)]
+    dtype, data = L.dtype, [t.expand(*batch, *t.shape[-2:]) for t in (d, X, l, L)]
     with torch.no_grad():
         flat = [t.detach().double().reshape(batch.numel(), *t.shape[-2:]) for t in data]
         pieces = []
         for start in range(0, max(batch.numel(), 1), _CHUNK):
-            sample = _prepare(*(t[start : start + _CHUNK] for t in flat), torch.finfo(L.dtype).eps)
+            sample = _prepare([t[start : start + _CHUNK] for t in flat], torch.finfo(dtype).eps)
             pieces.append(_finish(sample, *candidates(sample)))
         model, valid = (torch.cat(parts) for parts in zip(*pieces, strict=True))
-        model = model.to(L.dtype)
+        model = model.to(dtype)
         valid = valid & model.isfinite().flatten(-2).all(-1)
-        model = torch.where(valid[..., None, None], model, torch.eye(3, 4, dtype=L.dtype, device=L.device))
+        model = torch.where(valid[..., None, None], model, torch.eye(3, 4, dtype=dtype, device=L.device))
         model, valid = model.reshape(*batch, slots, 3, 4), valid.reshape(*batch, slots)
     if wants_derivative(*data):
         model = attach_implicit(equations, model, *(t[..., None, :, :] for t in data), dims=2, valid=valid)
     return Solutions(model, valid)
 
 
-def _prepare(d: Tensor, X: Tensor, l: Tensor, L: Tensor, eps: float) -> Sample:  # noqa: E741
+def _prepare(data: list[Tensor], eps: float) -> Sample:
     """Lay the problems out; what is not sound gets harmless numbers."""
-    sound = torch.stack([usable(t).flatten(-2).all(-1) for t in (d, X, l, L)]).all(0)
-    d, X, l, L = (torch.where(sound[:, None, None], t, 1.0) for t in (d, X, l, L))  # noqa: E741
+    sound = torch.stack([usable(t).flatten(-2).all(-1) for t in data]).all(0)
+    d, X, l, L = (torch.where(sound[:, None, None], t, 1.0) for t in data)  # noqa: E741
     for t in (d, l, L[..., :3]):
         sound = sound & (t != 0).any(-1).all(-1)
     d, l = _unit(d), _unit(l)  # noqa: E741
