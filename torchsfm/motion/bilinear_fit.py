@@ -14,12 +14,16 @@ Both have Hessians `B = alpha I - sum_k q_k q_k'` in y (Gauss-Newton), so one Sc
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.linalg import eigh, eigvalsh, qr
+from torchsfm.optim.descent import Options, Problem, Step, descend
+from torchsfm.optim.pytree import Places, pick
 
 
 @dataclass(frozen=True)
@@ -28,10 +32,6 @@ class Rays:
 
     a: Float[Tensor, "p v 3 n"]
     w: Float[Tensor, "p v n"]
-
-    def take(self, index: Tensor) -> "Rays":
-        """Some of the problems."""
-        return Rays(self.a[index], self.w[index])
 
 
 @dataclass(frozen=True)
@@ -82,59 +82,99 @@ def fit_with_prior(
 
     With `prior = 1` the rays may be any vectors: what is minimised is the sum of `w |a - P u|^2`.
     """
-    P = _balanced(P)
-    u, cost = _best_points(rays, P, prior)
-    damping, growth, total = torch.full_like(cost, 1e-4), torch.full_like(cost, 2), _total(rays)
-    done = torch.zeros_like(cost, dtype=torch.bool)
-    for _ in range(steps):
-        y = P @ u[:, None]
-        along = (rays.a * y).sum(2, keepdim=True)
-        w = rays.w[:, :, None]
-        slope = w * (y - ((1 - prior) * along + prior) * rays.a)
-        q = ((1 - prior) * w).sqrt() * rays.a
-        system = _Linearisation(P, u, slope, rays.w, q[:, :, None])
-        step, _, solved, promise = _step(system, damping, points=False)
-        trial = _balanced(P + step)
-        v, trial_cost = _best_points(rays, trial, prior)
-        better, cost_before = solved & (trial_cost < cost) & ~done, cost
-        small = cost - trial_cost <= tolerance * cost
-        P = torch.where(better[:, None, None, None], trial, P)
-        u = torch.where(better[:, None, None], v, u)
-        done = done | (better & small) | (damping > 1e8)
-        cost = torch.where(better, trial_cost, cost)
-        damping, growth = _next(damping, growth, better, (cost_before - trial_cost) * total / promise)
-        if bool(done.all()):
-            break
-    return P, u, done
+    found = descend(_WithPrior(rays, prior), _balanced(P), Options(steps, tolerance))
+    return found.x, _best_points(rays, found.x, prior)[0], found.status == Status.OK
 
 
 def fit_angles(
     rays: Rays, P: Float[Tensor, "p v 3 r"], u: Float[Tensor, "p r n"], steps: int
 ) -> tuple[Fit, list[Tensor], Tensor]:
     """Minimise the squared sines over cameras and points; also the cost after each step, and which problems came to an end."""
-    P, u = _unit(P, u)
-    cost = sine_cost(rays, P, u)
-    history = [cost]
-    damping, growth, total = torch.full_like(cost, 1e-4), torch.full_like(cost, 2), _total(rays)
-    done = cost == 0
-    still = torch.zeros_like(done)
-    for _ in range(steps):
-        step, move, solved, promise = _step(_angles(rays, P, u), damping, points=True)
-        Q, v = _unit(P + step, u + move)
-        trial = sine_cost(rays, Q, v)
-        better = solved & (trial < cost) & ~done
-        # Twice in a row: a first small step may be one that was damped hard.
-        small = better & (cost - trial <= 1e-10 * cost)
-        done = done | (small & still) | (~better & (damping > 1e6)) | (better & (trial < 1e-30))
-        still = small
-        P = torch.where(better[:, None, None, None], Q, P)
-        u = torch.where(better[:, None, None], v, u)
-        cost = torch.where(better, trial, cost)
-        history.append(cost)
-        damping, growth = _next(damping, growth, better, (history[-2] - trial) * total / promise)
-        if bool(done.all()):
-            break
-    return Fit(P, u, cost), history, done
+    start = _unit(P, u)
+    history = [sine_cost(rays, *start)]
+    found = descend(_Sines(rays), start, Options(steps, 1e-10, progress=lambda _, cost: history.append(cost)))
+    P, u = found.x
+    return Fit(P, u, found.cost), history, found.status == Status.OK
+
+
+@dataclass(frozen=True)
+class _System:
+    """The misfit linearised; `x` is what moves, cameras or both."""
+
+    x: Any
+    cost: Tensor
+    linear: _Linearisation
+    total: Tensor
+
+    def steepest(self) -> Tensor:
+        """The largest derivative by a prediction."""
+        return self.linear.slope.abs().flatten(1).amax(-1)
+
+    def along(self, delta: tuple[Tensor, Tensor]) -> Tensor:
+        """The derivative of the cost along a step of cameras and points."""
+        step, move = delta
+        y = step @ self.linear.u[:, None] + self.linear.P @ move[:, None]
+        return 2 * (self.linear.slope * y).sum((-3, -2, -1)) / self.total
+
+    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
+        """The step of cameras and points."""
+        step, move, solved, promise = _step(self.linear, damping, points=isinstance(self.x, tuple))
+        return Step((step, move), torch.where(solved, promise / self.total, torch.inf), solved, torch.zeros_like(solved))
+
+
+@dataclass(frozen=True)
+class _WithPrior(Problem[_System]):
+    """The misfit with a prior over balanced cameras; points are where they are best."""
+
+    rays: Rays
+    prior: float
+
+    def pick(self, at: Places) -> "_WithPrior":
+        """Some of the problems."""
+        return replace(self, rays=pick(at, self.rays))
+
+    def linearize(self, x: Tensor) -> _System:
+        """The system of cameras alone."""
+        rays, prior = self.rays, self.prior
+        u, cost = _best_points(rays, x, prior)
+        y = x @ u[:, None]
+        along = (rays.a * y).sum(2, keepdim=True)
+        w = rays.w[:, :, None]
+        slope = w * (y - ((1 - prior) * along + prior) * rays.a)
+        q = ((1 - prior) * w).sqrt() * rays.a
+        return _System(x, cost, _Linearisation(x, u, slope, rays.w, q[:, :, None]), _total(rays))
+
+    def advance(self, here: _System, step: Step) -> _System:
+        """The system where a step of the cameras leads."""
+        return self.linearize(_balanced(here.x + step.delta[0]))
+
+    def rounding(self, here: _System) -> Tensor:
+        """What rounding makes of unit rays."""
+        return torch.full_like(here.cost, (100 * self.epsilon) ** 2)
+
+
+@dataclass(frozen=True)
+class _Sines(Problem[_System]):
+    """The squared sines over cameras and points."""
+
+    rays: Rays
+
+    def pick(self, at: Places) -> "_Sines":
+        """Some of the problems."""
+        return _Sines(pick(at, self.rays))
+
+    def linearize(self, x: tuple[Tensor, Tensor]) -> _System:
+        """The system of cameras and points."""
+        return _System(x, sine_cost(self.rays, *x), _angles(self.rays, *x), _total(self.rays))
+
+    def advance(self, here: _System, step: Step) -> _System:
+        """The system where a step leads."""
+        (P, u), (moved, move) = here.x, step.delta
+        return self.linearize(_unit(P + moved, u + move))
+
+    def rounding(self, here: _System) -> Tensor:
+        """What rounding makes of unit rays."""
+        return torch.full_like(here.cost, (100 * self.epsilon) ** 2)
 
 
 def sine_cost(rays: Rays, P: Tensor, u: Tensor) -> Float[Tensor, "p"]:
@@ -277,7 +317,7 @@ def _step(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Tensor
     g, move = rest[:, 0], _back(F, rest, step)
     # The model: right' step + step' S step / 2 and what the points alone bring; twice that in units of the cost.
     promise = -(right * step[..., 0]).sum(-1) + g.square().sum((-2, -1))
-    return step.reshape(p, v, 3, system.P.shape[-1]), move, solved, promise.clamp_min(1e-300)
+    return step.reshape(p, v, 3, system.P.shape[-1]), move, solved, promise
 
 
 def _back(F: Tensor, rest: Tensor, step: Tensor) -> Float[Tensor, "p r n"]:
@@ -287,25 +327,22 @@ def _back(F: Tensor, rest: Tensor, step: Tensor) -> Float[Tensor, "p r n"]:
     return -(inverse * back[:, :, None]).sum(1)
 
 
-def _next(damping: Tensor, growth: Tensor, better: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
-    """Nielsen's rule (1999)."""
-    factor = (1 - (2 * gain.clamp(0, 1) - 1) ** 3).clamp_min(1 / 3)
-    factor = torch.where(gain > 0.9, 0.1, factor)
-    return torch.where(better, damping * factor, damping * growth).clamp(min=1e-14), torch.where(better, 2, 2 * growth)
-
-
 def _balanced(P: Tensor) -> Tensor:
     """The same column space with orthonormal columns, of a norm that does not depend on the number of views."""
-    p, v = P.shape[:2]
-    Q, _, _ = qr(P.reshape(p, 3 * v, P.shape[-1]))
-    balanced: Tensor = Q.reshape(p, v, 3, P.shape[-1]) * v**0.5
+    balanced: Tensor = _orthonormal(P)[0] * P.shape[1] ** 0.5
     return balanced
+
+
+def _orthonormal(P: Tensor) -> tuple[Tensor, Tensor]:
+    """Cameras with orthonormal joint columns, and what they are to be multiplied by; hardly turned where they nearly were."""
+    Q, R, _ = qr(P.flatten(1, 2))
+    sign = torch.where(R.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)
+    return (Q * sign[:, None]).reshape(P.shape), R * sign[..., None]
 
 
 def _unit(P: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """The frame in which the cameras' joint columns are orthonormal; then each camera and point of norm 1."""
-    p, v = P.shape[:2]
-    Q, R, _ = qr(P.reshape(p, 3 * v, P.shape[-1]))
-    P, u = Q.reshape(p, v, 3, P.shape[-1]), R @ u
+    P, R = _orthonormal(P)
+    u = R @ u
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-100)
     return P, torch.nn.functional.normalize(u, dim=1)

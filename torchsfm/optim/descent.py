@@ -83,15 +83,17 @@ S = TypeVar("S", bound=System)
 
 @runtime_checkable
 class Problem(Protocol[S]):
-    """What is minimised. In a batch, a dataclass of tensors with the batch in front."""
+    """What is minimised; a problem that inherits from this has no Newton steps, and ends by costs alone."""
 
     @property
     def epsilon(self) -> float:
         """The relative rounding error of parameters and data."""
+        return torch.finfo(torch.float64).eps
 
     @property
     def patience(self) -> int | None:
         """About how many Gauss-Newton steps a Newton step takes the time of; None where there are no Newton steps."""
+        return None
 
     def linearize(self, x: Any) -> S:
         """The system at x."""
@@ -101,12 +103,14 @@ class Problem(Protocol[S]):
 
     def curve(self, here: S, where: Tensor) -> S:
         """The system with the exact Hessian in the elements `where`."""
+        return here
 
     def rounding(self, here: S) -> Tensor:
         """The decrease of the cost that is nothing, whatever the tolerance, (*batch)."""
 
     def is_short(self, here: S, delta: Any, tolerance: float) -> Tensor:
         """Where a step is shorter than a fraction of what it moves, (*batch)."""
+        return torch.zeros_like(here.cost, dtype=torch.bool)
 
     def pick(self, at: Places) -> "Problem[S]":
         """The problems at some places, in a batch of one dimension; never asked of a batch of none."""
@@ -207,9 +211,11 @@ def descend(problem: Problem[Any], x0: Any, options: Options, *, enough: Tensor 
                 rest = places(active)
                 problem, state = problem.pick(rest), pick(rest, state)
             state = _stepped(problem, state, options)
-            if options.progress is not None and options.progress(iteration, _stored(found, state).cost) is False:
-                state = _end(state, state.active, Status.INTERRUPTED)
-                break
+            if options.progress is not None:
+                costs = put(state.at, found.cost, state.here.cost)
+                if options.progress(iteration, costs) is False:
+                    state = _end(state, state.active, Status.INTERRUPTED)
+                    break
     except KeyboardInterrupt:
         if not options.interruptible:
             raise
@@ -225,13 +231,12 @@ def _stepped(problem: Problem[Any], state: _State, options: Options) -> _State:
     cost = here.cost
     least = max(options.function_tolerance, (10 * problem.epsilon) ** 2) * cost + problem.rounding(here)
     left, sure = _left(state, step, exact, least)
-    # Gauss-Newton steps may promise too little.
-    done = left <= torch.where(sure, least, 1e-2 * least)
+    # Gauss-Newton steps may promise too little; more than all of the cost cannot be left.
+    done = (left <= torch.where(sure, least, 1e-2 * least)) | (cost <= least)
     # Promises of a smaller part of the cost come from near the minimum, where slopes tell what a step gains, not costs.
     settled = problem.epsilon**0.5 * cost
     near = state.active & (promise <= settled)
-    still = near & (state.damping <= LIGHT) & ~step.bent & ~done
-    if bool(still.any()):
+    if options.step_tolerance > 0 and bool((still := near & (state.damping <= LIGHT) & ~step.bent & ~done).any()):
         done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
     there = problem.advance(here, step)
     gain = cost - there.cost
