@@ -149,8 +149,9 @@ class _WithPrior(Problem[_System]):
         return self.linearize(_balanced(here.x + step.delta[0]))
 
     def rounding(self, here: _System) -> Tensor:
-        """What rounding makes of unit rays."""
-        return torch.full_like(here.cost, (100 * self.epsilon) ** 2)
+        """What rounding of the rays makes of the misfit."""
+        square = self.rays.a.square().sum(2)
+        return (10 * self.epsilon) ** 2 * (self.rays.w * square).sum((-2, -1)) / here.total
 
 
 @dataclass(frozen=True)
@@ -173,8 +174,8 @@ class _Sines(Problem[_System]):
         return self.linearize(_unit(P + moved, u + move))
 
     def rounding(self, here: _System) -> Tensor:
-        """What rounding makes of unit rays."""
-        return torch.full_like(here.cost, (100 * self.epsilon) ** 2)
+        """What rounding of unit rays makes of the misfit."""
+        return torch.full_like(here.cost, (10 * self.epsilon) ** 2)
 
 
 def sine_cost(rays: Rays, P: Tensor, u: Tensor) -> Float[Tensor, "p"]:
@@ -265,7 +266,8 @@ def _regular(H: Tensor) -> Tensor:
 def _reduced(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The Schur complement over the cameras, its right-hand side, and what back-substitution needs.
 
-    With `points`, these have a gradient of their own and are damped, and scales of cameras and points are held.
+    With `points`, these have a gradient of their own and are damped, and scales of cameras and points are held. Without,
+    cameras are balanced.
     """
     P, u, alpha, q = system.P, system.u, system.alpha, system.q
     p, v, k, _, n = q.shape
@@ -297,7 +299,12 @@ def _reduced(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Ten
     A = A + damping[:, None, None, None] * scale.clamp_min(1e-100) * torch.eye(3 * r, dtype=P.dtype, device=P.device)
     S = -(F @ F.mT)
     S.view(p, v, 3 * r, v, 3 * r).diagonal(dim1=1, dim2=3).add_(A.permute(0, 2, 3, 1))
-    right = (system.slope @ u.mT[:, None]).reshape(p, 3 * r * v)
+    right = (system.slope @ u.mT[:, None]).reshape(p, 3 * v, r)
+    if not points:
+        # Where the points are best no change of frame gains anything; what rounding leaves would be all that is promised.
+        frame = P.reshape(p, 3 * v, r)
+        right = right - frame @ (frame.mT @ right) / v
+    right = right.reshape(p, 3 * r * v)
     g = torch.zeros(p, r, n, dtype=P.dtype, device=P.device)
     if points:
         g = (P.mT @ system.slope).sum(1)

@@ -63,6 +63,11 @@ def dense_system(x: Any, cost: Tensor, gradient: Tensor, metric: Tensor) -> Dens
     return DenseSystem(x, cost, gradient, metric, metric, torch.where(finite, gradient.abs().amax(-1), torch.nan))
 
 
+def passable(there: DenseSystem) -> DenseSystem:
+    """A system to which steps may lead: where anything in it is not finite, the cost is not either."""
+    return replace(there, cost=torch.where(there.slope < torch.inf, there.cost, torch.inf))
+
+
 @dataclass(frozen=True)
 class DenseProblem:
     """Residuals as a function, derivatives by automatic differentiation unless they are written."""
@@ -140,9 +145,8 @@ class DenseProblem:
         return value.detach(), torch.stack(columns, -1)
 
     def advance(self, here: DenseSystem, step: Step) -> DenseSystem:
-        """The system where a step leads; where it is not finite is nowhere to go."""
-        there = self.linearize(self.retract(here.x, step.delta.to(leaves(here.x)[0].dtype)))
-        return replace(there, cost=torch.where(there.slope.isfinite(), there.cost, torch.inf))
+        """The system where a step leads."""
+        return passable(self.linearize(self.retract(here.x, step.delta.to(leaves(here.x)[0].dtype))))
 
     def curve(self, here: DenseSystem, where: Tensor) -> DenseSystem:
         """The exact second derivatives of the cost in some elements; not always positive."""

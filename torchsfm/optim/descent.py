@@ -139,14 +139,25 @@ class Descent(NamedTuple):
 
     `status` is OK at a minimum, `NOT_CONVERGED` where the limit of steps came first or no step lowers the cost though more is
     promised, `NOT_FINITE` where the cost or its derivatives are not, at the start or at the best place so far, `TOO_FEW` where
-    there are too few data, and `INTERRUPTED` where it was stopped from outside. `x` is always the best place so far.
+    there are too few data, and `INTERRUPTED` where it was stopped from outside; `x` is the best place so far all the same.
     """
 
-    x: Any
-    cost: Tensor
+    end: Any
+    """The system at the best place."""
     initial_cost: Tensor
     iterations: Tensor
     status: Tensor
+
+    @property
+    def x(self) -> Any:
+        """The best place."""
+        return self.end.x
+
+    @property
+    def cost(self) -> Tensor:
+        """The cost there."""
+        cost: Tensor = self.end.cost
+        return cost
 
 
 @dataclass(frozen=True)
@@ -196,21 +207,23 @@ def descend(problem: Problem[Any], x0: Any, options: Options, *, enough: Tensor 
     count = torch.zeros_like(status, dtype=torch.int32)
     damping, growth, last = options.initial_damping * ones, 2 * ones, torch.inf * ones
     state = _State((), here, status, count, damping, growth, last, dull=count, slow=none, curved=none)
-    found = Descent(x0, cost, cost, count, status)
+    found = Descent(here, cost, count, status)
     try:
         for iteration in range(1, options.max_iterations + 1):
             slope = state.here.steepest()
-            flat, wild = slope <= options.gradient_tolerance, ~(slope < torch.inf)
-            if bool((flat | wild).any()):
-                state = _end(_end(state, wild, Status.NOT_FINITE), flat, Status.OK)
+            falls = (slope > options.gradient_tolerance) & (slope < torch.inf)
+            if not bool(falls.all()):
+                state = _end(state, slope <= options.gradient_tolerance, Status.OK)
+                state = _end(state, ~falls, Status.NOT_FINITE)
             active = state.active
-            if not bool(active.any()):
+            number = int(active.sum())
+            if not number:
                 break
-            if active.ndim and 2 * int(active.sum()) <= active.numel():
+            if active.ndim and 2 * number <= active.numel():
                 found, state = _stored(found, state), replace(state, at=state.at or places(torch.ones_like(active)))
                 rest = places(active)
-                problem, state = problem.pick(rest), pick(rest, state)
-            state = _stepped(problem, state, options)
+                problem, state, active = problem.pick(rest), pick(rest, state), active[rest]
+            state = _stepped(problem, state, active, options)
             if options.progress is not None:
                 costs = put(state.at, found.cost, state.here.cost)
                 if options.progress(iteration, costs) is False:
@@ -224,18 +237,18 @@ def descend(problem: Problem[Any], x0: Any, options: Options, *, enough: Tensor 
     return found._replace(status=torch.where(found.status == _UNDER_WAY, int(Status.NOT_CONVERGED), found.status))
 
 
-def _stepped(problem: Problem[Any], state: _State, options: Options) -> _State:
+def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Options) -> _State:
     """One step of every element under way; a rejected one keeps the linearisation."""
     state, step, exact = _next_step(problem, state)
     here, promise = state.here, step.promise
     cost = here.cost
     least = max(options.function_tolerance, (10 * problem.epsilon) ** 2) * cost + problem.rounding(here)
-    left, sure = _left(state, step, exact, least)
+    left, sure = _left(state, step, exact, least, active)
     # Gauss-Newton steps may promise too little; more than all of the cost cannot be left.
     done = (left <= torch.where(sure, least, 1e-2 * least)) | (cost <= least)
     # Promises of a smaller part of the cost come from near the minimum, where slopes tell what a step gains, not costs.
     settled = problem.epsilon**0.5 * cost
-    near = state.active & (promise <= settled)
+    near = active & (promise <= settled)
     if options.step_tolerance > 0 and bool((still := near & (state.damping <= LIGHT) & ~step.bent & ~done).any()):
         done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
     there = problem.advance(here, step)
@@ -243,36 +256,36 @@ def _stepped(problem: Problem[Any], state: _State, options: Options) -> _State:
     if bool(near.any()):
         slopes = -(here.along(step.delta) + there.along(step.delta)) / 2
         gain = torch.where(near & (gain >= -settled), slopes, gain)
-    accepted = state.active & (gain > LEAST * promise)
+    accepted = active & (gain > LEAST * promise)
     # Steps that fall as a geometric series have this much still before them.
     rate = (gain / state.last).clamp_max(1)
     series = torch.where(rate < 1, gain * rate / (1 - rate), torch.inf)
     plain = accepted & ~exact
-    done = state.active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
-    dull, slow = state.dull, exact
+    done = active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
+    dull, slow, curved = state.dull, state.slow, state.curved
     if problem.patience is not None:
-        crawls = plain & (rate > SLOW) & (gain <= NEAR * cost)
+        crawls, slow = plain & (rate > SLOW) & (gain <= NEAR * cost), exact
         dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
         if bool(crawls.any()):
             far = gain * rate ** (problem.patience + 1) > least * (1 - rate)
             slow = slow | (crawls & far & ((dull > problem.patience) | (gain <= 100 * least)))
+        slow, curved = slow & ~done, curved & ~accepted
     trust = (gain / promise.clamp_min(torch.finfo(cost.dtype).tiny)).clamp(0, 1)
     shrink = (1 - (2 * trust - 1) ** 3).clamp_min(1 / 3)
     state = replace(
         state,
         here=choose(accepted, there, here),
-        iterations=state.iterations + state.active,
+        iterations=state.iterations + active,
         damping=torch.where(accepted, state.damping * shrink, state.damping * state.growth).clamp_min(WEAKEST),
         growth=torch.where(accepted, 2.0, 2 * state.growth),
         last=torch.where(accepted, gain, state.last),
         dull=dull,
-        slow=slow & ~done,
-        curved=state.curved & ~accepted,
+        slow=slow,
+        curved=curved,
     )
     if bool(done.any()):
         state = _end(state, done, Status.OK)
-    stuck = state.active & (state.damping > STRONGEST)
-    if bool(stuck.any()):
+    if bool((stuck := active & (state.damping > STRONGEST)).any()):
         # At a minimum, or where the cost is not smooth.
         light = _light(state, stuck)
         state = _end(state, stuck & (light <= least), Status.OK)
@@ -286,9 +299,8 @@ def _next_step(problem: Problem[Any], state: _State) -> tuple[_State, Step, Tens
     Where the Hessian is so far from positive that the damping would be the greater part of it, a Gauss-Newton step.
     """
     slow = state.slow
-    if not bool(slow.any()):
-        step = state.here.step(state.damping)
-        return state, step, slow
+    if problem.patience is None or not bool(slow.any()):
+        return state, state.here.step(state.damping), slow
     wanted = slow & ~state.curved
     if bool(wanted.any()):
         state = replace(state, here=problem.curve(state.here, wanted), curved=state.curved | wanted)
@@ -307,12 +319,12 @@ def _next_step(problem: Problem[Any], state: _State) -> tuple[_State, Step, Tens
     return replace(state, damping=damping), step, exact
 
 
-def _left(state: _State, step: Step, exact: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+def _left(state: _State, step: Step, exact: Tensor, least: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
     """What is left to gain, and where that is by the exact Hessian.
 
     What a heavily damped step promises says nothing, nor what one along which the cost bends down does.
     """
-    hidden = state.active & (step.promise <= least) & ((state.damping > LIGHT) | step.bent)
+    hidden = active & (step.promise <= least) & ((state.damping > LIGHT) | step.bent)
     if not bool(hidden.any()):
         return step.promise, exact
     return torch.where(hidden, _light(state, hidden), step.promise), exact & ~hidden
@@ -334,8 +346,7 @@ def _end(state: _State, where: Tensor, status: Status) -> _State:
 def _stored(found: Descent, state: _State) -> Descent:
     """What is known of all elements, with what those under way have reached."""
     return Descent(
-        put(state.at, found.x, state.here.x),
-        put(state.at, found.cost, state.here.cost),
+        put(state.at, found.end, state.here),
         found.initial_cost,
         put(state.at, found.iterations, state.iterations),
         put(state.at, found.status, state.status),

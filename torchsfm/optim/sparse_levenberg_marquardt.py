@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.optim.descent import MINIMUM, Descent, Options, Step, descend
+from torchsfm.optim.descent import MINIMUM, Options, Step, descend
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.normal_equations import NormalEquations
@@ -110,28 +110,22 @@ def sparse_levenberg_marquardt(
         layout = lay_out(double, counted, eliminate)
         # A residual of fixed variables is a constant of the cost.
         constant = sum((float(term_cost(t, term_residual(t, x))) for t in layout.still), 0.0)
+        cost, initial, iterations, status = constant, constant, 0, Status.TOO_FEW
         if not math.isfinite(constant) or (any(u.numel() for u in used) and not any(bool(u.any()) for u in used)):
-            found = _nothing_done(x, Status.NOT_FINITE)
-        elif not layout.pieces:
-            found = _nothing_done(x, Status.TOO_FEW)
-        else:
+            status = Status.NOT_FINITE
+        elif layout.pieces:
             problem = _SparseProblem(Elimination(double, layout, linear_solver), sum(_size(term) for term in counted))
             tell = None if progress is None else lambda k, cost: progress(k, float(cost) + constant)
             limits = (max_iterations, function_tolerance, step_tolerance, gradient_tolerance, initial_damping)
             found = descend(problem, x, Options(*limits, progress=tell, interruptible=True))
-    x = found.x
+            x, iterations, status = found.x, int(found.iterations), Status(int(found.status))
+            cost, initial = float(found.cost) + constant, float(found.initial_cost) + constant
     if wanted:
         x = attach_sparse_optimum(dict(blocks), terms, x, used, eliminate, hessian)
     plain = [replace(term, data=tuple(_double(d) for d in term.data)) for term in terms]
     residuals = tuple(term_residual(t, x) for t in plain)
     out = {name: x[name].to(b.x.dtype).contiguous() for name, b in blocks.items()}
-    cost, initial = (float(c) + constant for c in (found.cost, found.initial_cost))
-    return SparseResult(out, cost, initial, residuals, used, int(found.iterations), Status(int(found.status)))
-
-
-def _nothing_done(x: dict[str, Tensor], status: Status) -> Descent:
-    zero = torch.zeros((), dtype=torch.float64)
-    return Descent(x, zero, zero, torch.tensor(0), torch.tensor(int(status)))
+    return SparseResult(out, cost, initial, residuals, used, iterations, status)
 
 
 class _Place:

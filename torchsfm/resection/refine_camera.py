@@ -191,11 +191,12 @@ def _minimum(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_
     plain = problem.loss is None
     if plain:
         fit = minimise_pinhole(start, theta, x, X, w, problem.inside(camera), max_iterations)
-        covariance, determined = inverse(fit.normal)
+        pose, theta = fit.x
+        covariance, determined = inverse(fit.end.metric)
         total = w.sum(-1)
         error = (2 * fit.cost / torch.where(total > 0, total, 1.0)).clamp_min(0).sqrt()
-        in_front = fit.pose.transform(X)[..., 2] > 0
-        return _Fit(fit.pose, fit.theta, fit.cost, fit.iterations, fit.status, covariance, determined, in_front, error)
+        in_front = pose.transform(X)[..., 2] > 0
+        return _Fit(pose, theta, fit.cost, fit.iterations, fit.status, covariance, determined, in_front, error)
     result = levenberg_marquardt(
         problem.residual, (start, theta), x, X, camera, retract=problem.retract, size=6 + problem.size, weights=w,
         loss=problem.loss, linearize=problem.linearize, max_iterations=max_iterations, function_tolerance=1e-6,
