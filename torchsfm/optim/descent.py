@@ -220,9 +220,10 @@ def descend(problem: Problem[Any], x0: Any, options: Options, *, enough: Tensor 
             if not number:
                 break
             if active.ndim and 2 * number <= active.numel():
-                found, state = _stored(found, state), replace(state, at=state.at or places(torch.ones_like(active)))
-                rest = places(active)
-                problem, state, active = problem.pick(rest), pick(rest, state), active[rest]
+                found, rest = _stored(found, state), places(active)
+                at = pick(rest, state.at) if state.at else rest
+                problem, active = problem.pick(rest), active[rest]
+                state = replace(pick(rest, replace(state, at=())), at=at)
             state = _stepped(problem, state, active, options)
             if options.progress is not None:
                 costs = put(state.at, found.cost, state.here.cost)
