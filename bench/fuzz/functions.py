@@ -214,6 +214,7 @@ FUNCTIONS: dict[str, Function] = {
     "images.detect_edges": Function({"image": lambda s: _picture(s), "max_edgels": 500}, {"h": 32, "w": 40}),
     "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
     "images.fit_ellipse": Function({"x": _edge_points}, {"n": 24}),
+    "images.detect_segments": Function({"image": lambda s: _picture(s), "max_segments": 20}, {"h": 32, "w": 40}),
     "images.match_descriptors": Function({f"descriptors{i}": lambda s: s.rand(9, 16) for i in (1, 2)}, batched=False),
     "images.match_features": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),
     "images.retrieve_pairs": Function(

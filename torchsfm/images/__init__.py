@@ -10,6 +10,7 @@ from torchsfm.images.listing import list_images, list_skipped
 from torchsfm.images.matching import match_descriptors, match_features
 from torchsfm.images.reading import MAX_PIXELS, ImageError, Photograph, read_image, save_image, scale_image
 from torchsfm.images.retrieval import describe_images, retrieve_pairs
+from torchsfm.images.segments import Segments, detect_segments
 from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_sequence
 
 __all__ = [
@@ -23,12 +24,14 @@ __all__ = [
     "LearnedDetector",
     "LearnedMatcher",
     "Photograph",
+    "Segments",
     "TrackedPoints",
     "Tracks",
     "describe_images",
     "detect_corners",
     "detect_edges",
     "detect_features",
+    "detect_segments",
     "fit_ellipse",
     "list_images",
     "list_skipped",

@@ -101,9 +101,9 @@ def triangulate_lines(
             to each side of the point nearest to the principal point.
         P: Cameras `K [R | t]` or projective ones, of any scale and sign.
         visible: Which views see which line; all by default.
-        weights: Factors of the squared distances (inverse variances of an end across its line), 0 for absent. Segments fitted
-            to many edge points are best given by two points at 0.29 of their length from the middle, each of weight
-            `count / (2 sigma^2)`: see `Segments`.
+        weights: Factors of the squared distances (inverse variances of an end across its line), 0 for absent. Of detected
+            segments `Segments.fit_points` gives points and weights that say what their edge points do; end points alone
+            would count the angle too much.
         loss: Robust loss of each view's squared distance, the two ends together.
         max_iterations: Of Levenberg-Marquardt, for each line.
 
