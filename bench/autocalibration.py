@@ -33,7 +33,7 @@ from torchsfm.autocalibration import (
     intrinsics_from_modulus,
 )
 from torchsfm.bundle import bundle_adjust
-from torchsfm.geometry import BrownConrady, Camera, NoDistortion, Pose, Radial
+from torchsfm.geometry import BrownConrady, BundleProblem, Camera, NoDistortion, Pose, Radial
 from torchsfm.reconstruction import reconstruct, reconstruct_tracks
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.tensors import bifocal_tensors
@@ -65,8 +65,9 @@ def after_metric_bundle(scene: UnknownCameras, found: Autocalibration) -> float:
     R = torch.linalg.solve(found.K, found.P[..., :3])
     t = torch.linalg.solve(found.K, found.P[..., 3:])[..., 0]
     camera = Camera(found.K[:1], NoDistortion())
+    problem = BundleProblem.of(Pose(R, t), camera, found.X, scene.x[scene.visible], view, point)
     result = bundle_adjust(
-        Pose(R, t), camera, found.X, scene.x[scene.visible], view, point, free=("focal", "principal_point"), max_iterations=50,
+        problem, free=("focal", "principal_point"), max_iterations=50,
         intrinsics_sigma={"principal_point": 0.02 * IMAGE[0]}, intrinsics_mean=Camera(middle(camera.K), NoDistortion()),
     )  # fmt: skip
     return focal_error(result.cameras.K, scene)

@@ -166,7 +166,7 @@ ROBUST = {"threshold": 2.0, "max_iterations": 64, "generator": _generator}
 RAYS = ROBUST | {"threshold": 0.003}
 SIZED = {"image_size": tuple(map(float, SIZE))}
 CENTRED = {"c": lambda s: s.rand(2, low=-1.0, high=1.0)}
-ADJUSTED = {name: _bundle(name) for name in ("poses", "cameras", "X", "x", "view", "point", "camera_index")}
+ADJUSTED = {"problem": lambda s: random_bundle_problem(4, 20, 60, generator=_generator(s)).problem}
 PROJECTIVE = {
     "P": lambda s: _projective(s),
     "X": lambda s: torch.nn.functional.pad(_bundle("X")(s), (0, 1), value=1.0),

@@ -52,7 +52,9 @@ def test_two_problems_in_one(problem: BundleProblem) -> None:
     np.testing.assert_allclose(together.result.cost, one.result.cost + two.result.cost, rtol=1e-6)
     torch.testing.assert_close(together.result.residuals[:500], one.result.residuals, rtol=1e-2, atol=1e-2)
     m = together.model
-    covariance = bundle_covariance(m.poses, m.cameras, m.X, m.x, m.view, m.point, camera_index=m.camera_index, free=FREE)
+    covariance = bundle_covariance(
+        BundleProblem.of(m.poses, m.cameras, m.X, m.x, m.view, m.point, camera_index=m.camera_index), free=FREE
+    )
     assert covariance.nullity == 14
     assert covariance.X[covariance.determined_points].isfinite().all()
 
@@ -245,12 +247,12 @@ def test_wrong_indices_and_names(problem: BundleProblem) -> None:
         for wrong in (args[place] + 1, args[place] - 1):  # type: ignore[operator]
             bad = [*args[:place], wrong, *args[place + 1 :]]
             with pytest.raises(ValueError, match=f"{name}: wanted numbers from 0 to {limit}"):
-                bundle_adjust(*bad, free=())  # type: ignore[arg-type]
+                bundle_adjust(BundleProblem.of(*bad), free=())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="camera_index: wanted numbers from 0 to 7"):
-        bundle_adjust(*args, camera_index=torch.arange(8) + 1)  # type: ignore[arg-type]
+        bundle_adjust(BundleProblem.of(*args, camera_index=torch.arange(8) + 1))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="free: wanted names"):
-        bundle_adjust(*args, free=("zoom",))  # type: ignore[arg-type]
+        bundle_adjust(BundleProblem.of(*args), free=("zoom",))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="fixed_poses: wanted shape"):
-        bundle_adjust(*args, fixed_poses=torch.zeros(3, dtype=torch.bool))  # type: ignore[arg-type]
+        bundle_adjust(BundleProblem.of(*args), fixed_poses=torch.zeros(3, dtype=torch.bool))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="weights"):
-        bundle_adjust(*args, weights=torch.ones(3, dtype=F64))  # type: ignore[arg-type]
+        bundle_adjust(BundleProblem.of(*args), weights=torch.ones(3, dtype=F64))  # type: ignore[arg-type]

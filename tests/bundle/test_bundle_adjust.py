@@ -11,6 +11,7 @@ from torchsfm.bundle.projection import Projection
 from torchsfm.formats import read_bal
 from torchsfm.geometry import (
     DISTORTION_MODELS,
+    BundleProblem,
     Camera,
     NoDistortion,
     Pose,
@@ -119,7 +120,7 @@ def test_exact_data_are_recovered(model: str, generator: torch.Generator) -> Non
     rows[:, 5:] = 0
     guess = camera_from_row(rows, type(cameras.distortion))
     free = ("focal", *cameras.distortion.parameter_names)
-    result = bundle_adjust(start, guess, X0, x, view, point, free=free, fixed_poses=fixed, tolerance=1e-14)
+    result = bundle_adjust(BundleProblem.of(start, guess, X0, x, view, point), free=free, fixed_poses=fixed, tolerance=1e-14)
     assert result.status == Status.OK
     assert result.cost < 1e-12
     torch.testing.assert_close(result.X, X, rtol=0, atol=1e-8)
@@ -131,7 +132,7 @@ def test_noise_and_free_gauge(generator: torch.Generator) -> None:
     """With a free gauge the residual has its statistical size, and the shape is right up to a similarity."""
     poses, cameras, X, x, view, point, _ = make_scene(generator, points=400)
     start, X0 = perturb(poses, X, generator)
-    result = bundle_adjust(start, cameras, X0, x, view, point, free=("focal", "k1", "k2"))
+    result = bundle_adjust(BundleProblem.of(start, cameras, X0, x, view, point), free=("focal", "k1", "k2"))
     assert result.status == Status.OK
     dof = 2 * len(x) - (6 * 8 + 3 + 3 * 400 - 7)
     assert abs(result.cost / (0.125 * dof) - 1) < 4 * (2 / dof) ** 0.5
@@ -159,7 +160,9 @@ def test_efficiency(generator: torch.Generator) -> None:
     information = jacobian.T @ jacobian / 0.3**2
     for _ in range(40):
         noisy = x + 0.3 * torch.randn(x.shape, generator=generator, dtype=F64)
-        result = bundle_adjust(poses, cameras, X, noisy, view, point, free=(), fixed_points=fixed_points, tolerance=1e-10)
+        result = bundle_adjust(
+            BundleProblem.of(poses, cameras, X, noisy, view, point), free=(), fixed_points=fixed_points, tolerance=1e-10
+        )
         turn = result.poses.R @ poses.R.mT
         w = torch.stack((turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]), -1) / 2
         v = result.poses.t - (turn @ poses.t[:, :, None])[:, :, 0]
@@ -176,14 +179,18 @@ def test_shared_and_separate_intrinsics(generator: torch.Generator) -> None:
     guess = camera_from_row(rows, type(cameras.distortion))
     start, X0 = perturb(poses, X, generator, 0.003)
     result = bundle_adjust(
-        start, guess, X0, x, view, point, camera_index=group, free=("focal", "k1", "principal_point"), tolerance=1e-13
+        BundleProblem.of(start, guess, X0, x, view, point, camera_index=group),
+        free=("focal", "k1", "principal_point"),
+        tolerance=1e-13,
     )
     torch.testing.assert_close(row_from_camera(result.cameras), row_from_camera(cameras), rtol=1e-5, atol=1e-3)
     each = Camera(guess.K[group], type(cameras.distortion)(guess.distortion.k1[group]))
-    apart = bundle_adjust(start, each, X0, x, view, point, free=("focal", "k1"), tolerance=1e-13)
+    apart = bundle_adjust(BundleProblem.of(start, each, X0, x, view, point), free=("focal", "k1"), tolerance=1e-13)
     torch.testing.assert_close(apart.cameras.K[:, 0, 0], torch.full((8,), 800.0, dtype=F64), rtol=1e-5, atol=0)
     held = bundle_adjust(
-        start, guess, X0, x, view, point, camera_index=group, free=("focal",), fixed_cameras=torch.tensor([True, False])
+        BundleProblem.of(start, guess, X0, x, view, point, camera_index=group),
+        free=("focal",),
+        fixed_cameras=torch.tensor([True, False]),
     )
     assert torch.equal(held.cameras.K[0], guess.K[0])
     assert held.cameras.K[1, 0, 0] != guess.K[1, 0, 0]
@@ -195,31 +202,31 @@ def test_intrinsics_free_in_some_cameras(generator: torch.Generator) -> None:
     poses, cameras, X, x, view, point, group = make_scene(generator, groups=2)
     start, X0 = perturb(poses, X, generator, 0.003)
     first = torch.tensor([True, False])
-    args, options = (start, cameras, X0, x, view, point), {"camera_index": group, "tolerance": 1e-12}
-    one = bundle_adjust(*args, free=("focal",), fixed_cameras=first, **options)
-    two = bundle_adjust(*args, free=("focal",), fixed_intrinsics={"focal": first}, **options)
+    problem = BundleProblem.of(start, cameras, X0, x, view, point, camera_index=group)
+    one = bundle_adjust(problem, free=("focal",), fixed_cameras=first, tolerance=1e-12)
+    two = bundle_adjust(problem, free=("focal",), fixed_intrinsics={"focal": first}, tolerance=1e-12)
     np.testing.assert_allclose(two.cost, one.cost, rtol=1e-10)
     torch.testing.assert_close(two.X, one.X, rtol=0, atol=1e-8)
     assert torch.equal(two.cameras.K[0], cameras.K[0])
     free = ("focal", "principal_point", "k1", "k2")
     fixed = {"focal": first, "principal_point": torch.tensor([True, True]), "k2": ~first}
-    mixed = bundle_adjust(*args, free=free, fixed_intrinsics=fixed, **options)
+    mixed = bundle_adjust(problem, free=free, fixed_intrinsics=fixed, tolerance=1e-12)
     before, after = row_from_camera(cameras), row_from_camera(mixed.cameras)
     held = torch.tensor([[1, 1, 1, 1, 1, 0, 0], [0, 1, 1, 1, 1, 0, 1]], dtype=torch.bool)
     assert torch.equal(torch.isclose(after, before, rtol=1e-15, atol=0), held)
     assert torch.equal(mixed.cameras.K[0], cameras.K[0])
-    everything = bundle_adjust(*args, free=free, **options)
-    nothing = bundle_adjust(*args, free=(), **options)
+    everything = bundle_adjust(problem, free=free, tolerance=1e-12)
+    nothing = bundle_adjust(problem, free=(), tolerance=1e-12)
     assert everything.cost < mixed.cost < nothing.cost
     found = (mixed.poses, mixed.cameras, mixed.X, x, view, point)
-    known = bundle_covariance(*found, camera_index=group, free=free, fixed_intrinsics=fixed)
+    known = bundle_covariance(BundleProblem.of(*found, camera_index=group), free=free, fixed_intrinsics=fixed)
     assert known.nullity == 7
     columns = torch.tensor([[1, 1, 1, 0, 0], [0, 1, 1, 0, 1]], dtype=torch.bool)
     assert torch.equal(known.cameras.diagonal(dim1=1, dim2=2) == 0, columns)
     with pytest.raises(ValueError, match="fixed_intrinsics"):
-        bundle_adjust(*args, free=free, fixed_intrinsics={"focal": torch.ones(3, dtype=torch.bool)}, camera_index=group)
+        bundle_adjust(problem, free=free, fixed_intrinsics={"focal": torch.ones(3, dtype=torch.bool)})
     with pytest.raises(ValueError, match="zoom"):
-        bundle_adjust(*args, free=free, fixed_intrinsics={"zoom": first}, camera_index=group)
+        bundle_adjust(problem, free=free, fixed_intrinsics={"zoom": first})
 
 
 def test_masks_are_kept_bit_for_bit(generator: torch.Generator) -> None:
@@ -229,7 +236,10 @@ def test_masks_are_kept_bit_for_bit(generator: torch.Generator) -> None:
     fixed_points = torch.rand(100, generator=generator) < 0.4
     keep = (view != 5) & (point != 7)
     result = bundle_adjust(
-        start, cameras, X0, x[keep], view[keep], point[keep], free=(), fixed_poses=fixed_poses, fixed_points=fixed_points
+        BundleProblem.of(start, cameras, X0, x[keep], view[keep], point[keep]),
+        free=(),
+        fixed_poses=fixed_poses,
+        fixed_points=fixed_points,
     )
     fixed_poses[5] = True
     fixed_points[7] = True
@@ -248,9 +258,9 @@ def test_dropping_fixed_terms_changes_nothing(generator: torch.Generator) -> Non
     start, X0 = perturb(poses, X, generator)
     fixed_poses, fixed_points = torch.arange(8) > 2, torch.arange(100) > 30
     options = {"free": (), "fixed_poses": fixed_poses, "fixed_points": fixed_points, "tolerance": 1e-12}
-    everything = bundle_adjust(start, cameras, X0, x, view, point, **options)
+    everything = bundle_adjust(BundleProblem.of(start, cameras, X0, x, view, point), **options)
     matter = ~(fixed_poses[view] & fixed_points[point])
-    some = bundle_adjust(start, cameras, X0, x[matter], view[matter], point[matter], **options)
+    some = bundle_adjust(BundleProblem.of(start, cameras, X0, x[matter], view[matter], point[matter]), **options)
     torch.testing.assert_close(some.X, everything.X)
     assert everything.cost > some.cost
 
@@ -259,12 +269,12 @@ def test_bad_observations_and_points(generator: torch.Generator) -> None:
     poses, cameras, X, x, view, point, _ = make_scene(generator)
     start, X0 = perturb(poses, X, generator)
     keep = point != 3
-    clean = bundle_adjust(start, cameras, X0, x[keep][2:], view[keep][2:], point[keep][2:])
+    clean = bundle_adjust(BundleProblem.of(start, cameras, X0, x[keep][2:], view[keep][2:], point[keep][2:]))
     x, X0 = x.clone(), X0.clone()
     bad = keep.nonzero()[:2, 0]
     x[bad] = torch.tensor([[torch.nan, 1.0], [torch.inf, 2.0]], dtype=F64)
     X0[3] = torch.nan
-    result = bundle_adjust(start, cameras, X0, x, view, point)
+    result = bundle_adjust(BundleProblem.of(start, cameras, X0, x, view, point))
     assert result.status == Status.OK
     unused = ~keep
     unused[bad] = True
@@ -281,7 +291,7 @@ def test_points_behind_and_in_the_focal_plane(generator: torch.Generator) -> Non
     X0 = X.clone()
     X0[0] = poses[0].centre - 2 * poses[0].R[2]
     X0[1] = poses[1].centre + poses[1].R[0]
-    result = bundle_adjust(poses, cameras, X0, x, view, point, loss=Cauchy(1.0))
+    result = bundle_adjust(BundleProblem.of(poses, cameras, X0, x, view, point), loss=Cauchy(1.0))
     assert result.cost < result.initial_cost
     for value in (result.X, result.poses.R, result.poses.t, result.cameras.K, result.residuals):
         assert value.isfinite().all()
@@ -292,9 +302,9 @@ def test_outliers_and_losses(generator: torch.Generator) -> None:
     outlier = torch.rand(len(x), generator=generator) < 0.1
     spoiled = torch.where(outlier[:, None], x + 60 * torch.randn(x.shape, generator=generator, dtype=F64), x)
     start, X0 = perturb(poses, X, generator, 0.003)
-    robust = bundle_adjust(start, cameras, X0, spoiled, view, point, free=("focal",), loss=Cauchy(1.0))
-    squares = bundle_adjust(start, cameras, X0, spoiled, view, point, free=("focal",))
-    inliers = bundle_adjust(start, cameras, X0, x, view, point, free=("focal",), weights=(~outlier).double())
+    robust = bundle_adjust(BundleProblem.of(start, cameras, X0, spoiled, view, point), free=("focal",), loss=Cauchy(1.0))
+    squares = bundle_adjust(BundleProblem.of(start, cameras, X0, spoiled, view, point), free=("focal",))
+    inliers = bundle_adjust(BundleProblem.of(start, cameras, X0, x, view, point), free=("focal",), weights=(~outlier).double())
 
     def error(result: BundleResult) -> Tensor:
         return (similarity_from_points(result.X, X).transform(result.X) - X).square().mean().sqrt()
@@ -307,28 +317,29 @@ def test_priors_on_intrinsics(generator: torch.Generator) -> None:
     """A tight prior holds the focal length, a loose one lets it go, between them information adds up."""
     poses, cameras, X, x, view, point, _ = make_scene(generator, model="pinhole")
     guess = Camera(intrinsics(torch.tensor([840.0], dtype=F64), torch.tensor([[320.0, 240.0]], dtype=F64)), NoDistortion())
-    args = (poses, guess, X, x, view, point)
+    problem = BundleProblem.of(poses, guess, X, x, view, point)
     focal = [
-        bundle_adjust(*args, free=("focal",), intrinsics_sigma={"focal": s}, tolerance=1e-10).cameras.K[0, 0, 0]
+        bundle_adjust(problem, free=("focal",), intrinsics_sigma={"focal": s}, tolerance=1e-10).cameras.K[0, 0, 0]
         for s in (1e-7, 1e-3, 10.0)
     ]
-    free = bundle_adjust(*args, free=("focal",), tolerance=1e-10).cameras.K[0, 0, 0]
+    free = bundle_adjust(problem, free=("focal",), tolerance=1e-10).cameras.K[0, 0, 0]
     assert abs(focal[0] - 840) < 0.1
     assert abs(focal[2] - free) < 0.01
     assert free + 1 < focal[1] < 839
-    centred = bundle_adjust(*args, free=("focal",), intrinsics_sigma={"focal": 1e-7}, intrinsics_mean=cameras)
+    centred = bundle_adjust(problem, free=("focal",), intrinsics_sigma={"focal": 1e-7}, intrinsics_mean=cameras)
     assert abs(centred.cameras.K[0, 0, 0] - 800) < 0.1
 
 
 def test_float32_and_repeatability(generator: torch.Generator) -> None:
     poses, cameras, X, x, view, point, _ = make_scene(generator)
     start, X0 = perturb(poses, X, generator)
-    double = bundle_adjust(start, cameras, X0, x, view, point, free=("focal", "k1"))
-    again = bundle_adjust(start, cameras, X0, x, view, point, free=("focal", "k1"))
+    double = bundle_adjust(BundleProblem.of(start, cameras, X0, x, view, point), free=("focal", "k1"))
+    again = bundle_adjust(BundleProblem.of(start, cameras, X0, x, view, point), free=("focal", "k1"))
     assert torch.equal(double.X, again.X)
     camera = Camera(cameras.K.float(), Radial(cameras.distortion.k1.float(), cameras.distortion.k2.float()))
     single = bundle_adjust(
-        Pose(start.R.float(), start.t.float()), camera, X0.float(), x.float(), view, point, free=("focal", "k1")
+        BundleProblem.of(Pose(start.R.float(), start.t.float()), camera, X0.float(), x.float(), view, point),
+        free=("focal", "k1"),
     )
     assert single.X.dtype == single.poses.R.dtype == single.cameras.K.dtype == torch.float32
     np.testing.assert_allclose(single.cost, double.cost, rtol=1e-4)
@@ -340,15 +351,19 @@ def test_iteration_limit_and_nothing_free(generator: torch.Generator) -> None:
     poses, cameras, X, x, view, point, _ = make_scene(generator)
     start, X0 = perturb(poses, X, generator)
     seen = []
-    result = bundle_adjust(start, cameras, X0, x, view, point, max_iterations=1, progress=lambda k, c: seen.append((k, c)))
+    result = bundle_adjust(
+        BundleProblem.of(start, cameras, X0, x, view, point), max_iterations=1, progress=lambda k, c: seen.append((k, c))
+    )
     assert result.status == Status.NOT_CONVERGED
     assert seen == [(1, result.cost)]
     assert result.cost < result.initial_cost
     every = torch.ones(8, dtype=torch.bool), torch.ones(100, dtype=torch.bool)
-    still = bundle_adjust(start, cameras, X0, x, view, point, free=(), fixed_poses=every[0], fixed_points=every[1])
+    still = bundle_adjust(
+        BundleProblem.of(start, cameras, X0, x, view, point), free=(), fixed_poses=every[0], fixed_points=every[1]
+    )
     assert still.status == Status.TOO_FEW
     assert still.cost == pytest.approx(result.initial_cost)
-    empty = bundle_adjust(start, cameras, X0, x[:0], view[:0], point[:0])
+    empty = bundle_adjust(BundleProblem.of(start, cameras, X0, x[:0], view[:0], point[:0]))
     assert empty.status == Status.TOO_FEW
     assert empty.residuals.shape == (0,)
 
@@ -356,15 +371,15 @@ def test_iteration_limit_and_nothing_free(generator: torch.Generator) -> None:
 def test_wrong_arguments(generator: torch.Generator, unchecked: None) -> None:
     poses, cameras, X, x, view, point, _ = make_scene(generator)
     with pytest.raises(ValueError, match="free"):
-        bundle_adjust(poses, cameras, X, x, view, point, free=("k3",))
+        bundle_adjust(BundleProblem.of(poses, cameras, X, x, view, point), free=("k3",))
     with pytest.raises(ValueError, match="view: wanted numbers from 0 to 7"):
-        bundle_adjust(poses, cameras, X, x, view + 1, point)
+        bundle_adjust(BundleProblem.of(poses, cameras, X, x, view + 1, point))
     with pytest.raises(ValueError, match="point"):
-        bundle_adjust(poses, cameras, X, x, view, point[:-1])
+        bundle_adjust(BundleProblem.of(poses, cameras, X, x, view, point[:-1]))
     with pytest.raises(ValueError, match="camera_index"):
-        bundle_adjust(poses, make_camera("radial", 2), X, x, view, point)
+        bundle_adjust(BundleProblem.of(poses, make_camera("radial", 2), X, x, view, point))
     with pytest.raises(ValueError, match="fixed_points"):
-        bundle_adjust(poses, cameras, X, x, view, point, fixed_points=torch.ones(3, dtype=torch.bool))
+        bundle_adjust(BundleProblem.of(poses, cameras, X, x, view, point), fixed_points=torch.ones(3, dtype=torch.bool))
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,9 @@ def test_a_problem_is_adjusted_as_its_parts(problem: BundleProblem) -> None:
     options = {"free": ("focal", "k1", "k2"), "tolerance": 1e-9}
     whole = bundle_adjust_model(problem, **options)
     p = problem
-    parts = bundle_adjust(p.poses, p.cameras, p.X, p.x, p.view, p.point, camera_index=p.camera_index, **options)
+    parts = bundle_adjust(
+        BundleProblem.of(p.poses, p.cameras, p.X, p.x, p.view, p.point, camera_index=p.camera_index), **options
+    )
     assert whole.result.cost == parts.cost
     assert isinstance(whole.model, BundleProblem)
     assert torch.equal(whole.model.X, parts.X)
@@ -111,10 +113,12 @@ def test_poses_are_eliminated_where_they_are_many() -> None:
     few = p.point < 20
     fixed = torch.arange(40) < 3
     args = (p.poses, p.cameras, p.X, p.x[few], p.view[few], p.point[few])
-    one = bundle_adjust(*args, fixed_points=fixed, tolerance=1e-10, max_iterations=200)
+    one = bundle_adjust(BundleProblem.of(*args), fixed_points=fixed, tolerance=1e-10, max_iterations=200)
     # Points that nobody sees change what is eliminated, and nothing else.
     more = torch.cat((p.X, torch.zeros(60, 3, dtype=F64)))
-    two = bundle_adjust(*args[:2], more, *args[3:], fixed_points=torch.arange(100) < 3, tolerance=1e-10, max_iterations=200)
+    two = bundle_adjust(
+        BundleProblem.of(*args[:2], more, *args[3:]), fixed_points=torch.arange(100) < 3, tolerance=1e-10, max_iterations=200
+    )
     assert one.status == two.status == Status.OK
     np.testing.assert_allclose(one.cost, two.cost, rtol=1e-8)
     torch.testing.assert_close(one.residuals, two.residuals, rtol=1e-3, atol=1e-3)
@@ -131,7 +135,11 @@ def test_derivatives_where_poses_are_eliminated(generator: torch.Generator) -> N
 
     def function(x: Tensor, X: Tensor) -> Tensor:
         result = bundle_adjust(
-            poses, Camera(K), X, x, view, point, free=(), fixed_points=torch.arange(8) < 3, tolerance=1e-15, max_iterations=200
+            BundleProblem.of(poses, Camera(K), X, x, view, point),
+            free=(),
+            fixed_points=torch.arange(8) < 3,
+            tolerance=1e-15,
+            max_iterations=200,
         )
         return result.X[3:].sum() + result.poses.t.square().sum() + result.residuals[:9].square().sum()
 

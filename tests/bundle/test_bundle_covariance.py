@@ -3,7 +3,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.bundle import bundle_adjust, bundle_covariance
-from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_from_rotvec
+from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics, rotation_from_rotvec
 
 F64 = torch.float64
 Scene = tuple[Pose, Camera, Tensor, Tensor, Tensor, Tensor]
@@ -30,7 +30,7 @@ def test_spread_of_many_trials(scene: Scene, generator: torch.Generator) -> None
     poses, camera, X, x, view, point = scene
     fixed = torch.tensor([True, True, False, False, False])
     options = {"free": ("focal", "k1", "k2"), "fixed_poses": fixed}
-    known = bundle_covariance(poses, camera, X, x, view, point, sigma=0.2, **options)
+    known = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), sigma=0.2, **options)
     assert known.nullity == 0
     once = torch.bincount(point, minlength=40) < 2
     assert torch.equal(known.determined_points, ~once)
@@ -38,12 +38,14 @@ def test_spread_of_many_trials(scene: Scene, generator: torch.Generator) -> None
     points, focals, shifts, sigmas = [], [], [], []
     for _ in range(40):
         noisy = x + 0.2 * torch.randn(x.shape, generator=generator, dtype=F64)
-        result = bundle_adjust(poses, camera, X, noisy, view, point, **options)
+        result = bundle_adjust(BundleProblem.of(poses, camera, X, noisy, view, point), **options)
         points.append((result.X - X)[~once])
         focals.append((result.cameras.K[0, 0, 0] - 700).square() / known.cameras[0, 0, 0])
         turn = result.poses.R[2:] @ poses.R[2:].mT
         shifts.append(result.poses.t[2:] - (turn @ poses.t[2:, :, None])[:, :, 0])
-        sigmas.append(bundle_covariance(result.poses, result.cameras, result.X, noisy, view, point, **options).sigma)
+        sigmas.append(
+            bundle_covariance(BundleProblem.of(result.poses, result.cameras, result.X, noisy, view, point), **options).sigma
+        )
     for errors, covariance in ((torch.stack(points), known.X[~once]), (torch.stack(shifts), known.poses[2:, 3:, 3:])):
         chi2 = (errors[..., None, :] @ torch.linalg.solve(covariance, errors[..., None])).mean() / 3
         assert 0.85 < chi2 < 1.15
@@ -54,10 +56,12 @@ def test_spread_of_many_trials(scene: Scene, generator: torch.Generator) -> None
 
 def test_gauge(scene: Scene) -> None:
     poses, camera, X, x, view, point = scene
-    free = bundle_covariance(poses, camera, X, x, view, point, sigma=1.0, free=())
+    free = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), sigma=1.0, free=())
     assert free.nullity == 7
     assert free.X[free.determined_points].isfinite().all()
-    held = bundle_covariance(poses, camera, X, x, view, point, sigma=1.0, free=(), fixed_poses=torch.arange(5) == 0)
+    held = bundle_covariance(
+        BundleProblem.of(poses, camera, X, x, view, point), sigma=1.0, free=(), fixed_poses=torch.arange(5) == 0
+    )
     assert held.nullity == 1
     assert (held.poses[0] == 0).all()
     # Fixing one camera's place and turn moves the uncertainty to the others.
@@ -71,7 +75,7 @@ def test_derivative_of_a_bundle(scene: Scene, generator: torch.Generator) -> Non
 
     def shape(x: Tensor, K: Tensor, k1: Tensor) -> Tensor:
         cameras = Camera(K, Radial(k1, camera.distortion.k2))
-        result = bundle_adjust(poses, cameras, X, x, view, point, free=(), tolerance=1e-15)
+        result = bundle_adjust(BundleProblem.of(poses, cameras, X, x, view, point), free=(), tolerance=1e-15)
         ratios = (result.X[0] - result.X[1:5]).norm(dim=1) / (result.poses.centre[0] - result.poses.centre[1]).norm()
         return ratios.sum() + result.residuals[:20].square().sum()
 
@@ -89,13 +93,13 @@ def test_derivative_of_a_bundle(scene: Scene, generator: torch.Generator) -> Non
 def test_priors_of_intrinsics_count(scene: Scene) -> None:
     poses, camera, X, x, view, point = scene
     data = (poses, camera, X, x, view, point)
-    free = bundle_covariance(*data, sigma=1.0, free=("focal",))
-    fixed = bundle_covariance(*data, sigma=1.0, free=())
+    free = bundle_covariance(BundleProblem.of(*data), sigma=1.0, free=("focal",))
+    fixed = bundle_covariance(BundleProblem.of(*data), sigma=1.0, free=())
     for width in (1e-9, 1e9):
-        known = bundle_covariance(*data, sigma=1.0, free=("focal",), intrinsics_sigma={"focal": width})
+        known = bundle_covariance(BundleProblem.of(*data), sigma=1.0, free=("focal",), intrinsics_sigma={"focal": width})
         expected = free if width > 1 else fixed
         torch.testing.assert_close(known.poses, expected.poses, rtol=1e-4, atol=1e-12)
     # A prior as wide as what the images say halves the variance.
     sigma = float(free.cameras[0, 0, 0].sqrt() / camera.K[..., 0, 0].flatten()[0])
-    both = bundle_covariance(*data, sigma=1.0, free=("focal",), intrinsics_sigma={"focal": sigma})
+    both = bundle_covariance(BundleProblem.of(*data), sigma=1.0, free=("focal",), intrinsics_sigma={"focal": sigma})
     torch.testing.assert_close(both.cameras[0, 0, 0], free.cameras[0, 0, 0] / 2, rtol=1e-6, atol=0)

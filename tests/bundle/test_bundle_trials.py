@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_adjust, bundle_covariance
 from torchsfm.formats import read_bal
-from torchsfm.geometry import Camera, Pose, intrinsics, rotation_from_rotvec, rotvec_from_rotation
+from torchsfm.geometry import BundleProblem, Camera, Pose, intrinsics, rotation_from_rotvec, rotvec_from_rotation
 from torchsfm.optim import levenberg_marquardt
 
 F64 = torch.float64
@@ -62,7 +62,7 @@ def trials(scene: tuple[Pose, Camera, Tensor, Tensor, Tensor, Tensor], generator
 @pytest.mark.slow
 def test_free_network(scene: tuple[Pose, Camera, Tensor, Tensor, Tensor, Tensor], generator: torch.Generator) -> None:
     poses, camera, X, x, view, point = scene
-    known = bundle_covariance(poses, camera, X, x, view, point, free=(), sigma=SIGMA)
+    known = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), free=(), sigma=SIGMA)
     assert known.nullity == 7
     error = trials(scene, generator)
     # Both in one gauge: steps without a part along the seven directions.
@@ -96,7 +96,7 @@ def test_the_adjustment_is_that_of_the_trials(
     N = gauge_directions(poses)
     across = torch.eye(6 * VIEWS, dtype=F64) - N @ torch.linalg.pinv(N)
     for k in range(5):
-        found = bundle_adjust(poses, camera, X, noisy[k], view, point, free=(), tolerance=1e-12).poses
+        found = bundle_adjust(BundleProblem.of(poses, camera, X, noisy[k], view, point), free=(), tolerance=1e-12).poses
         w = rotvec_from_rotation(found.R @ poses.R.mT)
         v = found.t - (found.R @ poses.R.mT @ poses.t[:, :, None])[:, :, 0]
         step = torch.cat((w, v), 1).flatten()
@@ -113,8 +113,10 @@ def test_covariance_of_poses_is_pycolmaps(
     poses, camera, X, x, view, point = scene
     x = x + SIGMA * torch.randn(x.shape, generator=generator, dtype=F64)
     fixed = torch.tensor([True, True, False, False])
-    found = bundle_adjust(poses, camera, X, x, view, point, free=(), fixed_poses=fixed, tolerance=1e-12)
-    ours = bundle_covariance(found.poses, camera, found.X, x, view, point, free=(), fixed_poses=fixed, sigma=1.0)
+    found = bundle_adjust(BundleProblem.of(poses, camera, X, x, view, point), free=(), fixed_poses=fixed, tolerance=1e-12)
+    ours = bundle_covariance(
+        BundleProblem.of(found.poses, camera, found.X, x, view, point), free=(), fixed_poses=fixed, sigma=1.0
+    )
 
     model = pycolmap.Reconstruction()
     K = camera.K[0]
@@ -161,11 +163,15 @@ def test_derivative_on_ladybug(data: Path, generator: torch.Generator) -> None:
     problem = read_bal(data / "bal" / "problem-49-7776-pre.txt.gz")
     free = {"free": ("focal", "k1", "k2"), "max_iterations": 500}
     start = bundle_adjust(
-        problem.poses, problem.cameras, problem.X, problem.x, problem.view, problem.point, tolerance=1e-12, **free
+        BundleProblem.of(problem.poses, problem.cameras, problem.X, problem.x, problem.view, problem.point),
+        tolerance=1e-12,
+        **free,
     )
 
     def quantity(x: Tensor, tolerance: float = 1e-13) -> Tensor:
-        found = bundle_adjust(start.poses, start.cameras, start.X, x, problem.view, problem.point, tolerance=tolerance, **free)
+        found = bundle_adjust(
+            BundleProblem.of(start.poses, start.cameras, start.X, x, problem.view, problem.point), tolerance=tolerance, **free
+        )
         length = found.poses.centre.diff(dim=0).norm(dim=1)
         ramp = torch.linspace(-1, 1, 49, dtype=F64)
         return 100 * (length[1:] / length[:-1]) @ ramp[:47] + found.cameras.K[:, 0, 0] @ ramp

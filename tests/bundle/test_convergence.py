@@ -74,10 +74,8 @@ def test_the_derivative_of_the_default_call(outliers: float, loss: Cauchy | None
     for problem in problems(4, outliers):
 
         def adjust(x: Tensor, start: BundleProblem, problem: BundleProblem = problem, **options: float) -> BundleResult:
-            return bundle_adjust(
-                start.poses, start.cameras, start.X, x, problem.view, problem.point,
-                camera_index=problem.camera_index, free=FREE, loss=loss, **options,
-            )  # fmt: skip
+            moved = replace(problem, poses=start.poses, cameras=start.cameras, X=start.X, x=x)
+            return bundle_adjust(moved, free=FREE, loss=loss, **options)
 
         def size(result: BundleResult) -> Tensor:
             length = result.poses.centre.diff(dim=0).norm(dim=1)

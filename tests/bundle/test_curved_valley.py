@@ -49,8 +49,8 @@ def test_the_bottom_of_the_valley_is_reached(generator: torch.Generator, factor:
         start = zoomed(truth, factor)
         data = (truth.x, truth.view, truth.point)
         options = {"free": ("focal", "k1", "k2", "principal_point"), "tolerance": 1e-9}
-        best = bundle_adjust(truth.poses, truth.cameras, truth.X, *data, **options, max_iterations=200)
-        found = bundle_adjust(start.poses, start.cameras, start.X, *data, **options, max_iterations=25)
+        best = bundle_adjust(BundleProblem.of(truth.poses, truth.cameras, truth.X, *data), **options, max_iterations=200)
+        found = bundle_adjust(BundleProblem.of(start.poses, start.cameras, start.X, *data), **options, max_iterations=25)
         assert found.status == best.status == Status.OK
         assert found.cost < best.cost * (1 + 1e-6)
         assert abs(float(found.cameras.K[0, 0, 0] / best.cameras.K[0, 0, 0]) - 1) < 1e-3

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchsfm.bundle import CentrePrior, PointPrior, PosePrior, Prior, Rig, bundle_adjust, bundle_covariance
 from torchsfm.geometry import (
+    BundleProblem,
     Camera,
     NoDistortion,
     Pose,
@@ -57,11 +58,13 @@ def test_positions_hold_the_world(scene: Scene, generator: torch.Generator) -> N
         PointPrior(torch.arange(20), X[:20], 0.01),
         PosePrior(torch.arange(6), poses, 0.01),
     ):
-        result = bundle_adjust(start, camera, X0, x, view, point, free=(), priors=[prior], tolerance=1e-12, max_iterations=100)
+        result = bundle_adjust(
+            BundleProblem.of(start, camera, X0, x, view, point), free=(), priors=[prior], tolerance=1e-12, max_iterations=100
+        )
         assert (result.poses.centre - truth).norm(dim=1).max() < 0.05
         assert (result.X - X).norm(dim=1).mean() < 0.02
-        free = bundle_covariance(poses, camera, X, x, view, point, free=())
-        held = bundle_covariance(poses, camera, X, x, view, point, free=(), priors=[prior], sigma=0.5)
+        free = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), free=())
+        held = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), free=(), priors=[prior], sigma=0.5)
         assert (free.nullity, held.nullity) == (7, 0)
 
 
@@ -72,13 +75,17 @@ def test_information_adds_up(scene: Scene, generator: torch.Generator) -> None:
     sigma = torch.tensor([0.02, 0.02, 0.05], dtype=F64)
     weights = torch.full((len(x),), 1 / 0.5**2, dtype=F64)
     prior = CentrePrior(torch.arange(6), poses.centre, sigma)
-    known = bundle_covariance(poses, camera, X, exact, view, point, free=(), weights=weights, sigma=1.0, priors=[prior])
+    known = bundle_covariance(
+        BundleProblem.of(poses, camera, X, exact, view, point), free=(), weights=weights, sigma=1.0, priors=[prior]
+    )
     chi2 = []
     for _ in range(30):
         noisy = exact + 0.5 * torch.randn(x.shape, generator=generator, dtype=F64)
         gps = poses.centre + sigma * torch.randn(6, 3, generator=generator, dtype=F64)
         prior = CentrePrior(torch.arange(6), gps, sigma)
-        result = bundle_adjust(poses, camera, X, noisy, view, point, free=(), weights=weights, priors=[prior], tolerance=1e-10)
+        result = bundle_adjust(
+            BundleProblem.of(poses, camera, X, noisy, view, point), free=(), weights=weights, priors=[prior], tolerance=1e-10
+        )
         error = (result.X - X)[:, None]
         chi2.append((error @ torch.linalg.solve(known.X, error.mT)).mean() / 3)
     # All points of a trial share the error of the world's place.
@@ -91,9 +98,9 @@ def test_sigmas_and_covariances_say_the_same(scene: Scene, generator: torch.Gene
     sigma = torch.tensor([0.01, 0.02, 0.03], dtype=F64)
     centre = poses.centre[which] + 0.02
     covariance = torch.diag(sigma.square()).expand(3, 3, 3)
-    args = (poses, camera, X, x, view, point)
-    one = bundle_adjust(*args, free=(), priors=[CentrePrior(which, centre, sigma)], tolerance=1e-12)
-    two = bundle_adjust(*args, free=(), priors=[CentrePrior(which, centre, 1.0, covariance=covariance)], tolerance=1e-12)
+    problem = BundleProblem.of(poses, camera, X, x, view, point)
+    one = bundle_adjust(problem, free=(), priors=[CentrePrior(which, centre, sigma)], tolerance=1e-12)
+    two = bundle_adjust(problem, free=(), priors=[CentrePrior(which, centre, 1.0, covariance=covariance)], tolerance=1e-12)
     torch.testing.assert_close(one.X, two.X, rtol=0, atol=1e-9)
     assert one.cost == pytest.approx(two.cost, rel=1e-10)
     # A rotated covariance is that of rotated errors: the cost at the start is the Mahalanobis distance.
@@ -101,9 +108,12 @@ def test_sigmas_and_covariances_say_the_same(scene: Scene, generator: torch.Gene
     skewed = turn @ torch.diag(sigma.square()) @ turn.mT
     error = poses.centre[which] - centre
     expected = (error[:, None] @ torch.linalg.solve(skewed, error[:, :, None])).sum() / 2
-    plain = bundle_adjust(*args, free=(), max_iterations=0)
+    plain = bundle_adjust(problem, free=(), max_iterations=0)
     three = bundle_adjust(
-        *args, free=(), max_iterations=0, priors=[CentrePrior(which, centre, 1.0, covariance=skewed.expand(3, 3, 3))]
+        problem,
+        free=(),
+        max_iterations=0,
+        priors=[CentrePrior(which, centre, 1.0, covariance=skewed.expand(3, 3, 3))],
     )
     assert three.initial_cost - plain.initial_cost == pytest.approx(float(expected), rel=1e-9)
 
@@ -113,9 +123,9 @@ def test_a_pose_prior_measures_its_own_coordinates(scene: Scene, generator: torc
     delta = 0.1 * torch.randn(6, 6, generator=generator, dtype=F64)
     off = poses.retract(delta)
     sigma = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=F64)
-    args = (off, camera, X, x, view, point)
-    with_prior = bundle_adjust(*args, free=(), max_iterations=0, priors=[PosePrior(torch.arange(6), poses, sigma)])
-    without = bundle_adjust(*args, free=(), max_iterations=0)
+    problem = BundleProblem.of(off, camera, X, x, view, point)
+    with_prior = bundle_adjust(problem, free=(), max_iterations=0, priors=[PosePrior(torch.arange(6), poses, sigma)])
+    without = bundle_adjust(problem, free=(), max_iterations=0)
     expected = float((delta / sigma).square().sum() / 2)
     assert with_prior.initial_cost - without.initial_cost == pytest.approx(expected, rel=1e-8)
 
@@ -124,9 +134,9 @@ def test_a_robust_prior_survives_a_wrong_position(scene: Scene) -> None:
     poses, camera, X, x, view, point = scene
     centre = poses.centre.clone()
     centre[4] += 5.0
-    args = (poses, camera, X, x, view, point)
-    plain = bundle_adjust(*args, free=(), priors=[CentrePrior(torch.arange(6), centre, 0.01)])
-    robust = bundle_adjust(*args, free=(), priors=[CentrePrior(torch.arange(6), centre, 0.01, loss=Cauchy(2.0))])
+    problem = BundleProblem.of(poses, camera, X, x, view, point)
+    plain = bundle_adjust(problem, free=(), priors=[CentrePrior(torch.arange(6), centre, 0.01)])
+    robust = bundle_adjust(problem, free=(), priors=[CentrePrior(torch.arange(6), centre, 0.01, loss=Cauchy(2.0))])
     assert (robust.poses.centre - poses.centre).norm(dim=1).max() < 0.05
     assert (plain.poses.centre - poses.centre).norm(dim=1).max() > 0.3
 
@@ -142,7 +152,9 @@ def test_priors_place_what_images_do_not(scene: Scene) -> None:
         PointPrior(torch.tensor([3]), goal * torch.nan, 0.1),
         CentrePrior(torch.tensor([4]), goal, 0.0),
     ]
-    result = bundle_adjust(poses, camera, X, x[keep], view[keep], point[keep], free=(), priors=priors, tolerance=1e-12)
+    result = bundle_adjust(
+        BundleProblem.of(poses, camera, X, x[keep], view[keep], point[keep]), free=(), priors=priors, tolerance=1e-12
+    )
     torch.testing.assert_close(result.poses.t[1], goal[0], rtol=0, atol=1e-6)
     torch.testing.assert_close(result.X[2], goal[0], rtol=0, atol=1e-6)
     assert result.X.isfinite().all()
@@ -154,7 +166,9 @@ def test_derivatives_of_priors(scene: Scene, generator: torch.Generator) -> None
 
     def function(centre: Tensor, control: Tensor) -> Tensor:
         priors: list[Prior] = [CentrePrior(torch.arange(6), centre, 0.02), PointPrior(torch.arange(4), control, 0.03)]
-        result = bundle_adjust(poses, camera, X, x, view, point, free=("focal",), priors=priors, tolerance=1e-15)
+        result = bundle_adjust(
+            BundleProblem.of(poses, camera, X, x, view, point), free=("focal",), priors=priors, tolerance=1e-15
+        )
         return result.X.sum() + result.poses.t.square().sum() + result.cameras.K[0, 0, 0] / 100
 
     inputs = poses.centre, X[:4]
@@ -171,9 +185,9 @@ def test_first_gauge(scene: Scene, generator: torch.Generator) -> None:
     start = poses.retract(0.02 * torch.randn(6, 6, generator=generator, dtype=F64))
     X0 = X + 0.02 * torch.randn(X.shape, generator=generator, dtype=F64)
     seen = view != 0
-    args = (start, camera, X0, x[seen], view[seen], point[seen])
-    free = bundle_adjust(*args, free=(), tolerance=1e-12)
-    first = bundle_adjust(*args, free=(), tolerance=1e-12, gauge="first")
+    problem = BundleProblem.of(start, camera, X0, x[seen], view[seen], point[seen])
+    free = bundle_adjust(problem, free=(), tolerance=1e-12)
+    first = bundle_adjust(problem, free=(), tolerance=1e-12, gauge="first")
     assert first.cost == free.cost
     # View 0 sees nothing and stays; view 1 is the first that takes part.
     for k in (0, 1):
@@ -198,7 +212,12 @@ def test_first_gauge_of_a_rig(scene: Scene, generator: torch.Generator) -> None:
     body = body.retract(0.01 * torch.randn(6, 6, generator=generator, dtype=F64))
     for fixed in (None, torch.tensor([True, True])):
         result = bundle_adjust(
-            body, camera, X, x, view, point, free=(), rig=rig, fixed_sensors=fixed, gauge="first", tolerance=1e-12
+            BundleProblem.of(body, camera, X, x, view, point),
+            free=(),
+            rig=rig,
+            fixed_sensors=fixed,
+            gauge="first",
+            tolerance=1e-12,
         )
         assert torch.equal(result.poses.R[0], body.R[0])
         assert result.rig is not None
@@ -210,23 +229,26 @@ def test_first_gauge_of_a_rig(scene: Scene, generator: torch.Generator) -> None:
 
 def test_gauge_that_is_held_already(scene: Scene) -> None:
     poses, camera, X, x, view, point = scene
-    args = (poses, camera, X, x, view, point)
+    problem = BundleProblem.of(poses, camera, X, x, view, point)
     for options in (
         {"fixed_poses": torch.arange(6) == 0},
         {"fixed_points": torch.arange(60) == 0},
         {"priors": [CentrePrior(torch.arange(6), poses.centre, 1.0)]},
     ):
         with pytest.raises(ValueError, match="gauge"):
-            bundle_adjust(*args, gauge="first", **options)  # type: ignore[arg-type]
+            bundle_adjust(problem, gauge="first", **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_priors(scene: Scene) -> None:
     poses, camera, X, x, view, point = scene
-    args = (poses, camera, X, x, view, point)
+    problem = BundleProblem.of(poses, camera, X, x, view, point)
     with pytest.raises(ValueError, match="centre: wanted k = 2"):
         CentrePrior(torch.arange(2), poses.centre, 1.0)
     with pytest.raises(ValueError, match="covariance: wanted shape"):
         PointPrior(torch.arange(2), X[:2], 1.0, covariance=torch.eye(3, dtype=F64)[0])
     with pytest.raises(ValueError, match=r"priors\[1\]\.index: wanted numbers from 0 to 5"):
-        bundle_adjust(*args, priors=[PointPrior(torch.tensor([7]), X[:1], 1.0), PosePrior(torch.tensor([6]), poses[:1], 1.0)])
+        bundle_adjust(
+            problem,
+            priors=[PointPrior(torch.tensor([7]), X[:1], 1.0), PosePrior(torch.tensor([6]), poses[:1], 1.0)],
+        )

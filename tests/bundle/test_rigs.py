@@ -8,7 +8,7 @@ from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, Rig, bundle_adjust, bundle_covariance
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rig import RigProjection
-from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_angle, rotation_from_rotvec
+from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.intrinsic_parameters import row_from_camera
 from torchsfm.optim import RigidMotion, Subset
 from torchsfm.optim.terms import Block, Term, Workspace, lift_of, linearize
@@ -54,10 +54,11 @@ def run(scene: Scene, generator: torch.Generator, **options: object) -> BundleRe
             torch.where(fixed[:, None, None], rig.cam_from_rig.R, places.R),
             torch.where(fixed[:, None], rig.cam_from_rig.t, places.t),
         )
-    options = {"free": (), "camera_index": rig.sensor, "tolerance": 1e-12} | options
+    options = {"free": (), "tolerance": 1e-12} | options
     start = Rig(places, rig.sensor, rig.frame)
     noisy = X + 0.02 * torch.randn(X.shape, generator=generator, dtype=F64)
-    return bundle_adjust(disturb(body, generator), cameras, noisy, x, view, point, rig=start, **options)  # type: ignore[arg-type]
+    problem = BundleProblem(start.view_poses(disturb(body, generator)), cameras, rig.sensor, noisy, x, view, point)
+    return bundle_adjust(problem, rig=start, **options)  # type: ignore[arg-type]
 
 
 def test_jacobians(generator: torch.Generator) -> None:
@@ -135,10 +136,14 @@ def test_one_sensor_is_no_rig(generator: torch.Generator) -> None:
     first = rig.sensor[view] == 0
     args = x[first], rig.frame[view[first]], point[first]
     start, X0 = disturb(body, generator), X + 0.01
-    plain = bundle_adjust(start, cameras[:1], X0, *args, free=("focal", "k1"), tolerance=1e-12)
+    plain = bundle_adjust(BundleProblem.of(start, cameras[:1], X0, *args), free=("focal", "k1"), tolerance=1e-12)
     one = Rig(Pose.identity(1, dtype=F64), torch.zeros(5, dtype=torch.int64), torch.arange(5))
     through = bundle_adjust(
-        start, cameras[:1], X0, *args, free=("focal", "k1"), tolerance=1e-12, rig=one, fixed_sensors=torch.tensor([True])
+        BundleProblem.of(start, cameras[:1], X0, *args),
+        free=("focal", "k1"),
+        tolerance=1e-12,
+        rig=one,
+        fixed_sensors=torch.tensor([True]),
     )
     assert through.cost == pytest.approx(plain.cost, rel=1e-8)
     torch.testing.assert_close(through.residuals, plain.residuals, rtol=1e-4, atol=1e-4)
@@ -151,14 +156,19 @@ def test_statistics_and_gain(generator: torch.Generator) -> None:
     result = run(scene, generator, fixed_sensors=torch.tensor([True, False, False]))
     freedom = 2 * len(x) - 6 * 5 - 6 * 2 - 3 * 300 + 7
     assert abs(result.cost / (0.045 * freedom) - 1) < 4 * (2 / freedom) ** 0.5
-    options = {"camera_index": rig.sensor, "free": (), "sigma": 0.3}
+    options = {"free": (), "sigma": 0.3}
+    problem = BundleProblem(rig.view_poses(body), cameras, rig.sensor, X, x, view, point)
     hold = torch.arange(5) == 0
     bound = bundle_covariance(
-        body, cameras, X, x, view, point, rig=rig, fixed_sensors=torch.tensor([True] * 3), fixed_poses=hold, **options
+        problem,
+        rig=rig,
+        fixed_sensors=torch.tensor([True] * 3),
+        fixed_poses=hold,
+        **options,
     )
     assert bound.nullity == 0
     assert bound.sensors is not None
-    loose = bundle_covariance(rig.view_poses(body), cameras, X, x, view, point, fixed_poses=hold[rig.frame], **options)
+    loose = bundle_covariance(problem, fixed_poses=hold[rig.frame], **options)
     first = torch.tensor([int((rig.frame == k).nonzero()[0]) for k in range(5)])
     assert (bound.poses[1:].diagonal(dim1=1, dim2=2) < 1.001 * loose.poses[first][1:].diagonal(dim1=1, dim2=2)).all()
 
@@ -170,9 +180,8 @@ def test_derivatives(generator: torch.Generator) -> None:
     def function(x: Tensor, t: Tensor) -> Tensor:
         at = Rig(Pose(rig.cam_from_rig.R, t), rig.sensor, rig.frame)
         hold = torch.tensor([True, True, False])
-        result = bundle_adjust(
-            body, cameras, X, x, view, point, camera_index=rig.sensor, free=(), rig=at, fixed_sensors=hold, tolerance=1e-15
-        )
+        problem = BundleProblem(at.view_poses(body), cameras, rig.sensor, X, x, view, point)
+        result = bundle_adjust(problem, free=(), rig=at, fixed_sensors=hold, tolerance=1e-15)
         assert result.rig is not None
         return (
             (result.X[0] - result.X[1:5]).norm(dim=1).sum()
@@ -194,12 +203,14 @@ def test_derivatives(generator: torch.Generator) -> None:
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_rigs(generator: torch.Generator) -> None:
     body, rig, cameras, X, x, view, point = make_scene(generator)
-    options = {"camera_index": rig.sensor}
-    with pytest.raises(ValueError, match=r"rig\.frame: wanted numbers from 0 to 3"):
-        bundle_adjust(body[:4], cameras, X, x, view, point, rig=rig, **options)
+    problem = BundleProblem(rig.view_poses(body), cameras, rig.sensor, X, x, view, point)
+    with pytest.raises(ValueError, match=r"rig\.frame: wanted numbers from 0 to 13"):
+        bundle_adjust(problem, rig=Rig(rig.cam_from_rig, rig.sensor, rig.frame + 20))
+    with pytest.raises(ValueError, match="sensor: wanted v = 14"):
+        bundle_adjust(problem, rig=Rig(rig.cam_from_rig, rig.sensor[:13], rig.frame[:13]))
     with pytest.raises(ValueError, match=r"rig\.sensor: wanted numbers from 0 to 2"):
-        bundle_adjust(body, cameras, X, x, view, point, rig=Rig(rig.cam_from_rig, rig.sensor + 1, rig.frame), **options)
+        bundle_adjust(problem, rig=Rig(rig.cam_from_rig, rig.sensor + 1, rig.frame))
     with pytest.raises(ValueError, match="without a rig"):
-        bundle_adjust(body, cameras[:1], X, x, view * 0, point, fixed_sensors=torch.tensor([True]))
+        bundle_adjust(BundleProblem.of(body, cameras[:1], X, x, view * 0, point), fixed_sensors=torch.tensor([True]))
     with pytest.raises(ValueError, match="frame: wanted v = 3"):
         Rig(rig.cam_from_rig, rig.sensor[:3], rig.frame)

@@ -64,11 +64,10 @@ def test_forward_motion_finds_its_focal_length(generator: torch.Generator) -> No
 def test_deviations_are_those_of_the_whole_covariance(generator: torch.Generator) -> None:
     for _ in range(5):
         p = random_bundle_problem(6, 80, 300, generator=generator).truth
-        data = (p.poses, p.cameras, p.X, p.x, p.view, p.point)
-        options = {"camera_index": p.camera_index, "free": ("focal", "k1", "k2"), "loss": Cauchy(1.0)}
+        options = {"free": ("focal", "k1", "k2"), "loss": Cauchy(1.0)}
         options["fixed_intrinsics"] = {"k2": torch.arange(6) < 2}
-        expected = bundle_covariance(*data, **options, sigma=1.0).cameras
-        found = intrinsics_covariance(*data, **options)
+        expected = bundle_covariance(p, **options, sigma=1.0).cameras
+        found = intrinsics_covariance(p, **options)
         # Relative to the deviations; what is held has none.
         scale = expected.diagonal(dim1=1, dim2=2).sqrt()
         scale = torch.where(scale > 0, scale, 1.0)
@@ -78,12 +77,11 @@ def test_deviations_are_those_of_the_whole_covariance(generator: torch.Generator
 
 def test_a_prior_adds_its_information(generator: torch.Generator) -> None:
     p = random_bundle_problem(6, 80, 300, generator=generator).truth
-    data = (p.poses, p.cameras, p.X, p.x, p.view, p.point)
     held = {"focal": torch.arange(6) > 0}
-    options = {"camera_index": p.camera_index, "free": ("focal",), "fixed_intrinsics": held}
+    options = {"free": ("focal",), "fixed_intrinsics": held}
     width = torch.tensor([0.01, 1.0, 1.0, 1.0, 1.0, 1.0]).double()
-    without = intrinsics_covariance(*data, **options)[0, 0, 0]
-    found = intrinsics_covariance(*data, **options, intrinsics_sigma={"focal": width})[0, 0, 0]
+    without = intrinsics_covariance(p, **options)[0, 0, 0]
+    found = intrinsics_covariance(p, **options, intrinsics_sigma={"focal": width})[0, 0, 0]
     prior = (0.01 * p.cameras.K[0, 0, 0]) ** 2
     torch.testing.assert_close(1 / found, 1 / without + 1 / prior, rtol=1e-6, atol=0)
 

@@ -1,5 +1,6 @@
 """Which poses, cameras and structure, all together, explain the images best?"""
 
+from torchsfm.bundle.blocks import BundleTerms
 from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
 from torchsfm.bundle.bundle_adjust_model import AdjustedModel, BundleModel, bundle_adjust_model
 from torchsfm.bundle.bundle_adjust_projective import ProjectiveBundleResult, bundle_adjust_projective
@@ -14,6 +15,7 @@ __all__ = [
     "BundleCovariance",
     "BundleModel",
     "BundleResult",
+    "BundleTerms",
     "CentrePrior",
     "Gauge",
     "PointPrior",

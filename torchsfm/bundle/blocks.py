@@ -2,97 +2,127 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypedDict
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options, check_tensors
-from torchsfm.bundle.intrinsics import Switched, free_columns, free_switches
+from torchsfm.bundle.intrinsics import Switched, free_columns, free_switches, intrinsics_prior
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rays import RayPoint, ray_points
 from torchsfm.bundle.rig import Rig, RigProjection
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.geometry.intrinsic_parameters import HEAD, SKEW, camera_from_row, row_from_camera
 from torchsfm.optim import Block, Loss, RigidMotion, Subset, Term
 
 
-@dataclass(frozen=True)
-class Bundle:
-    """What is adjusted: everything that blocks and terms are made of; see `bundle_adjust`."""
+class BundleTerms(TypedDict, total=False):
+    """What of a bundle is adjusted, held and known: `bundle_adjust(problem, free=("focal", "k1"), fixed_points=known)`.
 
-    poses: Pose
-    cameras: Camera
-    X: Tensor
-    x: Tensor
-    view: Tensor
-    point: Tensor
-    camera_index: Tensor | None
+    Attributes:
+        free: What is optimised in the cameras: any of "focal" (one scale of fx and fy), "aspect", "principal_point", "skew",
+            and names of distortion parameters; "focal" if not given, empty for known intrinsics.
+        fixed_poses: Poses that do not move, `(v)`; with a rig, those of its frames, `(f)`.
+        fixed_points: Points that do not move, `(n)`.
+        fixed_cameras: Cameras that do not change, `(g)`.
+        fixed_intrinsics: By names as in `free`, cameras `(g)` in which these do not change, where they are free in others.
+        rig: Which views were taken together: `cam_from_world = cam_from_rig rig_from_world`. It starts, frame by frame, where
+            its first view is.
+        fixed_sensors: Sensors `(k)` whose place on the rig does not change: all of a calibrated rig, or one of each rig, whose
+            frame is then the rig's own (else damping decides that, too).
+        weights: Weight of each observation's squared distance, `(m)`; 0 leaves it out.
+        loss: Robust loss of the squared distance (see `torchsfm.optim`), squares if not given.
+        priors: What is known of poses and points: `CentrePrior`, `PosePrior`, `PointPrior`.
+        intrinsics_sigma: Standard deviations of Gaussian priors on free intrinsics, by the names in `free`, as a fraction of
+            the mean for "focal" and absolute otherwise, for all cameras or (g,) for each. An observation's distance counts in
+            units of 1 pixel.
+        intrinsics_mean: Where these are centred; the cameras given if not given.
+    """
+
     free: Sequence[str]
+    fixed_poses: Bool[Tensor, "f"] | None
+    fixed_points: Bool[Tensor, "n"] | None
+    fixed_cameras: Bool[Tensor, "g"] | None
+    fixed_intrinsics: Mapping[str, Bool[Tensor, "g"]] | None
     rig: Rig | None
-    fixed_poses: Tensor | None
-    fixed_points: Tensor | None
-    fixed_cameras: Tensor | None
-    fixed_intrinsics: Mapping[str, Tensor] | None
-    fixed_sensors: Tensor | None
-    weights: Tensor | None
+    fixed_sensors: Bool[Tensor, "k"] | None
+    weights: Float[Tensor, "m"] | None
     loss: Loss | None
     priors: Sequence[Prior]
+    intrinsics_sigma: Mapping[str, float | Tensor] | None
+    intrinsics_mean: Camera | None
 
-    def camera_of_views(self) -> Tensor:
-        """Check shapes and indices; return the camera of each view.
+
+@dataclass(frozen=True)
+class Bundle:
+    """A problem with what is adjusted, held and known of it, by the names of `BundleTerms`."""
+
+    start: BundleProblem
+    free: Sequence[str] = ("focal",)
+    fixed_poses: Tensor | None = None
+    fixed_points: Tensor | None = None
+    fixed_cameras: Tensor | None = None
+    fixed_intrinsics: Mapping[str, Tensor] | None = None
+    rig: Rig | None = None
+    fixed_sensors: Tensor | None = None
+    weights: Tensor | None = None
+    loss: Loss | None = None
+    priors: Sequence[Prior] = ()
+    intrinsics_sigma: Mapping[str, float | Tensor] | None = None
+    intrinsics_mean: Camera | None = None
+
+    @cached_property
+    def poses(self) -> Pose:
+        """The poses that move: of the views, or of the frames of the rig."""
+        return self.start.poses if self.rig is None else self.rig.frame_poses(self.start.poses)
+
+    def check(self) -> None:
+        """Check shapes and indices.
 
         Raises:
             ValueError: Something does not fit.
         """
-        poses, cameras, rig = self.poses, self.cameras, self.rig
+        start, rig = self.start, self.rig
+        check_options(problem=(start, BundleProblem))
         check_options(
-            poses=(poses, Pose),
-            cameras=(cameras, Camera),
+            poses=(start.poses, Pose),
+            cameras=(start.cameras, Camera),
             free=(self.free, Sequence),
             fixed_intrinsics=(self.fixed_intrinsics, Mapping | None),
             rig=(rig, Rig | None),
             loss=(self.loss, Callable | None),
             priors=(self.priors, list | tuple),
+            intrinsics_sigma=(self.intrinsics_sigma, Mapping | None),
+            intrinsics_mean=(self.intrinsics_mean, Camera | None),
         )
-        if len(poses.shape) != 1 or len(cameras.shape) != 1:
-            got = f"{tuple(poses.shape)}, {tuple(cameras.shape)}"
-            raise ValueError(f"poses, cameras: wanted one batch dimension each, got {got}")
-        views = poses.shape[0] if rig is None else rig.frame.shape[0]
+        views, groups = start.poses.shape[0], start.cameras.shape[0]
+        check_index(view=(start.view, views), point=(start.point, len(start.X)), camera_index=(start.camera_index, groups))
+        if rig is not None:
+            check_tensors(
+                poses=(start.poses.R, "v 3 3"),
+                cam_from_rig=(rig.cam_from_rig.R, "k 3 3"),
+                sensor=(rig.sensor, "v: int"),
+                fixed_sensors=(self.fixed_sensors, "?k: bool"),
+            )
+            check_index(**{"rig.sensor": (rig.sensor, len(rig.cam_from_rig.t)), "rig.frame": (rig.frame, views)})
+        elif self.fixed_sensors is not None:
+            raise ValueError("fixed_sensors: wanted none without a rig")
+        poses = self.poses.shape[0]
         check_one_problem(
-            poses=(poses.R, f"{poses.shape[0]} 3 3"),
-            cameras=(cameras.K, "g 3 3"),
-            X=(self.X, "n 3"),
-            x=(self.x, "m 2"),
-            view=(self.view, "m: int"),
-            point=(self.point, "m: int"),
-            camera_index=(self.camera_index, f"?{views}: int"),
-            fixed_poses=(self.fixed_poses, f"?{poses.shape[0]}: bool"),
+            X=(start.X, "n 3"),
+            x=(start.x, "m 2"),
+            cameras=(start.cameras.K, "g 3 3"),
+            fixed_poses=(self.fixed_poses, f"?{poses}: bool"),
             fixed_points=(self.fixed_points, "?n: bool"),
             fixed_cameras=(self.fixed_cameras, "?g: bool"),
             weights=(self.weights, "?m"),
         )
-        groups = cameras.shape[0]
-        index = self.camera_index
-        if index is None:
-            if groups not in (1, views):
-                raise ValueError(
-                    f"camera_index: wanted the camera of each view, since there are {groups} cameras and {views} views"
-                )
-            index = torch.arange(views, device=self.X.device) if groups == views else self.view.new_zeros(views)
-        check_index(view=(self.view, views), point=(self.point, self.X.shape[0]), camera_index=(index, groups))
-        if rig is not None:
-            check_tensors(
-                poses=(poses.R, "f 3 3"),
-                cam_from_rig=(rig.cam_from_rig.R, "k 3 3"),
-                fixed_sensors=(self.fixed_sensors, "?k: bool"),
-            )
-            check_index(**{"rig.sensor": (rig.sensor, rig.cam_from_rig.shape[0]), "rig.frame": (rig.frame, poses.shape[0])})
-        elif self.fixed_sensors is not None:
-            raise ValueError("fixed_sensors: wanted none without a rig")
-        limits = {"pose": poses.shape[0], "point": self.X.shape[0]}
+        limits = {"pose": poses, "point": len(start.X)}
         check_index(**{f"priors[{k}].index": (prior.index, limits[prior.block]) for k, prior in enumerate(self.priors)})
-        return index
 
     def problem(self) -> tuple[dict[str, Block], list[Term]]:
         """The variables, "pose", "camera", "point" and with a rig "sensor", and the terms, reprojection first.
@@ -100,38 +130,42 @@ class Bundle:
         Raises:
             ValueError: Something does not fit.
         """
-        camera_index = self.camera_of_views()
-        model = type(self.cameras.distortion)
+        self.check()
+        cameras, X, x, view, point = self.start.cameras, self.start.X, self.start.x, self.start.view, self.start.point
+        camera = self.start.camera_index[view]
+        model = type(cameras.distortion)
         columns = free_columns(self.free, model)
-        rows = row_from_camera(self.cameras)
+        rows = row_from_camera(cameras)
         manifold: Subset | Switched = Subset(rows.shape[1], columns)
         if self.fixed_intrinsics:
             manifold = Switched(rows.shape[1], columns)
-            switches = free_switches(columns, self.fixed_intrinsics, model, self.cameras.K)
+            switches = free_switches(columns, self.fixed_intrinsics, model, cameras.K)
             rows = torch.cat((rows, switches.to(rows.dtype)), 1)
-        counts = (self.x.isfinite().all(-1)) & rows.isfinite().all(-1)[camera_index[self.view]]
+        counts = x.isfinite().all(-1) & rows.isfinite().all(-1)[camera]
         if self.weights is not None:
             counts &= self.weights > 0
         centres = (self.poses if self.rig is None else self.rig.view_poses(self.poses)).centre
         blocks = {
             "pose": Block(_pose_rows(self.poses), RigidMotion(), self.fixed_poses),
             "camera": Block(rows, manifold, self.fixed_cameras),
-            "point": Block(ray_points(self.X, centres, self.view, self.point, counts), RayPoint(), self.fixed_points),
+            "point": Block(ray_points(X, centres, view, point, counts), RayPoint(), self.fixed_points),
         }
-        skew = SKEW in columns or self.cameras.K.requires_grad or bool((rows[:, SKEW] != 0).any())
+        skew = SKEW in columns or cameras.K.requires_grad or bool((rows[:, SKEW] != 0).any())
         projection = Projection(model, columns, skew, bool(self.fixed_intrinsics))
-        camera = camera_index[self.view]
-        data, options = (self.x,), (self.loss, self.weights)
+        data, options = (x,), (self.loss, self.weights)
         if self.rig is None:
-            index = (self.view, camera, self.point)
+            index = (view, camera, point)
             term = Term(projection.residual, ("pose", "camera", "point"), index, data, *options, projection.linearize)
         else:
             blocks["sensor"] = Block(_pose_rows(self.rig.cam_from_rig), RigidMotion(), self.fixed_sensors)
             through = RigProjection(projection)
             names = ("pose", "sensor", "camera", "point")
-            places = (self.rig.frame[self.view], self.rig.sensor[self.view], camera, self.point)
+            places = (self.rig.frame[view], self.rig.sensor[view], camera, point)
             term = Term(through.residual, names, places, data, *options, through.linearize)
-        return blocks, [term, *(_prior_term(prior) for prior in self.priors)]
+        terms = [term, *(_prior_term(prior) for prior in self.priors)]
+        if self.intrinsics_sigma:
+            terms.append(intrinsics_prior(self.intrinsics_sigma, self.intrinsics_mean or cameras))
+        return blocks, terms
 
 
 def cheapest_elimination(blocks: Mapping[str, Block]) -> str:

@@ -1,17 +1,15 @@
 """Bundle adjustment of a whole model: a `Reconstruction`, a `BundleProblem`, or whatever else has the same members."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, TypedDict, TypeVar, Unpack, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, Unpack, runtime_checkable
 
 from torch import Tensor
 
+from torchsfm.bundle.blocks import BundleTerms
 from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
 from torchsfm.bundle.gauge import Gauge
-from torchsfm.bundle.priors import Prior
-from torchsfm.bundle.rig import Rig
-from torchsfm.geometry import Camera, Pose
-from torchsfm.optim import Loss
+from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.optim.schur import Solver
 from torchsfm.optim.sparse_derivative import Hessian
 
@@ -52,21 +50,9 @@ class BundleModel(Protocol):
 M = TypeVar("M", bound=BundleModel)
 
 
-class BundleOptions(TypedDict, total=False):
+class BundleOptions(BundleTerms, total=False):
     """The options of `bundle_adjust`, where they are described."""
 
-    free: Sequence[str]
-    fixed_poses: Tensor | None
-    fixed_points: Tensor | None
-    fixed_cameras: Tensor | None
-    fixed_intrinsics: Mapping[str, Tensor] | None
-    rig: Rig | None
-    fixed_sensors: Tensor | None
-    weights: Tensor | None
-    loss: Loss | None
-    intrinsics_sigma: Mapping[str, float | Tensor] | None
-    intrinsics_mean: Camera | None
-    priors: Sequence[Prior]
     gauge: Gauge
     max_iterations: int
     tolerance: float
@@ -84,14 +70,13 @@ class AdjustedModel(Generic[M]):
 
 
 def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedModel[M]:
-    """Minimise the reprojection error over all poses, cameras and points of a model; `bundle_adjust` in one argument.
+    """Minimise the reprojection error over all poses, cameras and points of a model; `bundle_adjust` for what holds a bundle.
 
     Everything else in the model (names, colours, observations) stays. Views without observations keep their poses.
 
     Args:
         model: A `Reconstruction`, a `BundleProblem`, or a frozen dataclass with their members.
-        **options: Those of `bundle_adjust`. With `rig`, the model's poses are still those of its views: the rig starts, frame
-            by frame, where its first view is, and `fixed_poses` goes by frames.
+        **options: Those of `bundle_adjust`.
 
     Returns:
         The new model, of the same kind, and the result with costs, residuals and status.
@@ -99,11 +84,8 @@ def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedM
     Raises:
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
-    rig = options.get("rig")
-    poses = model.poses if rig is None else rig.frame_poses(model.poses)
-    result = bundle_adjust(
-        poses, model.cameras, model.X, model.x, model.view, model.point, camera_index=model.camera_index, **options
-    )
+    problem = BundleProblem(model.poses, model.cameras, model.camera_index, model.X, model.x, model.view, model.point)
+    result = bundle_adjust(problem, **options)
     poses = result.poses if result.rig is None else result.rig.view_poses(result.poses)
     whole: Any = model
     return AdjustedModel(replace(whole, poses=poses, cameras=result.cameras, X=result.X), result)

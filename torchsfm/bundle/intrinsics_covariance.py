@@ -3,25 +3,17 @@
 from collections.abc import Mapping, Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_options
 from torchsfm.bundle.blocks import Bundle
-from torchsfm.bundle.intrinsics import intrinsics_prior
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import BundleProblem, Camera
 from torchsfm.optim import Loss, marginal_covariance
 
 
 def intrinsics_covariance(
-    poses: Pose,
-    cameras: Camera,
-    X: Float[Tensor, "n 3"],
-    x: Float[Tensor, "m 2"],
-    view: Int[Tensor, "m"],
-    point: Int[Tensor, "m"],
+    problem: BundleProblem,
     *,
-    camera_index: Int[Tensor, "v"] | None = None,
     free: Sequence[str] = ("focal",),
     fixed_intrinsics: Mapping[str, Bool[Tensor, "g"]] | None = None,
     loss: Loss | None = None,
@@ -41,11 +33,9 @@ def intrinsics_covariance(
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
     bundle = Bundle(
-        poses, cameras, X, x, view, point, camera_index, free, None, None, None, None, fixed_intrinsics, None, None, loss, ()
-    )
+        problem, free=free, fixed_intrinsics=fixed_intrinsics, loss=loss, intrinsics_sigma=intrinsics_sigma,
+        intrinsics_mean=intrinsics_mean,
+    )  # fmt: skip
     with torch.no_grad():
         blocks, terms = bundle.problem()
-        check_options(intrinsics_sigma=(intrinsics_sigma, Mapping | None))
-        if intrinsics_sigma:
-            terms.append(intrinsics_prior(intrinsics_sigma, cameras if intrinsics_mean is None else intrinsics_mean))
         return marginal_covariance(blocks, terms, "camera", eliminate="point")

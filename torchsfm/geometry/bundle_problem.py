@@ -44,6 +44,31 @@ class BundleProblem:
             point=(self.point, "m: int"),
         )
 
+    @classmethod
+    def of(
+        cls,
+        poses: Pose,
+        cameras: Camera,
+        X: Float[Tensor, "n 3"],
+        x: Float[Tensor, "m 2"],
+        view: Int[Tensor, "m"],
+        point: Int[Tensor, "m"],
+        *,
+        camera_index: Int[Tensor, "v"] | None = None,
+    ) -> "BundleProblem":
+        """The problem of views that one camera took, or each one of its own, unless `camera_index` says which.
+
+        Raises:
+            ValueError: `camera_index` is missing where there are several cameras, but not one for each view.
+        """
+        if camera_index is None:
+            views, groups = poses.t.shape[0], cameras.K.shape[0]
+            if groups not in (1, views):
+                got = f"{groups} cameras and {views} views"
+                raise ValueError(f"camera_index: wanted the camera of each view, since there are {got}")
+            camera_index = torch.arange(views, device=X.device) if groups == views else view.new_zeros(views)
+        return cls(poses, cameras, camera_index, X, x, view, point)
+
     def projections(self) -> Float[Tensor, "m 2"]:
         """Where each observed point projects, in pixels; finite but meaningless behind the camera."""
         X_cam = self.poses[self.view].transform(self.X[self.point, None])

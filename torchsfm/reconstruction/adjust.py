@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
+from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.calibration import (
     CameraPrior,
@@ -59,13 +60,7 @@ def adjust(
         node, view, point = node[keep], view[keep], point[keep]
         fixed_poses, fixed_points, free = ~moving, ~touched, None
     result = bundle_adjust(
-        mapping.poses,
-        mapping.cameras,
-        mapping.X,
-        mapping.graph.x[node],
-        view,
-        point,
-        camera_index=mapping.camera_index,
+        BundleProblem(mapping.poses, mapping.cameras, mapping.camera_index, mapping.X, mapping.graph.x[node], view, point),
         fixed_poses=fixed_poses,
         fixed_points=fixed_points,
         loss=LOSS,

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
+from torchsfm.geometry import BundleProblem
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
@@ -103,13 +104,7 @@ def pose_deviations(
     # A number that was held where it was expected is as uncertain as it was expected to be.
     uncertain = {name: torch.ones(len(mapping.cameras.K), dtype=torch.bool) for name in open_numbers}
     covariance = bundle_covariance(
-        mapping.poses,
-        mapping.cameras,
-        mapping.X,
-        mapping.graph.x[node],
-        view,
-        point,
-        camera_index=mapping.camera_index,
+        BundleProblem(mapping.poses, mapping.cameras, mapping.camera_index, mapping.X, mapping.graph.x[node], view, point),
         loss=LOSS,
         sigma=measure_noise(mapping, LOSS),
         **about_cameras(mapping, uncertain, prior),
