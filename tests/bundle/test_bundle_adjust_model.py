@@ -1,6 +1,6 @@
 """Whole models in one argument: of any kind that has the members; film of few points; real problems."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +10,8 @@ from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import Rig, bundle_adjust, bundle_adjust_model
-from torchsfm.bundle.blocks import cheapest_elimination
+from torchsfm.bundle import BundleTerms, Rig, bundle_adjust, bundle_adjust_model
+from torchsfm.bundle.blocks import Bundle, cheapest_elimination
 from torchsfm.formats import read_libmv
 from torchsfm.geometry import BundleProblem, Camera, Pose, intrinsics, project_points
 from torchsfm.optim import Block, RigidMotion, Subset
@@ -26,13 +26,18 @@ def problem() -> BundleProblem:
     return random_bundle_problem(6, 80, 260, layout="path", generator=seeded(3)).problem
 
 
+def test_what_is_held_is_explained_once() -> None:
+    names = set(BundleTerms.__annotations__)
+    assert names == {f.name for f in fields(Bundle)} - {"start"}
+    for name in names:
+        assert f"        {name}: " in (BundleTerms.__doc__ or ""), name
+
+
 def test_a_problem_is_adjusted_as_its_parts(problem: BundleProblem) -> None:
     options = {"free": ("focal", "k1", "k2"), "tolerance": 1e-9}
     whole = bundle_adjust_model(problem, **options)
     p = problem
-    parts = bundle_adjust(
-        BundleProblem.of(p.poses, p.cameras, p.X, p.x, p.view, p.point, camera_index=p.camera_index), **options
-    )
+    parts = bundle_adjust(BundleProblem.of(p.poses, p.cameras, p.X, p.x, p.view, p.point), **options)
     assert whole.result.cost == parts.cost
     assert isinstance(whole.model, BundleProblem)
     assert torch.equal(whole.model.X, parts.X)

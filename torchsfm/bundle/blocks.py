@@ -59,7 +59,11 @@ class BundleTerms(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Bundle:
-    """A problem with what is adjusted, held and known of it, by the names of `BundleTerms`."""
+    """A problem with what is adjusted, held and known of it, by the names of `BundleTerms`.
+
+    Raises:
+        ValueError: Shapes, dtypes or indices do not fit.
+    """
 
     start: BundleProblem
     free: Sequence[str] = ("focal",)
@@ -80,12 +84,7 @@ class Bundle:
         """The poses that move: of the views, or of the frames of the rig."""
         return self.start.poses if self.rig is None else self.rig.frame_poses(self.start.poses)
 
-    def check(self) -> None:
-        """Check shapes and indices.
-
-        Raises:
-            ValueError: Something does not fit.
-        """
+    def __post_init__(self) -> None:
         start, rig = self.start, self.rig
         check_options(problem=(start, BundleProblem))
         check_options(
@@ -121,6 +120,7 @@ class Bundle:
             fixed_cameras=(self.fixed_cameras, "?g: bool"),
             weights=(self.weights, "?m"),
         )
+        check_options(**{f"priors[{k}]": (prior, Prior) for k, prior in enumerate(self.priors)})
         limits = {"pose": poses, "point": len(start.X)}
         check_index(**{f"priors[{k}].index": (prior.index, limits[prior.block]) for k, prior in enumerate(self.priors)})
 
@@ -128,9 +128,8 @@ class Bundle:
         """The variables, "pose", "camera", "point" and with a rig "sensor", and the terms, reprojection first.
 
         Raises:
-            ValueError: Something does not fit.
+            ValueError: A name of a number in the cameras is unknown.
         """
-        self.check()
         cameras, X, x, view, point = self.start.cameras, self.start.X, self.start.x, self.start.view, self.start.point
         camera = self.start.camera_index[view]
         model = type(cameras.distortion)
