@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm.geometry.projection import quotient_slope
 from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.triangulation import triangulate_points
 
 MAX_SLOTS = 32
 """Views used to triangulate one point; longer tracks get the rest of their observations by completion."""
@@ -79,7 +79,7 @@ def _triangulate_rows(
     threshold: float,
     min_angle: float,
 ) -> tuple[Float[Tensor, "p 3"], Tensor]:
-    """Triangulate padded tracks robustly: best two-view hypothesis, then Gauss-Newton on its inliers."""
+    """Triangulate padded tracks robustly: the best two-view hypothesis, then least squares over its inliers."""
     visible = index >= 0
     safe = index.clamp(min=0)
     view = mapping.graph.view[node[safe]]
@@ -88,16 +88,17 @@ def _triangulate_rows(
     rays = d[safe]
     world = torch.nn.functional.normalize((poses.R.mT @ rays[..., None])[..., 0], dim=-1)
     centre = poses.centre
+    # Image points of cameras without distortion and principal point.
+    image = focal[..., None] * rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
+    P = poses.matrix() * torch.stack((focal, focal, torch.ones_like(focal)), -1)[..., None]
     first, second = _widest_pairs(world, visible)
     rows = torch.arange(len(index))[:, None]
     X, angle = _midpoints(world[rows, first], world[rows, second], centre[rows, first], centre[rows, second])
 
     def errors(points: Float[Tensor, "p h 3"]) -> Float[Tensor, "p h s"]:
-        X_cam = (poses.R[:, None] @ points[:, :, None, :, None])[..., 0] + poses.t[:, None]
-        depth = X_cam[..., 2]
-        u = X_cam[..., :2] / depth.clamp(min=1e-12)[..., None]
-        image = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
-        error = (u - image[:, None]).norm(dim=-1) * focal[:, None]
+        y = (P[:, None, :, :, :3] @ points[:, :, None, :, None])[..., 0] + P[:, None, :, :, 3]
+        depth = y[..., 2]
+        error = (y[..., :2] / depth.clamp(min=1e-12)[..., None] - image[:, None]).norm(dim=-1)
         return torch.where((depth > 0) & visible[:, None], error, torch.inf)
 
     error = errors(X)
@@ -107,8 +108,7 @@ def _triangulate_rows(
     X = X[rows[:, 0], best]
     usable = score[rows[:, 0], best].isfinite()
     inlier = (error[rows[:, 0], best] < threshold) & usable[:, None]
-    for _ in range(3):
-        X = _gauss_newton(X, poses.R, poses.t, rays, inlier)
+    X = triangulate_points(image[:, :, None], P, visible=inlier[..., None]).model[:, 0]
     inlier = (errors(X[:, None])[:, 0] < threshold) & usable[:, None]
     cosine = (world[:, :, None] * world[:, None]).sum(-1)
     wide = (inlier[:, :, None] & inlier[:, None] & (cosine < torch.cos(torch.tensor(min_angle)))).any(-1).any(-1)
@@ -136,21 +136,6 @@ def _midpoints(d1: Tensor, d2: Tensor, c1: Tensor, c2: Tensor) -> tuple[Float[Te
     t = (cosine * along1 - along2) / scale
     X = 0.5 * (c1 + s[..., None] * d1 + c2 + t[..., None] * d2)
     return X, torch.atan2(sine2.sqrt(), cosine)
-
-
-def _gauss_newton(X: Tensor, R: Tensor, t: Tensor, rays: Tensor, inlier: Tensor) -> Float[Tensor, "p 3"]:
-    """One step on the reprojection error in normalised coordinates; points whose system is singular stay."""
-    X_cam = (R @ X[:, None, :, None])[..., 0] + t
-    depth = X_cam[..., 2:].clamp(min=1e-9)
-    u = X_cam[..., :2] / depth
-    residual = u - rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
-    J = quotient_slope(R[..., :2, :], R[..., 2:, :], u[..., None], 1 / depth[..., None])
-    weight = inlier.to(X.dtype)[..., None]
-    J, residual = J * weight[..., None], residual * weight
-    J, residual = J.flatten(1, 2), residual.flatten(1, 2)
-    step, info = torch.linalg.solve_ex(J.mT @ J, J.mT @ residual[..., None])
-    good = (info == 0)[:, None] & step[..., 0].isfinite().all(-1, keepdim=True)
-    return torch.where(good, X - step[..., 0], X)
 
 
 def complete_tracks(mapping: Mapping, *, threshold: float, rounds: int = 3) -> Mapping:

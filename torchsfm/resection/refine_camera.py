@@ -12,8 +12,8 @@ from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry import Camera, Pose
 from torchsfm.geometry.intrinsic_parameters import SKEW, intrinsic_columns
 from torchsfm.optim import Loss, levenberg_marquardt
-from torchsfm.resection._pinhole import minimise_pinhole
 from torchsfm.resection._reprojection import Reprojection, inverse, like
+from torchsfm.resection._squares import minimise_squares
 
 Data = tuple[Tensor, Tensor, Tensor, Camera]
 """Image points, points, weights, cameras."""
@@ -190,7 +190,7 @@ def _minimum(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_
     x, X, w, camera = data
     plain = problem.loss is None
     if plain:
-        fit = minimise_pinhole(start, theta, x, X, w, problem.inside(camera), max_iterations)
+        fit = minimise_squares(start, theta, x, X, w, problem.inside(camera), max_iterations)
         pose, theta = fit.x
         covariance, determined = inverse(fit.end.metric)
         total = w.sum(-1)

@@ -1,4 +1,4 @@
-"""Least squares of reprojection errors, thousands of small problems at once.
+"""Least squares of reprojection errors without a robust loss, thousands of small problems at once.
 
 The same minimum as by `levenberg_marquardt`, with what makes it fast: coordinates in rows, residuals next to the Jacobian so
 that one product gives cost, gradient and normal matrix, and no pass over the points that is not needed.
@@ -23,19 +23,19 @@ _EXACT = 5e-27
 """Or no more than this, for unit weights in focal lengths."""
 
 
-def minimise_pinhole(
+def minimise_squares(
     pose: Pose, theta: Tensor, x: Tensor, X: Tensor, w: Tensor, inside: Inside, max_iterations: int
 ) -> Descent:
     """Levenberg-Marquardt for poses (b), displacements theta (b, k) and points (b, n), all float64, weights >= 0."""
     root = None if bool((w == 1).all()) else w.sqrt()[:, None, None]
     f = inside.camera.K[:, 0, 0]
     M = x.new_empty(len(x), 7 + theta.shape[-1], 2, x.shape[-2])
-    problem = _Pinhole(x.movedim(-1, 0).contiguous(), X.mT.contiguous(), root, inside, _EXACT * w.sum(-1) * f * f, M)
+    problem = _Squares(x.movedim(-1, 0).contiguous(), X.mT.contiguous(), root, inside, _EXACT * w.sum(-1) * f * f, M)
     return descend(problem, (pose, theta), Options(max_iterations, _FLAT), enough=2 * (w > 0).sum(-1) >= M.shape[1] - 1)
 
 
 @dataclass(frozen=True)
-class _Pinhole(Problem[DenseSystem]):
+class _Squares(Problem[DenseSystem]):
     """Points in rows, roots of weights if any, and memory for the Jacobian with the residual (b, k + 1, 2, n)."""
 
     x: Float[Tensor, "2 b n"]
@@ -45,10 +45,10 @@ class _Pinhole(Problem[DenseSystem]):
     least: Float[Tensor, "b"]
     memory: Tensor
 
-    def pick(self, at: Places) -> "_Pinhole":
+    def pick(self, at: Places) -> "_Squares":
         """Some of the problems."""
         X, root, inside, least = pick(at, (self.X, self.root, self.inside, self.least))
-        return _Pinhole(self.x.index_select(1, at[0]), X, root, inside, least, self.memory[: len(X)])
+        return _Squares(self.x.index_select(1, at[0]), X, root, inside, least, self.memory[: len(X)])
 
     def linearize(self, x: State) -> DenseSystem:
         """The products with each other of the Jacobian's columns and, last, the residual."""
