@@ -50,7 +50,7 @@ def reconstruct(
             report with the reason why it was not read.
         sequence: The images are consecutive frames of a video: corners are tracked through it, and features are matched
             between frames that are near in time or look alike, instead of between all.
-        camera: Distortion model: "pinhole", "simple_radial", "radial", "opencv" or "fisheye". By default "radial", or "pinhole"
+        camera: Name of the distortion model, one of `torchsfm.DISTORTION_MODELS`. By default "radial", or "pinhole"
             when `K` is given.
         shared_camera: Whether one camera took all images of the same size. By default it did where the files name the same
             camera and focal length, or name none.
