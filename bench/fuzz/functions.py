@@ -25,7 +25,7 @@ from torchsfm.geometry import (
     project_points,
     project_quadric,
 )
-from torchsfm.images import Features
+from torchsfm.images import Features, detect_segments
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
 from torchsfm.optim import Block, Cauchy, Term
 from torchsfm.reconstruction import ReconstructionError
@@ -215,6 +215,13 @@ FUNCTIONS: dict[str, Function] = {
     "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
     "images.fit_ellipse": Function({"x": _edge_points}, {"n": 24}),
     "images.detect_segments": Function({"image": lambda s: _picture(s), "max_segments": 20}, {"h": 32, "w": 40}),
+    "images.describe_segments": Function({"image": lambda s: _picture(s)}, batched=False),
+    "images.hough_lines": Function({"image": lambda s: _picture(s), "max_lines": 8, "min_count": 12}, {"h": 32, "w": 40}),
+    "images.match_segments": Function(
+        {f"segments{i}": lambda s: detect_segments(_picture(s), 20) for i in (1, 2)}
+        | {f"image{i}": lambda s: _picture(s) for i in (1, 2)},
+        batched=False,
+    ),
     "images.match_descriptors": Function({f"descriptors{i}": lambda s: s.rand(9, 16) for i in (1, 2)}, batched=False),
     "images.match_features": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),
     "images.retrieve_pairs": Function(

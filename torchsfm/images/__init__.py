@@ -5,11 +5,13 @@ from torchsfm.images.edges import Edges, detect_edges
 from torchsfm.images.exif import Exif, parse_exif
 from torchsfm.images.features import Features, detect_features
 from torchsfm.images.fit_ellipse import EllipseFit, fit_ellipse
+from torchsfm.images.hough import HoughLines, hough_lines
 from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
 from torchsfm.images.listing import list_images, list_skipped
 from torchsfm.images.matching import match_descriptors, match_features
 from torchsfm.images.reading import MAX_PIXELS, ImageError, Photograph, read_image, save_image, scale_image
 from torchsfm.images.retrieval import describe_images, retrieve_pairs
+from torchsfm.images.segment_matching import describe_segments, match_segments
 from torchsfm.images.segments import Segments, detect_segments
 from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_sequence
 
@@ -20,6 +22,7 @@ __all__ = [
     "EllipseFit",
     "Exif",
     "Features",
+    "HoughLines",
     "ImageError",
     "LearnedDetector",
     "LearnedMatcher",
@@ -28,17 +31,20 @@ __all__ = [
     "TrackedPoints",
     "Tracks",
     "describe_images",
+    "describe_segments",
     "detect_corners",
     "detect_edges",
     "detect_features",
     "detect_segments",
     "fit_ellipse",
+    "hough_lines",
     "list_images",
     "list_skipped",
     "load_detector",
     "load_matcher",
     "match_descriptors",
     "match_features",
+    "match_segments",
     "parse_exif",
     "read_image",
     "retrieve_pairs",
