@@ -87,7 +87,7 @@ def triangulate_lines(
     visible: Bool[Tensor, "*#batch v n"] | None = None,
     weights: Float[Tensor, "*#batch v n"] | None = None,
     loss: Loss | None = None,
-    max_iterations: int = 30,
+    max_iterations: int = 100,
 ) -> LineTriangulation:
     """Lines from their images in two known views or more, by least squares on distances of segment ends.
 
