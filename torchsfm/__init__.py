@@ -166,6 +166,7 @@ from torchsfm.images import (
 from torchsfm.linalg import compile_kernels
 from torchsfm.motion import (
     AffineFactorization,
+    ConicEpipolarFit,
     Factorization,
     FocalMotion,
     FundamentalEstimator,
@@ -191,6 +192,7 @@ from torchsfm.motion import (
     fundamental_7pt,
     fundamental_8pt,
     fundamental_affine_4pt,
+    fundamental_from_conics,
     homography_4pt,
     homography_dlt,
     motion_from_homography,
@@ -409,6 +411,7 @@ __all__ = [
     "CameraRefinement",
     "Cauchy",
     "CentrePrior",
+    "ConicEpipolarFit",
     "ConicTriangulation",
     "Corners",
     "Degeneracy",
@@ -597,6 +600,7 @@ __all__ = [
     "fundamental_affine_4pt",
     "fundamental_constraint",
     "fundamental_from_cameras",
+    "fundamental_from_conics",
     "fundamental_from_essential",
     "fundamental_from_pose",
     "fundamentals_from_quadrifocal",

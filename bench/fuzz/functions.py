@@ -98,6 +98,16 @@ def _outlines(s: Scene) -> Tensor:
     )
 
 
+def _tilted(s: Scene) -> tuple[Tensor, Tensor]:
+    """Five ellipses of different planes in two views."""
+    _, R, _ = s.parameters(4)
+    lengths = torch.tensor([0.8, 0.5, 0.0], dtype=torch.float64)
+    axes = lengths[:, None] * torch.cat((R, R[..., :1, :, :].mT @ R[..., 1:2, :, :].mT), -3)
+    dual = dual_quadric_from_ellipsoid(Ellipsoid(s.points(5), axes))
+    first, second = project_quadric(s.cameras(2)[..., :, None, :, :], dual[..., None, :, :, :]).unbind(-4)
+    return s.noisy_conics(first), s.noisy_conics(second)
+
+
 def _edge_points(s: Scene) -> Tensor:
     """Around an ellipse."""
     return _ellipse(s).points(s.rand(24, high=6.3)) + 0.3 * s.randn(24, 2)
@@ -246,6 +256,12 @@ FUNCTIONS: dict[str, Function] = {
     "motion.estimate_upright": Function(RAYS, {"n": 30}),
     "motion.factorize_affine": Function({"max_iterations": 20}),
     "motion.factorize_points": Function({"max_iterations": 20}),
+    "motion.fundamental_from_conics": Function(
+        {f"C{i + 1}": lambda s, i=i: _tilted(s)[i] for i in range(2)}
+        | {f"x{i + 1}": lambda s, i=i: s.images(2, 12)[..., i, :, :] for i in range(2)}
+        | {"starts": 2, "max_iterations": 9, "generator": _generator},
+        {"m": 5},
+    ),
     "motion.homography_4pt": Function(planar=True),
     "motion.homography_dlt": Function(planar=True),
     "motion.relative_6pt_focal": Function(centred=True),

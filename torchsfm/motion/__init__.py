@@ -13,6 +13,7 @@ from torchsfm.motion.factorization_points import Factorization, factorize_points
 from torchsfm.motion.fundamental_7pt import fundamental_7pt
 from torchsfm.motion.fundamental_8pt import fundamental_8pt
 from torchsfm.motion.fundamental_affine_4pt import fundamental_affine_4pt
+from torchsfm.motion.fundamental_from_conics import ConicEpipolarFit, fundamental_from_conics
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.homography_dlt import homography_dlt
 from torchsfm.motion.motions_from_homography import PlaneMotion, SelectedMotion, motion_from_homography, motions_from_homography
@@ -29,6 +30,7 @@ ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, 
 __all__ = [
     "ESTIMATORS",
     "AffineFactorization",
+    "ConicEpipolarFit",
     "Factorization",
     "FocalMotion",
     "FundamentalEstimator",
@@ -54,6 +56,7 @@ __all__ = [
     "fundamental_7pt",
     "fundamental_8pt",
     "fundamental_affine_4pt",
+    "fundamental_from_conics",
     "homography_4pt",
     "homography_dlt",
     "motion_from_homography",
