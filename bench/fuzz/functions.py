@@ -12,14 +12,17 @@ from torch import Tensor
 
 import torchsfm
 from bench.fuzz.scene import SIZE, Scene
+from torchsfm._types import tensor_map
 from torchsfm.geometry import (
     Camera,
+    Curve,
     Ellipse,
     Ellipsoid,
     Pose,
     Radial,
     camera_from_krt,
     conic_from_ellipse,
+    curve_from_samples,
     dual_quadric_from_ellipsoid,
     pluecker_from_points,
     project_points,
@@ -126,6 +129,21 @@ def _ellipsoid(s: Scene) -> Ellipsoid:
     return Ellipsoid(s.points(1)[..., 0, :], lengths[..., None] * R[..., 1, :, :])
 
 
+def _space_curve(s: Scene) -> Tensor:
+    """A bent ring amid the points."""
+    t = torch.arange(24, dtype=torch.float64) * (6.28318 / 24)
+    ring = torch.stack((t.cos(), 0.6 * t.sin(), 0.2 * (2 * t).sin()), -1)
+    return s.points(1) + 0.5 * ring + 0.001 * s.randn(24, 3)
+
+
+def _image_curves(s: Scene) -> Curve:
+    return curve_from_samples(project_points(s.cameras(4), _space_curve(s)[..., None, :, :]), closed=True)
+
+
+def _image_curve(s: Scene) -> Curve:
+    return tensor_map(lambda t: t[(*(slice(None),) * len(s.batch), 0)], _image_curves(s))
+
+
 def _features(s: Scene) -> list[Features]:
     one = [s.rand(20, high=9.0) for _ in range(3)]
     return [Features(s.rand(20, 2, high=100.0), *one, s.rand(20, 128)) for _ in range(3)]
@@ -208,6 +226,9 @@ FUNCTIONS: dict[str, Function] = {
     "bundle.intrinsics_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
     "geometry.conic_distance": Function({"C": lambda s: conic_from_ellipse(_ellipse(s))}),
     "geometry.conic_from_ellipse": Function({"ellipse": _ellipse}),
+    "geometry.curve_crossings": Function({"curve": _image_curve, "line": _middle_lines, "most": 3}),
+    "geometry.curve_from_samples": Function({"x": _space_curve}),
+    "geometry.foot_points": Function({"curve": _image_curve, "y": _edge_points}),
     "geometry.dual_quadric_from_ellipsoid": Function({"ellipsoid": _ellipsoid}),
     "geometry.ellipse_distance": Function({"ellipse": _ellipse}),
     "geometry.intersect_conics": Function({f"C{i}": lambda s: conic_from_ellipse(_ellipse(s)) for i in (1, 2)}),
@@ -321,6 +342,7 @@ FUNCTIONS: dict[str, Function] = {
     "simulation.simulate_images": Function({"poses": _poses, "cameras": _lenses, "generator": _generator}),
     "tensors.reordered_trifocal": Function({"views": (1, 0, 2)}),
     "simulation.simulate_conics": Function({"shape": (2,), "generator": _generator}),
+    "triangulation.triangulate_curves": Function({"curves": _image_curves, "P": lambda s: s.cameras(4), "samples": 12}),
     "triangulation.triangulate_conics": Function(sizes={"n": 2, "k": 12}, together=(("x", "weights"),)),
     "triangulation.triangulate_quadrics": Function({"C": _outlines}, {"n": 2, "k": 12}, together=(("x", "weights"),)),
     "triangulation.triangulate_points_robust": Function(

@@ -22,6 +22,7 @@ from torchsfm.geometry.conics import (
     tangent_lines,
     transform_conic,
 )
+from torchsfm.geometry.curves import Crossings, Curve, FootPoints, curve_crossings, curve_from_samples, foot_points
 from torchsfm.geometry.distortion import (
     DISTORTION_MODELS,
     BrownConrady,
@@ -86,9 +87,12 @@ __all__ = [
     "BrownConrady",
     "BundleProblem",
     "Camera",
+    "Crossings",
+    "Curve",
     "Distortion",
     "Ellipse",
     "Ellipsoid",
+    "FootPoints",
     "KannalaBrandt",
     "Line3D",
     "NoDistortion",
@@ -104,6 +108,8 @@ __all__ = [
     "conic_distance",
     "conic_from_ellipse",
     "cross_matrix",
+    "curve_crossings",
+    "curve_from_samples",
     "depth_space",
     "dual_conic",
     "dual_quadric",
@@ -112,6 +118,7 @@ __all__ = [
     "ellipse_from_conic",
     "ellipsoid_from_dual_quadric",
     "epipolar_distance",
+    "foot_points",
     "from_homogeneous",
     "intersect_conics",
     "intersect_line_conic",

@@ -1,8 +1,9 @@
-"""The cameras are known: where are the points and lines? Photogrammetry calls it intersection."""
+"""The cameras are known: where are the points, lines, conics and curves? Photogrammetry calls it intersection."""
 
 from torchsfm.triangulation.conics_2view import conics_2view
 from torchsfm.triangulation.optimal_correction import correct_matches
 from torchsfm.triangulation.triangulate_conics import ConicTriangulation, triangulate_conics, triangulate_quadrics
+from torchsfm.triangulation.triangulate_curves import CurveTriangulation, triangulate_curves
 from torchsfm.triangulation.triangulate_lines import LineFault, LineTriangulation, triangulate_lines
 from torchsfm.triangulation.triangulate_points import Triangulation, triangulate_points
 from torchsfm.triangulation.triangulate_points_dlt import triangulate_points_dlt
@@ -18,6 +19,7 @@ ESTIMATORS = (PointEstimator,)
 __all__ = [
     "ESTIMATORS",
     "ConicTriangulation",
+    "CurveTriangulation",
     "LineFault",
     "LineTriangulation",
     "PointEstimator",
@@ -26,6 +28,7 @@ __all__ = [
     "conics_2view",
     "correct_matches",
     "triangulate_conics",
+    "triangulate_curves",
     "triangulate_lines",
     "triangulate_points",
     "triangulate_points_dlt",
