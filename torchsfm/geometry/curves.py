@@ -198,8 +198,8 @@ def curve_crossings(curve: Curve, line: Float[Tensor, "*#batch m 3"], most: int)
     a, b = start.gather(-1, index), rise.gather(-1, index)
     t = torch.where(valid, -a / torch.where(valid & (b != 0), b, 1), 0)
     own = s.take(index.flatten(-2))
-    x = (own.start + own.chord * t.flatten(-2)[..., None]).unflatten(-2, index.shape[-2:])
-    width = torch.linalg.vector_norm(line[..., :2], dim=-1)[..., None] * own.length.unflatten(-1, index.shape[-2:])
+    x = (own.start + own.chord * t.flatten(-2)[..., None]).reshape(*index.shape, 2)
+    width = torch.linalg.vector_norm(line[..., :2], dim=-1)[..., None] * own.length.reshape(index.shape)
     sine = torch.where(valid & (width > 0), b.abs() / torch.where(width > 0, width, 1), 0).clamp(max=1)
     x = torch.where(valid[..., None], x, 0)
     pad = (0, most - k)
@@ -222,8 +222,10 @@ class _Segments(NamedTuple):
 
     def take(self, index: Int[Tensor, "*batch m"]) -> "_Segments":
         """Some of them."""
-        parts = (_rows(t, index) if t.ndim > index.ndim else t.gather(-1, index) for t in self[:-1])
-        return _Segments(*parts, self.open)
+        rows = (_rows(t, index) for t in (self.start, self.chord, self.slope, self.next_slope))
+        start, chord, slope, next_slope = rows
+        length, there = self.length.gather(-1, index), self.there.gather(-1, index)
+        return _Segments(start, chord, length, slope, next_slope, there, self.open)
 
     def at(self, t: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor, Tensor]:
         """The point at a share of each, and the first and second derivative by the share."""
