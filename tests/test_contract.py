@@ -179,7 +179,7 @@ def test_retraction_follows_the_manifold(kind: type, generator: torch.Generator)
     """No step is no move; every step is a model that data can have: exact data of it are found to fit after refinement."""
     if not hasattr(kind, "retract"):
         pytest.skip("models of this estimator do not say how they move")
-    scene = make_scene(kind, (6,), 40, generator, 1e-3)
+    scene = make_scene(kind, (6,), 40, generator, 1e-4)
     size = kind.dimension  # type: ignore[attr-defined]
     zero = torch.zeros(6, size, dtype=torch.float64)
     torch.testing.assert_close(scene.estimator.retract(scene.model, zero), scene.model, rtol=0, atol=1e-12)
