@@ -177,6 +177,21 @@ def test_what_the_data_do_not_say_is_told(generator):
     assert (triangulate_quadrics(scene.C[:, :2], scene.P[:, :2]).status == Status.TOO_FEW).all()
 
 
+def test_a_plane_seen_from_nearly_one_place_is_told(generator):
+    scene = simulate_conics((150,), views=2, generator=generator)
+    P = scene.P.clone()
+    P[:, 1] = P[:, 0]
+    P[:, 1, :, 3] += torch.tensor([800 * 0.15, 0, 0], dtype=F64)  # a fortieth of the distance
+    C = dual_conic(project_quadric(P[:, :, None], dual_quadric_from_ellipsoid(scene.model)[:, None]))
+    t = torch.arange(40, dtype=F64) * (2 * math.pi / 40)
+    x = ellipse_from_conic(C)[0].points(t)
+    x = x + 0.5 * torch.randn(x.shape, generator=generator, dtype=F64)
+    found = triangulate_conics(C, P, x=x)
+    wrong = (found.model.plane[..., :3] * scene.model.plane[..., :3]).sum(-1).abs() < 0.95
+    assert wrong.double().mean() > 0.1
+    assert_share(~(wrong & (found.status == Status.OK)), 0.95)
+
+
 def test_the_world_may_move_and_cameras_have_any_scale(generator):
     scene = simulate_conics((20,), views=3, noise=0.3, points=20, generator=generator)
     found = triangulate_conics(scene.C, scene.P, x=scene.x)

@@ -19,6 +19,8 @@ _RANK = 1e-12
 """Eigenvalues of the normal equations below this, in units in which their diagonal is one, are nothing."""
 _UNSURE = 0.5
 """The standard deviation of a semi-axis, relative to the longest, from which a shape is not determined."""
+_TILT = 0.15
+"""The standard deviation of a turn of the plane, in radians, from which it is not determined."""
 _ROUNDING = 1e-9
 """Of a conic in an image far from its origin, relative to its size."""
 _FLAT = 1e-6
@@ -33,7 +35,8 @@ class ConicTriangulation:
     """Centres and semi-axes, finite always; of an ellipse in space the third axis is zero."""
     status: Int8[Tensor, "*batch n"]
     """OK; NOT_FINITE: a wanted conic, edge point or camera is not finite; TOO_FEW: fewer than two views (three for ellipsoids);
-    DEGENERATE: an image is no ellipse, or the views do not determine the shape (no baseline, a plane through the centres);
+    DEGENERATE: an image is no ellipse, or the views do not determine the shape or its plane (no baseline to speak of, a plane
+    through the centres);
     BEHIND: not wholly in front of all views that see it; NOT_CONVERGED."""
     covariance: Float[Tensor, "*batch n k k"]
     """For independent noise of variance 1 / weight in every edge point (1 pixel where no weights are given), or as given with
@@ -194,8 +197,10 @@ def _judge(images: ConicImages, shape: Shape, squares: Tensor, converged: Tensor
     covariance = inner * unit[..., :, None] * unit[..., None, :]
     semi_axes = [5, 7] if m == 2 else [3, 6, 8]
     scatter = (squares / ((w > 0).sum(-1) - shape.size).clamp_min(1)).sqrt()
-    deviation = covariance.diagonal(dim1=-2, dim2=-1)[..., semi_axes].clamp_min(0).sqrt() * scatter[..., None]
-    unsure = (deviation > _UNSURE * lengths[..., :1]).any(-1)
+    deviation = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt() * scatter[..., None]
+    unsure = (deviation[..., semi_axes] > _UNSURE * lengths[..., :1]).any(-1)
+    if m == 2:
+        unsure = unsure | (deviation[..., 3:5] > _TILT).any(-1)
     flat = lengths[..., -1] <= _FLAT * lengths[..., 0]
     dual = dual_of_shape(shape.centre, shape.axes() @ shape.axes().mT)
     front = in_front(images.P, dual[..., None, :, :])
