@@ -18,6 +18,8 @@ from torchsfm.optim import attach_implicit, rotation_exponential, wants_derivati
 _STEPS = 3
 _MET = 1e-9
 """What may be left of an equation between unit vectors."""
+_LEFT = 1e-6
+"""What may be left of an equation over the size of what it is about."""
 _ROUNDING = 1e-14
 """What is left of them at best."""
 _TWICE = 1e-8
@@ -93,6 +95,9 @@ def solve_poses(
             sample = _prepare([t[start : start + _CHUNK] for t in flat], torch.finfo(dtype).eps)
             pieces.append(_finish(sample, *candidates(sample)))
         model, valid = (torch.cat(parts) for parts in zip(*pieces, strict=True))
+        # What is small against far points need not be so against a near line.
+        left = equations(model, *(t[:, None] for t in flat)).abs().amax(-1)
+        valid = valid & (left <= _LEFT)
         model = model.to(dtype)
         valid = valid & model.isfinite().flatten(-2).all(-1)
         model = torch.where(valid[..., None, None], model, torch.eye(3, 4, dtype=dtype, device=L.device))
