@@ -26,6 +26,8 @@ Equation = Callable[[Any, Arguments], Tensor]
 
 _SLACK = 1.01
 """Models in single precision have their inliers a little farther away than the threshold."""
+_ROUNDED = 1e-5
+"""How far, relative to the size of a datum, rounding the entries of a model to single precision moves it."""
 _MET = {torch.float64: 1e-5, torch.float32: 1e-2}
 """What may be left of an equation."""
 
@@ -38,13 +40,22 @@ def robust(distance: Distance, sample_size: int) -> Judge:
         if not bool(good.any()):
             return
         measured = distance(result.model.double(), a)
-        far = result.inliers & ~(measured <= _SLACK * result.threshold.double()[..., None])
+        limit = _SLACK * result.threshold.double()[..., None]
+        if result.model.dtype == torch.float32:
+            limit = limit + _ROUNDED * _sizes(a, result.inliers)
+        far = result.inliers & ~(measured <= limit)
         if bool(far[good].any()):
             yield f"unsupported model: inliers up to {float(measured[good & far.any(-1)].max()):.1e} away"
         if bool((result.inliers.sum(-1)[good] <= sample_size).any()):
             yield "unsupported model: called good with hardly an inlier"
 
     return judge
+
+
+def _sizes(a: Arguments, inliers: Tensor) -> Tensor:
+    """The largest coordinate of each datum."""
+    data = [v for v in a.values() if isinstance(v, Tensor) and v.is_floating_point() and v.shape[:-1] == inliers.shape]
+    return torch.cat(data, -1).abs().amax(-1) if data else torch.zeros_like(inliers, dtype=torch.float64)
 
 
 def structures(distance: Distance, sample_size: int) -> Judge:

@@ -150,6 +150,8 @@ def _attach(problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, st
 def _residual_shape(residual: Callable[..., Tensor], x0: Any, data: Any) -> torch.Size:
     """The shape (*batch, n, d) of the residuals."""
     first = leaves(x0)[0].shape
+    if first[:1] == (0,) and any(t.shape[:1] > (1,) for t in leaves(data)):
+        raise ValueError(f"x0: wanted parameters for each problem of the data, got shape {tuple(first)}")
     shape = residual(x0, *data).shape
     batch = shape[:-2]
     if len(shape) < 2 or first[: len(batch)] != batch or (isinstance(x0, Tensor) and len(first) != len(batch) + 1):

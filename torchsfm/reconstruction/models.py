@@ -230,6 +230,8 @@ def reconstruct_tracks(
         shared_camera=(shared_camera, bool | None),
     )  # fmt: skip
     v = len(image_size)
+    if names is not None and (isinstance(names, str) or len(names) != v or not all(isinstance(n, str) for n in names)):
+        raise ValueError(f"names: wanted {v} strings, one an image, got {names!r}")
     if len(view) and not (int(view.min()) >= 0 and int(view.max()) < v):
         raise ValueError(f"view: wanted indices from 0 to {v - 1}, got {int(view.min())} to {int(view.max())}")
     if len(track) and int(track.min()) < 0:

@@ -127,6 +127,8 @@ def _sound(rays: Tensor, points: Tensor, eps: float) -> Tensor:
     area = dot(normal, normal)
     bound = torch.maximum((256 * eps * eps) * longest, (16 * eps * eps) * reach) * longest
     shortest, longest_ray = (rays * rays).view(3, 3, -1).sum(1).aminmax(dim=0)
+    # Frames of triangles are made of products of four lengths, which must not vanish.
+    bound = bound.clamp(min=1e-280)
     return (zero == 0) & (area > bound) & (shortest > 1e-200) & (longest_ray < torch.inf)
 
 

@@ -62,6 +62,10 @@ def camera_pnp(
         parts = [_solve(data) for data in in_pieces(*fixed, batch)]
         model, error, status = (torch.cat(part) for part in zip(*parts, strict=True))
         model, error, status = model.reshape(*batch, 3, 4), error.reshape(batch), status.reshape(batch)
+        # Numbers of the caller's kind may be too small for them.
+        held = torch.isfinite(model.to(d.dtype)).flatten(-2).all(-1) & torch.isfinite(error.to(d.dtype))
+        model, error = torch.where(held[..., None, None], model, 0), torch.where(held, error, 0)
+        status = torch.where(held, status, int(Status.NOT_FINITE)).to(torch.int8)
     if wants_derivative(d, X, *(() if weights is None else (weights,))):
         model = attach(model, status == Status.OK, d, X, weights)
     return PoseEstimate(model.to(d.dtype), error.to(d.dtype), status)

@@ -67,6 +67,9 @@ def camera_up2p(
         down, world = (a.detach().double().expand(*batch, 3).reshape(-1, 3).T for a in (g, G))
         model, valid = _solve(rays, points, down, world, eps)
         model, valid = model.permute(3, 0, 1, 2).reshape(*batch, 2, 3, 4).to(d.dtype), valid.T.reshape(*batch, 2)
+        # Numbers of this kind may be too small for them.
+        held = torch.isfinite(model).flatten(-2).all(-1)
+        valid, model = valid & held, torch.where(held[..., None, None], model, 0)
     if wants_derivative(d, X, g, G):
         d, g, G = (moderate_directions(v) for v in (d, g, G))
         inputs = (d[..., None, :, :], X[..., None, :, :], g[..., None, :], G[..., None, :])

@@ -229,7 +229,7 @@ def triangulate_points_robust(
     return RobustTriangulation(
         model=torch.where(settled[..., None], final.model, found.model).to(dtype),
         inliers=inliers,
-        support=found.support.to(dtype),
+        support=found.support.clamp(max=torch.finfo(dtype).max).to(dtype),
         threshold=found.threshold.to(dtype),
         iterations=found.iterations,
         status=status,
