@@ -95,3 +95,11 @@ def test_nothing_known(tmp_path: Path) -> None:
     assert number(r"focal length ([\d.]+) \+-", around) == pytest.approx(1000.0, rel=0.02)
     assert number(r"points: ([\d.]+)% of the scene", around) < 1
     assert "autocalibration: OK" not in sideways
+
+
+def test_lines_and_curves(tmp_path: Path) -> None:
+    text = run("lines_and_curves.py", tmp_path)
+    assert number(r"direction off by ([\d.]+) degrees", text) < 1
+    assert number(r"centre off by ([\d.]+)", text) < 0.01
+    assert number(r"curve: (\d+) of 60", text) > 50
+    assert number(r"off by ([\d.]+) on average", text) < 1e-3
