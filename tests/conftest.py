@@ -29,6 +29,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(tryfirst=True)  # before hypothesis reads its own
 def pytest_configure(config: pytest.Config) -> None:
     set_seed(config.option.seed)
+    # Workers share the cores: with threads for all of them in each they would only wait for one another.
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    torch.set_num_threads(max(1, torch.get_num_threads() // workers))
     if config.option.hypothesis_seed is None:
         config.option.hypothesis_seed = config.option.seed
 
