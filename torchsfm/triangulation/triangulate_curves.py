@@ -125,7 +125,7 @@ class _Views(NamedTuple):
     curve: Curve
     """(p, v)."""
     P: Float[Tensor, "p v 3 4"]
-    """Depths in pixels' unit, positive in front."""
+    """Scaled so that depths are those in the world, positive in front."""
     used: Bool[Tensor, "p v"]
 
     def project(self, X: Float[Tensor, "p m 3"]) -> tuple[Float[Tensor, "p v m 2"], Float[Tensor, "p v m"]]:
@@ -145,7 +145,6 @@ class _Distances(NamedTuple):
     """Signed, along `normal`."""
     image: Float[Tensor, "p v m 2"]
     depth: Float[Tensor, "p v m"]
-    foot: Float[Tensor, "p v m 2"]
     normal: Float[Tensor, "p v m 2"]
     weight: Float[Tensor, "p v m"]
     """(1 - (r / threshold)^2)^2 (Tukey's biweight); 0 beyond the threshold, behind a camera and beyond an open end."""
@@ -256,7 +255,7 @@ def _distances(views: _Views, X: Float[Tensor, "p m 3"], threshold: float) -> _D
     r = ((y - foot.x) * normal).sum(-1)
     u = (r / threshold).square()
     counted = foot.within & (depth > 0) & views.used[..., None] & (u < 1)
-    return _Distances(r, y, depth, foot.x, normal, torch.where(counted, (1 - u).square(), 0))
+    return _Distances(r, y, depth, normal, torch.where(counted, (1 - u).square(), 0))
 
 
 def _path(
