@@ -174,8 +174,8 @@ class _Sines(Problem[_System]):
         return self.linearize(_unit(P + moved, u + move))
 
     def rounding(self, here: _System) -> Tensor:
-        """What rounding of unit rays makes of the misfit."""
-        return torch.full_like(here.cost, (10 * self.epsilon) ** 2)
+        """What rounding of unit rays makes of the misfit; in their products with cameras some of it grows by cancellation."""
+        return torch.full_like(here.cost, (30 * self.epsilon) ** 2)
 
 
 def sine_cost(rays: Rays, P: Tensor, u: Tensor) -> Float[Tensor, "p"]:
