@@ -149,6 +149,9 @@ def _attach(problem: DenseProblem, x: Any, data: Any, weights: Tensor | None, st
 
 def _residual_shape(residual: Callable[..., Tensor], x0: Any, data: Any) -> torch.Size:
     """The shape (*batch, n, d) of the residuals."""
+    places = {t.device for t in leaves((x0, data))}
+    if len(places) > 1:
+        raise ValueError(f"x0: wanted on the device of the data, got {', '.join(sorted(map(str, places)))}")
     first = leaves(x0)[0].shape
     if first[:1] == (0,) and any(t.shape[:1] > (1,) for t in leaves(data)):
         raise ValueError(f"x0: wanted parameters for each problem of the data, got shape {tuple(first)}")

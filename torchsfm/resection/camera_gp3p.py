@@ -72,6 +72,9 @@ def camera_gp3p(
         parts = [_solve(torch.finfo(d.dtype).eps, *(r[..., i : i + _CHUNK].contiguous() for r in rows)) for i in starts]
         model, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         model, valid = model.reshape(*batch, 8, 3, 4).to(d.dtype), valid.reshape(*batch, 8)
+        # Numbers of this kind may be too small for them.
+        held = torch.isfinite(model).flatten(-2).all(-1)
+        valid, model = valid & held, torch.where(held[..., None, None], model, 0)
     if wants_derivative(p, d, X):
         model = attach_implicit(equations, model, *(a[..., None, :, :] for a in (p, d, X)), dims=2, valid=valid)
     return Solutions(model, valid)

@@ -128,6 +128,10 @@ def refine_camera(
     refined, theta = problem.attach((fit.pose, fit.theta), data, (fit.status == Status.OK) & ~bad)
     inside = problem.inside(camera)
     ahead = torch.where(fit.in_front, w, 0.0).sum(-1)
+    R = refined.R
+    place = refined.t - (R @ middle[..., None])[..., 0]
+    # Numbers of the caller's kind may be too small for it.
+    bad = bad | ~torch.isfinite(place.to(dtype)).all(-1)
     status = fit.status
     for condition, code in (
         ((status == Status.OK) & (2 * ahead <= total[..., 0]), Status.BEHIND),
@@ -136,9 +140,7 @@ def refine_camera(
     ):
         status = torch.where(condition, int(code), status)
     known = fit.determined & ~bad
-    R = refined.R
-    world = Pose(R, refined.t - (R @ middle[..., None])[..., 0])
-    world = Pose(torch.where(bad[..., None, None], torch.eye(3, dtype=R.dtype, device=R.device), R), _or_zero(world.t, ~bad))
+    world = Pose(torch.where(bad[..., None, None], torch.eye(3, dtype=R.dtype, device=R.device), R), _or_zero(place, ~bad))
     return CameraRefinement(
         Pose(world.R.to(dtype), world.t.to(dtype)),
         tensor_map(lambda v: v.to(dtype), inside.moved(theta)),
