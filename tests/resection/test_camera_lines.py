@@ -118,6 +118,19 @@ def test_scales_signs_and_order_do_not_matter(kind, sample):
     assert_share(found.valid.sum(-1) == again.valid.sum(-1), 0.99)
 
 
+@pytest.mark.parametrize("exponent", [-1070, -1000, 400])
+def test_rays_and_normals_of_any_length(kind, sample, exponent):
+    # At 2^-1070 a handful of bits remain of a direction: what is left of it counts.
+    d, X, l, L, _ = sample(kind, 300)  # noqa: E741
+    l = torch.ldexp(l, torch.tensor(exponent))  # noqa: E741
+    d = torch.ldexp(d, torch.tensor(exponent))
+    found = kind.solve(d, X, l, L)
+    back = [torch.ldexp(torch.ldexp(v, torch.tensor(-exponent // 2)), torch.tensor(-exponent // 2)) for v in (d, l)]
+    error = equations(found.model, back[0][:, None], X[:, None], back[1][:, None], L[:, None]).abs().amax(-1)
+    assert (error[found.valid] < 1e-7).all()
+    assert exponent == -1070 or torch.equal(found.valid, kind.solve(back[0], X, back[1], L).valid)
+
+
 def test_the_world_may_be_anywhere_and_of_any_size(kind, sample, generator):
     d, X, l, L, P = sample(kind, 500)  # noqa: E741
     S = torch.eye(4, dtype=F64)

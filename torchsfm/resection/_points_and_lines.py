@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes
+from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross, usable
 from torchsfm.optim import attach_implicit, rotation_exponential, wants_derivative
 
@@ -115,6 +116,8 @@ def _prepare(data: list[Tensor], eps: float) -> Sample:
         sound = sound & (t != 0).any(-1).all(-1)
     d, l = _unit(d), _unit(l)  # noqa: E741
     size = _length(L[..., :3])
+    # Squares of what is smaller vanish.
+    sound = sound & (size > 1e-150).flatten(1).all(-1)
     V, m = L[..., :3] / size, L[..., 3:] / size
     A = cross(V, m)
     if X.shape[-2]:
@@ -220,4 +223,5 @@ def _length(v: Tensor) -> Tensor:
 
 
 def _unit(v: Tensor) -> Tensor:
+    v = moderate_directions(v)
     return v / _length(v)
