@@ -118,7 +118,7 @@ def test_scales_signs_and_order_do_not_matter(kind, sample):
     assert_share(found.valid.sum(-1) == again.valid.sum(-1), 0.99)
 
 
-@pytest.mark.parametrize("exponent", [-1070, -1000, 400])
+@pytest.mark.parametrize("exponent", [-1070, -1000, 120])
 def test_rays_and_normals_of_any_length(kind, sample, exponent):
     # At 2^-1070 a handful of bits remain of a direction: what is left of it counts.
     d, X, l, L, _ = sample(kind, 300)  # noqa: E741
