@@ -159,6 +159,17 @@ def _batches(arguments: dict[str, tuple[Tensor | None, str]]) -> dict[str, torch
     return batches
 
 
+def check_index(**indices: tuple[Tensor, int]) -> None:
+    """See that index tensors, each given with its limit, point at something.
+
+    Raises:
+        ValueError: A number is negative or not below its limit.
+    """
+    for name, (index, limit) in indices.items():
+        if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < limit:
+            raise ValueError(f"{name}: wanted numbers from 0 to {limit - 1}, got {int(index.min())} to {int(index.max())}")
+
+
 def check_options(**arguments: tuple[object, Any]) -> None:
     """Check options, which are no tensors: numbers, choices and objects.
 

@@ -20,6 +20,7 @@ from torchsfm.optim import (
     schur_grouped,
     schur_matrix_free,
     schur_pairwise,
+    sparse_covariance,
     sparse_levenberg_marquardt,
 )
 from torchsfm.optim.manifold import rotation_exponential
@@ -308,5 +309,50 @@ def test_layout_drops_what_cannot_move(scene: Scene) -> None:
     blocks = scene.blocks(pose=pose, focal=torch.ones(2, dtype=torch.bool), point=torch.arange(20) >= 10)
     found = layout.lay_out(blocks, [scene.term()], "point")
     assert found.size == 6
-    assert found.points == 10
+    assert found.families[0].points == 10
     assert sum(p.slots.numel() for p in found.pieces) == int(((scene.view == 2) | (scene.seen < 10)).sum())
+
+
+@pytest.mark.parametrize("solver", ["dense", "pcg"])
+def test_two_families_are_eliminated_as_one_is(generator: torch.Generator, solver: schur.Solver) -> None:
+    """Stations see marks of the plane and walls of one number: which of them are eliminated changes nothing but the work."""
+    stations, marks, walls = 5, 60, 70
+    place = torch.randn(stations, 2, generator=generator, dtype=F64)
+    mark = 3 * torch.randn(marks, 2, generator=generator, dtype=F64)
+    wall = 3 * torch.randn(walls, 1, generator=generator, dtype=F64)
+    s, m = torch.cartesian_prod(torch.arange(stations), torch.arange(marks)).unbind(1)
+    t, w = torch.cartesian_prod(torch.arange(stations), torch.arange(walls)).unbind(1)
+    noise = [0.1 * torch.randn(len(k), 1, generator=generator, dtype=F64) for k in (s, t)]
+    terms = [
+        Term(lambda p, X, d: (X - p).norm(dim=1, keepdim=True) - d, ("station", "mark"), (s, m), (
+            (mark[m] - place[s]).norm(dim=1, keepdim=True) + noise[0],)),
+        Term(lambda p, h, d: h - p[:, :1].sin() - d, ("station", "wall"), (t, w), (
+            wall[w] - place[t, :1].sin() + noise[1],), loss=Cauchy(0.5)),
+    ]  # fmt: skip
+    held = torch.arange(stations) == 0
+    blocks = {
+        "station": Block(place + 0.1 * torch.randn(stations, 2, generator=generator, dtype=F64) * ~held[:, None], None, held),
+        "mark": Block(mark + 0.1 * torch.randn(marks, 2, generator=generator, dtype=F64)),
+        "wall": Block(wall),
+    }
+    found = [
+        sparse_levenberg_marquardt(
+            blocks, terms, eliminate=eliminate, linear_solver=solver, function_tolerance=1e-14, max_iterations=200
+        )
+        for eliminate in (None, "mark", ("mark", "wall"), ("wall", "mark"))
+    ]
+    for other in found[1:]:
+        assert other.cost == pytest.approx(found[0].cost, rel=1e-9)
+        torch.testing.assert_close(other.x["wall"], found[0].x["wall"], rtol=0, atol=1e-5)
+    spread = [sparse_covariance(blocks, terms, eliminate=eliminate) for eliminate in (None, ("mark", "wall"))]
+    for name in blocks:
+        torch.testing.assert_close(spread[1].blocks[name], spread[0].blocks[name], rtol=1e-6, atol=1e-9)
+    assert spread[0].redundancy == spread[1].redundancy
+
+
+def test_a_residual_of_two_families_is_refused() -> None:
+    one = torch.zeros(1, dtype=torch.long)
+    blocks = {"a": Block(torch.zeros(1, 1, dtype=F64)), "b": Block(torch.zeros(1, 1, dtype=F64))}
+    term = Term(lambda a, b: a + b, ("a", "b"), (one, one))
+    with pytest.raises(ValueError, match="'a' and 'b'"):
+        sparse_levenberg_marquardt(blocks, [term], eliminate=("a", "b"))

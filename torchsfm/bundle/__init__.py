@@ -7,12 +7,15 @@ from torchsfm.bundle.bundle_adjust_projective import ProjectiveBundleResult, bun
 from torchsfm.bundle.bundle_covariance import BundleCovariance, bundle_covariance
 from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.intrinsics_covariance import intrinsics_covariance
+from torchsfm.bundle.lines import BundleLines
 from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior
 from torchsfm.bundle.rig import Rig
+from torchsfm.bundle.structure import Structure
 
 __all__ = [
     "AdjustedModel",
     "BundleCovariance",
+    "BundleLines",
     "BundleModel",
     "BundleResult",
     "BundleTerms",
@@ -23,6 +26,7 @@ __all__ = [
     "Prior",
     "ProjectiveBundleResult",
     "Rig",
+    "Structure",
     "bundle_adjust",
     "bundle_adjust_model",
     "bundle_adjust_projective",

@@ -9,12 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import check_one_problem, check_options, check_tensors
+from torchsfm._types import check_index, check_one_problem, check_options, check_tensors
 from torchsfm.bundle.intrinsics import Switched, free_columns, free_switches, intrinsics_prior
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rays import RayPoint, ray_points
 from torchsfm.bundle.rig import Rig, RigProjection
+from torchsfm.bundle.structure import Sight, Structure
 from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.geometry.intrinsic_parameters import HEAD, SKEW, camera_from_row, row_from_camera
 from torchsfm.optim import Block, Loss, RigidMotion, Subset, Term
@@ -41,6 +42,7 @@ class BundleTerms(TypedDict, total=False):
             the mean for "focal" and absolute otherwise, for all cameras or (g,) for each. An observation's distance counts in
             units of 1 pixel.
         intrinsics_mean: Where these are centred; the cameras given if not given.
+        structure: What the views see besides points: `BundleLines`. One of a kind.
     """
 
     free: Sequence[str]
@@ -55,6 +57,7 @@ class BundleTerms(TypedDict, total=False):
     priors: Sequence[Prior]
     intrinsics_sigma: Mapping[str, float | Tensor] | None
     intrinsics_mean: Camera | None
+    structure: Sequence[Structure]
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,7 @@ class Bundle:
     priors: Sequence[Prior] = ()
     intrinsics_sigma: Mapping[str, float | Tensor] | None = None
     intrinsics_mean: Camera | None = None
+    structure: Sequence[Structure] = ()
 
     @cached_property
     def poses(self) -> Pose:
@@ -97,6 +101,7 @@ class Bundle:
             priors=(self.priors, list | tuple),
             intrinsics_sigma=(self.intrinsics_sigma, Mapping | None),
             intrinsics_mean=(self.intrinsics_mean, Camera | None),
+            structure=(self.structure, list | tuple),
         )
         views, groups = start.poses.shape[0], start.cameras.shape[0]
         check_index(view=(start.view, views), point=(start.point, len(start.X)), camera_index=(start.camera_index, groups))
@@ -121,11 +126,18 @@ class Bundle:
             weights=(self.weights, "?m"),
         )
         check_options(**{f"priors[{k}]": (prior, Prior) for k, prior in enumerate(self.priors)})
+        check_options(**{f"structure[{k}]": (some, Structure) for k, some in enumerate(self.structure)})
+        if len({some.block for some in self.structure}) < len(self.structure):
+            raise ValueError(f"structure: wanted one of a kind, got {[some.block for some in self.structure]}")
+        for some in self.structure:
+            some.check(views)
         limits = {"pose": poses, "point": len(start.X)}
         check_index(**{f"priors[{k}].index": (prior.index, limits[prior.block]) for k, prior in enumerate(self.priors)})
 
     def problem(self) -> tuple[dict[str, Block], list[Term]]:
-        """The variables, "pose", "camera", "point" and with a rig "sensor", and the terms, reprojection first.
+        """The variables, "pose", "camera", "point", with a rig "sensor", and those of other structure; and the terms.
+
+        The first term is the reprojection of points, then come those of other structure, one each.
 
         Raises:
             ValueError: A name of a number in the cameras is unknown.
@@ -143,46 +155,48 @@ class Bundle:
         counts = x.isfinite().all(-1) & rows.isfinite().all(-1)[camera]
         if self.weights is not None:
             counts &= self.weights > 0
-        centres = (self.poses if self.rig is None else self.rig.view_poses(self.poses)).centre
+        view_poses = self.poses if self.rig is None else self.rig.view_poses(self.poses)
         blocks = {
             "pose": Block(_pose_rows(self.poses), RigidMotion(), self.fixed_poses),
             "camera": Block(rows, manifold, self.fixed_cameras),
-            "point": Block(ray_points(X, centres, view, point, counts), RayPoint(), self.fixed_points),
+            "point": Block(ray_points(X, view_poses.centre, view, point, counts), RayPoint(), self.fixed_points),
         }
         skew = SKEW in columns or cameras.K.requires_grad or bool((rows[:, SKEW] != 0).any())
         projection = Projection(model, columns, skew, bool(self.fixed_intrinsics))
         data, options = (x,), (self.loss, self.weights)
+        names: tuple[str, ...]
+        of_view: tuple[Tensor, ...]
+        through: Projection | RigProjection
         if self.rig is None:
-            index = (view, camera, point)
-            term = Term(projection.residual, ("pose", "camera", "point"), index, data, *options, projection.linearize)
+            through, names = projection, ("pose", "camera")
+            of_view = (torch.arange(len(view_poses.t), device=X.device), self.start.camera_index)
         else:
             blocks["sensor"] = Block(_pose_rows(self.rig.cam_from_rig), RigidMotion(), self.fixed_sensors)
-            through = RigProjection(projection)
-            names = ("pose", "sensor", "camera", "point")
-            places = (self.rig.frame[view], self.rig.sensor[view], camera, point)
-            term = Term(through.residual, names, places, data, *options, through.linearize)
-        terms = [term, *(_prior_term(prior) for prior in self.priors)]
+            through, names = RigProjection(projection), ("pose", "sensor", "camera")
+            of_view = (self.rig.frame, self.rig.sensor, self.start.camera_index)
+        sight = Sight(names, of_view, projection, view_poses, cameras[self.start.camera_index])
+        terms = [Term(through.residual, (*names, "point"), (*sight.at(view), point), data, *options, through.linearize)]
+        for some in self.structure:
+            blocks[some.block] = some.variables(sight)
+            terms.append(some.term(sight, blocks[some.block]))
+        terms += [_prior_term(prior) for prior in self.priors]
         if self.intrinsics_sigma:
             terms.append(intrinsics_prior(self.intrinsics_sigma, self.intrinsics_mean or cameras))
         return blocks, terms
 
 
-def cheapest_elimination(blocks: Mapping[str, Block]) -> str:
-    """Points, unless eliminating poses leaves a system of less than half the size: film of few points."""
+def cheapest_elimination(bundle: Bundle, blocks: Mapping[str, Block]) -> tuple[str, ...]:
+    """Points and other structure, unless eliminating poses leaves a system of less than half the size: film of few points."""
+    structure = structure_blocks(bundle)
     sizes = {name: block.x.shape[0] * block.tangent for name, block in blocks.items()}
-    rest = sum(size for name, size in sizes.items() if name not in ("pose", "point"))
-    return "pose" if 2 * (sizes["point"] + rest) < sizes["pose"] + rest else "point"
+    seen = sum(sizes[name] for name in structure)
+    rest = sum(size for name, size in sizes.items() if name not in ("pose", *structure))
+    return ("pose",) if 2 * (seen + rest) < sizes["pose"] + rest else structure
 
 
-def check_index(**indices: tuple[Tensor, int]) -> None:
-    """See that index tensors, each given with its limit, point at something.
-
-    Raises:
-        ValueError: A number is negative or not below its limit.
-    """
-    for name, (index, limit) in indices.items():
-        if index.numel() and not 0 <= int(index.min()) <= int(index.max()) < limit:
-            raise ValueError(f"{name}: wanted numbers from 0 to {limit - 1}, got {int(index.min())} to {int(index.max())}")
+def structure_blocks(bundle: Bundle) -> tuple[str, ...]:
+    """The blocks of what the views see: points and other structure."""
+    return ("point", *(some.block for some in bundle.structure))
 
 
 def moved_poses(poses: Pose, start: Tensor, end: Tensor) -> Pose:

@@ -12,6 +12,7 @@ from torchsfm._types import Status, check_options
 from torchsfm.bundle.blocks import Bundle, BundleTerms, cheapest_elimination, moved_cameras, moved_poses
 from torchsfm.bundle.gauge import Gauge, restore_gauge
 from torchsfm.bundle.rig import Rig
+from torchsfm.bundle.structure import Structure
 from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.optim import sparse_levenberg_marquardt
 from torchsfm.optim.schur import Solver
@@ -40,6 +41,10 @@ class BundleResult:
     status: Status
     rig: Rig | None = None
     """The rig adjusted, where one was given."""
+    structure: tuple[Structure, ...] = ()
+    """What was seen besides points, adjusted, in the order given."""
+    structure_residuals: tuple[Float[Tensor, "_ _"], ...] = ()
+    """Of each observation of it the signed distances, pixels (of a segment, of both ends), inf where it does not count."""
 
 
 def bundle_adjust(
@@ -53,14 +58,14 @@ def bundle_adjust(
     progress: Callable[[int, float], bool | None] | None = None,
     **terms: Unpack[BundleTerms],
 ) -> BundleResult:
-    """Minimise the reprojection error over poses, cameras and points together (Triggs et al. 2000; HZ 18.1).
+    """Minimise the reprojection error over poses, cameras and structure together (Triggs et al. 2000; HZ 18.1).
 
-    Points are eliminated by the Schur complement (poses, where there are many more poses than points). Seven dimensions of
-    gauge (place, orientation, size of the world) are free unless something holds them: fixed poses or points, priors, a rig of
-    known size (which holds the size). A free gauge does no harm: the damping takes the shortest step, and the model stays about
-    where it was; see `gauge` for other wishes. Fixed and unobserved poses, cameras and points come back bit for bit.
-    Observations behind a camera count by the formula (a pinhole shows them mirrored): leave them out, or use a loss. Computed
-    in float64.
+    Points, and lines where `structure` has some, are eliminated by the Schur complement (poses, where there are many more
+    poses than structure). Seven dimensions of gauge (place, orientation, size of the world) are free unless something holds
+    them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does no harm: the damping
+    takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Fixed and unobserved
+    poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a pinhole
+    shows them mirrored): leave them out, or use a loss. Computed in float64.
 
     Args:
         problem: Views of points, with estimates of everything.
@@ -91,7 +96,7 @@ def bundle_adjust(
     result = sparse_levenberg_marquardt(
         blocks,
         residuals,
-        eliminate=cheapest_elimination(blocks),
+        eliminate=cheapest_elimination(bundle, blocks),
         max_iterations=max_iterations,
         function_tolerance=tolerance,
         linear_solver=linear_solver,
@@ -104,12 +109,16 @@ def bundle_adjust(
     points = result.x["point"][:, :3].to(X.dtype)
     if rig is not None:
         rig = Rig(moved_poses(rig.cam_from_rig, blocks["sensor"].x, result.x["sensor"]), rig.sensor, rig.frame)
+    world = None
     if gauge == "first":
         keep_size = (
             rig is not None and bundle.fixed_sensors is not None and bool((rig.cam_from_rig.t[bundle.fixed_sensors] != 0).any())
         )
         moved = (points != X).any(-1)
-        new_poses, points, rig = restore_gauge(poses, new_poses, points, moved, rig, keep_size)
+        new_poses, points, rig, world = restore_gauge(poses, new_poses, points, moved, rig, keep_size)
+    structure = tuple(s.moved(blocks[s.block].x, result.x[s.block], world) for s in bundle.structure)
+    seen = zip(result.residuals[1:], result.used[1:], bundle.structure, strict=False)
+    apart = tuple(torch.where(counts[:, None], r, torch.inf).to(X.dtype) for r, counts, _ in seen)
     return BundleResult(
         new_poses,
         moved_cameras(problem.cameras, blocks["camera"].x, result.x["camera"]),
@@ -121,4 +130,6 @@ def bundle_adjust(
         result.iterations,
         result.status,
         rig,
+        structure,
+        apart,
     )

@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status, check_one_problem, check_options
-from torchsfm.bundle.blocks import check_index
+from torchsfm._types import Status, check_index, check_one_problem, check_options
 from torchsfm.geometry import normalize_sphere
 from torchsfm.geometry.projection import camera_slopes, point_slopes
 from torchsfm.geometry.radial import flatten

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_options
-from torchsfm.bundle.blocks import Bundle, BundleTerms
+from torchsfm.bundle.blocks import Bundle, BundleTerms, structure_blocks
 from torchsfm.geometry import BundleProblem
 from torchsfm.optim import SparseCovariance, sparse_covariance
 
@@ -33,6 +33,8 @@ class BundleCovariance:
     everything: SparseCovariance
     sensors: Float[Tensor, "s 6 6"] | None = None
     """Of each place on the rig, (w, v), where there is a rig."""
+    structure: tuple[Float[Tensor, "_ _ _"], ...] = ()
+    """Of what is seen besides points, in the order given, each in the coordinates its class names."""
 
 
 def bundle_covariance(problem: BundleProblem, *, sigma: float | None = None, **terms: Unpack[BundleTerms]) -> BundleCovariance:
@@ -58,14 +60,15 @@ def bundle_covariance(problem: BundleProblem, *, sigma: float | None = None, **t
     bundle = Bundle(problem, **terms)
     with torch.no_grad():
         blocks, residuals = bundle.problem()
-        unit = sparse_covariance(blocks, residuals, eliminate="point")
+        unit = sparse_covariance(blocks, residuals, eliminate=structure_blocks(bundle))
     scale = sigma if sigma is not None else (unit.square_sum / max(unit.redundancy, 1)) ** 0.5
     pose, camera, points = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
     sensor = None if bundle.rig is None else unit.blocks["sensor"] * scale**2
+    structure = tuple(some.covariance(blocks[some.block].x, unit.blocks[some.block] * scale**2) for some in bundle.structure)
     held = 0
     if bundle.fixed_intrinsics and camera.shape[-1]:
         # Those held in one camera but not in others stand in the system as directions that nothing determines.
         switch = blocks["camera"].x[:, -camera.shape[-1] :] > 0
         camera = torch.where(switch[:, :, None] & switch[:, None], camera, 0.0)
         held = int((~switch & (unit.columns["camera"] >= 0)).sum())
-    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity - held, unit, sensor)
+    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity - held, unit, sensor, structure)

@@ -16,7 +16,7 @@ chosen changes no residual: the adjustment itself is free, which converges best,
 
 def restore_gauge(
     before: Pose, poses: Pose, X: Tensor, moved_points: Tensor, rig: Rig | None, keep_size: bool
-) -> tuple[Pose, Tensor, Rig | None]:
+) -> tuple[Pose, Tensor, Rig | None, Similarity | None]:
     """Move the world so that the first pose that changed is again what it was, and the farthest from it as far away.
 
     Args:
@@ -26,11 +26,14 @@ def restore_gauge(
         moved_points: Which points were part of it.
         rig: The rig after the adjustment.
         keep_size: Whether something else gives the size of the world (a rig of known size).
+
+    Returns:
+        Poses, points and rig after that, and how the world moved, None if it did not.
     """
     with torch.no_grad():
         moved = ((poses.R != before.R).any(-1).any(-1)) | (poses.t != before.t).any(-1)
         if not bool(moved.any()):
-            return poses, X, rig
+            return poses, X, rig, None
         first = int(moved.to(torch.uint8).argmax())
         away = (before.centre - before.centre[first]).norm(dim=-1)
         far = int(torch.where(moved, away, -1.0).argmax())
@@ -49,4 +52,4 @@ def restore_gauge(
     points = torch.where(moved_points[:, None], world.transform(X), X)
     if rig is not None and not keep_size:
         rig = Rig(Pose(rig.cam_from_rig.R, scale * rig.cam_from_rig.t), rig.sensor, rig.frame)
-    return Pose(R_new, t_new), points, rig
+    return Pose(R_new, t_new), points, rig, world

@@ -48,6 +48,48 @@ class Line3D:
         return torch.cat((new_sin * frame[..., 1], new_cos * frame[..., 0]), -1)
 
 
+def line_tangents(line: Float[Tensor, "*n 6"]) -> Float[Tensor, "*n 6 4"]:
+    """The derivatives of lines along the steps of `Line3D`: columns orthogonal to each other and to the line."""
+    d, m = line[..., :3], line[..., 3:]
+    u1, u2 = (v / _length(v).clamp_min(1e-300) for v in (m, d))
+    u3 = torch.linalg.cross(u1, u2)
+    sin, cos = _length(d), _length(m)
+    zero = torch.zeros_like(d)
+    upper = torch.stack((sin * u3, zero, -sin * u1, cos * u2), -1)
+    lower = torch.stack((zero, -cos * u3, cos * u2, -sin * u1), -1)
+    return torch.cat((upper, lower), -2)
+
+
+def world_covariance(
+    C: Float[Tensor, "n 4 4"],
+    line: Float[Tensor, "n 6"],
+    model: Float[Tensor, "n 6"],
+    origin: Float[Tensor, "n 3"],
+    unit: Float[Tensor, "n"],
+) -> Float[Tensor, "n 4 4"]:
+    """The covariance along steps of `Line3D` from lines of the world, of that along steps in frames of their own.
+
+    Args:
+        C: Covariances of steps from `line`.
+        line: Lines about `origin`, moments in `unit`.
+        model: The same lines in the world, of unit direction.
+        origin: The origins of the frames.
+        unit: Their units.
+
+    Returns:
+        The covariances; zero for lines through the world's origin, where those steps say too little.
+    """
+    size = _length(line[:, :3])[:, 0].clamp_min(1e-300)[:, None, None]
+    inner = line_tangents(line) / size
+    dd, dm = inner[:, :3], inner[:, 3:]
+    moved = torch.cat((dd, unit[:, None, None] * dm + torch.linalg.cross(origin[..., None].expand_as(dd), dd, dim=-2)), -2)
+    outer = line_tangents(model)
+    square = outer.square().sum(-2)
+    determined = (square > 1e-20 * model.square().sum(-1, keepdim=True)).all(-1)
+    G = (outer.mT @ moved) / torch.where(determined[:, None], square, 1.0)[..., None]
+    return torch.where(determined[:, None, None], G @ C @ G.mT, 0.0)
+
+
 def _length(v: Tensor) -> Tensor:
     length: Tensor = torch.linalg.vector_norm(v, dim=-1, keepdim=True)
     return length

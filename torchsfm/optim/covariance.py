@@ -16,7 +16,7 @@ from torchsfm._types import check_options
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.loss import loss_slope
 from torchsfm.optim.schur import Elimination
-from torchsfm.optim.terms import Block, Term, prepare, term_residual
+from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_residual
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,15 @@ class SparseCovariance:
     square_sum: float
 
 
-def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eliminate: str | None = None) -> SparseCovariance:
+def sparse_covariance(
+    blocks: Mapping[str, Block], terms: Sequence[Term], *, eliminate: str | Sequence[str] | None = None
+) -> SparseCovariance:
     """Compute covariances at a minimum.
 
     Args:
         blocks: Variables at the minimum.
         terms: Residuals in units of their standard deviation; those that are not finite are left out.
-        eliminate: The block to eliminate, as in `sparse_levenberg_marquardt`.
+        eliminate: The blocks to eliminate, as in `sparse_levenberg_marquardt`.
 
     Returns:
         The covariances, float64.
@@ -58,7 +60,8 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
         layout = lay_out(double, counted, eliminate)
         engine = Elimination(double, layout, "dense", spread=True)
         inverse = engine.linearize(x).invert()
-        free_points = inverse.point_covariance() if inverse.L else None
+        points = zip(layout.families, inverse.point_covariances(), inverse.determined, strict=True)
+        eliminated = {family.name: (of_points, good) for family, of_points, good in points}
         squares = sum((_square_sum(part.term, x) for part in engine.parts), 0.0)
         rows = sum(part.components * part.term.index[0].shape[0] for part in engine.parts)
     found: dict[str, Tensor] = {}
@@ -71,23 +74,23 @@ def sparse_covariance(blocks: Mapping[str, Block], terms: Sequence[Term], *, eli
         covariance = block.x.new_zeros((count, width, width))
         covariance[~known] = torch.diag(block.x.new_full((width,), torch.inf))
         place = torch.full((count, width), -1, device=free.device)
-        if name == eliminate:
-            if free_points is not None:
-                good = inverse.determined
-                known[free[good]] = True
-                covariance[free[good]] = free_points[good]
+        if name in eliminated:
+            of_points, good = eliminated[name]
+            known[free[good]] = True
+            covariance[free[good]] = of_points[good]
         elif free.numel():
             place[free] = layout.first[name] + torch.arange(free.numel() * width, device=free.device).view(-1, width)
             kept = inverse.kept[place[free][:, :, None], place[free][:, None]]
             known[free] = kept.isfinite().all(-1).all(-1)
             covariance[free] = torch.where(known[free][:, None, None], kept, covariance[free])
         found[name], determined[name], columns[name] = covariance, known, place
-    unknowns = layout.size - inverse.nullity + int(inverse.determined.sum()) * layout.point_size
+    families = zip(layout.families, inverse.determined, strict=True)
+    unknowns = layout.size - inverse.nullity + sum(int(good.sum()) * family.point_size for family, good in families)
     return SparseCovariance(found, determined, inverse.kept, columns, inverse.nullity, rows - unknowns, squares)
 
 
 def marginal_covariance(
-    blocks: Mapping[str, Block], terms: Sequence[Term], name: str, *, eliminate: str | None = None
+    blocks: Mapping[str, Block], terms: Sequence[Term], name: str, *, eliminate: str | Sequence[str] | None = None
 ) -> Float[Tensor, "n k k"]:
     """The covariance of each variable of one block alone, which costs no more than a step.
 
@@ -117,9 +120,9 @@ def marginal_covariance(
     return out
 
 
-def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | None) -> None:
+def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None) -> None:
     check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple))
-    check_options(eliminate=(eliminate, (None, *blocks)))
+    check_eliminate(blocks, eliminate)
 
 
 def _square_sum(term: Term, x: dict[str, Tensor]) -> float:

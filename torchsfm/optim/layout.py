@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsfm.optim.terms import Block, Term
+from torchsfm.optim.terms import Block, Term, block_names
 
 CHUNK = 10000
 """Residuals linearised at once: few enough for temporaries to stay in the cache. Rows of a power of two would collide."""
@@ -27,6 +27,8 @@ class Piece:
     """Slot of each residual (m)."""
     columns: Tensor
     """Column of each tangent coordinate of each slot: (slots, c)."""
+    family: str | None
+    """The block of the residuals' eliminated variables."""
     point: Tensor | None
     """Number of each residual's eliminated variable, (m)."""
 
@@ -34,6 +36,21 @@ class Piece:
     def coupled(self) -> bool:
         """Whether retained and eliminated variables meet here."""
         return self.point is not None and self.columns.shape[1] > 0
+
+
+@dataclass(frozen=True)
+class Family:
+    """The eliminated variables of one block, and the residuals by which they meet retained ones."""
+
+    name: str
+    size: int
+    """Number of columns of the reduced system."""
+    point_size: int
+    """Tangent coordinates of a variable."""
+    points: int
+    """Number of free variables."""
+    pieces: list[Piece]
+    """The pieces of the layout in its order; those of other families are not coupled here."""
 
 
 @dataclass(frozen=True)
@@ -46,26 +63,22 @@ class Layout:
     """First column of each retained block with free variables."""
     size: int
     """Number of columns of the reduced system; the gradient is column `size`, column `size + 1` belongs to fixed variables."""
-    eliminated: str | None
-    point_size: int
+    families: list[Family]
+    """The eliminated blocks that have free variables."""
     pieces: list[Piece]
     still: list[Term]
     """Residuals that depend on nothing free."""
 
-    @property
-    def points(self) -> int:
-        """Number of free eliminated variables."""
-        return 0 if self.eliminated is None else self.free[self.eliminated].numel()
 
-
-def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | None) -> Layout:
+def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None) -> Layout:
     """Decide which variables move, drop residuals without any, and sort the others.
 
     Args:
         blocks: The variables.
         terms: The residuals; those with weight 0 are dropped.
-        eliminate: The block to eliminate, if any; no residual may depend on two of its variables.
+        eliminate: The blocks to eliminate, if any; no residual may depend on two of their variables.
     """
+    gone = block_names(eliminate)
     free: dict[str, Tensor] = {}
     number: dict[str, Tensor] = {}
     first: dict[str, int] = {}
@@ -81,35 +94,43 @@ def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | No
         free[name] = moves.nonzero()[:, 0]
         number[name] = torch.full(moves.shape, -1, device=moves.device)
         number[name][free[name]] = torch.arange(free[name].numel(), device=moves.device)
-        if name != eliminate and free[name].numel():
+        if name not in gone and free[name].numel():
             first[name] = size
             size += free[name].numel() * block.tangent
     drafts: list[Piece] = []
     still: list[Term] = []
     for term in terms:
-        rows = _cut(term, number, eliminate)
+        rows = _cut(term, number, gone)
         places = [number[name][index] for name, index in zip(term.blocks, term.index, strict=True)]
         for kind in ((True, True), (True, False), (False, True)):
             if rows[kind].numel():
-                drafts.append(_find_slots(term, rows[kind], places, kind, blocks, first, size, eliminate))
+                drafts.append(_find_slots(term, rows[kind], places, kind, blocks, first, size, gone))
         if rows[False, False].numel():
             still.append(term.select(rows[False, False]))
-    if eliminate is None or not free[eliminate].numel():
-        return Layout(free, first, size, None, 0, [_sort(piece, None) for piece in drafts], still)
-    order = _order_points(drafts, free[eliminate].numel())
-    free[eliminate] = free[eliminate][order]
-    rank = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
-    return Layout(free, first, size, eliminate, blocks[eliminate].tangent, [_sort(piece, rank) for piece in drafts], still)
+    ranks: dict[str, Tensor] = {}
+    for name in gone:
+        if free[name].numel():
+            order = _order_points([piece for piece in drafts if piece.family == name], free[name].numel())
+            free[name] = free[name][order]
+            ranks[name] = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
+    pieces = [_sort(piece, ranks.get(piece.family or "")) for piece in drafts]
+    families = []
+    for name in ranks:
+        own = [piece if piece.family == name else replace(piece, family=None, point=None) for piece in pieces]
+        families.append(Family(name, size, blocks[name].tangent, free[name].numel(), own))
+    return Layout(free, first, size, families, pieces, still)
 
 
-def _cut(term: Term, number: dict[str, Tensor], eliminate: str | None) -> dict[tuple[bool, bool], Tensor]:
+def _cut(term: Term, number: dict[str, Tensor], gone: tuple[str, ...]) -> dict[tuple[bool, bool], Tensor]:
     """The residuals of a term by whether they have a free retained and a free eliminated variable."""
-    if term.blocks.count(eliminate or "") > 1:
-        raise ValueError(f"eliminate: a residual depends on two variables of {eliminate!r}; they cannot be eliminated singly")
+    met = [name for name in term.blocks if name in gone]
+    if len(met) > 1:
+        both = " and ".join(repr(name) for name in dict.fromkeys(met))
+        raise ValueError(f"eliminate: a residual depends on two variables of {both}; they cannot be eliminated singly")
     has_point = torch.zeros_like(term.index[0], dtype=torch.bool)
     has_kept = torch.zeros_like(has_point)
     for name, index in zip(term.blocks, term.index, strict=True):
-        if name == eliminate:
+        if name in gone:
             has_point |= number[name][index] >= 0
         else:
             has_kept |= number[name][index] >= 0
@@ -129,17 +150,17 @@ def _find_slots(
     blocks: dict[str, Block],
     first: dict[str, int],
     size: int,
-    eliminate: str | None,
+    gone: tuple[str, ...],
 ) -> Piece:
     """A piece, not sorted yet."""
     kept, with_point = kind
     places = [place[rows] for place in places]
     wanted = tuple(
-        with_point if name == eliminate else kept and bool((place >= 0).any())
+        with_point if name in gone else kept and bool((place >= 0).any())
         for name, place in zip(term.blocks, places, strict=True)
     )
-    retained = [(n, p) for n, p, w in zip(term.blocks, places, wanted, strict=True) if w and n != eliminate]
-    point = next((p for n, p in zip(term.blocks, places, strict=True) if n == eliminate), None) if with_point else None
+    retained = [(n, p) for n, p, w in zip(term.blocks, places, wanted, strict=True) if w and n not in gone]
+    family, point = next(((n, p) for n, p in zip(term.blocks, places, strict=True) if with_point and n in gone), (None, None))
     # Slots in the order of the first retained block, then the second, ...; -1 (fixed) is a value like any other.
     key = torch.zeros_like(rows)
     for _, place in retained:
@@ -151,7 +172,7 @@ def _find_slots(
         width = blocks[name].tangent
         step = torch.arange(width, device=rows.device)
         columns = torch.cat((torch.where(mine >= 0, first[name] + mine * width + step, size + 1), columns), 1)
-    return Piece(term.select(rows), wanted, slots, columns, point)
+    return Piece(term.select(rows), wanted, slots, columns, family, point)
 
 
 def _sort(piece: Piece, rank: Tensor | None) -> Piece:

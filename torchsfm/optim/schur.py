@@ -1,11 +1,12 @@
-"""The Schur complement: normal equations in which one family of variables is eliminated, each variable by itself.
+"""The Schur complement: normal equations in which families of variables are eliminated, each variable by itself.
 
 With the eliminated variables (points, for short) last, the normal equations of a problem of terms are
 
     [ U   W ] [ a ]     [ g ]
     [ W'  V ] [ b ] = - [ h ],    V block diagonal,
 
-and `S = U - W V^-1 W'` is a system in the retained variables alone (Brown 1958; Triggs et al. 2000, 6.1; HZ A6.3).
+and `S = U - W V^-1 W'` is a system in the retained variables alone (Brown 1958; Triggs et al. 2000, 6.1; HZ A6.3). Points and
+lines are families with blocks V of 3 and of 4 columns: what each takes off U is a sum over its own variables.
 Work comes in three tiers: once per problem (`layout`: who meets whom), once per linearisation (`Elimination.linearize`), once
 per damping (`NormalEquations.step`), so that a rejected step costs only the last.
 """
@@ -19,7 +20,7 @@ from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import backward, factor, forward, measure, place
 from torchsfm.optim.layout import CHUNK, Layout, Piece
-from torchsfm.optim.normal_equations import NormalEquations
+from torchsfm.optim.normal_equations import Eliminated, NormalEquations
 from torchsfm.optim.retained_blocks import RetainedBlocks, Runs, find_runs
 from torchsfm.optim.schur_grouped import GroupCoupling, plan_groups
 from torchsfm.optim.schur_matrix_free import Clusters, RowCoupling, find_clusters
@@ -67,6 +68,8 @@ class _Part:
     components: int
     """Numbers in a residual."""
     runs: Runs
+    family: int | None
+    """The place of its eliminated variables' family in the layout."""
     point: Tensor | None
 
 
@@ -85,25 +88,32 @@ class Elimination:
         self.blocks = blocks
         self.layout = layout
         x = {name: b.x for name, b in blocks.items()}
-        self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, x)]
+        numbers = {family.name: k for k, family in enumerate(layout.families)}
+        self.parts = [part for k, piece in enumerate(layout.pieces) for part in _parts(k, piece, x, numbers)]
         some = next(iter(blocks.values())).x
-        q, n = layout.point_size, layout.points
         self.squares = RetainedBlocks(layout, some)
-        self.V = some.new_empty((q * (q + 3) // 2, n))
         self.work = Workspace(some)
-        self.coupling: GroupCoupling | PairCoupling | RowCoupling | None = None
         self.clusters: Clusters | None = None
+        self.eliminated: list[Eliminated] = []
         self.current: NormalEquations | None = None
         """What the memory holds."""
         self._exact: Elimination | None = None
-        coupled = any(piece.coupled for piece in layout.pieces)
-        if solver == "pcg" or (solver == "auto" and too_large(layout)):
-            rows = RowCoupling(layout, some) if coupled else None
-            self.coupling, self.clusters = rows, find_clusters(layout, rows)
-        elif coupled:
-            spans, seconds = plan_groups(layout)
-            grouped = spread or seconds <= estimate_pairs(layout)
-            self.coupling = GroupCoupling(layout, spans, some) if grouped else PairCoupling(layout, some)
+        iterative = solver == "pcg" or (solver == "auto" and too_large(layout))
+        for family in layout.families:
+            V = some.new_empty((family.point_size * (family.point_size + 3) // 2, family.points))
+            coupling: GroupCoupling | PairCoupling | RowCoupling | None = None
+            if not any(piece.coupled for piece in family.pieces):
+                pass
+            elif iterative:
+                coupling = RowCoupling(family, some)
+            else:
+                spans, seconds = plan_groups(family)
+                grouped = spread or seconds <= estimate_pairs(family)
+                coupling = GroupCoupling(family, spans, some) if grouped else PairCoupling(family, some)
+            self.eliminated.append(Eliminated(family, coupling, V, V))
+        if iterative:
+            rows = [part.coupling for part in self.eliminated if isinstance(part.coupling, RowCoupling)]
+            self.clusters = find_clusters(layout, rows)
 
     def curve(self, x: dict[str, Tensor], system: NormalEquations) -> NormalEquations:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
@@ -113,37 +123,47 @@ class Elimination:
         """
         if self._exact is None:
             self._exact = Elimination(self.blocks, self.layout, "dense" if self.clusters is None else "pcg")
-        exact, q = self._exact, self.layout.point_size
-        exact.squares.clear()
-        exact.V.zero_()
-        if exact.coupling is not None:
-            exact.coupling.clear()
+        exact = self._exact
+        exact._clear()
         for part in exact.parts:
             exact._add_curvature(part, x)
-        for mine, given in zip(exact.squares.values, system.squares.values, strict=True):
-            mine[:, -1], mine[:, :, -1] = given[:, -1], given[:, :, -1]
-        for a in range(q):
-            exact.V[place(a, q, q)] = system.V[place(a, q, q)]
-        if q:
-            exact.V.copy_(torch.where(factor(exact.V - BENT * measure(system.V, q), q)[1], exact.V, system.V))
-        return replace(system, coupling=exact.coupling, squares=exact.squares, V=exact.V)
+        for mine, other in zip(exact.squares.values, system.squares.values, strict=True):
+            mine[:, -1], mine[:, :, -1] = other[:, -1], other[:, :, -1]
+        eliminated = []
+        for own, given in zip(exact.eliminated, system.eliminated, strict=True):
+            q = own.q
+            for a in range(q):
+                own.V[place(a, q, q)] = given.V[place(a, q, q)]
+            own.V.copy_(torch.where(factor(own.V - BENT * measure(given.V, q), q)[1], own.V, given.V))
+            eliminated.append(replace(own, metric=given.V))
+        return replace(system, eliminated=eliminated, squares=exact.squares, curved=True)
+
+    def _clear(self) -> None:
+        """Start a linearisation."""
+        self.squares.clear()
+        for part in self.eliminated:
+            part.V.zero_()
+            if part.coupling is not None:
+                part.coupling.clear()
 
     def _add_curvature(self, part: _Part, x: dict[str, Tensor]) -> None:
         """Add a part's exact second derivatives to the system."""
         starts = torch.tensor([start for start, _ in part.runs.ends], device=part.runs.slots.device)
         lengths = [end - start for start, end in part.runs.ends]
         run = torch.arange(len(lengths), device=starts.device).repeat_interleave(torch.tensor(lengths, device=starts.device))
-        U, W, V = curvature(part.term, x, self.blocks, part.wanted, self.layout.eliminated, (run, starts))
+        family = None if part.family is None else self.eliminated[part.family]
+        name = None if family is None else family.family.name
+        U, W, V = curvature(part.term, x, self.blocks, part.wanted, name, (run, starts))
         if part.width:
             self.squares.values[part.piece][:, :-1, :-1].index_add_(0, part.runs.slots, U.permute(2, 0, 1))
-        if part.point is None:
+        if family is None or part.point is None:
             return
         q = len(V)
         for a in range(q):
-            self.V[place(a, a, q) : place(a, q, q)].index_add_(1, part.point, V[a, a:])
-        if part.width and self.coupling is not None:
+            family.V[place(a, a, q) : place(a, q, q)].index_add_(1, part.point, V[a, a:])
+        if part.width and family.coupling is not None:
             eye = torch.eye(q, dtype=V.dtype, device=V.device)[:, :, None].expand(-1, -1, V.shape[2])
-            self.coupling.add(part.piece, part.start, W.transpose(0, 1), eye)
+            family.coupling.add(part.piece, part.start, W.transpose(0, 1), eye)
 
     def cost(self, x: dict[str, Tensor]) -> Tensor:
         """The cost of all residuals that depend on something free."""
@@ -155,31 +175,29 @@ class Elimination:
 
         They do not depend on each other once the retained ones have moved; a few that go astray need not hold back all.
         """
-        name = self.layout.eliminated
-        if name is None:
-            return trial
-        free, best, least = self.layout.free[name], trial[name], self._point_costs(trial)
-        for part in PARTS:
-            other = move(self.blocks, self.layout, x, {name: part * step[name]})[name]
-            cost = self._point_costs(trial | {name: other})
-            better = free[cost < least]
-            best = best.index_copy(0, better, other[better])
-            least = torch.minimum(cost, least)
-        return trial | {name: best.mT.contiguous().mT}
+        found = dict(trial)
+        for k, family in enumerate(self.layout.families):
+            name = family.name
+            free, best, least = self.layout.free[name], trial[name], self._point_costs(trial, k)
+            for share in PARTS:
+                other = move(self.blocks, self.layout, x, {name: share * step[name]})[name]
+                cost = self._point_costs(trial | {name: other}, k)
+                better = free[cost < least]
+                best = best.index_copy(0, better, other[better])
+                least = torch.minimum(cost, least)
+            found[name] = best.mT.contiguous().mT
+        return found
 
     def linearize(self, x: dict[str, Tensor]) -> "NormalEquations":
         """The blocks of the normal equations at `x`; they are overwritten by the next call."""
         self.current = None
         lifts = self._lifts(x)
-        self.squares.clear()
-        self.V.zero_()
-        if self.coupling is not None:
-            self.coupling.clear()
+        self._clear()
         for part in self.parts:
-            self._add(part, x, lifts, self.V)
+            self._add(part, x, lifts, None if part.family is None else self.eliminated[part.family].V)
         squares = self.squares
         self.current = NormalEquations(
-            self.layout, self.coupling, squares, self.V, self.clusters, squares.diagonal(), self.V, squares.gradient()
+            self.layout, self.eliminated, squares, self.clusters, squares.diagonal(), squares.gradient()
         )
         return self.current
 
@@ -189,26 +207,27 @@ class Elimination:
         A long step along a curved valley of the cost (focal length against depth) leaves it sideways; with the points brought
         back to where the moved cameras want them it stays inside (embedded point iterations, Jeong et al. 2012).
         """
-        q, layout = self.layout.point_size, self.layout
-        if layout.eliminated is None:
-            return x
-        V, lifts = self.work.get("settled", *self.V.shape).zero_(), self._lifts(x)
-        for part in self.parts:
-            if part.point is not None:
-                self._add(part, x, lifts, V, held=True)
-        L, _ = factor(V + SETTLING * measure(V, q), q)
-        step = -backward(L, forward(L, V[[place(a, q, q) for a in range(q)]]))
-        moved = move(self.blocks, layout, x, {layout.eliminated: step.mT})
-        before, after = self._point_costs(x), self._point_costs(moved)
-        better = torch.zeros(x[layout.eliminated].shape[0], dtype=torch.bool, device=V.device)
-        better[layout.free[layout.eliminated]] = after < before
-        return x | {layout.eliminated: torch.where(better, moved[layout.eliminated].mT, x[layout.eliminated].mT).mT}
+        lifts, found = self._lifts(x), dict(x)
+        for k, part in enumerate(self.eliminated):
+            q, name = part.q, part.family.name
+            V = self.work.get("settled", *part.V.shape).zero_()
+            for some in self.parts:
+                if some.family == k:
+                    self._add(some, x, lifts, V, held=True)
+            L, _ = factor(V + SETTLING * measure(V, q), q)
+            step = -backward(L, forward(L, V[[place(a, q, q) for a in range(q)]]))
+            moved = move(self.blocks, self.layout, x, {name: step.mT})
+            before, after = self._point_costs(x, k), self._point_costs(moved, k)
+            better = torch.zeros(x[name].shape[0], dtype=torch.bool, device=V.device)
+            better[self.layout.free[name]] = after < before
+            found[name] = torch.where(better, moved[name].mT, x[name].mT).mT
+        return found
 
-    def _point_costs(self, x: dict[str, Tensor]) -> Tensor:
-        """The cost of each eliminated variable's residuals, inf where it is not a number."""
-        total = self.V.new_zeros(self.layout.points)
+    def _point_costs(self, x: dict[str, Tensor], family: int) -> Tensor:
+        """The cost of the residuals of each eliminated variable of a family, inf where it is not a number."""
+        total = self.eliminated[family].V.new_zeros(self.layout.families[family].points)
         for part in self.parts:
-            if part.point is not None:
+            if part.family == family and part.point is not None:
                 total.index_add_(0, part.point, residual_costs(part.term, term_residual(part.term, x, self.work)))
         return total.nan_to_num(nan=torch.inf)
 
@@ -224,16 +243,17 @@ class Elimination:
         return {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
 
     def _add(
-        self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None], V: Tensor, *, held: bool = False
+        self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None], V: Tensor | None, *, held: bool = False
     ) -> None:
         """Add squares and products of a part's Jacobians to the system, or with the retained variables held to V alone."""
-        q, c, d, m = self.layout.point_size, 0 if held else part.width, part.components, part.term.index[0].shape[0]
+        family = None if part.family is None else self.eliminated[part.family]
+        q, c, d, m = 0 if family is None else family.q, 0 if held else part.width, part.components, part.term.index[0].shape[0]
         # Both with the residual as one more column, which gives the gradients.
         J, P = self.work.get("J", d, c + 1, m), self.work.get("P", d, q + 1, m)
         out: list[Tensor | None] = []
         start = 0
         for name, wanted in zip(part.term.blocks, part.wanted, strict=True):
-            if wanted and name == self.layout.eliminated:
+            if wanted and family is not None and name == family.family.name:
                 out.append(P[:, :q].permute(2, 0, 1))
             elif held or not wanted:
                 out.append(None)
@@ -247,7 +267,7 @@ class Elimination:
             J *= scale
         if c:
             self.squares.values[part.piece].index_add_(0, part.runs.slots, part.runs.squares(J))
-        if part.point is None:
+        if family is None or part.point is None or V is None:
             return
         if scale is not None:
             P[:, :q] *= scale
@@ -261,8 +281,8 @@ class Elimination:
                 rows.addcmul_(P[k, a], P[k, a:])
             row += q + 1 - a
         V.index_add_(1, part.point, squares)
-        if c and self.coupling is not None:
-            self.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
+        if c and family.coupling is not None:
+            family.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
 
 
 def too_large(layout: Layout) -> bool:
@@ -271,7 +291,7 @@ def too_large(layout: Layout) -> bool:
     return layout.size > LARGEST or layout.size**3 * FLOP > rows * PASS
 
 
-def _parts(number: int, piece: Piece, x: dict[str, Tensor]) -> list[_Part]:
+def _parts(number: int, piece: Piece, x: dict[str, Tensor], families: dict[str, int]) -> list[_Part]:
     """Cut a piece where the residuals linearised at once become too many."""
     m, width = piece.slots.numel(), piece.columns.shape[1]
     parts = []
@@ -286,7 +306,8 @@ def _parts(number: int, piece: Piece, x: dict[str, Tensor]) -> list[_Part]:
         )
         point = None if piece.point is None else piece.point[rows]
         runs = find_runs(piece.slots[rows])
-        parts.append(_Part(number, first, term, piece.wanted, width, components, runs, point))
+        family = None if piece.family is None else families[piece.family]
+        parts.append(_Part(number, first, term, piece.wanted, width, components, runs, family, point))
     return parts
 
 

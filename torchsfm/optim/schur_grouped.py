@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import Triangle
-from torchsfm.optim.layout import CHUNK, Layout, Piece
+from torchsfm.optim.layout import CHUNK, Family, Piece
 from torchsfm.optim.terms import Workspace
 
 CACHE = 100_000
@@ -41,9 +41,9 @@ class _Group:
 class GroupCoupling:
     """`W` as one dense matrix (q, columns, points) for each group."""
 
-    def __init__(self, layout: Layout, spans: list[Span], some: Tensor) -> None:
-        self.size, self.q, self.points = layout.size, layout.point_size, layout.points
-        self.groups, targets = _lay_groups(layout, spans)
+    def __init__(self, family: Family, spans: list[Span], some: Tensor) -> None:
+        self.size, self.q, self.points = family.size, family.point_size, family.points
+        self.groups, targets = _lay_groups(family, spans)
         # Contiguous for each call of `add`.
         self._targets = [
             {start: t[:, start : start + CHUNK].flatten() for start in range(0, t.shape[1], CHUNK)} for t in targets
@@ -133,12 +133,12 @@ class GroupCoupling:
         return self._W[:, group.offset : group.offset + columns * points].view(-1, columns, points)
 
 
-def plan_groups(layout: Layout) -> tuple[list[Span], float]:
+def plan_groups(family: Family) -> tuple[list[Span], float]:
     """Cut the points into groups, joining neighbours while that saves time; return them and the estimated seconds."""
-    count = layout.points
+    count = family.points
     sets = [0] * -(-count // ATOM)
     first, widest = 0, 1
-    for piece in layout.pieces:
+    for piece in family.pieces:
         if piece.coupled and piece.point is not None:
             slots = piece.columns.shape[0]
             pairs = torch.unique(torch.div(piece.point, ATOM, rounding_mode="floor") * slots + piece.slots)
@@ -148,7 +148,7 @@ def plan_groups(layout: Layout) -> tuple[list[Span], float]:
             widest = max(widest, piece.columns.shape[1])
 
     def seconds(slots: int, points: int) -> float:
-        columns = min(slots.bit_count() * widest, layout.size)
+        columns = min(slots.bit_count() * widest, family.size)
         return columns * columns * (points * PRODUCT + ENTRY) + VISIT
 
     spans: list[Span] = []
@@ -165,14 +165,14 @@ def plan_groups(layout: Layout) -> tuple[list[Span], float]:
     return spans, sum(seconds(slots, end - start) for start, end, slots in spans)
 
 
-def _lay_groups(layout: Layout, spans: list[Span]) -> tuple[list[_Group], list[Tensor]]:
+def _lay_groups(family: Family, spans: list[Span]) -> tuple[list[_Group], list[Tensor]]:
     """The columns of each group, and where in the groups' matrices each piece's residuals go: (c, m)."""
-    device = layout.pieces[0].slots.device
-    number = torch.empty(layout.points, dtype=torch.int64, device=device)
+    device = family.pieces[0].slots.device
+    number = torch.empty(family.points, dtype=torch.int64, device=device)
     for g, (start, end, _) in enumerate(spans):
         number[start:end] = g
-    wide = layout.size + 2
-    seen = [_seen(piece, number, wide) for piece in layout.pieces if piece.coupled]
+    wide = family.size + 2
+    seen = [_seen(piece, number, wide) for piece in family.pieces if piece.coupled]
     keys = torch.unique(torch.cat(seen))
     table = torch.full((len(spans) * wide,), -1, device=device)
     sizes = torch.bincount(torch.div(keys, wide, rounding_mode="floor"), minlength=len(spans))
@@ -180,7 +180,7 @@ def _lay_groups(layout: Layout, spans: list[Span]) -> tuple[list[_Group], list[T
     groups: list[_Group] = []
     offset = 0
     for (start, end, _), columns in zip(spans, (keys % wide).split(sizes.tolist()), strict=True):
-        everything = columns.numel() == layout.size and (layout.size == 0 or int(columns[-1]) < layout.size)
+        everything = columns.numel() == family.size and (family.size == 0 or int(columns[-1]) < family.size)
         groups.append(_Group(start, end, offset, columns, everything))
         offset += columns.numel() * (end - start)
     starts, widths, offsets = (
@@ -188,7 +188,7 @@ def _lay_groups(layout: Layout, spans: list[Span]) -> tuple[list[_Group], list[T
         for values in ([g.start for g in groups], [g.end - g.start for g in groups], [g.offset for g in groups])
     )
     targets: list[Tensor] = []
-    for piece in layout.pieces:
+    for piece in family.pieces:
         if not piece.coupled or piece.point is None:
             targets.append(number.new_empty((0, 0)))
             continue

@@ -7,7 +7,7 @@ preconditioner inverts diagonal blocks of S (Schur-Jacobi), one for each cluster
 such as the pose and the intrinsics of one photograph.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import Triangle, backward, forward
-from torchsfm.optim.layout import CHUNK, Layout
+from torchsfm.optim.layout import CHUNK, Family, Layout
 from torchsfm.optim.retained_blocks import RetainedBlocks, Runs, find_runs
 from torchsfm.optim.terms import Workspace
 
@@ -40,18 +40,18 @@ class _Chunk:
 class RowCoupling:
     """`W` as a matrix (q, c) for each coupled residual, pieces one after the other."""
 
-    def __init__(self, layout: Layout, some: Tensor) -> None:
-        self.size, self.q, self.points = layout.size, layout.point_size, layout.points
-        coupled = [piece for piece in layout.pieces if piece.coupled]
+    def __init__(self, family: Family, some: Tensor) -> None:
+        self.size, self.q, self.points = family.size, family.point_size, family.points
+        coupled = [piece for piece in family.pieces if piece.coupled]
         self.width = max(piece.columns.shape[1] for piece in coupled)
         self._chunks: dict[tuple[int, int], _Chunk] = {}
         columns, slots, points = [], [], []
         rows = count = 0
-        for k, piece in enumerate(layout.pieces):
+        for k, piece in enumerate(family.pieces):
             if not piece.coupled or piece.point is None:
                 continue
             # Narrower slots are padded with the column that collects what belongs to nobody.
-            blank = piece.columns.new_full((piece.columns.shape[0], self.width - piece.columns.shape[1]), layout.size + 1)
+            blank = piece.columns.new_full((piece.columns.shape[0], self.width - piece.columns.shape[1]), family.size + 1)
             columns.append(torch.cat((piece.columns, blank), 1))
             slots.append(piece.slots + count)
             points.append(piece.point)
@@ -133,12 +133,12 @@ class Clusters:
     """Columns of the clusters of each width, (clusters, width)."""
     places: list[Tensor]
     """Where the entries of each piece's squares go in the blocks one after the other, at their end if nowhere."""
-    coupled: Tensor
-    """The same for the squares of a `RowCoupling`."""
+    coupled: list[Tensor]
+    """The same for the squares of each `RowCoupling`."""
     total: int
 
 
-def find_clusters(layout: Layout, coupling: RowCoupling | None) -> Clusters:
+def find_clusters(layout: Layout, couplings: Sequence[RowCoupling]) -> Clusters:
     """Put variables that occur in the same slots together."""
     device = layout.pieces[0].columns.device
     owner = _owners(layout, device)
@@ -148,7 +148,7 @@ def find_clusters(layout: Layout, coupling: RowCoupling | None) -> Clusters:
     # The first column of each variable stands for it.
     head = torch.ones_like(owner, dtype=torch.bool)
     head[1:] = owner[1:] != owner[:-1]
-    columns = [coupling.columns] if coupling is not None else [p.columns for p in layout.pieces]
+    columns = [coupling.columns for coupling in couplings] or [p.columns for p in layout.pieces]
     met, keys = [], []
     for c in columns:
         counts = head[c] & (c < layout.size)
@@ -159,7 +159,7 @@ def find_clusters(layout: Layout, coupling: RowCoupling | None) -> Clusters:
     signature = torch.zeros_like(mark).index_add_(0, *pairs)
     alone = torch.ones_like(mark, dtype=torch.bool).index_fill_(0, pairs[0], False)
     _, cluster = torch.unique(torch.where(alone, mark, signature)[:variables], return_inverse=True)
-    return _lay_blocks(layout, coupling, cluster[owner[: layout.size]])
+    return _lay_blocks(layout, couplings, cluster[owner[: layout.size]])
 
 
 def _owners(layout: Layout, device: torch.device) -> Tensor:
@@ -175,7 +175,7 @@ def _owners(layout: Layout, device: torch.device) -> Tensor:
     return owner
 
 
-def _lay_blocks(layout: Layout, coupling: RowCoupling | None, cluster: Tensor) -> Clusters:
+def _lay_blocks(layout: Layout, couplings: Sequence[RowCoupling], cluster: Tensor) -> Clusters:
     """Where each cluster's block stands, given the cluster of each column."""
     widths = torch.bincount(cluster)
     order = torch.argsort(cluster, stable=True)
@@ -198,20 +198,19 @@ def _lay_blocks(layout: Layout, coupling: RowCoupling | None, cluster: Tensor) -
         found = offset[mine.clamp_min(0)][:, :, None] + at[:, :, None] * widths[mine.clamp_min(0)][:, :, None] + at[:, None]
         return torch.where(together, found, total).flatten()
 
-    empty = layout.pieces[0].columns[:0]
     pieces = [places(piece.columns) for piece in layout.pieces]
-    return Clusters(groups, pieces, places(empty if coupling is None else coupling.columns), total)
+    return Clusters(groups, pieces, [places(coupling.columns) for coupling in couplings], total)
 
 
 class _SchurJacobi:
     """The inverses of the diagonal blocks."""
 
-    def __init__(self, clusters: Clusters, squares: RetainedBlocks, coupled: Tensor | None, weight: Tensor) -> None:
+    def __init__(self, clusters: Clusters, squares: RetainedBlocks, coupled: list[Tensor], weight: Tensor) -> None:
         flat = weight.new_zeros(clusters.total + 1)
         for place, values in zip(clusters.places, squares.values, strict=True):
             flat.index_add_(0, place, values[:, :-1, :-1].flatten())
-        if coupled is not None:
-            flat.index_add_(0, clusters.coupled, coupled[:, :-1, :-1].flatten(), alpha=-1)
+        for place, values in zip(clusters.coupled, coupled, strict=True):
+            flat.index_add_(0, place, values[:, :-1, :-1].flatten(), alpha=-1)
         ends = [0]
         for group in clusters.groups:
             ends.append(ends[-1] + group.numel() * group.shape[1])
@@ -232,34 +231,31 @@ class _SchurJacobi:
 
 
 def solve_reduced(
-    squares: RetainedBlocks, coupling: RowCoupling | None, clusters: Clusters, L: Triangle, z: Tensor, weight: Tensor
+    squares: RetainedBlocks, eliminated: Sequence[tuple[RowCoupling, Triangle, Tensor]], clusters: Clusters, weight: Tensor
 ) -> tuple[Tensor, bool]:
     """The step of the retained variables for a damping `weight`, to the accuracy of `FORCING`, and whether there is one.
 
     Args:
         squares: U and the gradient.
-        coupling: W.
+        eliminated: W, the factors L of V, and `L^-1 h` of each eliminated family that meets retained variables.
         clusters: The preconditioner's blocks.
-        L: The factors of V.
-        z: `L^-1 h`.
         weight: Added to the diagonal, (size).
     """
-    right = squares.gradient()
-    coupled = None if coupling is None else coupling.squares(L, z)
-    if coupling is not None and coupled is not None:
-        columns, share = coupling.columns.flatten(), coupled[:, :-1, -1].flatten()
-        full = torch.cat((right, right.new_zeros(2)))
-        right = full.index_add_(0, columns, share, alpha=-1)[: len(right)]
+    size = squares.size
+    right = torch.nn.functional.pad(squares.gradient(), (0, 2))
+    coupled = [coupling.squares(L, z) for coupling, L, z in eliminated]
+    for (coupling, _, _), values in zip(eliminated, coupled, strict=True):
+        right.index_add_(0, coupling.columns.flatten(), values[:, :-1, -1].flatten(), alpha=-1)
     precondition = _SchurJacobi(clusters, squares, coupled, weight)
 
     def apply(x: Tensor) -> Tensor:
         out = squares.product(x) + weight * x
-        if coupling is not None:
-            inner = coupling.product(torch.cat((x, x.new_zeros(2))))
-            out -= coupling.lift(backward(L, forward(L, inner)))[: len(x)]
+        for coupling, L, _ in eliminated:
+            inner = coupling.product(torch.nn.functional.pad(x, (0, 2)))
+            out -= coupling.lift(backward(L, forward(L, inner)))[:size]
         return out
 
-    return conjugate_gradients(apply, precondition, -right, FORCING)
+    return conjugate_gradients(apply, precondition, -right[:size], FORCING)
 
 
 def conjugate_gradients(apply: Apply, precondition: Apply, b: Tensor, forcing: float) -> tuple[Tensor, bool]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import Triangle
-from torchsfm.optim.layout import Layout
+from torchsfm.optim.layout import Family
 from torchsfm.optim.retained_blocks import add_squares
 from torchsfm.optim.schur_matrix_free import RowCoupling
 from torchsfm.optim.terms import Workspace
@@ -24,9 +24,9 @@ BATCH = 4096
 class PairCoupling:
     """`W` as a matrix for each residual, and the plan of all pairs."""
 
-    def __init__(self, layout: Layout, some: Tensor) -> None:
-        self._rows = RowCoupling(layout, some)
-        self._plan(self._rows.slots, self._rows.columns.shape[0], layout.size + 2)
+    def __init__(self, family: Family, some: Tensor) -> None:
+        self._rows = RowCoupling(family, some)
+        self._plan(self._rows.slots, self._rows.columns.shape[0], family.size + 2)
         # One row of zeros more, for padding.
         self._Y = some.new_zeros((self._rows.slots.numel() + 1, self._rows.q, self._rows.width))
         self._work = Workspace(some)
@@ -104,12 +104,12 @@ def _pairs(point: Tensor, slots: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return torch.cat(first), torch.cat(second)
 
 
-def estimate_pairs(layout: Layout) -> float:
+def estimate_pairs(family: Family) -> float:
     """Seconds that a reduction pair by pair takes, about."""
-    count = torch.zeros(layout.points, device=layout.pieces[0].slots.device)
+    count = torch.zeros(family.points, device=family.pieces[0].slots.device)
     rows = 0
-    for piece in layout.pieces:
+    for piece in family.pieces:
         if piece.coupled and piece.point is not None:
-            count += torch.bincount(piece.point, minlength=layout.points)
+            count += torch.bincount(piece.point, minlength=family.points)
             rows += piece.point.numel()
     return float((count * (count - 1)).sum()) / 2 * PAIR + rows * RESIDUAL

@@ -32,7 +32,7 @@ class _Problem:
     blocks: dict[str, Block]
     terms: list[Term]
     used: list[Tensor]
-    eliminate: str | None
+    eliminate: str | Sequence[str] | None
     hessian: Hessian
 
     def inputs(self, values: Sequence[Tensor]) -> tuple[dict[str, Tensor], list[Term]]:
@@ -69,7 +69,7 @@ def attach_sparse_optimum(
     terms: Sequence[Term],
     x: dict[str, Tensor],
     used: Sequence[Tensor],
-    eliminate: str | None,
+    eliminate: str | Sequence[str] | None,
     hessian: Hessian,
 ) -> dict[str, Tensor]:
     """Give the minimum `x` its derivatives with respect to data, weights and the fixed variables among the blocks.
@@ -79,7 +79,7 @@ def attach_sparse_optimum(
         terms: The residuals.
         x: All variables at the minimum, float64.
         used: Which residuals of each term count.
-        eliminate: The eliminated block.
+        eliminate: The eliminated blocks.
         hessian: "exact", or "gauss-newton" which leaves out second derivatives of the residuals.
 
     Returns:
@@ -117,7 +117,7 @@ class _Optimum(torch.autograd.Function):
 def _pull(blocks: dict[str, Block], layout: Layout, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
     """Gradients by ambient numbers as gradients by tangent steps of the free variables."""
     found = {}
-    for name in (*layout.first, *([layout.eliminated] if layout.eliminated else [])):
+    for name in (*layout.first, *(family.name for family in layout.families)):
         free = layout.free[name]
         with torch.enable_grad():
             delta = blocks[name].x.new_zeros((free.numel(), blocks[name].tangent)).requires_grad_()

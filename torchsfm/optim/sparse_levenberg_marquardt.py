@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for one large sparse problem: terms over variable blocks, one block eliminated (`schur`)."""
+"""Levenberg-Marquardt for one large sparse problem: terms over variable blocks, some of them eliminated (`schur`)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ from torchsfm.optim.normal_equations import NormalEquations
 from torchsfm.optim.pytree import Places
 from torchsfm.optim.schur import Elimination, Solver, move
 from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
-from torchsfm.optim.terms import Block, Term, prepare, term_cost, term_residual
+from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_cost, term_residual
 
 STRAIGHT = 0.75
 """Steps that lower the cost by less than this part of what they promise left the linear model's reach."""
@@ -48,7 +48,7 @@ def sparse_levenberg_marquardt(
     blocks: Mapping[str, Block],
     terms: Sequence[Term],
     *,
-    eliminate: str | None = None,
+    eliminate: str | Sequence[str] | None = None,
     max_iterations: int = 50,
     function_tolerance: float = 1e-6,
     gradient_tolerance: float = 1e-10,
@@ -69,7 +69,8 @@ def sparse_levenberg_marquardt(
     Args:
         blocks: Variables by name.
         terms: Residuals over them.
-        eliminate: The block with the most variables (points); no residual may depend on two of its variables.
+        eliminate: The block with the most variables (points), or several (points and lines); no residual may depend on two
+            of their variables.
         max_iterations: Most accepted or rejected steps.
         function_tolerance: End when no more than this fraction of the cost is left to gain, by the promise of a step or by how
             fast gains fall.
@@ -227,10 +228,9 @@ def _double(x: Tensor) -> Tensor:
     return x.double() if x.is_floating_point() else x
 
 
-def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | None) -> None:
-    check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple), eliminate=(eliminate, str | None))
-    if eliminate is not None and eliminate not in blocks:
-        raise ValueError(f"eliminate: wanted one of {sorted(blocks)}, got {eliminate!r}")
+def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None) -> None:
+    check_options(blocks=(blocks, Mapping), terms=(terms, list | tuple))
+    check_eliminate(blocks, eliminate)
     for k, term in enumerate(terms):
         if len(term.blocks) != len(term.index):
             raise ValueError(f"terms[{k}]: wanted one index for each of {term.blocks}, got {len(term.index)}")

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import check_options
 from torchsfm.optim.loss import Loss, loss_slope
 from torchsfm.optim.manifold import Manifold
 
@@ -64,6 +65,23 @@ class Term:
             data=tuple(_columns(d).index_select(-1, rows).movedim(-1, 0) for d in self.data),
             weights=None if self.weights is None else self.weights.index_select(0, rows),
         )
+
+
+def block_names(eliminate: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The blocks to eliminate, one or several."""
+    return () if eliminate is None else (eliminate,) if isinstance(eliminate, str) else tuple(eliminate)
+
+
+def check_eliminate(blocks: Mapping[str, Block], eliminate: str | Sequence[str] | None) -> None:
+    """See that what is to be eliminated is there.
+
+    Raises:
+        ValueError: A name is not that of a block.
+    """
+    check_options(eliminate=(eliminate, str | Sequence | None))
+    for name in block_names(eliminate):
+        if name not in blocks:
+            raise ValueError(f"eliminate: wanted names among {sorted(blocks)}, got {name!r}")
 
 
 def prepare(blocks: Mapping[str, Block], terms: Sequence[Term]) -> tuple[dict[str, Block], list[Term], tuple[Tensor, ...]]:

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.geometry import line_from_points, to_homogeneous
+from torchsfm.geometry.line_manifold import line_tangents
 from torchsfm.linalg import adjugate_3x3, cross, determinant_3x3, eigh, usable
 
 SAME = 1e-7
@@ -197,23 +198,11 @@ def residuals(line: Tensor, projections: Tensor, ends: Tensor) -> Tensor:
 def linearize(line: Tensor, projections: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """The residuals and their derivatives (n, v, 2, 4) along the tangents of `Line3D`."""
     l = (projections @ line[..., None, :, None])[..., 0]  # noqa: E741
-    moved = projections @ tangents(line)[..., None, :, :]
+    moved = projections @ line_tangents(line)[..., None, :, :]
     scale = l[..., :2].square().sum(-1, keepdim=True).clamp_min(1e-200).rsqrt()
     r = (ends * l[..., None, :]).sum(-1) * scale
     stretch = (l[..., :2, None] * moved[..., :2, :]).sum(-2) * scale.square()
     return r, (ends @ moved) * scale[..., None] - r[..., None] * stretch[..., None, :]
-
-
-def tangents(line: Tensor) -> Tensor:
-    """The derivatives (*n, 6, 4) of lines along the steps of `Line3D`: columns orthogonal to each other and to the line."""
-    d, m = line[..., :3], line[..., 3:]
-    u1, u2 = _unit(m), _unit(d)
-    u3 = cross(u1, u2)
-    sin, cos = torch.linalg.vector_norm(d, dim=-1, keepdim=True), torch.linalg.vector_norm(m, dim=-1, keepdim=True)
-    zero = torch.zeros_like(d)
-    upper = torch.stack((sin * u3, zero, -sin * u1, cos * u2), -1)
-    lower = torch.stack((zero, -cos * u3, cos * u2, -sin * u1), -1)
-    return torch.cat((upper, lower), -2)
 
 
 def in_world(line: Tensor, origin: Tensor, unit: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import Line3D
+from torchsfm.geometry.line_manifold import line_tangents, world_covariance
 from torchsfm.linalg import cross, eigvalsh, inverse
 from torchsfm.optim import Loss, levenberg_marquardt
 from torchsfm.triangulation._line_views import (
@@ -25,7 +26,6 @@ from torchsfm.triangulation._line_views import (
     one_plane,
     residuals,
     seen_points,
-    tangents,
 )
 
 PIECE = 1 << 17
@@ -174,7 +174,7 @@ def _solve(views: LineViews, segments: bool, loss: Loss | None, max_iterations: 
         # What is exact but for rounding is a minimum, whatever steps promise.
         exact = error <= _EXACT * (views.w * fixed.ends.square().sum((-2, -1))).sum(1).sqrt()
         status = _status(views, fault, in_front, (found.status == Status.NOT_CONVERGED) & ~exact)
-        covariance = _in_world_tangents(local, line, model.detach(), origin, unit)
+        covariance = world_covariance(local, line, model.detach(), origin, unit)
         good = (status == Status.OK) | (status == Status.BEHIND) | (status == Status.NOT_CONVERGED)
         covariance = torch.where(good[:, None, None], covariance, 0.0)
         end_covariance = torch.where(good[:, None, None, None], end_covariance, 0.0)
@@ -285,25 +285,12 @@ def _covariance(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor]:
 def _across(line: Tensor, ends: Tensor, C: Tensor) -> Tensor:
     """Covariance (n, 2, 3, 3) of the line's place at two of its points, across it."""
     size = torch.linalg.vector_norm(line[:, :3], dim=-1).clamp_min(1e-300)
-    moved = tangents(line) / size[:, None, None]
+    moved = line_tangents(line) / size[:, None, None]
     d = (line[:, :3] / size[:, None])[:, None, :, None]
     # X x d = m, so that across the line dX = d x (dm - X x dd).
     dm, dd = moved[:, None, 3:], moved[:, None, :3]
     G = _cross_columns(d, dm - _cross_columns(ends[..., None], dd))
     return G @ C[:, None] @ G.mT
-
-
-def _in_world_tangents(C: Tensor, line: Tensor, model: Tensor, origin: Tensor, unit: Tensor) -> Tensor:
-    """The covariance along the steps of `Line3D` from the line in the world."""
-    size = torch.linalg.vector_norm(line[:, :3], dim=-1).clamp_min(1e-300)[:, None, None]
-    inner = tangents(line) / size
-    dd, dm = inner[:, :3], inner[:, 3:]
-    moved = torch.cat((dd, unit[:, None, None] * dm + _cross_columns(origin[..., None], dd)), -2)
-    outer = tangents(model)
-    square = outer.square().sum(-2)
-    determined = (square > 1e-20 * model.square().sum(-1, keepdim=True)).all(-1)
-    G = (outer.mT @ moved) / torch.where(determined[:, None], square, 1.0)[..., None]
-    return torch.where(determined[:, None, None], G @ C @ G.mT, 0.0)
 
 
 def _cross_columns(a: Tensor, b: Tensor) -> Tensor:

@@ -1,0 +1,74 @@
+"""What views see besides points: kinds of structure that a bundle adjusts together with them, each in a file of its own."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm.bundle.projection import Projection
+from torchsfm.geometry import Camera, Pose, Similarity
+from torchsfm.optim import Block, Term
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What is between the world and the images of a bundle: the variables, which of them each view has, and the formula."""
+
+    blocks: tuple[str, ...]
+    """Names of the variables: those of poses, one after the other from the world to the camera, and the camera's last."""
+    index: tuple[Int[Tensor, "v"], ...]
+    """Which variable of each block belongs to each view."""
+    projection: Projection
+    poses: Pose
+    """Of the views, at the start."""
+    cameras: Camera
+    """Of the views, at the start."""
+
+    def at(self, view: Int[Tensor, "m"]) -> tuple[Int[Tensor, "m"], ...]:
+        """The variables between the world and observations in some views."""
+        return tuple(index[view] for index in self.index)
+
+    def pose(self, *rows: Float[Tensor, "m 12"]) -> tuple[Float[Tensor, "3 3 m"], Float[Tensor, "3 m"]]:
+        """Camera from world, R and t, by rows of poses from the world to the camera; rows of observations last."""
+        R, t = _parts(rows[0])
+        for row in rows[1:]:
+            S, s = _parts(row)
+            R, t = (S[:, :, None] * R[None]).sum(1), (S * t[None]).sum(1) + s
+        return R, t
+
+
+@runtime_checkable
+class Structure(Protocol):
+    """Variables of one kind and what the views show of them.
+
+    They are eliminated as points are, each by itself, so that no residual may depend on two of them.
+    """
+
+    @property
+    def block(self) -> str:
+        """The name of the variables."""
+
+    def check(self, views: int) -> None:
+        """See that the observations fit a bundle of so many views.
+
+        Raises:
+            ValueError: An index points at nothing.
+        """
+
+    def variables(self, sight: Sight) -> Block:
+        """The variables where they start."""
+
+    def term(self, sight: Sight, start: Block) -> Term:
+        """The residuals, pixels, one row an observation."""
+
+    def covariance(self, x: Tensor, C: Tensor) -> Tensor:
+        """Covariances of the variables in coordinates that mean something outside, from those of their steps."""
+
+    def moved(self, start: Tensor, end: Tensor, world: Similarity | None) -> "Structure":
+        """The same with the variables moved, and then the world of those that did; others keep every bit."""
+
+
+def _parts(row: Float[Tensor, "m 12"]) -> tuple[Tensor, Tensor]:
+    columns = row.mT
+    return columns[:9].reshape(3, 3, -1), columns[9:]
