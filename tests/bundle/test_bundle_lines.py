@@ -120,7 +120,7 @@ def test_residuals_are_distances_from_the_image_of_the_line(generator: torch.Gen
     # As if the intrinsics had moved since the rays were taken: the camera is another one.
     row = blocks["camera"].x * 1.02
     found = term_residual(terms[1], {name: b.x for name, b in blocks.items()} | {"camera": row})
-    share = torch.linspace(-0.5, 1.5, 40001, dtype=F64)[:, None]
+    share = torch.linspace(-0.5, 1.5, 20001, dtype=F64)[:, None]
     distortion = type(scene.problem.cameras.distortion).from_parameters(row[0, 5:])
     camera = Camera(intrinsics(row[0, 0], row[0, 3:5], row[0, 1]), distortion)
     for k in range(0, len(lines.x), 7):
@@ -191,7 +191,7 @@ def test_errors_are_those_of_the_covariance(generator: torch.Generator, lens: st
     scene = make_scene(generator, lens=lens, points=12, lines=10)
     held = first_two(scene.problem)
     C = bundle_covariance(scene.problem, sigma=0.2, structure=[scene.lines], fixed_poses=held)
-    for _ in range(25):
+    for _ in range(10):
         noise = [0.2 * torch.randn(x.shape, generator=generator, dtype=F64) for x in (scene.problem.x, scene.lines.x)]
         noisy = dataclasses.replace(scene.problem, x=scene.problem.x + noise[0])
         seen = dataclasses.replace(scene.lines, x=scene.lines.x + noise[1])
