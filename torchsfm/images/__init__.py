@@ -14,6 +14,7 @@ from torchsfm.images.retrieval import describe_images, retrieve_pairs
 from torchsfm.images.segment_matching import describe_segments, match_segments
 from torchsfm.images.segments import Segments, detect_segments
 from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_sequence
+from torchsfm.images.undistort import Pinholes, undistort_images, undistorted_cameras
 
 __all__ = [
     "MAX_PIXELS",
@@ -27,6 +28,7 @@ __all__ = [
     "LearnedDetector",
     "LearnedMatcher",
     "Photograph",
+    "Pinholes",
     "Segments",
     "TrackedPoints",
     "Tracks",
@@ -52,4 +54,6 @@ __all__ = [
     "scale_image",
     "track_points",
     "track_sequence",
+    "undistort_images",
+    "undistorted_cameras",
 ]
