@@ -348,7 +348,7 @@ def test_intrinsics_for_another_size_are_warned_of(finished: tuple[Path, str], c
 def test_info_of_nothing(tmp_path: Path) -> None:
     (tmp_path / "letter.npz").write_text("Dear Sir or Madam,\n")
     for path, word in (
-        (tmp_path / "missing", "no such folder"),
+        (tmp_path / "missing", "no such file or folder"),
         (tmp_path, "no model"),
         (tmp_path / "letter.npz", "not a saved"),
     ):

@@ -76,6 +76,12 @@ def _lenses(s: Scene) -> Camera:
     return Camera(K, Radial(s.rand(4, low=-0.1, high=0.1), s.rand(4, low=-0.02, high=0.02)))
 
 
+def _small_lens(s: Scene) -> Camera:
+    """Of a picture of 40 x 32 pixels."""
+    K = torch.tensor([[40.0, 0.0, 19.5], [0.0, 42.0, 15.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return Camera(K.expand(*s.batch, 3, 3).clone(), Radial(s.rand(low=-0.1, high=0.1), s.rand(low=-0.02, high=0.02)))
+
+
 def _board(s: Scene) -> tuple[Tensor, Tensor]:
     """Points of a plane in its own coordinates, and their images."""
     K, R, t = s.parameters(4)
@@ -262,6 +268,11 @@ FUNCTIONS: dict[str, Function] = {
     "images.track_points": Function(
         {"image1": lambda s: s.rand(1, 40, 40), "image2": lambda s: s.rand(1, 40, 40), "x1": lambda s: s.rand(6, 2, high=39.0)}
     ),
+    "images.undistort_images": Function({
+        "images": lambda s: s.rand(2, 32, 40), "cameras": _small_lens, "pinholes": lambda s: Camera(_small_lens(s).K),
+        "size": (36, 30)}),
+    "images.undistorted_cameras": Function({
+        "cameras": _small_lens, "size": lambda s: torch.tensor([40, 32]).expand(*s.batch, 2).clone()}),
     "images.track_sequence": Function({"images": lambda s: list(s.rand(3, 1, 40, 40))}, batched=False),
     "linalg.nearest_rank": Function({"rank": 2}),
     "linalg.nullspace_rows": Function(batched=False),
@@ -355,8 +366,10 @@ FILES = "reads or writes files, which `bench.fuzz.files` spoils"
 EXCEPTIONS: dict[str, str] = {
     "bundle.bundle_adjust_model": "hands a model to bundle_adjust",
     "cli.main": "a program; its options and files are tested in tests/test_cli.py",
-    **{f"formats.{name}": FILES for name in ("read_bal", "read_colmap", "read_libmv", "read_ply", "read_vgg")},
-    **{f"formats.{name}": FILES for name in ("write_bal", "write_colmap", "write_ply")},
+    **{f"formats.read_{name}": FILES for name in ("bal", "colmap", "libmv", "model", "nerfstudio", "ply", "vgg")},
+    **{f"formats.write_{name}": FILES for name in ("bal", "colmap", "model", "nerfstudio", "ply")},
+    "formats.export_model": FILES,
+    "formats.undistorted_model": "hands a model to undistorted_cameras",
     **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},
     **{f"images.{name}": FILES for name in ("parse_exif", "read_image", "save_image")},
     "linalg.compile_kernels": "a switch",

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import typer
@@ -12,13 +12,12 @@ import typer
 from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, bundle_adjust_model
 from torchsfm.cli.job import INTERRUPTED, NOTHING, Job, UserError, told
-from torchsfm.formats import read_bal, read_colmap, read_libmv, write_bal, write_colmap, write_ply
-from torchsfm.geometry import BundleProblem, Radial
+from torchsfm.formats import write_model
+from torchsfm.formats.problem import Model
+from torchsfm.formats.registry import format_for, read_model_or_problem
+from torchsfm.geometry import Radial
 from torchsfm.geometry.intrinsic_parameters import INTRINSICS
 from torchsfm.optim import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey
-from torchsfm.reconstruction import Reconstruction
-
-Model = Reconstruction | BundleProblem
 
 
 class LossName(StrEnum):
@@ -52,14 +51,15 @@ def bundle(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A BAL problem (.txt, .txt.gz, .txt.bz2), a libmv problem (.bin), a COLMAP folder, or a saved model (.npz).",
+            help="A BAL or libmv problem, a saved model (.npz), or a model of any other format.",
             show_default=False,
         ),
     ],
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Where to write the result: .npz, .ply, .txt, .txt.gz or .txt.bz2 (BAL); anything else is a COLMAP folder.",
+            help="Where to write the result: .npz, .ply, .txt, .txt.gz or .txt.bz2 (BAL), or what else `torchsfm convert`"
+            " writes; a name without ending is a COLMAP folder.",
             show_default=False,
         ),
     ] = None,
@@ -84,7 +84,7 @@ def bundle(
     with told(Job(out or file)) as job:
         job.set_threads(threads)
         job.progress("problem", 0, 1)
-        model = read_model(file)
+        model = load(file)
         job.progress("problem", 1, 1)
         check_output(model, out)
         names = free_names(model, free)
@@ -109,26 +109,20 @@ def bundle(
             typer.echo(f"torchsfm: {file}: nothing to adjust: no observation of finite numbers", err=True)
             raise typer.Exit(NOTHING)
         if out is not None:
-            write_model(adjusted.model, out)
+            save(adjusted.model, out)
             typer.echo(f"written: {out}")
         if result.status == Status.INTERRUPTED:
             raise typer.Exit(INTERRUPTED)
 
 
-def read_model(path: Path) -> Model:
+def load(path: Path) -> Model:
     """Read whatever the path holds.
 
     Raises:
-        UserError: It is not there or cannot be read as what its name says.
+        UserError: It is not there or no model.
     """
-    if not path.exists():
-        raise UserError(f"{path}: no such file or folder")
     try:
-        if path.is_dir():
-            return read_colmap(path)
-        if path.suffix == ".npz":
-            return Reconstruction.load(path)
-        return read_libmv(path) if path.suffix == ".bin" else read_bal(path)
+        return read_model_or_problem(path)
     except ValueError as error:
         raise UserError(" ".join(str(error).split())) from None
 
@@ -184,58 +178,21 @@ def check_output(model: Model, out: Path | None) -> None:
         return
     if not out.absolute().parent.is_dir():
         raise UserError(f"{out.absolute().parent}: no such folder")
-    if is_bal(out) and not Radial.includes(type(model.cameras.distortion)):
+    try:
+        kind = format_for(out)
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    if kind.name == "bal" and not Radial.includes(type(model.cameras.distortion)):
         raise UserError(f"{out}: BAL holds two radial coefficients, not {type(model.cameras.distortion).__name__}")
 
 
-def is_bal(path: Path) -> bool:
-    """Whether the name is that of a BAL problem."""
-    return path.suffix in (".txt", ".gz", ".bz2")
-
-
-def write_model(model: Model, out: Path) -> None:
+def save(model: Model, out: Path) -> None:
     """Write in the format that the name says.
 
     Raises:
         UserError: The format cannot hold the model.
     """
     try:
-        if is_bal(out):
-            write_bal(as_problem(model), out)
-        elif out.suffix == ".npz":
-            as_reconstruction(model).save(out)
-        elif out.suffix == ".ply":
-            write_ply(as_reconstruction(model), out)
-        else:
-            write_colmap(as_reconstruction(model), out)
+        write_model(model, out)
     except ValueError as error:
         raise UserError(f"{out}: {' '.join(str(error).split())}") from None
-
-
-def as_problem(model: Model) -> BundleProblem:
-    """The members that count."""
-    names: dict[str, Any] = {name: getattr(model, name) for name in BundleProblem.__dataclass_fields__}
-    return BundleProblem(**names)
-
-
-def as_reconstruction(model: Model) -> Reconstruction:
-    """With names that are numbers, grey points, and images as large as their observations need."""
-    if isinstance(model, Reconstruction):
-        return model
-    views = model.poses.shape[0]
-    order = torch.argsort(model.point * views + model.view)
-    size = torch.ones(views, 2, dtype=torch.int64)
-    size.scatter_reduce_(0, model.view[:, None].expand(-1, 2), model.x.nan_to_num(0).ceil().long() + 1, "amax")
-    return Reconstruction(
-        tuple(f"{k:06d}" for k in range(views)),
-        size,
-        model.cameras,
-        model.camera_index,
-        model.poses,
-        torch.ones(views, dtype=torch.bool),
-        model.X,
-        torch.full_like(model.X, 0.5),
-        model.x[order],
-        model.view[order],
-        model.point[order],
-    )

@@ -10,13 +10,15 @@ import torch
 import typer
 
 from torchsfm.cli.bundle import bundle
+from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
 from torchsfm.cli.inputs import photograph_folder, read_intrinsics, warn_about_intrinsics
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.results import VERSION, compare, finish
+from torchsfm.formats import TARGETS
+from torchsfm.formats.registry import model_files
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS, save_image
-from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import printable
 from torchsfm.simulation import render_sequence
 
@@ -112,12 +114,26 @@ def reconstruct(
     ] = Method.incremental,
     max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
     max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,
+    targets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--for",
+            callback=known_targets,
+            metavar=f"[{'|'.join(TARGETS)}]",
+            help="Also write a folder of this name for a program, as `torchsfm export` does; may be given several times.",
+            show_default=False,
+        ),
+    ] = None,
     seed: Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on where an earlier run into the same folder stopped.")] = False,
     threads: Threads = None,
 ) -> None:
     """Turn photographs into calibrated cameras and coloured 3D points."""
     with told(Job(out)) as job, output_folder(out):
+        folder = photograph_folder(images)
+        if targets and folder is None:
+            raise UserError("--for: the images lie in several folders; give a folder of images")
+        check_exports(out, targets or [])
         K = None if intrinsics is None else read_intrinsics(intrinsics)
         source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
         result = job.run(
@@ -127,7 +143,9 @@ def reconstruct(
         )  # fmt: skip
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
-        finish(job, result, photograph_folder(images), {}, max_pixels)
+        finish(job, result, folder, {}, max_pixels)
+        for target in targets or []:
+            write_export(job, result.models[0], target, out / target, folder)
 
 
 @app.command()
@@ -160,23 +178,19 @@ def demo(
 
 @app.command()
 def info(
-    folder: Annotated[Path, typer.Argument(help="Folder written by `torchsfm reconstruct`, or a saved model (.npz).")],
+    folder: Annotated[Path, typer.Argument(help="Folder written by `torchsfm reconstruct`, or a model of any format.")],
 ) -> None:
     """Describe saved models: cameras, points and how well each image fits."""
     with told(Job(folder)):
-        if not folder.exists():
-            raise UserError(f"{folder}: no such folder")
         if unfinished(folder):
             with output_folder(folder):
                 finish_replacing(folder)
-        files = sorted(folder.glob("model*.npz"), key=lambda path: (len(path.name), path.name)) if folder.is_dir() else [folder]
-        if not files:
-            raise UserError(f"{folder}: holds no model (no model.npz)")
-        for file in files:
-            try:
-                model = Reconstruction.load(file)
-            except ValueError as error:
-                raise UserError(" ".join(str(error).split())) from None
+        try:
+            found = model_files(folder)
+        except ValueError as error:
+            raise UserError(" ".join(str(error).split())) from None
+        for _, file in found:
+            model = load(file)
             typer.echo(f"{file}\n{model.summary()}\n")
             counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
             errors = model.view_errors().tolist()
@@ -188,4 +202,5 @@ def info(
             typer.echo("")
 
 
-app.command()(bundle)
+for command in (bundle, export, convert):
+    app.command()(command)

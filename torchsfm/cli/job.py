@@ -30,6 +30,7 @@ LABELS = {
     "refine": "refining the model",
     "bundle": "adjusting",
     "write": "writing results",
+    "pictures": "writing pictures",
 }
 
 

@@ -14,6 +14,7 @@ import typer
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.cli.export import PHOTOGRAPHS
 from torchsfm.cli.job import NOTHING, Job
 from torchsfm.cli.output import replacing_results
 from torchsfm.formats import write_colmap, write_ply
@@ -62,6 +63,7 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
         max_pixels: The most that a photograph on the page may have.
     """
     more: dict[str, Any] = {"version": VERSION, "command": shlex.join(sys.argv[1:])}
+    more[PHOTOGRAPHS] = None if folder is None else str(folder.absolute())
     if not result.models:
         more["failure"] = result.failure()
     with replacing_results(job.out) as out:

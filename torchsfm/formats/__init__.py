@@ -2,19 +2,31 @@
 
 from torchsfm.formats.bal import read_bal, write_bal
 from torchsfm.formats.colmap import read_colmap, write_colmap
+from torchsfm.formats.export import TARGETS, export_model
 from torchsfm.formats.libmv import read_libmv
+from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
+from torchsfm.formats.pictures import undistorted_model
 from torchsfm.formats.ply import PointCloud, read_ply, write_ply
+from torchsfm.formats.registry import FORMATS, read_model, write_model
 from torchsfm.formats.vgg import VggScene, read_vgg
 
 __all__ = [
+    "FORMATS",
+    "TARGETS",
     "PointCloud",
     "VggScene",
+    "export_model",
     "read_bal",
     "read_colmap",
     "read_libmv",
+    "read_model",
+    "read_nerfstudio",
     "read_ply",
     "read_vgg",
+    "undistorted_model",
     "write_bal",
     "write_colmap",
+    "write_model",
+    "write_nerfstudio",
     "write_ply",
 ]

@@ -5,11 +5,11 @@ and nowhere else.
 """
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchsfm.formats import colmap_binary, colmap_text
 from torchsfm.formats.colmap_model import (
@@ -24,17 +24,30 @@ from torchsfm.formats.colmap_model import (
     check_model,
     poses,
 )
-from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics, quaternion_wxyz_from_rotation
+from torchsfm.formats.joining import Lens, join_cameras
+from torchsfm.geometry import DISTORTION_MODELS, Camera, quaternion_wxyz_from_rotation
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 HALF_PIXEL = 0.5
+TABLES = ("cameras", "images", "points3D", "rigs", "frames")
+"""The files of a model; the last two may be missing."""
 UNREGISTERED = "unregistered.txt"
 """COLMAP's files have no place for images without a pose: they are listed here, one `IMAGE_ID CAMERA_ID NAME` a line."""
 
 
-def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
-    """Write a model as COLMAP's binary files, with one trivial rig per camera and one frame per image.
+SPLATTING = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
+"""The camera models that gsplat's reader takes."""
+
+
+def write_colmap(
+    reconstruction: Reconstruction,
+    folder: str | Path,
+    *,
+    text: bool = False,
+    models: Collection[str] = PARAMETERS.keys(),
+) -> None:
+    """Write a model as COLMAP's files, binary or text, with one trivial rig per camera and one frame per image.
 
     Pinholes are written as SIMPLE_PINHOLE or PINHOLE, radial distortion as SIMPLE_RADIAL or RADIAL where both focal lengths are
     equal and as OPENCV where not, Brown-Conrady as OPENCV or, with k3, FULL_OPENCV, Kannala-Brandt as OPENCV_FISHEYE. Image and
@@ -44,23 +57,28 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     Args:
         reconstruction: The model.
         folder: Where to; made if it is not there. Files of an earlier model in it are replaced, all of them or none.
+        text: Write text files instead, with all digits.
+        models: COLMAP's camera models that the reader of the files knows.
 
     Raises:
-        ValueError: A camera has skew, or a distortion, which no model of COLMAP has.
+        ValueError: A camera has skew, or a distortion, which none of the models has, or text files cannot hold a name.
         OSError: The folder cannot be made or written.
     """
     folder = Path(folder)
+    if unknown := set(models) - set(PARAMETERS):
+        raise ValueError(f"models: wanted names among {', '.join(PARAMETERS)}, got {min(unknown)!r}")
     model = reconstruction.to("cpu", torch.float64)
     keys = torch.cat([model.camera_index[:, None], model.image_size.to(model.camera_index.dtype)], -1)
     used, index = torch.unique(keys, dim=0, return_inverse=True)
     cameras = {
-        i: ColmapCamera(*_colmap_parameters(model.cameras[camera], camera, (width, height)))
+        i: ColmapCamera(*_colmap_parameters(model.cameras[camera], camera, (width, height), models))
         for i, (camera, width, height) in enumerate(used.tolist(), start=1)
     }
     camera_ids = (index + 1).tolist()
     images, points = _tables(model, camera_ids)
     frames = {i: ColmapFrame(image.camera_id, image.cam_from_world, ((image.camera_id, i),)) for i, image in images.items()}
-    contents = colmap_binary.write_files(ColmapModel(cameras, images, points, {i: {i: STILL} for i in cameras}, frames))
+    writer, other = (colmap_text, "bin") if text else (colmap_binary, "txt")
+    contents = writer.write_files(ColmapModel(cameras, images, points, {i: {i: STILL} for i in cameras}, frames))
     lines = [
         f"{i} {camera_id} {_one_line(name)}\n"
         for i, (camera_id, name) in enumerate(zip(camera_ids, model.names, strict=True), start=1)
@@ -72,6 +90,8 @@ def write_colmap(reconstruction: Reconstruction, folder: str | Path) -> None:
     write_whole_files({folder / name: content for name, content in contents.items()})
     if not lines:
         (folder / UNREGISTERED).unlink(missing_ok=True)
+    for name in TABLES:  # a model of the other kind, which readers may prefer
+        (folder / f"{name}.{other}").unlink(missing_ok=True)
 
 
 def _tables(model: Reconstruction, camera_ids: list[int]) -> tuple[dict[int, ColmapImage], ColmapPoints]:
@@ -166,8 +186,8 @@ def read_colmap(folder: str | Path) -> Reconstruction:
 def _read_files(folder: Path) -> ColmapModel:
     """Read the tables, from binary files if all of them are there."""
     for reader, ending in ((colmap_binary, "bin"), (colmap_text, "txt")):
-        paths = {name: folder / f"{name}.{ending}" for name in ("cameras", "images", "points3D", "rigs", "frames")}
-        if all(paths[name].is_file() for name in ("cameras", "images", "points3D")):
+        paths = {name: folder / f"{name}.{ending}" for name in TABLES}
+        if all(paths[name].is_file() for name in TABLES[:3]):
             cameras = dict(sorted(reader.read_cameras(paths["cameras"]).items()))
             images, points = reader.read_images(paths["images"]), reader.read_points(paths["points3D"])
             rigs = reader.read_rigs(paths["rigs"]) if paths["rigs"].is_file() else {}
@@ -176,7 +196,9 @@ def _read_files(folder: Path) -> ColmapModel:
     raise ValueError(f"{folder} does not hold a COLMAP model (cameras, images and points3D, as .bin or .txt)")
 
 
-def _colmap_parameters(camera: Camera, index: int, size: tuple[int, int]) -> tuple[str, int, int, tuple[float, ...]]:
+def _colmap_parameters(
+    camera: Camera, index: int, size: tuple[int, int], models: Collection[str]
+) -> tuple[str, int, int, tuple[float, ...]]:
     """Choose the COLMAP model that holds a camera exactly: its name, the size of the images, the parameters."""
     (fx, skew, cx), (_, fy, cy) = camera.K[0].tolist(), camera.K[1].tolist()
     if abs(skew) > 1e-9 * abs(fx):
@@ -188,15 +210,17 @@ def _colmap_parameters(camera: Camera, index: int, size: tuple[int, int]) -> tup
     needed = {name for name, value in values.items() if value != 0}
     for name in (name for model in DISTORTION_MODELS.values() if model.includes(lens) for name in model.colmap):
         _, focals, held = PARAMETERS[name]
-        if needed <= set(held) and (equal or focals == 2):
+        if name in models and needed <= set(held) and (equal or focals == 2):
             head = (*(fx, fy)[:focals], cx + HALF_PIXEL, cy + HALF_PIXEL)
             return name, *size, (*head, *(values.get(name, 0.0) for name in held))
-    raise ValueError(f"camera {index} has {lens.__name__} distortion, which no camera model of COLMAP has")
+    kinds = "no camera model of COLMAP" if len(models) == len(PARAMETERS) else f"none of {', '.join(sorted(models))}"
+    detail = f" with {', '.join(sorted(needed))}" if needed else ""
+    raise ValueError(f"camera {index} has {lens.__name__} distortion{detail}, which {kinds} has")
 
 
 def _cameras_from_colmap(cameras: dict[int, ColmapCamera]) -> Camera:
     """Join cameras into one batch, of the first distortion model that holds them all."""
-    K, named, kinds = [], [], set()
+    lenses = []
     for camera_id, camera in cameras.items():
         known = [model for model in DISTORTION_MODELS.values() if camera.model in model.colmap]
         if not known:
@@ -206,21 +230,8 @@ def _cameras_from_colmap(cameras: dict[int, ColmapCamera]) -> Camera:
         values = dict(zip(names, rest, strict=True))
         if lost := [name for name, value in values.items() if value != 0 and name not in known[0].parameter_names]:
             raise ValueError(f"camera {camera_id} is a {camera.model} with {' and '.join(lost)}, which has no equal here")
-        f = torch.tensor(fx, dtype=torch.float64)
-        c = torch.tensor([cx, cy], dtype=torch.float64) - HALF_PIXEL
-        K.append(intrinsics(f, c, aspect=fy / fx))
-        kinds.add(known[0])
-        named.append(values)
-    if not K:
-        return Camera(torch.zeros(0, 3, 3, dtype=torch.float64))
-    common = [model for model in DISTORTION_MODELS.values() if all(model.includes(kind) for kind in kinds)]
-    if not common:
-        mixed = " and ".join(sorted(kind.__name__ for kind in kinds))
-        raise ValueError(f"the model mixes {mixed} cameras, which one batch of cameras cannot hold")
-    rows: list[Tensor] = [
-        torch.tensor([values.get(name, 0.0) for name in common[0].parameter_names], dtype=torch.float64) for values in named
-    ]
-    return Camera(torch.stack(K), common[0].from_parameters(torch.stack(rows)))
+        lenses.append(Lens((fx, fy), (cx - HALF_PIXEL, cy - HALF_PIXEL), known[0], values))
+    return join_cameras(lenses)
 
 
 def _read_unregistered(path: Path, camera_of: dict[int, int]) -> dict[int, tuple[int, str]]:

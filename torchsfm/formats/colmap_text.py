@@ -1,6 +1,6 @@
 """COLMAP's text files: one entry a line (two lines for an image), words between spaces, comments behind `#`."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -13,6 +13,7 @@ from torchsfm.formats.colmap_model import (
     ColmapCamera,
     ColmapFrame,
     ColmapImage,
+    ColmapModel,
     ColmapPoints,
     Motion,
     motion,
@@ -118,6 +119,62 @@ def read_frames(path: Path) -> dict[int, ColmapFrame]:
         return frame_id, ColmapFrame(rig_id, pose, tuple((sensor, image) for kind, sensor, image in data if kind == CAMERA))
 
     return _table(path, "FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA_IDS and the data", frame)
+
+
+def write_files(model: ColmapModel) -> dict[str, bytes]:
+    """The contents of all five files, by name.
+
+    Raises:
+        ValueError: The name of an image cannot stand on a line.
+    """
+    for image in model.images.values():
+        if image.name != image.name.strip() or not image.name or "\n" in image.name or "\r" in image.name:
+            raise ValueError(f"COLMAP's text files cannot hold the name {image.name!r}")
+    points = model.points
+    track = np.split(points.track, np.cumsum(points.track_length)[:-1]) if len(points.X) else []
+    rows = zip(points.point_id, points.X, points.color, points.error, track, strict=True)
+    return {
+        "cameras.txt": _text(
+            _line(i, camera.model, camera.width, camera.height, *camera.parameters) for i, camera in model.cameras.items()
+        ),
+        "images.txt": _text(
+            _line(i, *image.cam_from_world, image.camera_id, image.name) + _line(*_points_of(image))
+            for i, image in model.images.items()
+        ),
+        "points3D.txt": _text(_line(i, *X, *color, error, *seen.flat) for i, X, color, error, seen in rows),
+        "rigs.txt": _text(_line(i, len(rig), *_sensors(rig)) for i, rig in model.rigs.items()),
+        "frames.txt": _text(
+            _line(
+                i,
+                frame.rig_id,
+                *frame.rig_from_world,
+                len(frame.images),
+                *(w for pair in frame.images for w in (CAMERA, *pair)),
+            )
+            for i, frame in model.frames.items()
+        ),
+    }
+
+
+def _points_of(image: ColmapImage) -> Iterator[object]:
+    return (word for x, point in zip(image.x, image.point_id, strict=True) for word in (*x, point))
+
+
+def _sensors(rig: dict[int, Motion | None]) -> Iterator[object]:
+    """The words for the sensors of a rig, of which the first is the reference."""
+    for k, (sensor_id, pose) in enumerate(rig.items()):
+        yield from (CAMERA, sensor_id)
+        if k > 0:
+            yield from (0,) if pose is None else (1, *pose)
+
+
+def _line(*words: object) -> str:
+    """A line; `str` of a number has all its digits."""
+    return " ".join(str(word) for word in words) + "\n"
+
+
+def _text(lines: Iterable[str]) -> bytes:
+    return "".join(lines).encode("utf-8", "surrogateescape")
 
 
 def _end(rest: Iterator[str]) -> None:

@@ -39,8 +39,8 @@ def undistorted_cameras(
         centred: Put the principal point at the centre of the picture.
 
     Returns:
-        The cameras, without skew too, and their sizes: at least one pixel, and no side farther from the optical axis than the old
-        picture is wide and high, as no pinhole shows all that a very wide lens does.
+        The cameras, without skew too, and their sizes: at least one pixel, and no side farther from the optical axis than the
+        old picture is wide and high, as no pinhole shows all that a very wide lens does.
     """
     batch = check_tensors(size=(size, "2: int"))
     check_tensors(K=(cameras.K, "3 3"))
@@ -58,10 +58,11 @@ def undistorted_cameras(
     wide = _in_double(cameras)
     d, valid = wide.unproject(x)
     forward = valid & (d[..., 2] > 1e-6)
-    flat = (d[..., :2] / torch.where(forward, d[..., 2], 1.0)[..., None]).unflatten(-2, (2, 2, BORDER))
+    flat = d[..., :2] / torch.where(forward, d[..., 2], 1.0)[..., None]
+    flat = flat.reshape(*batch, 2, 2, BORDER, 2)
     # By axis and side, how far from the optical axis, outwards.
     away = torch.stack([flat[..., 0, :, :, 0], flat[..., 1, :, :, 1]], -3) * K.new_tensor([[-1.0], [1.0]])
-    seen = forward.unflatten(-1, (2, 2, BORDER))
+    seen = forward.reshape(*batch, 2, 2, BORDER)
     near = torch.where(seen, away, torch.inf).amin(-1)
     far = torch.where(seen, away, -torch.inf).amax(-1)
     limit = (last / f)[..., None]
@@ -109,14 +110,14 @@ def undistort_images(
     shown = valid & lens.in_domain(d) & ((x > -0.5) & (x < extent - 0.5)).all(-1)
     # Half pixels count from the edge here, as in `grid_sample`; a place that is shown nothing of is somewhere, not NaN.
     grid = torch.where(shown[..., None], (2 * x + 1) / extent - 1, -1.0).to(images.dtype)
-    grid, shown = grid.unflatten(-2, (h2, w2)), shown.unflatten(-1, (h2, w2))
+    grid, shown = grid.reshape(*lenses, h2, w2, 2), shown.reshape(*lenses, h2, w2)
     if not lenses:
         # One lookup serves all pictures, which then are channels of one.
         flat, grid = images.reshape(1, -1, h, w), grid[None]
     else:
         flat = images.reshape(-1, *images.shape[-3:])
         grid = grid.expand(*batch, h2, w2, 2).reshape(-1, h2, w2, 2)
-    taken = grid_sample(flat, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    taken: Tensor = grid_sample(flat, grid, mode="bilinear", padding_mode="border", align_corners=False)
     return taken.reshape(*images.shape[:-2], h2, w2) * shown.unsqueeze(-3)
 
 
