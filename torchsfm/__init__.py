@@ -47,13 +47,16 @@ from torchsfm.bundle import (
 from torchsfm.formats import (
     PointCloud,
     VggScene,
+    export_model,
     read_bal,
     read_colmap,
     read_libmv,
+    read_model,
     read_ply,
     read_vgg,
     write_bal,
     write_colmap,
+    write_model,
     write_ply,
 )
 from torchsfm.geometry import (
@@ -588,6 +591,7 @@ __all__ = [
     "estimate_homography",
     "estimate_trifocal",
     "estimate_upright",
+    "export_model",
     "factorize_affine",
     "factorize_points",
     "find_structures",
@@ -682,6 +686,7 @@ __all__ = [
     "read_colmap",
     "read_image",
     "read_libmv",
+    "read_model",
     "read_ply",
     "read_vgg",
     "reconstruct",
@@ -755,6 +760,7 @@ __all__ = [
     "viewing_planes",
     "write_bal",
     "write_colmap",
+    "write_model",
     "write_page",
     "write_ply",
 ]

@@ -101,7 +101,8 @@ def undistort_images(
     if broadcast_shapes(batch, lenses) != batch:
         raise ValueError(f"cameras: wanted batch dimensions that broadcast to {tuple(batch)} of images, got {tuple(lenses)}")
     (w2, h2), (h, w) = size, images.shape[-2:]
-    pixel = torch.cartesian_prod(torch.arange(h2), torch.arange(w2)).flip(-1).to(pinholes.K.device, torch.float64)
+    rows, columns = (torch.arange(n, dtype=torch.float64, device=pinholes.K.device) for n in (h2, w2))
+    pixel = torch.cartesian_prod(rows, columns).flip(-1)
     d, valid = _in_double(pinholes).unproject(pixel)
     lens = _in_double(cameras)
     x = lens.project(d)
