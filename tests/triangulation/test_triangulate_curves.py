@@ -147,6 +147,22 @@ def test_views_that_tell_nothing(generator: torch.Generator) -> None:
     assert not flat.measured.any()
 
 
+@pytest.mark.parametrize("v", [2, 3, 4])
+def test_what_takes_a_wrong_turn_is_not_called_measured(v: int, generator: torch.Generator) -> None:
+    """Every turn of a helix looks like the next, and views ten degrees apart see it from the same side."""
+    t = torch.linspace(0, 6 * math.pi, 400, dtype=F64)
+    spin = rotation_from_rotvec(torch.randn(12, 3, dtype=F64, generator=generator))
+    X = torch.stack((t.cos(), t.sin(), 0.12 * (t - 3 * math.pi)), -1) @ spin.mT
+    K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=F64)
+    turn = torch.zeros(v, 3, dtype=F64)
+    turn[:, 1] = torch.arange(v) * (math.pi / 18)
+    P = camera_from_krt(K, rotation_from_rotvec(turn), torch.tensor([0.0, 0.0, 10.0], dtype=F64).expand(v, 3))
+    found = triangulate_curves(curve_from_samples(images(X, P)), P, samples=60)
+    gap = distance(found, X, closed=False)[found.measured]
+    assert found.measured.sum() > (20, 300, 400)[v - 2]
+    assert_share(gap < 0.05, 0.96)
+
+
 def test_derivatives_are_those_of_the_optimum(generator: torch.Generator) -> None:
     P, X = cameras(1, 5, generator), space_curves(1, 400, generator, closed=True)
     truth = curve_from_samples(X[0], closed=True)
