@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsfm.geometry import random_rotation, rotation_angle, rotation_from_rotvec
+from torchsfm.geometry import pluecker_from_points, random_rotation, rotation_angle, rotation_from_rotvec
 from torchsfm.tensors import trifocal_from_cameras
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -166,6 +166,30 @@ def _camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generat
     return Scene(kind(K), data, torch.cat((R, t[..., None]), -1), _pose_error, _wrong_first, noise)
 
 
+def _point_line_camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    """Each datum a point or, as often, a segment."""
+    scene = _camera(kind, batch, n, generator, 0.0)
+    Y = _points(batch, 2 * n, generator).unflatten(-2, (n, 2))
+    R, t = scene.model[..., :3], scene.model[..., 3]
+    ends = _image(Y, noise, generator).flatten(-2)
+    A, B = ((Y - t[..., None, None, :]) @ R[..., None, :, :]).unbind(-2)
+    L = pluecker_from_points(A, B)
+    L = L / L[..., :3].norm(dim=-1, keepdim=True)
+    line = torch.rand(*batch, n, 1, generator=generator) < 0.5
+    x = scene.data[0] + noise * torch.randn(scene.data[0].shape, generator=generator, dtype=torch.float64)
+    points = torch.cat((scene.data[1], torch.zeros_like(scene.data[1])), -1)
+    data = (torch.where(line, ends, torch.cat((x, x), -1)), torch.where(line, L, points), line.double())
+    return Scene(scene.estimator, data, scene.model, _pose_error, _wrong_segments, noise)
+
+
+def _wrong_segments(data: tuple[Tensor, ...], wrong: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Spread points and both ends of segments over the image."""
+    x, X, kind = data
+    ends = torch.rand(x.shape, generator=generator, dtype=x.dtype) * 2 - 1
+    anywhere = torch.where(kind > 0, ends, torch.cat((ends[..., :2], ends[..., :2]), -1))
+    return torch.where(wrong[..., None], anywhere, x), X, kind
+
+
 def _focal_camera(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
     Y = _points(batch, n, generator)
     R = random_rotation(*batch, generator=generator, dtype=torch.float64)
@@ -201,6 +225,7 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "homography": _plane,
     "trifocal": _three_views,
     "camera": _camera,
+    "point_line_camera": _point_line_camera,
     "focal_camera": _focal_camera,
     "projective_camera": _projective_camera,
     "point": _point,

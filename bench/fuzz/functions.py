@@ -161,6 +161,25 @@ def _sight(s: Scene, n: int) -> tuple[Tensor, Tensor]:
     return torch.linalg.cross(a, b), pluecker_from_points(a, b)
 
 
+def _sometimes_lines(make: Callable[[Scene], Any]) -> Callable[[Scene], Any]:
+    """For half of the scenes, those with segments in the first view besides their points."""
+    return lambda s: make(s) if s.generator.initial_seed() % 2 else None
+
+
+def _segments(s: Scene) -> Tensor:
+    """Of lines in the first view."""
+    return torch.stack([project_points(s.cameras(1)[..., 0, :, :], X) for X in s.space_lines(12)], -2) + 0.3 * s.randn(12, 2, 2)
+
+
+def _space_lines(s: Scene) -> Tensor:
+    return pluecker_from_points(*s.space_lines(12))
+
+
+def _of_each(s: Scene, n: int) -> Tensor:
+    """Numbers for n points and, where there are any, the lines."""
+    return s.rand(n + 12 * (s.generator.initial_seed() % 2), low=0.2, high=1.0)
+
+
 def _picture(s: Scene) -> Tensor:
     """A bright rectangle with noise."""
     image = s.rand(1, 32, 40, high=0.05)
@@ -328,7 +347,13 @@ FUNCTIONS: dict[str, Function] = {
     "resection.camera_p4pf": Function(centred=True),
     "resection.camera_p35pf": Function(centred=True),
     "resection.camera_planar": Function(planar=True),
-    "resection.estimate_camera": Function(ROBUST, {"n": 20}),
+    "resection.estimate_camera": Function(
+        ROBUST
+        | {"l": _sometimes_lines(_segments), "L": _sometimes_lines(_space_lines)}
+        | {"mask": lambda s: _of_each(s, 20) < 0.95, "weights": lambda s: _of_each(s, 20)}
+        | {"quality": lambda s: None if s.generator.initial_seed() % 3 else _of_each(s, 20)},
+        {"n": 20},
+    ),
     "resection.estimate_camera_focal": Function(ROBUST, {"n": 20}),
     "resection.estimate_camera_projective": Function(ROBUST, {"n": 20}),
     "resection.refine_camera": Function(

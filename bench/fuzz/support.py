@@ -12,7 +12,14 @@ from torch import Tensor
 
 from bench.fuzz.promises import tensors
 from torchsfm._types import tensor_map
-from torchsfm.geometry import cross_matrix, reprojection_distance, sampson_distance, to_homogeneous
+from torchsfm.geometry import (
+    cross_matrix,
+    point_line_distance,
+    project_lines,
+    reprojection_distance,
+    sampson_distance,
+    to_homogeneous,
+)
 from torchsfm.motion import HomographyEstimator, TrifocalEstimator
 
 Arguments = Mapping[str, Any]
@@ -55,6 +62,9 @@ def robust(distance: Distance, sample_size: int) -> Judge:
 def _sizes(a: Arguments, inliers: Tensor) -> Tensor:
     """The largest coordinate of each datum."""
     data = [v for v in a.values() if isinstance(v, Tensor) and v.is_floating_point() and v.shape[:-1] == inliers.shape]
+    if a.get("l") is not None:
+        parts = [[a["x"], a["X"]], [a["l"].flatten(-2), a["L"]]]
+        data = [torch.cat([torch.cat(part, -1).abs().amax(-1) for part in parts], -1)[..., None]]
     return torch.cat(data, -1).abs().amax(-1) if data else torch.zeros_like(inliers, dtype=torch.float64)
 
 
@@ -134,6 +144,9 @@ def _projections(P: Tensor, a: Arguments) -> Tensor:
 
 def _projections_with_intrinsics(P: Tensor, a: Arguments) -> Tensor:
     distance = reprojection_distance(a["K"] @ P, a["X"], a["x"])
+    if a.get("l") is not None:
+        away = point_line_distance(a["l"], project_lines(a["K"] @ P, a["L"])[..., None, :])
+        distance = torch.cat((distance, away.norm(dim=-1)), -1)
     # What else stands in the last row of K than (0, 0, 1) is not looked at.
     proper = (a["K"][..., 2, :] == torch.tensor([0.0, 0.0, 1.0], dtype=P.dtype)).all(-1)
     return torch.where(proper[..., None], distance, 0.0)

@@ -8,7 +8,7 @@ import torch
 from chance import seeded
 from torch import Tensor
 
-from torchsfm.geometry import random_rotation, rotation_from_rotvec, rotvec_from_rotation
+from torchsfm.geometry import pluecker_from_points, random_rotation, rotation_from_rotvec, rotvec_from_rotation
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography, estimate_trifocal, estimate_upright
 from torchsfm.resection import estimate_camera, estimate_camera_focal, estimate_camera_projective
 from torchsfm.robust import RobustResult
@@ -131,6 +131,14 @@ def _with_intrinsics(p: int, n: int, g: torch.Generator) -> Scene:
     return replace(_camera(p, n, g), known=(K.expand(p, 3, 3),))
 
 
+def _lines(p: int, n: int, g: torch.Generator) -> Scene:
+    """Segments and the lines that they are on."""
+    A, B = (_points(p, n, g) for _ in range(2))
+    R, middle = random_rotation(p, generator=g, dtype=F64), torch.tensor([0.0, 0, 6], dtype=F64)
+    L = pluecker_from_points((A - middle) @ R, (B - middle) @ R)
+    return Scene((torch.cat((pixels(A), pixels(B)), -1), L), (K.expand(p, 3, 3),))
+
+
 def _with_centre(p: int, n: int, g: torch.Generator) -> Scene:
     return replace(_camera(p, n, g), known=(K[:2, 2].expand(p, 2),))
 
@@ -187,6 +195,15 @@ def _calibrated(s: Scene, unit: float, *, threshold: Any, **options: Any) -> Any
     return estimate_camera(*(unit * d for d in s.data), S * s.known[0], threshold=_times(unit, threshold), **options)
 
 
+def _of_lines(s: Scene, unit: float, *, threshold: Any, **options: Any) -> Any:
+    S = torch.tensor([unit, unit, 1.0], dtype=s.data[0].dtype)[:, None]
+    l, L = s.data  # noqa: E741
+    none = (l[..., :0, :2], L[..., :0, :3])
+    return estimate_camera(
+        *none, S * s.known[0], unit * l.unflatten(-1, (2, 2)), L, threshold=_times(unit, threshold), **options
+    )  # fmt: skip
+
+
 def _focal(s: Scene, unit: float, *, threshold: Any, **options: Any) -> Any:
     data = [unit * d for d in (*s.data, *s.known)]
     return estimate_camera_focal(*data, threshold=_times(unit, threshold), **options)
@@ -220,6 +237,7 @@ DOORS = {
     "upright": Door(3, 2, _upright, _of_rays(estimate_upright), 3),
     "trifocal": Door(6, 3, _three_views, _trifocal, 18, dims=3),
     "camera": Door(3, 1, _with_intrinsics, _calibrated, 6, pose_step),
+    "lines": Door(3, 1, _lines, _of_lines, 6, pose_step),
     "focal": Door(4, 1, _with_centre, _focal, 7, focal_step),
     "projective": Door(6, 1, _camera, _projective(estimate_camera_projective), 11),
     "point": Door(2, 1, _views_of_a_point, _triangulate, 3, dims=1),
@@ -237,13 +255,14 @@ def extremes(door: Door, generator: torch.Generator) -> tuple[Scene, Tensor, dic
     along = torch.rand(LARGE, 1, generator=generator, dtype=F64)
     for i, d in enumerate(data):
         if i < door.images:
-            d[row["wrong"]] = torch.rand(LARGE, 2, generator=generator, dtype=F64) * SIZE
+            d[row["wrong"]] = torch.rand(LARGE, d.shape[-1], generator=generator, dtype=F64) * SIZE
         d[row["right"]] = right.data[i][row["right"]]
         d[row["same"]] = d[row["same"], :1].clone()
         d[row["some NaN"], ::3] = torch.nan
         d[row["all NaN"]] = torch.nan
         ends = right.data[i][row["collinear"], :2]
-        d[row["collinear"]] = ends[0] + along * (ends[1] - ends[0])
+        # Between two lines there are no others: all are the first.
+        d[row["collinear"]] = ends[0] + along * (ends[1] - ends[0]) * (d.shape[-1] != 6)
     data[0][row["infinities"], ::4, 0] = torch.inf
     data[-1][row["infinities"], 1::4, -1] = -torch.inf
     mask = torch.arange(LARGE) < torch.tensor(list(sizes.values()))[:, None]

@@ -14,10 +14,11 @@ from torchsfm.resection.camera_up2p import camera_up2p
 from torchsfm.resection.estimate_camera import CameraEstimator, estimate_camera
 from torchsfm.resection.estimate_camera_focal import FocalCameraEstimator, estimate_camera_focal
 from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
+from torchsfm.resection.point_line_camera import PointLineCameraEstimator
 from torchsfm.resection.refine_camera import CameraRefinement, refine_camera
 from torchsfm.resection.resect_cameras import ResectedCameras, resect_cameras
 
-ESTIMATORS = (CameraEstimator, FocalCameraEstimator, ProjectiveCameraEstimator)
+ESTIMATORS = (CameraEstimator, FocalCameraEstimator, PointLineCameraEstimator, ProjectiveCameraEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "CameraRefinement",
     "FocalCameraEstimator",
     "PlanarPoses",
+    "PointLineCameraEstimator",
     "PoseEstimate",
     "ProjectiveCameraEstimator",
     "ResectedCameras",

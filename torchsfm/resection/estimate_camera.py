@@ -1,4 +1,4 @@
-"""The pose of a calibrated camera from correspondences with known points, of which many are wrong."""
+"""The pose of a calibrated camera from correspondences with known points and lines, of which many are wrong."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Unpack
@@ -10,9 +10,11 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
+from torchsfm.resection._moderate_lines import image_rows, kinds, line_data, moderate_structure
 from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
+from torchsfm.resection.point_line_camera import PointLineCameraEstimator
+from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_counts, check_door, estimate_robustly
 from torchsfm.robust.moderation import moderate, moved_and_scaled, present
 
 
@@ -104,55 +106,83 @@ def estimate_camera(
     x: Float[Tensor, "*#batch n 2"],
     X: Float[Tensor, "*#batch n 3"],
     K: Float[Tensor, "*#batch 3 3"],
+    l: Float[Tensor, "*#batch k 2 2"] | Float[Tensor, "*#batch k 3"] | None = None,  # noqa: E741
+    L: Float[Tensor, "*#batch k 6"] | None = None,
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
     **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 4"]]:
-    """The pose of each camera, from correspondences of image points with known points, of which many may be wrong.
+    """The pose of each camera, from correspondences with known points, and with lines, of which many may be wrong.
 
-    LO-RANSAC over three-point samples, then a robust minimum of the reprojection error over the pose. Computed in float64,
-    hypotheses scored in float32 after centring and scaling the world.
+    LO-RANSAC over samples of three points, or of three points and lines as they come, then a robust minimum of the distances in
+    the image over the pose. Computed in float64, hypotheses scored in float32 after centring and scaling the world.
+
+    With lines a datum is a point or a line, all points before all lines: `mask`, `quality`, `weights` and the result's
+    `inliers` have n + k entries. The distance of a line is the root of the sum of the squared distances of both ends of its
+    segment from its image, two errors as a point has; the weights say which of both is worth more.
 
     Args:
-        x: Image points in pixels, without distortion.
+        x: Image points in pixels, without distortion; there may be none with lines.
         X: The points in the world.
         K: Intrinsics, upper triangular with last row (0, 0, 1).
-        threshold: Largest reprojection error of an inlier in pixels.
+        l: Segments, two image points each, without distortion; or homogeneous image lines of any scale, whose errors then count
+            a focal length to each side of the point nearest to the principal point.
+        L: The lines in the world, Pluecker vectors (d, m). What is no line (d'm is not 0) is left out.
+        threshold: Largest distance of an inlier in pixels.
             None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         **options: See `RansacOptions`.
 
     Returns:
-        The pose `[R | t]`, `X_cam = R X + t`; inliers (in front of the camera), support, iterations, status, degeneracy
+        The pose `[R | t]`, `X_cam = R X + t`; inliers (in front of the camera, but for lines without ends), support,
+        iterations, status, degeneracy
         (COLLINEAR: all inliers but so few as chance explains are on a line, and the pose may turn about it; PLANAR: they are in
-        a plane, which determines the pose, though a second one may fit nearly as well), covariance (6 x 6, of a perturbation
-        (w, v) in the camera's frame as in `Pose.retract`). The pose carries its derivatives with respect to the inliers and K
-        (see `ransac`).
+        a plane, which determines the pose, though a second one may fit nearly as well; UNDETERMINED: of so many lines and
+        points no large motion of the camera is seen, as of lines that are parallel or meet in a point), covariance (6 x 6, of a
+        perturbation (w, v) in the camera's frame as in `Pose.retract`). The pose carries its derivatives with respect to the
+        inliers and K (see `ransac`).
 
     Raises:
-        ValueError: A shape, dtype, device or option does not fit.
+        ValueError: A shape, dtype, device or option does not fit, or only one of `l` and `L` is given.
     """
-    batch = check_door({"x": (x, "n 2"), "X": (X, "n 3"), "K": (K, "3 3")}, threshold, options)
+    data: dict[str, tuple[Tensor | None, str]] = {"x": (x, "n 2"), "X": (X, "n 3"), "K": (K, "3 3")}
+    if l is None and L is None:
+        batch = check_door(data, threshold, options)
+    else:
+        batch = check_door(data | line_data(l, L), threshold, options, of_datum="m")
+        check_counts(options, x.shape[-2] + L.shape[-2])  # type: ignore[union-attr]
     dtype = x.dtype
     x, X, K = x.double(), X.double(), K.double()
-    Y, centre, size = moderate(X, present(options.get("mask"), x, X))
-    focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt().detach()
-    focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
-    # Pixels from the principal point, in focal lengths.
-    middle = K[..., :2, 2].detach()
-    y = moved_and_scaled(x, middle, focal)
-    offset = (K[..., :2, 2] - middle)[..., None]
-    last = torch.eye(3, dtype=K.dtype, device=K.device)[2:].expand(*K.shape[:-2], 1, 3)
-    intrinsics = torch.cat((torch.cat((K[..., :2, :2], offset), -1) / focal[..., None, None], last), -2)
+    intrinsics, middle, focal = _in_focal_lengths(K)
+    estimator: CameraEstimator | PointLineCameraEstimator
+    if l is None or L is None:
+        world, centre, size = moderate(X, present(options.get("mask"), x, X))
+        estimator, rows = CameraEstimator(intrinsics.expand(*batch, 3, 3)), [moved_and_scaled(x, middle, focal), world]
+    else:
+        world, centre, size = moderate_structure(X, L.double(), options.get("mask"))
+        kind = kinds(x.shape[-2], l.double())
+        estimator, rows = (
+            PointLineCameraEstimator(intrinsics.expand(*batch, 3, 3)),
+            [image_rows(x, l.double(), middle, focal), world, kind],
+        )
 
     def back(model: Tensor) -> Tensor:
         return world_pose(model, centre, size)
 
     # [R | t] <- exp(w) [R | t] + [0 | v] in the scaled world is the same in the world, with v scaled back.
     unit = torch.cat((torch.ones_like(centre), size[..., None].expand_as(centre)), -1)
-    estimator = CameraEstimator(intrinsics.expand(*batch, 3, 3))
     return estimate_robustly(
-        estimator, y, Y, threshold=threshold, dtype=dtype, scale=1 / focal, back=back, step_unit=unit, **options
+        estimator, *rows, threshold=threshold, dtype=dtype, scale=1 / focal, back=back, step_unit=unit, **options
     )  # fmt: skip
+
+
+def _in_focal_lengths(K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Intrinsics for images in focal lengths from the principal point, with K's derivatives; and that point and length."""
+    focal = (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt().detach()
+    focal = torch.where(torch.isfinite(focal) & (focal > 0), focal, 1)
+    middle = K[..., :2, 2].detach()
+    offset = (K[..., :2, 2] - middle)[..., None]
+    last = torch.eye(3, dtype=K.dtype, device=K.device)[2:].expand(*K.shape[:-2], 1, 3)
+    return torch.cat((torch.cat((K[..., :2, :2], offset), -1) / focal[..., None, None], last), -2), middle, focal
 
 
 def world_pose(model: Tensor, centre: Tensor, size: Tensor) -> Tensor:

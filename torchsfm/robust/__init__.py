@@ -1,7 +1,7 @@
 """Engine: which model do most of the data agree on? It knows no model; the rooms that do bring an `Estimator`."""
 
 from torchsfm.robust.degeneracy import Degeneracy
-from torchsfm.robust.doors import RansacOptions, SearchOptions, check_door, estimate_robustly
+from torchsfm.robust.doors import RansacOptions, SearchOptions, check_counts, check_door, estimate_robustly
 from torchsfm.robust.estimator import (
     Diagnosed,
     Differentiable,
@@ -39,6 +39,7 @@ __all__ = [
     "Uniform",
     "Weigh",
     "WithAlternatives",
+    "check_counts",
     "check_door",
     "constant_weights",
     "estimate_robustly",

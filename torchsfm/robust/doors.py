@@ -98,6 +98,18 @@ def check_door(
     return batch
 
 
+def check_counts(options: Any, count: int) -> None:
+    """Check that what is said of each datum is said of all, where these come in several tensors.
+
+    Raises:
+        ValueError: It names the option, and the numbers wanted and given.
+    """
+    for name in ("mask", "quality", "weights"):
+        given = options.get(name)
+        if given is not None and given.shape[-1] != count:
+            raise ValueError(f"{name}: wanted {count} in the last dimension, for all data, got shape {tuple(given.shape)}")
+
+
 def _check_radians(threshold: float | Tensor | None) -> None:
     """Refuse thresholds that cannot be meant as angles."""
     if isinstance(threshold, Tensor):

@@ -236,8 +236,9 @@ def refine_finally(fine: Problems, coarse: Problems, best: Best) -> tuple[Best, 
         # A threshold smaller than the noise would blame the better model.
         judged = torch.maximum(old.limit, reach)
         loss = score.cost(squared, judged, counts, k)[:, 0]
-        before = squared_residual(rough.estimator, start, *rough.data)
-        before_loss = score.cost(before, judged, counts, k)[:, 0].double()
+        # In double precision too: in single precision what is far may look near by a threshold below rounding.
+        before = squared_residual(wide.estimator, cast(start, torch.float64), *wide.data)
+        before_loss = score.cost(before, judged, counts, k)[:, 0]
         # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
         won = (loss <= 1.02 * before_loss + 1) & (loss < torch.inf)
         # Noise that leaves the threshold so much less support is none: the model is not quite that of the data.
