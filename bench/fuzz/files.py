@@ -29,16 +29,20 @@ from torchsfm.formats import (
     VggScene,
     read_bal,
     read_colmap,
+    read_database,
     read_libmv,
+    read_model,
     read_ply,
     read_vgg,
     write_bal,
     write_colmap,
+    write_database,
+    write_nerfstudio,
     write_ply,
 )
 from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics, random_rotation
 from torchsfm.images import Photograph, parse_exif, read_image, save_image
-from torchsfm.reconstruction import Reconstruction
+from torchsfm.reconstruction import MatchedImages, Reconstruction
 from torchsfm.reconstruction.files import load_arrays
 
 FILES_PER_TRIAL = 10
@@ -134,6 +138,12 @@ def _faults(found: Any) -> list[str]:
             if len(found.residuals()) != len(found.x):
                 faults.append("residuals")
             return faults
+        case MatchedImages():
+            faults = [] if len(found.pairs) == len(found.matches) else ["pairs"]
+            for (i, j), rows in zip(found.pairs.tolist(), found.matches, strict=True):
+                limit = torch.tensor([len(found.keypoints[i]), len(found.keypoints[j])])
+                faults += [] if bool(((rows >= 0) & (rows < limit)).all()) else ["matches are out of range"]
+            return faults
         case VggScene():
             tensors = {"x": found.x, "P": found.P, "X": found.X, "segments": found.segments, "L": found.L}
             return [f"{name} is not finite" for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]
@@ -195,6 +205,14 @@ def _formats() -> list[Format]:
         write_colmap(model, folder / "colmap")
         formats.append(Format("colmap.binary", _files(folder, "colmap"), read_colmap))
         formats.append(Format("colmap.text", _colmap_text(), read_colmap))
+        write_nerfstudio(model, folder / "transforms.json")
+        nerfstudio = _files(folder, "transforms.json") | _files(folder, "points.ply")
+        formats.append(Format("nerfstudio", nerfstudio, read_model))
+        keypoints = tuple(x.float() for x in torch.split(model.x, [6, 6, 6]))
+        pairs, rows = torch.tensor([[0, 1], [1, 2]]), torch.arange(6)[:, None].expand(6, 2)
+        matched = MatchedImages(model.names[:3], model.image_size[:3], keypoints, pairs, (rows, rows))
+        write_database(matched, folder / "database.db")
+        formats.append(Format("database", _files(folder, "database.db"), read_database))
         model.save(folder / "model.npz")
         formats.append(Format("model", _files(folder, "model.npz"), Reconstruction.load, _in_zip))
         np.savez(folder / "stage.npz", a=np.arange(5), b=np.array("text"))

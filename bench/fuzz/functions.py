@@ -391,8 +391,9 @@ FILES = "reads or writes files, which `bench.fuzz.files` spoils"
 EXCEPTIONS: dict[str, str] = {
     "bundle.bundle_adjust_model": "hands a model to bundle_adjust",
     "cli.main": "a program; its options and files are tested in tests/test_cli.py",
-    **{f"formats.read_{name}": FILES for name in ("bal", "colmap", "libmv", "model", "nerfstudio", "ply", "vgg")},
-    **{f"formats.write_{name}": FILES for name in ("bal", "colmap", "model", "nerfstudio", "ply")},
+    **{f"formats.read_{name}": FILES for name in (
+        "bal", "colmap", "database", "hloc", "libmv", "model", "nerfstudio", "ply", "vgg")},
+    **{f"formats.write_{name}": FILES for name in ("bal", "colmap", "database", "model", "nerfstudio", "ply")},
     "formats.export_model": FILES,
     "formats.undistorted_model": "hands a model to undistorted_cameras",
     **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},
@@ -400,6 +401,7 @@ EXCEPTIONS: dict[str, str] = {
     "linalg.compile_kernels": "a switch",
     "optim.wants_derivative": "a question about tensors, not their values",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
+    "reconstruction.reconstruct_matches": "lists of tensors; its stages are tried by reconstruct_tracks",
     **{f"robust.{name}": "what doors have in common; each door is tried" for name in ("check_door", "estimate_robustly")},
     "simulation.courtyard_scene": "takes no data, and seconds",
     "simulation.render_sequence": "takes no data, and seconds",

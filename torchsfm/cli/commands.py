@@ -11,7 +11,7 @@ import typer
 
 from torchsfm.cli.bundle import bundle
 from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
-from torchsfm.cli.inputs import photograph_folder, read_intrinsics, warn_about_intrinsics
+from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched, warn_about_intrinsics
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.results import VERSION, compare, finish
@@ -78,7 +78,14 @@ def options(
 
 @app.command()
 def reconstruct(
-    images: Annotated[list[Path], typer.Argument(help="A folder of images, or image files.", show_default=False)],
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            help="A folder of images, or image files; or keypoints and matches of other programs: COLMAP's database.db, or"
+            " hloc's two files, features.h5 and matches.h5.",
+            show_default=False,
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the model, the page, the report and the finished stages.")],
     sequence: Annotated[bool, typer.Option("--sequence", help="The images are frames of a video, in order.")] = False,
     camera: Annotated[
@@ -130,17 +137,23 @@ def reconstruct(
 ) -> None:
     """Turn photographs into calibrated cameras and coloured 3D points."""
     with told(Job(out)) as job, output_folder(out):
-        folder = photograph_folder(images)
+        matched = read_matched(images)
+        folder = photograph_folder(images) if matched is None else None
         if targets and folder is None:
-            raise UserError("--for: the images lie in several folders; give a folder of images")
+            raise UserError("--for: wants a folder of images; torchsfm export has the option --images")
         check_exports(out, targets or [])
         K = None if intrinsics is None else read_intrinsics(intrinsics)
-        source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
-        result = job.run(
-            source, threads, sequence=sequence, camera=camera, K=K, shared_camera=shared_camera,
-            free_principal_point=free_principal_point, method=method.value, max_features=max_features, max_pixels=max_pixels,
-            seed=seed, resume=resume,
-        )  # fmt: skip
+        options = {
+            "camera": camera, "K": K, "shared_camera": shared_camera, "free_principal_point": free_principal_point,
+            "method": method.value, "seed": seed,
+        }  # fmt: skip
+        if matched is not None:
+            result = job.run_matched(matched, threads, **options)
+        else:
+            source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
+            result = job.run(
+                source, threads, sequence=sequence, max_features=max_features, max_pixels=max_pixels, resume=resume, **options
+            )
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
         finish(job, result, folder, {}, max_pixels)

@@ -9,7 +9,32 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.cli.job import UserError
-from torchsfm.reconstruction import Reconstruction
+from torchsfm.formats import read_database, read_hloc
+from torchsfm.reconstruction import MatchedImages, Reconstruction
+
+SQLITE, HDF5 = b"SQLite format 3\0", b"\x89HDF\r\n\x1a\n"
+
+
+def read_matched(inputs: list[Path]) -> MatchedImages | None:
+    """Keypoints and matches of another program, where files of such are given instead of images.
+
+    Raises:
+        UserError: They cannot be read.
+    """
+    heads = []
+    for path in inputs:
+        if not path.is_file():
+            return None
+        with path.open("rb") as file:
+            heads.append(file.read(16))
+    try:
+        if len(inputs) == 1 and (heads[0] == SQLITE or inputs[0].suffix == ".db"):
+            return read_database(inputs[0])
+        if len(inputs) == 2 and all(head.startswith(HDF5) for head in heads):
+            return read_hloc(*inputs)
+    except (ValueError, ImportError) as error:
+        raise UserError(" ".join(str(error).split())) from None
+    return None
 
 
 def photograph_folder(images: list[Path]) -> Path | None:

@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
-from torchsfm.reconstruction import ReconstructionError, SfmResult, reconstruct
+from torchsfm.reconstruction import MatchedImages, ReconstructionError, SfmResult, reconstruct, reconstruct_matches
 
 NOTHING, WRONG, INTERRUPTED = 1, 2, 130
 
@@ -92,6 +92,25 @@ class Job:
         """Limit the processor threads of the numerical work."""
         if threads is not None:
             torch.set_num_threads(threads)
+
+    def run_matched(self, matched: MatchedImages, threads: int | None, **arguments: Any) -> SfmResult:
+        """Reconstruct from keypoints and matches, with faults of the input told as such."""
+        self.set_threads(threads)
+        try:
+            return reconstruct_matches(
+                matched.keypoints,
+                matched.pairs,
+                matched.matches,
+                matched.image_size,
+                weights=matched.weights,
+                names=matched.names,
+                camera_index=matched.camera_index,
+                focal=matched.focal,
+                progress=self.progress,
+                **arguments,
+            )
+        except ReconstructionError as error:
+            raise UserError(" ".join(str(error).split())) from None
 
     def run(self, images: Path | list[Path], threads: int | None, **arguments: Any) -> SfmResult:
         """Reconstruct, with faults of the input told as such."""

@@ -2,7 +2,9 @@
 
 from torchsfm.formats.bal import read_bal, write_bal
 from torchsfm.formats.colmap import read_colmap, write_colmap
+from torchsfm.formats.colmap_database import read_database, write_database
 from torchsfm.formats.export import TARGETS, export_model
+from torchsfm.formats.hloc import read_hloc
 from torchsfm.formats.libmv import read_libmv
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchsfm.formats.pictures import undistorted_model
@@ -18,6 +20,8 @@ __all__ = [
     "export_model",
     "read_bal",
     "read_colmap",
+    "read_database",
+    "read_hloc",
     "read_libmv",
     "read_model",
     "read_nerfstudio",
@@ -26,6 +30,7 @@ __all__ = [
     "undistorted_model",
     "write_bal",
     "write_colmap",
+    "write_database",
     "write_model",
     "write_nerfstudio",
     "write_ply",

@@ -1,5 +1,6 @@
 """How do images become a model? The `Reconstruction`, and the doors from photographs and from tracks."""
 
+from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
 from torchsfm.reconstruction.models import reconstruct_tracks
 from torchsfm.reconstruction.photographs import reconstruct
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -8,6 +9,7 @@ from torchsfm.reconstruction.view_graph import Verdict
 
 __all__ = [
     "ImageReport",
+    "MatchedImages",
     "PairReport",
     "Reconstruction",
     "ReconstructionError",
@@ -15,5 +17,6 @@ __all__ = [
     "SfmResult",
     "Verdict",
     "reconstruct",
+    "reconstruct_matches",
     "reconstruct_tracks",
 ]

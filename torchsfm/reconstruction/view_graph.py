@@ -113,6 +113,7 @@ def verify_pairs(
     pairs: Int[Tensor, "q 2"],
     matches: Sequence[Int[Tensor, "_ 2"]],
     *,
+    quality: Sequence[Float[Tensor, "_"]] | None = None,
     threshold: float = 3.0,
     generator: torch.Generator | None = None,
 ) -> ViewGraph:
@@ -125,6 +126,7 @@ def verify_pairs(
         color: Colours of the image points.
         pairs: Pairs of images that were matched.
         matches: Per pair, indices of matching points in its first and second image.
+        quality: Per pair, how much each match can be trusted, the larger the more, in any unit: samples favour the best.
         threshold: Largest distance of an inlier in pixels, for images whose longer side is 1600 pixels or less; it grows in
             proportion beyond that.
         generator: Source of randomness.
@@ -149,12 +151,16 @@ def verify_pairs(
         mask = torch.arange(slots) < counts[block, None]
         limit = threshold * scale[pairs[block]].amax(dim=-1)
         options: dict[str, Any] = {"generator": generator, "confidence": CONFIDENCE, "max_iterations": _trials(slots)}
+        if quality is not None:
+            rows = [quality[index].to(dtype) for index in block.tolist()]
+            options["quality"] = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
         epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, **options)
         F[block] = epipolar.model
         num_F[block] = epipolar.inliers.sum(-1) * (epipolar.status == Status.OK)
         # Images that do not differ, or differ by a homography, may leave F undetermined and yet have all in common.
         related = (num_F[block] >= MIN_INLIERS) | (epipolar.status == Status.DEGENERATE)
         if bool(related.any()):
+            options |= {"quality": options["quality"][related]} if quality is not None else {}
             planar = estimate_homography(x1[related], x2[related], threshold=limit[related], mask=mask[related], **options)
             H[block[related]] = planar.model
             num_H[block[related]] = planar.inliers.sum(-1) * (planar.status == Status.OK)

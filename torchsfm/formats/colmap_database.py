@@ -1,0 +1,177 @@
+"""`database.db` of COLMAP and hloc: keypoints and matches in SQLite, both ways.
+
+COLMAP puts the centre of the top-left pixel at (0.5, 0.5), this library at (0, 0): the half pixel is added and taken away here.
+Keypoints are in single precision there. A pair of images i < j has the number 2147483647 i + j.
+"""
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchsfm.formats.colmap_model import MAX_SIZE, PARAMETERS
+from torchsfm.formats.joining import reading
+from torchsfm.reconstruction.files import whole_file
+from torchsfm.reconstruction.matched import MatchedImages
+
+HALF_PIXEL = 0.5
+MAX_IMAGES = 2147483647
+MODELS = {parameters.number: parameters for parameters in PARAMETERS.values()}
+DEFAULT_FOCAL = 1.2
+"""Focal length over the longer side of the image that COLMAP, too, starts from where nothing tells it."""
+
+SCHEMA = """
+CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, model INTEGER NOT NULL, width INTEGER NOT NULL,
+    height INTEGER NOT NULL, params BLOB, prior_focal_length INTEGER NOT NULL);
+CREATE TABLE images (image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, name TEXT NOT NULL UNIQUE, camera_id INTEGER NOT NULL,
+    CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < 2147483647),
+    FOREIGN KEY(camera_id) REFERENCES cameras(camera_id));
+CREATE UNIQUE INDEX index_name ON images(name);
+CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB,
+    FOREIGN KEY(image_id) REFERENCES images(image_id) ON DELETE CASCADE);
+CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB);
+"""
+"""The tables that are filled; COLMAP makes the others when it opens the file."""
+
+
+def read_database(path: str | Path) -> MatchedImages:
+    """Read keypoints and matches from COLMAP's database, for `reconstruct_matches`.
+
+    Args:
+        path: The file, which is not changed.
+
+    Returns:
+        Images in the order of COLMAP's numbers, with their cameras. A focal length is known where the database says that it was
+        (COLMAP then read it from the Exif tags). Matches are those of the table `matches`, or where it is empty the verified
+        ones of `two_view_geometries`.
+
+    Raises:
+        ValueError: The file is no such database, or a damaged one; one line that says why.
+        OSError: It cannot be read.
+    """
+    path = Path(path)
+    with path.open("rb"):
+        pass
+    with reading(path, "a COLMAP database"), _opened(path) as database:
+        cameras = {}
+        for camera_id, model, width, height, params, known in database.execute(
+            "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY camera_id"
+        ):
+            if not (0 < width < MAX_SIZE and 0 < height < MAX_SIZE):
+                raise ValueError(f"camera {camera_id} has images of {width} x {height} pixels")
+            focals = np.frombuffer(params or b"", "<f8")[: MODELS[model].focals if model in MODELS else 1]
+            told = known and len(focals) and bool((np.isfinite(focals) & (focals > 0)).all())
+            cameras[camera_id] = (int(width), int(height)), float(focals.mean()) if told else None
+        rows = database.execute("SELECT image_id, name, camera_id FROM images ORDER BY image_id").fetchall()
+        image_of = {image_id: i for i, (image_id, _, _) in enumerate(rows)}
+        number_of = {camera_id: k for k, camera_id in enumerate(sorted({camera_id for _, _, camera_id in rows}))}
+        taken = [cameras[camera_id] for _, _, camera_id in rows]
+        keypoints = [torch.zeros(0, 2)] * len(rows)
+        for image_id, count, columns, data in database.execute("SELECT image_id, rows, cols, data FROM keypoints"):
+            table = _table(data, count, columns, np.dtype("<f4"), 2)
+            keypoints[image_of[image_id]] = torch.from_numpy(table[:, :2] - np.float32(HALF_PIXEL))
+        pairs: list[list[int]] = []
+        matches: list[Tensor] = []
+        for source in ("matches", "two_view_geometries"):
+            if matches or not _has_table(database, source):
+                continue
+            query = f"SELECT pair_id, rows, cols, data FROM {source} WHERE rows > 0 ORDER BY pair_id"
+            for pair_id, count, columns, data in database.execute(query):
+                table = _table(data, count, columns, np.dtype("<u4"), 2)[:, :2].astype(np.int64)
+                pair = [image_of[image_id] for image_id in divmod(pair_id, MAX_IMAGES)]
+                if pair[0] == pair[1] or (table >= [len(keypoints[i]) for i in pair]).any():
+                    raise ValueError(f"the matches of pair {pair_id} are of keypoints that are not there")
+                pairs.append(pair)
+                matches.append(torch.from_numpy(table))
+        return MatchedImages(
+            names=tuple(str(name) for _, name, _ in rows),
+            image_size=torch.tensor([size for size, _ in taken], dtype=torch.long).reshape(-1, 2),
+            keypoints=tuple(keypoints),
+            pairs=torch.tensor(pairs, dtype=torch.long).reshape(-1, 2),
+            matches=tuple(matches),
+            camera_index=torch.tensor([number_of[camera_id] for _, _, camera_id in rows], dtype=torch.long),
+            focal=tuple(focal for _, focal in taken),
+        )
+
+
+def write_database(matched: MatchedImages, path: str | Path) -> None:
+    """Write keypoints and matches as a database that COLMAP opens, verifies (`colmap geometric_verifier`) and maps.
+
+    Every camera is a SIMPLE_RADIAL with the known focal length, else with one to start from, and without distortion.
+
+    Args:
+        matched: Keypoints and matches; weights have no place in the database.
+        path: The file to write; one that is there is replaced.
+
+    Raises:
+        ValueError: Two images have one name, or one camera has two sizes of images.
+        OSError: The file cannot be written.
+    """
+    if len(set(matched.names)) < len(matched.names):
+        raise ValueError("matched: wanted a name for each image, got one twice")
+    index = torch.arange(len(matched.names)) if matched.camera_index is None else matched.camera_index
+    focal = matched.focal or (None,) * len(matched.names)
+    with closing(sqlite3.connect(":memory:")) as database:
+        database.executescript(SCHEMA)
+        for k in torch.unique(index).tolist():
+            members = (index == k).nonzero()[:, 0].tolist()
+            sizes = torch.unique(matched.image_size[members], dim=0).tolist()
+            if len(sizes) > 1:
+                raise ValueError(f"matched: wanted one size of image a camera, got {sizes} of camera {k}")
+            width, height = sizes[0]
+            known = [f for f in (focal[i] for i in members) if f]
+            f = float(np.median(known)) if known else DEFAULT_FOCAL * max(width, height)
+            params = np.array([f, width / 2, height / 2, 0.0], "<f8").tobytes()
+            model = PARAMETERS["SIMPLE_RADIAL"].number
+            database.execute(
+                "INSERT INTO cameras VALUES (?, ?, ?, ?, ?, ?)", (k + 1, model, width, height, params, bool(known))
+            )
+        for i, name in enumerate(matched.names):
+            text = name.encode("utf-8", "surrogateescape")
+            database.execute("INSERT INTO images VALUES (?, CAST(? AS TEXT), ?)", (i + 1, text, int(index[i]) + 1))
+            x = (matched.keypoints[i].detach().cpu().double().numpy() + HALF_PIXEL).astype("<f4")
+            database.execute("INSERT INTO keypoints VALUES (?, ?, 2, ?)", (i + 1, len(x), x.tobytes()))
+        collected: dict[int, NDArray[np.uint32]] = {}
+        for (i, j), m in zip(matched.pairs.tolist(), matched.matches, strict=True):
+            rows = (m if i < j else m.flip(1)).cpu().numpy().astype("<u4")
+            pair_id = MAX_IMAGES * (min(i, j) + 1) + max(i, j) + 1
+            collected[pair_id] = np.concatenate([collected[pair_id], rows]) if pair_id in collected else rows
+        for pair_id, rows in collected.items():
+            database.execute("INSERT INTO matches VALUES (?, ?, 2, ?)", (pair_id, len(rows), rows.tobytes()))
+        database.commit()
+        content = database.serialize()
+    with whole_file(path) as file:
+        file.write(content)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """The database, to be read only; its errors are those of a bad file."""
+    try:
+        with closing(sqlite3.connect(f"file:{quote(os.fsencode(path.absolute()))}?mode=ro&immutable=1", uri=True)) as database:
+            database.text_factory = lambda data: data.decode("utf-8", "surrogateescape")
+            if missing := [name for name in ("cameras", "images", "keypoints") if not _has_table(database, name)]:
+                raise ValueError(f"it has no table {missing[0]}")
+            yield database
+    except sqlite3.Error as error:
+        raise ValueError(str(error)) from None
+
+
+def _has_table(database: sqlite3.Connection, name: str) -> bool:
+    query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = ?"
+    return bool(database.execute(query, (name,)).fetchone()[0])
+
+
+def _table(data: bytes | None, rows: int, columns: int, kind: np.dtype, least: int) -> NDArray:  # type: ignore[type-arg]
+    """A table of numbers as the database holds it."""
+    data = data or b""
+    if rows and (columns < least or rows < 0 or len(data) != rows * columns * kind.itemsize):
+        raise ValueError(f"{len(data)} bytes are no table of {rows} x {columns} numbers")
+    return np.frombuffer(data, kind).reshape(rows, columns) if rows else np.empty((0, least), kind)
