@@ -14,7 +14,7 @@ from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_h
 from torchsfm.resection import estimate_camera
 from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac, NeverZero
 from torchsfm.robust.hypotheses import losses, squared_residual
-from torchsfm.robust.local_optimisation import optimise_fully, optimise_within
+from torchsfm.robust.local_optimisation import optimise_fully, step_within
 from torchsfm.triangulation import ESTIMATORS as OF_POINTS
 
 OF_RAYS = ("essential", "upright")
@@ -56,19 +56,18 @@ def test_what_is_no_model_has_no_score(kind: type, dtype: torch.dtype, generator
 def test_steps_are_bounded_where_all_curvatures_vanish(kind: type, generator: torch.Generator) -> None:
     """All data at distances where the loss is no longer convex: the step stays near, and refinement does not raise the loss."""
     scene = make_scene(kind, (20,), 40, generator, 1e-3)
-    data, start = [d[:, None] for d in scene.data], scene.model[:, None]
-    estimator = type(scene.estimator)(*(v[:, None] for v in vars(scene.estimator).values()))
-    squared = squared_residual(estimator, start, *data)[:, 0]
+    data, start, estimator = scene.data, scene.model, scene.estimator
+    squared = squared_residual(estimator, start, *data)
     # The nearest datum just past the inflection.
     reach = 3 * squared.amin(-1) * (3 if kind.codimension == 1 else 1.5)  # type: ignore[attr-defined]
     reach = torch.where(torch.isfinite(reach), reach, 1.0).clamp(min=1e-12)
     counts = squared > reach[:, None] * kind.codimension / (2 + kind.codimension)  # type: ignore[attr-defined]
 
     def loss(model: torch.Tensor) -> torch.Tensor:
-        u = (squared_residual(estimator, model, *data)[:, 0] / reach[:, None]).clamp(max=1)
+        u = (squared_residual(estimator, model, *data) / reach[:, None]).clamp(max=1)
         return ((u - u * u / 2) * counts).sum(-1)
 
-    one = optimise_within(estimator, start, data, reach, counts, 1)
+    one, _ = step_within(estimator, start, data, reach, counts)
     assert torch.isfinite(one).all()
     assert ((one - start).flatten(1).norm(dim=-1) < 10 * (1 + start.flatten(1).norm(dim=-1))).all()
     final, settled = optimise_fully(estimator, start, data, reach, counts)

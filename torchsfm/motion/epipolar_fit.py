@@ -52,12 +52,17 @@ def cross_rows(t: Float[Tensor, "*#batch 3"], A: Float[Tensor, "*#batch 3 3"]) -
     return product
 
 
+def product(A: Float[Tensor, "*#batch r q"], B: Float[Tensor, "*#batch q c"]) -> Float[Tensor, "*batch r c"]:
+    """A B, without the shapes that broadcasting needs where there is nothing to broadcast."""
+    return torch.bmm(A, B) if A.ndim == 3 == B.ndim and len(A) == len(B) else A @ B
+
+
 def apply_rows(B: Float[Tensor, "*#batch r q"], z: Float[Tensor, "*#batch q n"]) -> Float[Tensor, "*batch r n"]:
     """B z, as one product for several models of the same data."""
     if B.ndim == z.ndim and z.ndim > 2 and z.shape[-3] == 1 and B.shape[-3] > 1:
         merged: Tensor = B.flatten(-3, -2) @ z[..., 0, :, :]
         return merged.reshape(*B.shape[:-1], z.shape[-1])
-    return B @ z
+    return product(B, z)
 
 
 def sums_of_products(a: Tensor, z: Tensor) -> Tensor:
@@ -65,7 +70,7 @@ def sums_of_products(a: Tensor, z: Tensor) -> Tensor:
     if a.ndim == z.ndim and z.ndim > 2 and z.shape[-3] == 1 and a.shape[-3] > 1:
         merged: Tensor = a.flatten(-3, -2) @ z[..., 0, :, :].mT
         return merged.reshape(*a.shape[:-1], z.shape[-2])
-    return a @ z.mT
+    return product(a, z.mT)
 
 
 def matrices(entries: Float[Tensor, "*batch nn"], n: int) -> Float[Tensor, "*batch n n"]:
@@ -86,6 +91,6 @@ def with_left_epipole(F: Float[Tensor, "*#batch 3 3"], e: Float[Tensor, "*#batch
     """
     first, second, third = F.unbind(-1)
     across = torch.linalg.cross(torch.add(first, third, alpha=MIXTURE[0]), torch.add(second, third, alpha=MIXTURE[1]))
-    scale = (across * across).sum(-1, keepdim=True).clamp(min=1e-200).rsqrt()
-    turned = across * torch.copysign(scale, (across * e).sum(-1, keepdim=True))
+    length = torch.linalg.vector_norm(across, dim=-1, keepdim=True).clamp(min=1e-100)
+    turned = across / torch.copysign(length, (across * e).sum(-1, keepdim=True))
     return torch.cat((F, turned[..., None]), -1)

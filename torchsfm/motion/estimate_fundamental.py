@@ -68,12 +68,15 @@ class FundamentalEstimator:
         A, b = step_equations(model, x1, x2, weigh)
         F, e = model[..., :3].double(), model[..., 3].double()
         f, normal = F.flatten(-2), cofactors(F).flatten(-2)
-        A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * f[..., :, None] * f[..., None, :]
+        # The unit sphere's normal, as large as the rest.
+        size = A.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+        A = torch.addcmul(A, (size * f)[..., None], f[..., None, :])
         free, bound = damped_solve(A, torch.stack((b, normal), -1)).unbind(-1)
-        gap = (normal * f).sum(-1) / 3 - (normal * free).sum(-1)
-        share = (normal * bound).sum(-1)
-        f = f - free - (gap / torch.where(share > 0, share, torch.inf))[..., None] * bound
-        F = matrices(f * (f * f).sum(-1, keepdim=True).rsqrt(), 3)
+        # The determinant is a third of the product with its gradient.
+        gap = (normal * torch.sub(f, free, alpha=3)).sum(-1, keepdim=True) / 3
+        share = (normal * bound).sum(-1, keepdim=True)
+        f = torch.addcmul(f - free, gap / torch.where(share > 0, share, torch.inf), bound, value=-1)
+        F = matrices(f / torch.linalg.vector_norm(f, dim=-1, keepdim=True), 3)
         return with_left_epipole(F, e).to(x1.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:

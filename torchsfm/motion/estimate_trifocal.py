@@ -37,8 +37,6 @@ class TrifocalEstimator:
     codimension: ClassVar[int] = 3
     dimension: ClassVar[int] = 18
     never_zero: ClassVar[bool] = True
-    traceable: ClassVar[bool] = False
-    """Compiled steps differ from those of eager mode (PyTorch 2.13)."""
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#batch 6 2"], x3: Float[Tensor, "*#batch 6 2"]

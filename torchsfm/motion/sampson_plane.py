@@ -5,13 +5,11 @@ point is behind one of the cameras if h2' [e2]x F h1 > 0 (Chum, Werner & Matas 2
 a datum, of degree two at most in either point: for many models of the same data one matrix product gives them.
 """
 
-from functools import cache
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.motion.epipolar_fit import apply_rows, cross_rows, matrices, one_data_set_for_many, sums_of_products
+from torchsfm.motion.epipolar_fit import apply_rows, cross_rows, one_data_set_for_many, product
 from torchsfm.motion.forms_of_models import ONE, Forms, Term
 from torchsfm.robust import Weigh
 
@@ -20,19 +18,13 @@ MANY = 4
 """From how many models of the same data on monomials pay."""
 
 _DEGREE_TWO = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Which coordinates make the monomials of a point, as `quadratic` has them."""
+"""Which coordinates make the monomials of degree two of a point."""
 _SQUARES = ((0, 0), (0, 1), (1, 1))
 
 
 def homogeneous_rows(x: Float[Tensor, "*batch n 2"]) -> Float[Tensor, "*batch 3 n"]:
     """The coordinates x, y, 1 of points."""
-    rows = x.mT
-    return torch.cat((rows, torch.ones_like(rows[..., :1, :])), -2)
-
-
-def quadratic(h: Float[Tensor, "*batch 3 n"]) -> Float[Tensor, "*batch 6 n"]:
-    """x^2, x y, x, y^2, y, 1."""
-    return torch.cat((h[..., :1, :] * h, h[..., 1:2, :] * h[..., 1:, :], h[..., 2:, :]), -2)
+    return torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0)
 
 
 def infinite_where_positive(squared: Float[Tensor, "*batch n"], behind: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
@@ -102,34 +94,17 @@ def _forms(
 def step_equations(
     model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"], weigh: Weigh
 ) -> tuple[Float[Tensor, "*batch 9 9"], Float[Tensor, "*batch 9"]]:
-    """J' C J and J' W r of the distance over the nine entries of F, in float64, W and C as `weigh` has them of the distances.
-
-    The right side is exact; in the matrix the measured points stand for those corrected to first order.
-    """
+    """J' C J and J' W r of the distance over the nine entries of F, in float64, W and C as `weigh` has them."""
     h1, h2 = homogeneous_rows(x1), homogeneous_rows(x2)
     e, side, first, second, size = _forms(model, h1, h2)
-    squared = e * e / size
-    weights, curvature = weigh(infinite_where_positive(squared, side))
-    # The derivative of e^2 / (2 |g|^2): e de / |g|^2 - e^2 / |g|^4 d|g|^2 / 2.
-    scale = weights / size
-    share, slope = scale * squared, scale * e
-    left = slope[..., None, :] * h2
+    share = e / size
+    weights, curvature = weigh(infinite_where_positive(share * e, side))
+    # |g| times the derivative of e / |g|: that of e, less e / |g|^2 times that of |g|^2 / 2.
+    left = h2.expand(*share.shape[:-1], *h2.shape[-2:]).clone()
     left[..., :2, :].addcmul_(share[..., None, :], second, value=-1)
-    b = sums_of_products(left, h1)
-    b[..., :2] -= sums_of_products(share[..., None, :] * first, h2).mT
-    # (h2 (x) h1) (h2 (x) h1)' has 36 different entries.
-    weighted = (curvature / size)[..., None, :] * quadratic(h2)
-    S = sums_of_products(weighted, quadratic(h1)).flatten(-2)
-    A = matrices(S[..., _square_of_products(S.device)], 9)
-    return A.double(), b.flatten(-2).double()
-
-
-@cache
-def _square_of_products(device: torch.device) -> Tensor:
-    """Where (h2_i h1_j) (h2_k h1_l) is among the products of the six monomials of h2 and of h1."""
-    place = {pair: n for n, pair in enumerate(_DEGREE_TWO)}
-    place |= {(j, i): n for (i, j), n in place.items()}
-    three = range(3)
-    index = [6 * place[i, k] + place[j, m] for i in three for j in three for k in three for m in three]
-    with torch.inference_mode(False):
-        return torch.tensor(index, device=device)
+    J = left[..., :, None, :] * h1[..., None, :, :]
+    J[..., :2, :].addcmul_(h2[..., :, None, :], (share[..., None, :] * first)[..., None, :, :], value=-1)
+    J = J.flatten(-3, -2)
+    # A product with a single column would be rounded otherwise for one problem than for several.
+    both = product(torch.cat(((curvature / size)[..., None, :] * J, (weights * share)[..., None, :]), -2), J.mT).double()
+    return both[..., :9, :], both[..., 9, :]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg import damped_solve
-from torchsfm.motion.epipolar_fit import apply_rows, one_data_set_for_many, sums_of_products
+from torchsfm.motion.epipolar_fit import apply_rows, one_data_set_for_many, product, sums_of_products
 from torchsfm.motion.forms_of_models import ONE, Forms, Term
 from torchsfm.motion.sampson_plane import MANY, infinite_where_positive
 from torchsfm.robust import Weigh
@@ -73,7 +73,7 @@ def _forms(
 ) -> tuple[Tensor, ...]:
     """The squared distance, how far beyond the slack rays miss the front, e, |g|^2, t'd1', t'd2, the cosine, p and p x d2."""
     R, t = model[..., :3], model[..., 3]
-    first = apply_rows(torch.cat((R, t[..., None, :] @ R), -2), h1)
+    first = apply_rows(torch.cat((R, product(t[..., None, :], R)), -2), h1)
     p, along1 = first[..., :3, :], first[..., 3, :]
     along2 = apply_rows(t[..., None, :], h2)[..., 0, :]
     p0, p1, p2 = p.unbind(-2)
@@ -111,10 +111,10 @@ def step_equations(
     share = scale * squared
     slope = e * (scale + 2 * share)
     # A product with a single column would be rounded otherwise for one problem than for several.
-    both = torch.cat(((curvature / size)[..., None, :] * J, slope[..., None, :]), -2) @ J.mT
+    both = product(torch.cat(((curvature / size)[..., None, :] * J, slope[..., None, :]), -2), J.mT)
     A, (turn, move) = both[..., :6, :].double(), both[..., 6, :].double().chunk(2, -1)
     pair = torch.stack((share * along1, share * along2), -2)
-    near, far, t = (pair @ p.mT)[..., 0, :].double(), sums_of_products(pair, h2)[..., 1, :].double(), t.double()
+    near, far, t = product(pair, p.mT)[..., 0, :].double(), sums_of_products(pair, h2)[..., 1, :].double(), t.double()
     turn, move = turn + torch.linalg.cross(near, t), move + near + far
     return A, torch.cat((turn, move - t * (t * move).sum(-1, keepdim=True)), -1)
 
@@ -135,5 +135,6 @@ def pose_step(
 ) -> Float[Tensor, "*batch k"]:
     """The step, the last three of whose unknowns move t, across t: a move along it changes nothing but the length of E."""
     along = torch.nn.functional.pad(t, (A.shape[-1] - 3, 0))
-    A = A + A.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * along[..., :, None] * along[..., None, :]
+    size = A.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+    A = torch.addcmul(A, (size * along)[..., None], along[..., None, :])
     return -damped_solve(A, b[..., None])[..., 0]

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
-from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator, is_never_zero
 from torchsfm.robust.models import cast, take_slots, tensors_of
 from torchsfm.robust.problems import Problems
@@ -137,21 +136,15 @@ def losses(
     g, s = first.shape[:2]
     each = s * data[0].shape[-2]
     portion = max(1, NUMBERS[first.device.type == "cpu"] // max(each, 1))
-    if portion >= g > 0 or _costs.compiles(estimator):
-        return _costs(estimator, models, data, limit, counts, scoring)
     rows = []
     for i in range(0, g, portion):
         some = slice(i, i + portion)
-        own, of, at, edge, part = tensor_map(lambda t: t[some], (estimator, models, tuple(data), limit, counts))  # noqa: B023
-        rows.append(_costs(own, of, at, edge, part, scoring))
-    return torch.cat(rows) if rows else limit.new_zeros(g, s)
-
-
-@fused("g 1", "g s", "g 1 n", "g", "g n")
-def _costs(
-    estimator: Estimator[Any], models: Any, data: Sequence[Tensor], limit: Tensor, counts: Tensor | None, scoring: Scoring
-) -> Tensor:
-    return scoring.cost(squared_residual(estimator, models, *data), limit, counts, estimator.codimension)
+        whole = (estimator, models, tuple(data), limit, counts)
+        own, of, at, edge, part = whole if portion >= g else tensor_map(lambda t: t[some], whole)  # noqa: B023
+        rows.append(scoring.cost(squared_residual(own, of, *at), edge, part, own.codimension))
+    if not rows:
+        return limit.new_zeros(g, s)
+    return rows[0] if len(rows) == 1 else torch.cat(rows)
 
 
 def smallest(loss: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]:

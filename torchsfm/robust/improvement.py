@@ -15,7 +15,7 @@ from torchsfm._types import tensor_map
 from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
-from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally, optimise_within
+from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally, step_within
 from torchsfm.robust.models import cast, join, put, select, take_slots
 from torchsfm.robust.noise import SCALE_DATA, scale_of_noise
 from torchsfm.robust.problems import Problems
@@ -222,33 +222,28 @@ def refine_finally(fine: Problems, coarse: Problems, best: Best) -> tuple[Best, 
     """
     parts, distances, score, k = [], [], Msac(), fine.estimator.codimension
     for part in _portions(_all(fine), fine.width, _NUMBERS):
-        some, rough, old = fine.take(part), coarse.take(part).spread(), best.take(part)
-        counts = rough.counts
-        start = tensor_map(lambda t: t[:, None], old.model)
-        model, reach = scale_of_noise(
-            rough.estimator, start, [d[:, :, :SCALE_DATA] for d in rough.data], old.limit, counts[:, :SCALE_DATA]
-        )
-        model = optimise_within(rough.estimator, model, rough.data, reach * old.limit, counts, 1)
+        some, rough, old = fine.take(part), coarse.take(part), best.take(part)
+        near = [d[:, :SCALE_DATA] for d in rough.data]
+        model, reach = scale_of_noise(rough.estimator, old.model, near, old.limit, rough.counts[:, :SCALE_DATA])
+        model, _ = step_within(rough.estimator, model, rough.data, reach * old.limit, rough.counts)
         old, reach = cast(old, torch.float64), reach.double() * old.limit
-        wide, counts = some.spread(), some.counts
-        model, settled = optimise_fully(wide.estimator, cast(model, torch.float64), wide.data, reach, counts)
-        squared = squared_residual(wide.estimator, model, *wide.data)
+        model, settled = optimise_fully(some.estimator, cast(model, torch.float64), some.data, reach, some.counts)
+        # In double precision too: in single precision what is far may look near by a threshold below rounding.
+        squared, before = (squared_residual(some.estimator, m, *some.data) for m in (model, old.model))
         # A threshold smaller than the noise would blame the better model.
         judged = torch.maximum(old.limit, reach)
-        loss = score.cost(squared, judged, counts, k)[:, 0]
-        # In double precision too: in single precision what is far may look near by a threshold below rounding.
-        before = squared_residual(wide.estimator, cast(start, torch.float64), *wide.data)
-        before_loss = score.cost(before, judged, counts, k)[:, 0]
+        both, counts = torch.stack((squared, before), 1), some.counts
+        loss, before_loss = score.cost(both, judged, counts, k).unbind(1)
         # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
         won = (loss <= 1.02 * before_loss + 1) & (loss < torch.inf)
         # Noise that leaves the threshold so much less support is none: the model is not quite that of the data.
-        within, within_before = (((d < old.limit[:, None, None]) * counts[:, None]).sum(-1)[:, 0] for d in (squared, before))
+        within, within_before = ((both < old.limit[:, None, None]) * counts[:, None]).sum(-1).unbind(1)
         won &= within >= _SUPPORT * within_before
-        distances.append(torch.where(won[:, None], squared[:, 0], before[:, 0]))
+        distances.append(torch.where(won[:, None], squared, before))
         parts.append(
             replace(
                 old,
-                model=select(won, tensor_map(lambda t: t[:, 0], model), old.model),
+                model=select(won, model, old.model),
                 loss=torch.where(won, loss, before_loss),
                 reach=torch.where(won & settled, reach, 0),
             )

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import tensor_map
-from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.models import put, select, tensors_of, zip_map
 from torchsfm.robust.scoring import Scoring
@@ -53,7 +52,6 @@ def optimise_locally(
     return model
 
 
-@fused("g 1", "g k", "g 1 n", "g k", "g n")
 def _local_step(
     estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Tensor, counts: Tensor, scoring: Scoring
 ) -> M:
@@ -66,20 +64,6 @@ def _local_step(
     return estimator.step(model, *data, weigh=weigh)
 
 
-def optimise_within(
-    estimator: Estimator[M],
-    model: M,
-    data: Sequence[Tensor],
-    reach: Float[Tensor, "g"],
-    counts: Tensor,
-    steps: int,
-) -> M:
-    """Steps from models `(g, 1, ...)` to a minimum of the sum of u - u^2 / 2, u the squared distance over the squared reach."""
-    for _ in range(steps):
-        model, _ = _step_within(estimator, model, data, reach, counts, torch.zeros_like(reach))
-    return model
-
-
 def optimise_fully(
     estimator: Estimator[M],
     model: M,
@@ -87,28 +71,29 @@ def optimise_fully(
     reach: Float[Tensor, "g"],
     counts: Tensor,
 ) -> tuple[M, Bool[Tensor, "g"]]:
-    """That minimum itself, and where it was reached: only a minimum has a derivative.
+    """Steps from one model of each problem to a minimum of the loss of `step_within`, and where it was reached.
 
-    A step that raises the loss is taken back and the next one damped (Levenberg 1944): in the limit it is a short one of
-    reweighted least squares, which cannot raise it. Steps that shrink slowly are drawn out (Anderson 1965, of depth 1).
+    Only a minimum has a derivative. A step that raises the loss is taken back and the next one damped (Levenberg 1944): in the
+    limit it is a short one of reweighted least squares, which cannot raise it. Steps that shrink slowly are drawn out (Anderson
+    1965, of depth 1).
     """
     settled = torch.zeros_like(reach, dtype=torch.bool)
     # What comes in lower precision is beside the manifold, where the loss may be less than anywhere on it.
-    coarse, model = model, optimise_within(estimator, model, data, reach, counts, 1)
+    coarse, (model, _) = model, step_within(estimator, model, data, reach, counts)
     found, row = model, torch.arange(len(reach), device=reach.device)
     problem: tuple[Any, ...] = (estimator, tuple(data), reach, counts)
-    start, last, step = model, model, zip_map(torch.sub, model, coarse)
-    first, least, damping = _size(step), torch.full_like(reach, torch.inf), torch.zeros_like(reach)
+    start, last, step = model, model, _entries(model) - _entries(coarse)
+    first, least, damping = _length(step), torch.full_like(reach, torch.inf), torch.zeros_like(reach)
     for count in range(2, _MOST_STEPS + 1):
         own, values, edge, counted = problem
-        moved, loss = _step_within(own, model, values, edge, counted, damping)
+        moved, loss = step_within(own, model, values, edge, counted, damping)
         # A loss that is no number is none.
         good = loss <= least * (1 + _ROUNDING)
         damping = torch.where(good, torch.where(loss < least, damping / 4, damping), (4 * damping).clamp(min=1))
         start, least = select(good, model, start), torch.where(good, loss, least)
-        before, step = step, zip_map(torch.sub, moved, model)
-        size = _size(step)
-        done = good & ((size <= _STILL * first) | (size <= _SMALL * _size(moved)))
+        entries = _entries(moved)
+        before, step = step, entries - _entries(model)
+        done = good & (_length(step) <= torch.maximum(_STILL * first, _SMALL * _length(entries)))
         drawn = _drawn_out(moved, last, step, before) if count > 2 else moved
         last, model = moved, select(good, drawn, start)
         if count < _LAST_STEPS or not (bool(done.any()) or count == _MOST_STEPS):
@@ -125,50 +110,63 @@ def optimise_fully(
     return found, settled
 
 
-def _drawn_out(moved: M, last: M, step: M, before: M) -> M:
+def _drawn_out(moved: M, last: M, step: Float[Tensor, "g e"], before: Float[Tensor, "g e"]) -> M:
     """Where two steps, and the models they led to, say that steps lead."""
-    change = zip_map(torch.sub, step, before)
-    share = (_dot(step, change) / _dot(change, change)).nan_to_num(nan=0.0).clamp(-_DRAWN, 0.5)
-    return zip_map(lambda t, old: t - share.reshape(-1, *(1,) * (t.ndim - 1)) * (t - old), moved, last)
+    change = step - before
+    share = ((step * change).sum(-1) / (change * change).sum(-1)).nan_to_num(nan=0.0).clamp(-_DRAWN, 0.5)
+    return zip_map(lambda t, old: torch.addcmul(t, share.view(-1, *(1,) * (t.ndim - 1)), t - old, value=-1), moved, last)
 
 
-def _dot(model: M, other: M) -> Float[Tensor, "g"]:
-    """The sum of products of the entries of models `(g, 1, ...)`."""
-    return torch.stack([t.flatten(1).sum(-1) for t in tensors_of(zip_map(torch.mul, model, other))]).sum(0)
+def _entries(model: Any) -> Float[Tensor, "g e"]:
+    """The entries of models `(g, ...)` side by side."""
+    parts = [t.flatten(1) if t.ndim > 1 else t[:, None] for t in tensors_of(model)]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
-def _size(model: M) -> Float[Tensor, "g"]:
-    """The length of the entries of models."""
-    return _dot(model, model).sqrt()
+def _length(entries: Float[Tensor, "g e"]) -> Float[Tensor, "g"]:
+    length: Tensor = torch.linalg.vector_norm(entries, dim=-1)
+    return length
 
 
-@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
-def _step_within(
-    estimator: Estimator[M], model: M, data: Sequence[Tensor], reach: Tensor, counts: Tensor, damping: Tensor
-) -> tuple[M, Tensor]:
-    """A step, and the loss `(g)` before it."""
-    scale, loss = (1 / reach)[:, None, None], reach
+def step_within(
+    estimator: Estimator[M],
+    model: M,
+    data: Sequence[Tensor],
+    reach: Float[Tensor, "g"],
+    counts: Tensor,
+    damping: Float[Tensor, "g"] | None = None,
+) -> tuple[M, Float[Tensor, "g"]]:
+    """A step towards a minimum of the sum of u - u^2 / 2, u the squared distance over the squared reach; that sum before it.
+
+    Args:
+        estimator: The problem.
+        model: One model of each problem, `(g, ...)`.
+        data: The data, each `(g, n, d)`.
+        reach: Squared distance beyond which a datum does not matter.
+        counts: What the data count, `(g, n)`: a boolean or a weight.
+        damping: How much of least squares to add to the curvature of the loss; none if not given.
+    """
+    loss = reach
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
         nonlocal loss
-        u = (squared * scale).clamp(max=1)
-        loss = ((u - 0.5 * u * u) * counts[:, None]).sum(-1)[:, 0]
+        u = (squared / reach[:, None]).clamp(max=1)
+        loss = (torch.addcmul(u, u, u, value=-0.5) * counts).sum(-1)
         weights, curvature = falling(u, counts, estimator.codimension)
-        return weights, curvature + damping[:, None, None] * weights
+        return weights, curvature if damping is None else torch.addcmul(curvature, damping[:, None], weights)
 
     return estimator.step(model, *data, weigh=weigh), loss
 
 
 def falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tensor]:
-    """Weight and curvature of the loss u - u^2 / 2, up to its maximum.
+    """Weight and curvature of the loss u - u^2 / 2, for u up to 1, its maximum.
 
     Curvatures that are negative, or next to nothing, could make the Hessian indefinite or vanish. What they are raised by is
     taken from all in proportion, so that steps are as long as they should be on average, and bounded by a multiple of those of
     reweighted least squares.
     """
-    u, counts = u.clamp(max=1), counts[:, None]
-    slope = 1 - u
-    curvature = slope - (2 / codimension) * u * (slope > 0)
-    total, curvature = (curvature * counts).sum(-1, keepdim=True), torch.maximum(curvature, _FLAT * slope) * counts
-    share = total / curvature.sum(-1, keepdim=True).clamp(min=_LEAST)
-    return slope * counts, curvature * share.clamp(min=0.3)
+    slope, counts = 1 - u, (u < 1) * counts
+    curvature = torch.sub(slope, u, alpha=2 / codimension)
+    raised = torch.maximum(curvature, _FLAT * slope) * counts
+    share = (curvature * counts).sum(-1, keepdim=True) / raised.sum(-1, keepdim=True).clamp(min=_LEAST)
+    return slope * counts, raised * share.clamp(min=0.3)

@@ -9,11 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import tensor_map
-from torchsfm.linalg.fused import fused
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.hypotheses import squared_residual
-from torchsfm.robust.local_optimisation import LOCAL_DATA, falling, optimise_within
-from torchsfm.robust.models import join, take_slots, zip_map
+from torchsfm.robust.local_optimisation import LOCAL_DATA, falling, step_within
+from torchsfm.robust.models import select, zip_map
 
 M = TypeVar("M")
 T = TypeVar("T")
@@ -54,16 +53,16 @@ def scale_of_noise(
 
     Args:
         estimator: The problem.
-        model: One model of each problem, `(g, 1, ...)`.
-        data: The data, each `(g, 1, n, d)`.
+        model: One model of each problem, `(g, ...)`.
+        data: The data, each `(g, n, d)`.
         limit: Squared threshold.
         counts: What the data count, `(g, n)`: a boolean or a weight.
 
     Returns:
         The model, and the square of its reach in units of the squared threshold, rounded to a coarse grid: so the model that
-        `optimise_within` makes is the optimum of one fixed loss, also when the data move a little, and has a derivative.
+        `optimise_fully` makes is the optimum of one fixed loss, also when the data move a little, and has a derivative.
     """
-    _, noise, crowd = _first_noise(estimator, model, [d[:, :, :_GLANCE] for d in data], limit, counts[:, :_GLANCE])
+    _, noise, crowd = _first_noise(estimator, model, [d[:, :_GLANCE] for d in data], limit, counts[:, :_GLANCE])
     rows = crowd.nonzero()[:, 0]
     if len(rows):
 
@@ -81,42 +80,37 @@ def _widened(
     estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Float[Tensor, "g"], counts: Tensor
 ) -> tuple[M, tuple[Tensor, Tensor]]:
     """The likelier of a model and what becomes of it with far larger thresholds, and the noise."""
-    data, counts, wide = [d[:, :, :LOCAL_DATA] for d in data], counts[:, :LOCAL_DATA], model
+    data, counts, wide = [d[:, :LOCAL_DATA] for d in data], counts[:, :LOCAL_DATA], model
     for factor in _WIDE_STEPS:
-        wide = optimise_within(estimator, wide, data, factor**2 * limit, counts, 1)
-    both = join([model, wide], 1)
-    evidence, noise, _ = _first_noise(estimator, both, data, limit, counts)
-    winner = (evidence[:, 1:] > evidence[:, :1] + _MARGIN).long()
-    variance, share = (t.gather(1, winner[..., None]) for t in noise)
-    return take_slots(both, winner), (variance, share)
+        wide, _ = step_within(estimator, wide, data, factor**2 * limit, counts)
+    (old, noise, _), (new, wider, _) = (_first_noise(estimator, one, data, limit, counts) for one in (model, wide))
+    return select(new > old + _MARGIN, (wide, wider), (model, noise))
 
 
-@fused("g 1", "g k", "g 1 n", "g", "g n")
 def _first_noise(
     estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Tensor, counts: Tensor
 ) -> tuple[Tensor, tuple[Tensor, Tensor], Tensor]:
     """The likeliest scale of Gaussian noise among evenly spread outliers within the window.
 
     Returns:
-        The logarithm of the likelihood `(g, k)` against that of outliers alone; the variance and the share of inliers among
-        the data in the window, `(g, k, 1)`; and whether there are many data beyond the threshold of the first model, `(g)`.
+        The logarithm of the likelihood `(g)` against that of outliers alone; the variance and the share of inliers among the
+        data in the window, `(g, 1)`; and whether there are many data beyond the threshold, `(g)`.
     """
     k = estimator.codimension
     ratio, there, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
     core = ((ratio < 1) * there).sum(-1)
-    crowd = ((total[..., 0] - core) > _CROWD * core)[:, 0]
+    crowd = total[:, 0] - core > _CROWD * core
     variance = torch.tensor(_VARIANCES, dtype=ratio.dtype, device=ratio.device)[:, None]
     # The density of an inlier in units of that of an outlier.
-    density = torch.exp(ratio[..., None, :] * (-0.5 / variance)) * (_peak(k) * _WINDOW**k * variance ** (-k / 2))
-    gain, there, some = density - 1, there[..., None, :], total[..., None].clamp(min=1)
+    density = torch.exp(ratio[:, None] * (-0.5 / variance)) * (_peak(k) * _WINDOW**k * variance ** (-k / 2))
+    gain, there, some = density - 1, there[:, None], total[:, None].clamp(min=1)
     share = torch.full_like(gain[..., :1], 0.5)
     for _ in range(_SHARE_STEPS):
         share = ((there * share * density / (1 + share * gain)).sum(-1, keepdim=True) / some).clamp(max=0.999)
     evidence, index = (there * torch.log1p(share * gain)).sum(-1).max(-1, keepdim=True)
-    return evidence[..., 0], (variance[:, 0][index], share[..., 0].gather(-1, index)), crowd
+    return evidence[:, 0], (variance[:, 0][index], share[..., 0].gather(-1, index)), crowd
 
 
-@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
 def _scale_step(
     estimator: Estimator[M],
     model: M,
@@ -125,7 +119,7 @@ def _scale_step(
     counts: Tensor,
     noise: tuple[Tensor, Tensor],
 ) -> tuple[M, tuple[Tensor, Tensor]]:
-    """A step, and the noise by the distances before it: its variance and the share of inliers in the window, `(g, 1, 1)`."""
+    """A step, and the noise by the distances before it: its variance and the share of inliers in the window, `(g, 1)`."""
     k, found = estimator.codimension, noise
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,13 +130,12 @@ def _scale_step(
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, _MOST)
         found = variance, number / total.clamp(min=1)
-        return falling(ratio * (1 / reach), counts, k)
+        return falling((ratio / reach).clamp(max=1), counts, k)
 
     model = estimator.step(model, *data, weigh=weigh)
     return model, found
 
 
-@fused("g 1", "g 1", "g 1 n", "g", "g n", "g")
 def _reach_at(
     estimator: Estimator[M],
     model: M,
@@ -154,14 +147,14 @@ def _reach_at(
     """The squared reach `(g)` in units of the squared threshold, rounded."""
     _, _, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
     _, reach = _odds_and_reach(total, *noise, estimator.codimension)
-    return torch.exp2((4 * reach[:, 0, 0].log2()).round() / 4)
+    return torch.exp2((4 * reach[:, 0].log2()).round() / 4)
 
 
 def _within_window(squared: Tensor, limit: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Squared distances in units of the squared threshold, at most those of the window, what is within counts, and its sum."""
-    ratio = squared * (1 / limit)[:, None, None]
+    ratio = squared / limit[:, None]
     near = ratio < _WINDOW**2
-    there = (near * counts[:, None]).to(ratio.dtype)
+    there = (near * counts).to(ratio.dtype)
     return torch.where(near, ratio, _WINDOW**2), there, there.sum(-1, keepdim=True)
 
 
