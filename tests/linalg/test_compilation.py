@@ -1,10 +1,11 @@
-"""The switch for compiled kernels: the same answers, every batch size, errors instead of a silent fall back."""
+"""The switch for compiled functions: the same answers in both modes, for every size of a batch."""
 
 import subprocess
 import sys
 
 import pytest
 import torch
+from chance import stream_seed
 from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
@@ -37,48 +38,67 @@ def test_eager_mode_imports_no_compiler() -> None:
     assert done.returncode == 0, done.stderr
 
 
-PROGRAM = """
+SIZES = """
 import torch
-from torchsfm import compile_kernels, homography_4pt
+from torchsfm import compile_kernels
 from torchsfm.linalg.compilation import kernel
 
-@kernel(chunk=4)
+traced = 0
+
+@kernel(chunk=40)
 def doubled(x, y, *, factor=2.0):
+    global traced
+    traced += torch.compiler.is_compiling()
     return factor * x, x[0] + y
 
-@kernel
-def broken(x):
-    return (x * len(x[0].nonzero().tolist()),)
-
-def message(call):
-    try:
-        call()
-    except Exception as error:
-        return f"{type(error).__name__}: {error}"
-    return "no error"
-
-x1, x2 = torch.rand(2, 500, 4, 2, dtype=torch.float64)
-x1[7, 2] = torch.nan
-plain = homography_4pt(x1, x2)
 compile_kernels()
-fast = homography_4pt(x1, x2)
-assert torch.equal(fast.valid, plain.valid) and not fast.valid[7].any()
-torch.testing.assert_close(fast.model, plain.model, rtol=1e-6, atol=1e-9)
 for dtype in (torch.float64, torch.float32):
-    for batch in (1, 2, 17, 33, 20000):
+    for batch in (0, 1, 2, 17, 33, 200):
         x, y = torch.randn(2, batch, dtype=dtype), torch.randn(batch, dtype=dtype)
         a, b = doubled(x, y)
         assert torch.equal(a, 2 * x) and torch.equal(b, x[0] + y) and b.dtype == dtype
-text = message(lambda: broken(torch.ones(1, 40)))
-assert "Unsupported" in text or "data-dependent" in text.lower(), text
-torch.use_deterministic_algorithms(True)
-text = message(lambda: doubled(x, y))
-assert "compiled more than once" in text, text
+compile_kernels(False)
+before = traced
+doubled(x, y)
+assert 0 < before == traced
+"""
+
+SOLVERS = """
+import sys
+import torch
+from torchsfm import camera_p3p, compile_kernels, essential_5pt, fundamental_7pt, homography_4pt
+from torchsfm.motion.relative_5pt import relative_5pt
+
+torch.manual_seed(int(sys.argv[1]))
+def images(n):
+    x = torch.rand(500, n, 2, dtype=torch.float64)
+    x[7, 2] = torch.nan
+    return x
+
+def rays(n):
+    x = torch.randn(500, n, 3, dtype=torch.float64)
+    x[7, 2] = torch.nan
+    return x
+
+slack = torch.full((500,), 1e-3, dtype=torch.float64)
+calls = (homography_4pt, images(4), images(4)), (fundamental_7pt, images(7), images(7)), (camera_p3p, rays(3), rays(3))
+for solver, *sample in (*calls, (essential_5pt, rays(5), rays(5)), (relative_5pt, rays(5), rays(5), slack)):
+    plain = solver(*sample)
+    compile_kernels()
+    fast = solver(*sample)
+    compile_kernels(False)
+    assert not fast.valid[7].any()
+    # Solutions may be found in another order, or be lost, where rounding decides: where two nearly coincide.
+    one, other = (torch.where(s.valid.view(500, -1, 1), s.model.flatten(2), torch.inf) for s in (plain, fast))
+    apart = torch.minimum((one[:, :, None] - other[:, None]).abs().amax(-1), (one[:, :, None] + other[:, None]).abs().amax(-1))
+    found = (apart.nan_to_num(nan=0.0).amin(-1) < 1e-6).all(-1)
+    assert found.double().mean() > 0.98, (solver.__name__, found.double().mean())
 """
 
 
 @pytest.mark.slow
-def test_compiled_kernels_give_the_same_or_an_error() -> None:
+@pytest.mark.parametrize("program", [SIZES, SOLVERS], ids=["sizes", "solvers"])
+def test_compiled_functions_give_the_same(program: str) -> None:
     # In a process of its own, without the type checker's wrappers that dynamo cannot see through.
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", program, str(stream_seed())], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -5,9 +5,7 @@ from chance import assert_share
 from torch import Tensor
 from two_view_scenes import F64, two_views
 
-from torchsfm.motion import _essential_numbers, essential_5pt, relative_5pt
-from torchsfm.motion._essential_manifold import from_roots
-from torchsfm.motion._five_points import five_point_roots
+from torchsfm.motion import essential_5pt, relative_5pt
 from torchsfm.tensors import essential_from_pose
 
 
@@ -61,24 +59,3 @@ def test_poses_are_those_in_front(generator: torch.Generator) -> None:
     assert (gap[behind] > 1e-6).all()
     # The valid slots come first.
     assert not (~found.valid[:, :-1] & found.valid[:, 1:]).any()
-
-
-def test_formulas_for_the_compiler_are_the_same(generator: torch.Generator) -> None:
-    d1, d2, _ = rays(generator, 100)
-    roots = five_point_roots(d1.permute(2, 1, 0), d2.permute(2, 1, 0), steps=1)
-    rows = roots.rows, roots.s, roots.t, roots.basis
-    data = torch.cat((roots.d1, roots.d2))[..., roots.item]
-    slack = torch.full_like(roots.s, 1e-3)
-    whole, number = from_roots.function(*rows), _essential_numbers.from_roots(*rows)
-    fine = whole[2] < 1e-6
-    assert_share(fine, 0.9)
-    for a, b in zip(whole, number, strict=True):
-        torch.testing.assert_close(a[..., fine], b[..., fine], rtol=0, atol=1e-9)
-    u, worth = relative_5pt._starts.function(*rows, data, slack)
-    v, likewise = _essential_numbers.starts(*rows, data, slack + relative_5pt._MARGIN, relative_5pt._GAP)
-    torch.testing.assert_close(u, v, rtol=0, atol=1e-7)
-    assert_share(worth == likewise, 0.99)
-    whole, number = (f(u, roots.basis, data, slack) for f in (relative_5pt._polished.function, _essential_numbers.polished))
-    for a, b in zip(whole[:2], number[:2], strict=True):
-        torch.testing.assert_close(a[..., fine], b[..., fine], rtol=0, atol=1e-7)
-    assert_share(whole[2] == number[2], 0.99)

@@ -32,8 +32,6 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
 
 def nullspace_columns(a: Float[Tensor, "n m batch"]) -> tuple[Float[Tensor, "n k batch"], Float[Tensor, " batch"]]:
     """`nullspace_rows` with the matrices and the basis transposed, which is faster; what is in `a` is lost."""
-    if torch.compiler.is_compiling():
-        return _nullspace_numbers(a)
     n, m, batch = a.shape
     reflections: list[tuple[list[Tensor], Tensor, Tensor]] = []
     smallest = None
@@ -62,34 +60,6 @@ def nullspace_columns(a: Float[Tensor, "n m batch"]) -> tuple[Float[Tensor, "n k
         basis[i:].addcmul_(v[:, None], product)
     assert smallest is not None
     return basis, smallest
-
-
-def _nullspace_numbers(a: Tensor) -> tuple[Tensor, Tensor]:
-    """`nullspace_columns` number by number, as a compiler wants it."""
-    n, m, _ = a.shape
-    columns = [list(column.unbind(0)) for column in a.unbind(1)]
-    reflections: list[tuple[list[Tensor], Tensor]] = []
-    smallest = None
-    for i in range(m):
-        v = columns[i][i:]
-        length = combine_rows(v, v).sqrt()
-        smallest = length if smallest is None else torch.minimum(smallest, length)
-        signed = torch.copysign(length, v[0])
-        v[0] = v[0] + signed
-        reflections.append((v, -1 / (signed * v[0])))
-        for column in columns[i + 1 :]:
-            product = combine_rows(column[i:], v) * reflections[-1][1]
-            column[i:] = [torch.addcmul(x, y, product) for x, y in zip(column[i:], v, strict=True)]
-    basis = []
-    for k in range(m, n):
-        vector = [torch.full_like(a[0, 0], float(i == k)) for i in range(n)]
-        for i in range(m - 1, -1, -1):
-            v, beta = reflections[i]
-            product = combine_rows(vector[i:], v) * beta
-            vector[i:] = [torch.addcmul(x, y, product) for x, y in zip(vector[i:], v, strict=True)]
-        basis.append(torch.stack(vector))
-    assert smallest is not None
-    return torch.stack(basis, 1), smallest
 
 
 def null_vector(

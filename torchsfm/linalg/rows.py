@@ -5,7 +5,6 @@
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 
@@ -32,8 +31,3 @@ def combine_rows(rows: Tensor | Sequence[Tensor], weights: Tensor | Sequence[Ten
     for row, weight in zip(rows[1:], weights[1:], strict=True):
         total.addcmul_(row, weight)
     return total
-
-
-def multiply_into(out: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Write a b into rows of a larger tensor without a temporary, in the way that eager mode or the compiler wants."""
-    return out.copy_(a * b) if torch.compiler.is_compiling() else torch.mul(a, b, out=out)

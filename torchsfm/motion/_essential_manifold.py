@@ -5,8 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg.compilation import kernel
-from torchsfm.linalg.rows import add_rows, combine_rows, multiply_into
-from torchsfm.motion import _essential_numbers
+from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.motion._five_points import back_substitute, gone_round, longest, normalised, products_of_minors
 
 
@@ -47,8 +46,8 @@ def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tu
     v1, v2 = v.unbind(0)
     normals = E.new_empty(3, 3, 3, E.shape[-1])
     normals[0] = C
-    multiply_into(normals[1], u1, v1).addcmul_(u2, v2, value=-1)
-    multiply_into(normals[2], u1, v2).addcmul_(u2, v1)
+    torch.mul(u1, v1, out=normals[1]).addcmul_(u2, v2, value=-1)
+    torch.mul(u1, v2, out=normals[2]).addcmul_(u2, v1)
     products = combine_rows(normals.view(3, 9, 1, -1).unbind(1), basis.unbind(1))
     values = combine_rows(products.unbind(1), u.unbind(0))
     values *= values.new_tensor([2 / 3, 0.5, 0.5])[:, None]
@@ -61,17 +60,15 @@ def polish(u: Float[Tensor, "4 roots"], basis: Float[Tensor, "4 9 roots"]) -> tu
     m12, m13 = (p1 * q[2:]).addcmul_(p[2:], q1, value=-1)
     m23 = (p2 * q3).addcmul_(p3, q2, value=-1)
     new = torch.empty_like(u)
-    multiply_into(new[0], m12, r3).addcmul_(m13, r2, value=-1).addcmul_(m23, r1)
-    multiply_into(new[1], m03, r2).addcmul_(m02, r3, value=-1).addcmul_(m23, r0, value=-1)
-    multiply_into(new[2], m01, r3).addcmul_(m03, r1, value=-1).addcmul_(m13, r0)
-    multiply_into(new[3], m02, r1).addcmul_(m01, r2, value=-1).addcmul_(m12, r0, value=-1)
+    torch.mul(m12, r3, out=new[0]).addcmul_(m13, r2, value=-1).addcmul_(m23, r1)
+    torch.mul(m03, r2, out=new[1]).addcmul_(m02, r3, value=-1).addcmul_(m23, r0, value=-1)
+    torch.mul(m01, r3, out=new[2]).addcmul_(m03, r1, value=-1).addcmul_(m13, r0)
+    torch.mul(m02, r1, out=new[3]).addcmul_(m01, r2, value=-1).addcmul_(m12, r0, value=-1)
     return normalised(new), values.abs_().amax(0).mul_(2**0.5)
 
 
 @kernel(chunk=1 << 20)
 def from_roots(rows: Tensor, s: Tensor, t: Tensor, basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """A Newton step from the solution for each root s / t of the determinant: the coordinates, E, and the error before."""
-    if torch.compiler.is_compiling():
-        return _essential_numbers.from_roots(rows, s, t, basis)
     u, error = polish(back_substitute(rows, s, t), basis)
     return u, combine(u, basis), error

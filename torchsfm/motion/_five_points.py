@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.linalg.rows import add_rows, combine_rows, multiply_into, take_columns
+from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 
 # Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w), the last ones by powers of z; quadratic
 # ones as pairs, squares first.
@@ -153,7 +153,7 @@ def constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"]
 
 
 def _sum_of_products(left: Sequence[Tensor], right: Sequence[Tensor], out: Tensor) -> None:
-    multiply_into(out, left[0], right[0]).addcmul_(left[1], right[1]).addcmul_(left[2], right[2])
+    torch.mul(left[0], right[0], out=out).addcmul_(left[1], right[1]).addcmul_(left[2], right[2])
 
 
 def eliminate(A: Float[Tensor, "20 10 batch"]) -> Float[Tensor, "10 6 batch"]:
@@ -176,8 +176,8 @@ def back_substitute(rows: Float[Tensor, "13 3 roots"], s: Tensor, c: Tensor) -> 
     n = longest(add_rows((C * C).unbind(1)).unbind(0), C.unbind(0))
     u = n.new_empty(4, n.shape[-1])
     u[:2] = n[:2]
-    multiply_into(u[2], s, n[2])
-    multiply_into(u[3], c, n[2])
+    torch.mul(s, n[2], out=u[2])
+    torch.mul(c, n[2], out=u[3])
     return normalised(u)
 
 

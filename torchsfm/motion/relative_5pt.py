@@ -12,8 +12,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.linalg.compilation import kernel
 from torchsfm.linalg.real_roots import number_among_equals
-from torchsfm.linalg.rows import add_rows, combine_rows, multiply_into, take_columns
-from torchsfm.motion import _essential_numbers
+from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.motion._essential_manifold import combine, polish
 from torchsfm.motion._five_points import back_substitute, five_point_roots, gone_round, longest, normalised, products_of_minors
 from torchsfm.optim import attach_implicit, wants_derivative
@@ -108,8 +107,6 @@ def _poses(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack
 def _starts(matrices: Tensor, s: Tensor, t: Tensor, basis: Tensor, rays: Tensor, slack: Tensor) -> tuple[Tensor, Tensor]:
     """The coordinates of the solution for each root s / t, and whether it may have a pose in front."""
     slack = slack + _MARGIN
-    if torch.compiler.is_compiling():
-        return _essential_numbers.starts(matrices, s, t, basis, rays, slack, _GAP)
     u = back_substitute(matrices, s, t)
     _, front, gap = _in_front(combine(u, basis), rays, slack, only_whether=True)
     return u, front | ~(gap < _GAP)
@@ -118,8 +115,6 @@ def _starts(matrices: Tensor, s: Tensor, t: Tensor, basis: Tensor, rays: Tensor,
 @kernel(chunk=1 << 20)
 def _polished(u: Tensor, basis: Tensor, rays: Tensor, slack: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """A Newton step: coordinates, pose, whether it is in front, and the error before."""
-    if torch.compiler.is_compiling():
-        return _essential_numbers.polished(u, basis, rays, slack)
     u, error = polish(u, basis)
     return u, *_in_front(combine(u, basis), rays, slack)[:2], error
 
@@ -155,6 +150,6 @@ def _in_front(
     if only_whether:
         return C, ahead | behind, gap
     pose = E.new_empty(3, 4, E.shape[-1])
-    multiply_into(pose[:, :3], T, sign).add_(C)
-    multiply_into(pose[:, 3], t, torch.where(ahead, 1.0, -1.0).to(t.dtype))
+    torch.mul(T, sign, out=pose[:, :3]).add_(C)
+    torch.mul(t, torch.where(ahead, 1.0, -1.0).to(t.dtype), out=pose[:, 3])
     return pose.view(12, -1), ahead | behind, gap

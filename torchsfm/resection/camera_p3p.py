@@ -10,21 +10,9 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg.compilation import kernel
-from torchsfm.linalg.vectors import (
-    Vector,
-    across,
-    cross,
-    dot,
-    each,
-    fma,
-    fms,
-    minus,
-    scaled,
-    triad,
-    vectors,
-)
+from torchsfm.linalg.vectors import across, cross, dot, fma
 from torchsfm.optim import wants_derivative
-from torchsfm.resection._triangle import Points, Triangle
+from torchsfm.resection._triangle import Triangle
 
 
 def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"]) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:
@@ -70,25 +58,19 @@ def _solve(rays: Tensor, points: Tensor, eps: float, differentiable: bool) -> tu
     sound = _sound(rays.detach(), points.detach(), eps)
     safe = torch.tensor(_SAFE, dtype=rays.dtype, device=rays.device)[:, None]
     rays, points = torch.where(sound, rays, safe), torch.where(sound, points, safe)
-    u: Points
-    X: Points
-    if torch.compiler.is_compiling():
-        u, X = [scaled(ray, dot(ray, ray).rsqrt()) for ray in vectors(rays)], vectors(points)
-    else:
-        rays, X = rays.view(3, 3, -1), points.view(3, 3, -1)
-        u = rays * (rays * rays).sum(1, keepdim=True).rsqrt()
+    rays, X = rays.view(3, 3, -1), points.view(3, 3, -1)
+    u = rays * (rays * rays).sum(1, keepdim=True).rsqrt()
     with torch.no_grad():
-        triangle = Triangle(*(v.detach() if isinstance(v, Tensor) else v for v in (u, X)))
+        triangle = Triangle(u.detach(), X.detach())
         depths, valid = triangle.candidates()
         depths, valid = triangle.polish(depths, valid & sound)
     if differentiable:
         depths = Triangle(u, X).follow(depths, valid)
-    if isinstance(u, list) or isinstance(X, list):
-        assert isinstance(u, list)
-        assert isinstance(X, list)
-        return _pose(u, X, depths), valid
-    assert isinstance(depths, Tensor)
-    return _stacked_pose(u, X, depths, valid if differentiable else None), valid
+    Y = u.unsqueeze(2) * depths.unsqueeze(1)
+    if differentiable:
+        # Empty slots have no derivative.
+        Y = torch.where(valid, Y, Y.detach())
+    return _pose(X, Y), valid
 
 
 def equations(
@@ -104,7 +86,7 @@ def equations(
     rows, columns = torch.triu_indices(3, 3, device=R.device)
     Y = X @ R.mT + t[..., None, :]
     u = d / torch.linalg.vector_norm(d, dim=-1, keepdim=True)
-    sideways = [dot(Y.unbind(-1), e) / torch.linalg.vector_norm(Y.detach(), dim=-1) for e in across(u.unbind(-1))]
+    sideways = [dot(Y.movedim(-1, 0), e) / torch.linalg.vector_norm(Y.detach(), dim=-1) for e in across(u.movedim(-1, 0))]
     shape = broadcast_shapes(gram.shape[:-2], sideways[0].shape[:-1])
     return torch.cat([g.expand(*shape, -1) for g in (gram[..., rows, columns], *sideways)], -1)
 
@@ -118,9 +100,9 @@ def _sound(rays: Tensor, points: Tensor, eps: float) -> Tensor:
     # What is not finite is not 0 when subtracted from itself.
     zero = torch.cat((rays, points))
     zero = (zero - zero).sum(0)
-    X0, X1, X2 = vectors(points)
-    e1, e2 = minus(X1, X0), minus(X2, X0)
-    e3, normal = minus(e2, e1), cross(e1, e2)
+    X = points.view(3, 3, -1)
+    e1, e2 = X[1] - X[0], X[2] - X[0]
+    e3, normal = e2 - e1, cross(e1, e2)
     longest = torch.maximum(torch.maximum(dot(e1, e1), dot(e2, e2)), dot(e3, e3))
     # Twice the area against the longest side squared; rounding of far coordinates also counts.
     reach = (points * points).sum(0)
@@ -132,40 +114,17 @@ def _sound(rays: Tensor, points: Tensor, eps: float) -> Tensor:
     return (zero == 0) & (area > bound) & (shortest > 1e-200) & (longest_ray < torch.inf)
 
 
-def _stacked_pose(u: Tensor, X: Tensor, depths: Tensor, valid: Tensor | None) -> Tensor:
-    """As `_pose`, all points in one tensor (point, coordinate, problem); slots that are not `valid`, if given, detached."""
-    Y = u.unsqueeze(2) * depths.unsqueeze(1)
-    if valid is not None:
-        Y = torch.where(valid, Y, Y.detach())
+def _pose(X: Tensor, Y: Tensor) -> Tensor:
+    """`[R | t]` (3, 4, slot, problem) that takes the triangle X (point, coordinate, problem) to those of the slots."""
     # The triangle in the world as one more slot.
     points = torch.cat((X.unsqueeze(2), Y), 2)
     sides = points[1:] - points[:1]
     middle = points.sum(0) * (1 / 3)
     side = sides[0]
-    axes = torch.stack((side, _cross(side, sides[1])))
+    axes = torch.stack((side, cross(side, sides[1])))
     axes = axes * (axes * axes).sum(1, keepdim=True).clamp_min(1e-300).rsqrt()
     # Along the side, normal to the triangle, and across.
-    frame = [axes[0], axes[1], _cross(axes[1], axes[0])]
+    frame = [axes[0], axes[1], cross(axes[1], axes[0])]
     world, (x, y, z) = [v[:, :1] for v in frame], [v[:, None, 1:] for v in frame]
     R = fma(x, world[0], fma(y, world[1], z * world[2]))
     return torch.cat((R, (middle[:, 1:] - (R * middle[:, :1]).sum(1)).unsqueeze(1)), 1)
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    v = cross(a, b)
-    assert isinstance(v, Tensor)
-    return v
-
-
-def _pose(u: list[Vector], X: list[Vector], depths: Vector) -> Tensor:
-    """`[R | t]` (3, 4, slot, problem) that takes the triangle X to the one at the depths, number by number."""
-    Y = [scaled(ray, depth) for ray, depth in zip(u, depths, strict=True)]
-    a = triad(minus(X[1], X[0]), minus(X[2], X[0]))
-    b = triad(minus(Y[1], Y[0]), minus(Y[2], Y[0]))
-    columns = [each(lambda x, y, z, j=j: fma(x, a[0][j], fma(y, a[1][j], z * a[2][j])), *b) for j in range(3)]
-    m = each(lambda x, y, z: (x + y + z) * (1 / 3), *X)
-    t = each(lambda x, y, z: (x + y + z) * (1 / 3), *Y)
-    for j in range(3):
-        t = each(lambda x, y, j=j: fms(y, m[j], x), t, columns[j])
-    columns.append(t)
-    return torch.stack([v[i] for i in range(3) for v in columns]).view(3, 4, *t[0].shape)
