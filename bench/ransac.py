@@ -22,7 +22,6 @@ from torch import Tensor
 
 from bench.ransac_peers import CONFIDENCE, MOST, PEERS, answer, installed
 from bench.ransac_real import report
-from torchsfm import compile_kernels
 from torchsfm.geometry import random_rotation, rotation_angle, rotation_from_rotvec
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography
 from torchsfm.resection import estimate_camera
@@ -158,10 +157,7 @@ def grid(arguments: argparse.Namespace) -> None:
                     peer(name, model, part(scene, slice(1)))
                     seconds, found = measure(lambda: peer(name, model, few))  # noqa: B023
                     rows.append((name, seconds / len(found), errors(model, few, found)))
-                start = time.perf_counter()
                 ours(model, part(scene, slice(2)))
-                if arguments.compile:
-                    print(f"{model:5} {points:6} {ratio:7.2f} compiled in {time.perf_counter() - start:.1f} s", flush=True)
                 if arguments.single:
                     seconds, parts = 0.0, []
                     for i in range(arguments.single):
@@ -191,12 +187,10 @@ def main() -> None:
     parser.add_argument("--peer-pairs", type=int, default=64, help="how many pairs the peers get")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--compile", action="store_true", help="call compile_kernels; it says how long the first pairs took")
     parser.add_argument("--peers", default=",".join(PEERS), help=f"any of {', '.join(PEERS)}")
     parser.add_argument("--real", type=Path, help="folder of the real data sets")
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    compile_kernels(arguments.compile)
     with contextlib.suppress(ImportError):
         import cv2
 

@@ -26,7 +26,7 @@ def short_row(case: Case, options: argparse.Namespace) -> str:
     """One solver's line of the short table."""
     double, single = (recall.recall(case, "random", options.samples, d).share for d in (torch.float64, torch.float32))
     hard = min((recall.recall(case, family, options.samples, torch.float64).share, family) for family in case.families)
-    times = speed.speeds(case, options.batch, options.repeats, not options.no_compile)
+    times = speed.speeds(case, options.batch, options.repeats)
     peers = ", ".join(f"{name} {1e6 * times[name]:.2f}" for name in case.peers if name in times)
     cells = [
         f"`{case.name}`",
@@ -35,15 +35,15 @@ def short_row(case: Case, options: argparse.Namespace) -> str:
         f"{double:.4f} / {single:.4f}",
         f"{hard[0]:.4f}" + (f" ({hard[1]})" if hard[0] < 1 else ""),
     ]
-    cells += [f"{1e6 * times['eager']:.2f}", f"{1e6 * times['compiled']:.2f}" if "compiled" in times else "", peers]
+    cells += [f"{1e6 * times['torchsfm']:.2f}", peers]
     return "| " + " | ".join(cells) + " |"
 
 
 def write_results(rows: list[str]) -> None:
     """Put the table between the markers."""
     table = [
-        "| solver | data | solutions | recall f64 / f32 | least recall on hard scenes | µs | µs compiled | µs of others |",
-        "|---|---|---|---|---|---|---|---|",
+        "| solver | data | solutions | recall f64 / f32 | least recall on hard scenes | µs | µs of others |",
+        "|---|---|---|---|---|---|---|",
         *rows,
     ]
     text = RESULTS.read_text()
@@ -65,7 +65,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--gradient-samples", type=int, default=100_000)
     parser.add_argument("--batch", type=int, default=16384, help="samples for timing")
     parser.add_argument("--repeats", type=int, default=5, help="rounds of timing")
-    parser.add_argument("--no-compile", action="store_true", help="leave out torch.compile, which takes minutes the first time")
     parser.add_argument("--write", action="store_true", help="write the short table into RESULTS.md and print nothing else")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
@@ -80,7 +79,7 @@ def main(arguments: list[str] | None = None) -> None:
             if part == "recall":
                 recall.report(case, options.samples, options.peer_samples)
             elif part == "speed":
-                speed.report(case, options.batch, options.repeats, not options.no_compile)
+                speed.report(case, options.batch, options.repeats)
             elif part == "counts":
                 counts.report(case, options.samples)
             elif part == "gradients":

@@ -169,7 +169,6 @@ from torchsfm.images import (
     track_points,
     track_sequence,
 )
-from torchsfm.linalg import compile_kernels
 from torchsfm.motion import (
     AffineFactorization,
     ConicEpipolarFit,
@@ -558,7 +557,6 @@ __all__ = [
     "cameras_from_quadrifocal",
     "cameras_from_trifocal",
     "canonical_cameras",
-    "compile_kernels",
     "conic_distance",
     "conic_from_ellipse",
     "conics_2view",

@@ -64,8 +64,6 @@ class Case:
     peers: Mapping[str, Peer] = field(default_factory=dict)
     masked: bool = True
     """Whether the solver says which of its models are solutions; one made by `one_slot` does not."""
-    compiled: bool = False
-    """Whether its hot parts are kernels that `torchsfm.compile_kernels` compiles."""
     wanted: float = 0.9999
     """Recall on random scenes in float64."""
     published: float | None = None

@@ -185,7 +185,6 @@ CASES: tuple[Case, ...] = (
         degenerate=("repeated points", "collinear", "all at infinity", "pure rotation", "zero baseline"),
         peers={"PoseLib": Peer("poselib", poselib_p3p), "OpenCV": Peer("cv2", opencv_p3p)},
         published=4.5e6,
-        compiled=True,
     ),
     Case(
         "camera_up2p",

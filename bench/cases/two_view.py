@@ -269,7 +269,6 @@ CASES: tuple[Case, ...] = (
         },
         wanted=0.999,
         published=0.20e6,
-        compiled=True,
     ),
     Case(
         "fundamental_7pt",
@@ -285,7 +284,6 @@ CASES: tuple[Case, ...] = (
             "kornia": Peer("kornia", kornia_7pt, batched=True),
         },
         published=0.68e6,
-        compiled=True,
     ),
     Case(
         "homography_4pt",
@@ -301,7 +299,6 @@ CASES: tuple[Case, ...] = (
             "kornia": Peer("kornia", kornia_homography, batched=True),
         },
         published=23.2e6,
-        compiled=True,
     ),
     Case(
         "fundamental_8pt",

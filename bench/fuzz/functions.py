@@ -398,7 +398,6 @@ EXCEPTIONS: dict[str, str] = {
     "formats.undistorted_model": "hands a model to undistorted_cameras",
     **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},
     **{f"images.{name}": FILES for name in ("parse_exif", "read_image", "save_image")},
-    "linalg.compile_kernels": "a switch",
     "optim.wants_derivative": "a question about tensors, not their values",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.reconstruct_matches": "lists of tensors; its stages are tried by reconstruct_tracks",

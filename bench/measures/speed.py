@@ -7,9 +7,8 @@ from typing import Any
 
 import torch
 
-from bench.cases.case import Case, Sample
+from bench.cases.case import Case
 from bench.measures.recall import drawn, singles
-from torchsfm import compile_kernels
 
 SINGLES = 500
 """Samples of a round of a program that takes one at a time."""
@@ -22,12 +21,10 @@ def timed(function: Callable[[], Any], samples: int) -> float:
     return (time.process_time() - start) / samples
 
 
-def programs(case: Case, batch: int, compiled: bool) -> dict[str, tuple[Callable[[], Any], int]]:
+def programs(case: Case, batch: int) -> dict[str, tuple[Callable[[], Any], int]]:
     """Calls to be timed, and how many samples each solves."""
     sample, _ = drawn(case, "random", batch, torch.float64)
-    calls: dict[str, tuple[Callable[[], Any], int]] = {"eager": (partial(case.solve, *sample), batch)}
-    if compiled and case.compiled:
-        calls["compiled"] = partial(solved_compiled, case, sample), batch
+    calls: dict[str, tuple[Callable[[], Any], int]] = {"torchsfm": (partial(case.solve, *sample), batch)}
     for name, peer in case.peers.items():
         if not peer.installed():
             continue
@@ -40,23 +37,14 @@ def programs(case: Case, batch: int, compiled: bool) -> dict[str, tuple[Callable
     return calls
 
 
-def solved_compiled(case: Case, sample: Sample) -> None:
-    """The first call compiles."""
-    compile_kernels()
-    try:
-        case.solve(*sample)
-    finally:
-        compile_kernels(False)
-
-
 def looped(solve: Callable[..., Any], few: list[tuple[Any, ...]]) -> None:
     for one in few:
         solve(*one)
 
 
-def speeds(case: Case, batch: int, repeats: int, compiled: bool) -> dict[str, float]:
+def speeds(case: Case, batch: int, repeats: int) -> dict[str, float]:
     """The least seconds a sample of every program, in alternating rounds after one to warm up."""
-    calls = programs(case, batch, compiled)
+    calls = programs(case, batch)
     best = dict.fromkeys(calls, float("inf"))
     for round_ in range(repeats + 1):
         for name, (call, samples) in calls.items():
@@ -65,9 +53,9 @@ def speeds(case: Case, batch: int, repeats: int, compiled: bool) -> dict[str, fl
     return best
 
 
-def report(case: Case, batch: int, repeats: int, compiled: bool) -> dict[str, float]:
+def report(case: Case, batch: int, repeats: int) -> dict[str, float]:
     """Print a line for each program."""
-    found = speeds(case, batch, repeats, compiled)
+    found = speeds(case, batch, repeats)
     if case.published:
         found["PoseLib's C++ (published)"] = 1 / case.published
     for program, seconds in found.items():

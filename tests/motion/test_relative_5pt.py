@@ -1,4 +1,4 @@
-"""The poses of five rays against all of every essential matrix, and formulas for compilers against those for eager mode."""
+"""The poses of five rays against all of every essential matrix."""
 
 import torch
 from chance import assert_share

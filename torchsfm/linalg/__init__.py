@@ -1,6 +1,5 @@
 """Numbers without geometry: decompositions that never raise, null spaces, roots of polynomials, nearest matrices."""
 
-from torchsfm.linalg.compilation import compile_kernels
 from torchsfm.linalg.damped_solve import damped_solve
 from torchsfm.linalg.decompositions import eigh, eigvals, eigvalsh, inverse, qr, solve, svd, svdvals, triangular_factor
 from torchsfm.linalg.elimination import adjugate_3x3, adjugate_4x4, cross, determinant_3x3
@@ -15,7 +14,6 @@ __all__ = [
     "adjugate_3x3",
     "adjugate_4x4",
     "companion_roots",
-    "compile_kernels",
     "cross",
     "damped_solve",
     "determinant_3x3",

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.motion._five_points import back_substitute, gone_round, longest, normalised, products_of_minors
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import determinant_3x3
-from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.polynomial import cubic_rows
 from torchsfm.linalg.rows import combine_rows

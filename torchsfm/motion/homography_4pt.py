@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.vectors import fma, fms
 from torchsfm.optim import attach_implicit, wants_derivative
 

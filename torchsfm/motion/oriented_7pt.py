@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.linalg.vectors import cross, fma, fms
 from torchsfm.motion.epipolar_fit import MIXTURE, with_left_epipole

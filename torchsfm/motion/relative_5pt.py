@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes
-from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.real_roots import number_among_equals
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.motion._essential_manifold import combine, polish

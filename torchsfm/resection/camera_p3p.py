@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
-from torchsfm.linalg.compilation import kernel
+from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.vectors import across, cross, dot, fma
 from torchsfm.optim import wants_derivative
 from torchsfm.resection._triangle import Triangle
