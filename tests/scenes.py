@@ -218,6 +218,26 @@ def _point(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generato
     return Scene(kind(), (_image(Y, noise, generator), P.flatten(-2)), X, relative, _wrong_first, noise)
 
 
+def _line(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    """Segments of a line in n cameras around it, each of a piece of its own."""
+    scene = _point(kind, batch, n, generator, 0.0)
+    P = scene.data[1].unflatten(-1, (3, 4))
+    d = torch.nn.functional.normalize(torch.randn(*batch, 3, generator=generator, dtype=torch.float64), dim=-1)
+    at = torch.tensor([-1.0, 1.0]) + torch.rand(*batch, n, 2, generator=generator, dtype=torch.float64) - 0.5
+    X = scene.model[..., None, None, :] + at[..., None] * d[..., None, None, :]
+    Y = X @ P[..., :3].mT + P[..., None, :, 3]
+    x = Y[..., :2] / Y[..., 2:] + noise * torch.randn(*batch, n, 2, 2, generator=generator, dtype=torch.float64)
+    model = torch.cat((d, torch.linalg.cross(scene.model, d)), -1)
+    error = lambda A, B: torch.minimum((A - B).norm(dim=-1), (A + B).norm(dim=-1))  # noqa: E731
+    return Scene(kind(), (x.flatten(-2), scene.data[1]), model, error, _wrong_ends, noise)
+
+
+def _wrong_ends(data: tuple[Tensor, ...], wrong: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Spread the ends of segments over the image."""
+    anywhere = torch.rand(data[0].shape, generator=generator, dtype=data[0].dtype) * 2 - 1
+    return torch.where(wrong[..., None], anywhere, data[0]), data[1]
+
+
 _SCENES: dict[str, Callable[..., Scene]] = {
     "oriented_fundamental": _two_views,
     "relative_pose": _two_views,
@@ -228,5 +248,6 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "point_line_camera": _point_line_camera,
     "focal_camera": _focal_camera,
     "projective_camera": _projective_camera,
+    "line": _line,
     "point": _point,
 }

@@ -171,6 +171,13 @@ def _segments(s: Scene) -> Tensor:
     return torch.stack([project_points(s.cameras(1)[..., 0, :, :], X) for X in s.space_lines(12)], -2) + 0.3 * s.randn(12, 2, 2)
 
 
+def _all_segments(s: Scene) -> Tensor:
+    """Of lines in all views."""
+    ends = torch.stack(s.space_lines(12), -2).flatten(-3, -2)
+    seen = project_points(s.cameras(4), ends[..., None, :, :])
+    return seen.unflatten(-2, (12, 2)) + 0.3 * s.randn(4, 12, 2, 2)
+
+
 def _space_lines(s: Scene) -> Tensor:
     return pluecker_from_points(*s.space_lines(12))
 
@@ -381,6 +388,10 @@ FUNCTIONS: dict[str, Function] = {
     "triangulation.triangulate_curves": Function({"curves": _image_curves, "P": lambda s: s.cameras(4), "samples": 12}),
     "triangulation.triangulate_conics": Function(sizes={"n": 2, "k": 12}, together=(("x", "weights"),)),
     "triangulation.triangulate_quadrics": Function({"C": _outlines}, {"n": 2, "k": 12}, together=(("x", "weights"),)),
+    "triangulation.triangulate_lines_robust": Function(
+        {"l": _all_segments, "threshold": 2.0, "generator": _generator}
+        | {"weights": _of_observations, "quality": _of_observations}
+    ),
     "triangulation.triangulate_points_robust": Function(
         {"threshold": 2.0, "generator": _generator, "weights": _of_observations, "quality": _of_observations}
     ),

@@ -94,6 +94,17 @@ def triangulated(result: Any, a: Arguments) -> Iterator[str]:
         yield "unsupported point: called good with hardly an inlier"
 
 
+def triangulated_lines(result: Any, a: Arguments) -> Iterator[str]:
+    """Robust lines whose inliers do not see them where they are."""
+    image = project_lines(a["P"], result.model.double()[..., None, :, :])
+    distance = point_line_distance(a["l"], image[..., None, :]).norm(dim=-1)
+    far = (result.inliers & ~(distance <= _SLACK * a["threshold"])) & (result.status == 0)[..., None, :]
+    if bool(far.any()):
+        yield f"unsupported line: inliers up to {float(distance[far].max()):.1e} away"
+    if bool(((result.status == 0) & (result.inliers.sum(-2) < 2)).any()):
+        yield "unsupported line: called good with hardly an inlier"
+
+
 def solutions(*equations: Equation) -> Judge:
     """Models of a minimal solver, each in a slot after the batch, that do not meet their sample."""
 
@@ -273,6 +284,7 @@ JUDGES: dict[str, Judge] = {
     "resection.estimate_camera": robust(_projections_with_intrinsics, 3),
     "resection.estimate_camera_focal": robust(_projections, 4),
     "resection.estimate_camera_projective": robust(_projections, 6),
+    "triangulation.triangulate_lines_robust": triangulated_lines,
     "triangulation.triangulate_points_robust": triangulated,
 }
 """Of functions of which there is more to say than that what is good is finite."""

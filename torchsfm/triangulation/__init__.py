@@ -5,6 +5,11 @@ from torchsfm.triangulation.optimal_correction import correct_matches
 from torchsfm.triangulation.triangulate_conics import ConicTriangulation, triangulate_conics, triangulate_quadrics
 from torchsfm.triangulation.triangulate_curves import CurveTriangulation, triangulate_curves
 from torchsfm.triangulation.triangulate_lines import LineFault, LineTriangulation, triangulate_lines
+from torchsfm.triangulation.triangulate_lines_robust import (
+    LineEstimator,
+    RobustLineTriangulation,
+    triangulate_lines_robust,
+)
 from torchsfm.triangulation.triangulate_points import Triangulation, triangulate_points
 from torchsfm.triangulation.triangulate_points_dlt import triangulate_points_dlt
 from torchsfm.triangulation.triangulate_points_robust import (
@@ -13,16 +18,18 @@ from torchsfm.triangulation.triangulate_points_robust import (
     triangulate_points_robust,
 )
 
-ESTIMATORS = (PointEstimator,)
+ESTIMATORS = (LineEstimator, PointEstimator)
 """What `ransac` can estimate here; the contract tests run over them."""
 
 __all__ = [
     "ESTIMATORS",
     "ConicTriangulation",
     "CurveTriangulation",
+    "LineEstimator",
     "LineFault",
     "LineTriangulation",
     "PointEstimator",
+    "RobustLineTriangulation",
     "RobustTriangulation",
     "Triangulation",
     "conics_2view",
@@ -30,6 +37,7 @@ __all__ = [
     "triangulate_conics",
     "triangulate_curves",
     "triangulate_lines",
+    "triangulate_lines_robust",
     "triangulate_points",
     "triangulate_points_dlt",
     "triangulate_points_robust",

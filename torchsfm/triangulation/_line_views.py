@@ -13,6 +13,8 @@ from torchsfm.linalg import adjugate_3x3, cross, determinant_3x3, eigh, usable
 SAME = 1e-7
 """Angle between planes, and distance of centres over their own size, below which they are one but for rounding."""
 
+_POINT = 1e-9
+"""Length of an image line, over those of the line and of its projection, that is rounding."""
 _NOISE = 1.5
 """Distances, in units of noise, that say nothing."""
 
@@ -41,9 +43,7 @@ class LineViews(NamedTuple):
 
     def projections(self) -> Tensor:
         """The matrices (n, v, 3, 6) that take Pluecker vectors to image lines."""
-        M, p = self.P[..., :3], self.P[..., 3]
-        direct = torch.stack([cross(p, column) for column in M.unbind(-1)], -1)
-        return torch.cat((direct, adjugate_3x3(M).mT), -1)
+        return line_forms(self.P)
 
     def homogeneous_ends(self) -> Tensor:
         """The ends (n, v, 2, 3)."""
@@ -188,6 +188,25 @@ def seen_points(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(steep[..., None], points, 0.0), steep
 
 
+def line_forms(P: Tensor) -> Tensor:
+    """The matrices (*batch, 3, 6) that take Pluecker vectors to image lines."""
+    M, p = P[..., :3], P[..., 3]
+    direct = torch.stack([cross(p, column) for column in M.unbind(-1)], -1)
+    return torch.cat((direct, adjugate_3x3(M).mT), -1)
+
+
+def through_centre(l: Tensor, line: Tensor, projections: Tensor) -> Tensor:  # noqa: E741
+    """Whether lines pass through the centres of views, but for rounding: what is seen of them is then a point (*batch, v).
+
+    Args:
+        l: Their images (*batch, v, 3).
+        line: The lines (*batch, 6).
+        projections: The matrices (*#batch, v, 3, 6) between them.
+    """
+    size = projections.square().sum((-2, -1)) * line.square().sum(-1, keepdim=True)
+    return l.square().sum(-1) <= _POINT**2 * size
+
+
 def residuals(line: Tensor, projections: Tensor, ends: Tensor) -> Tensor:
     """Signed distances (n, v, 2) of homogeneous ends from images of lines, in pixels."""
     l = (projections @ line[..., None, :, None])[..., 0]  # noqa: E741
@@ -197,8 +216,13 @@ def residuals(line: Tensor, projections: Tensor, ends: Tensor) -> Tensor:
 
 def linearize(line: Tensor, projections: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """The residuals and their derivatives (n, v, 2, 4) along the tangents of `Line3D`."""
+    return slopes_along(line, line_tangents(line), projections, ends)
+
+
+def slopes_along(line: Tensor, tangents: Tensor, projections: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """The residuals (*batch, v, 2) and their derivatives (*batch, v, 2, k) along tangents (*batch, 6, k) of lines."""
     l = (projections @ line[..., None, :, None])[..., 0]  # noqa: E741
-    moved = projections @ line_tangents(line)[..., None, :, :]
+    moved = projections @ tangents[..., None, :, :]
     scale = l[..., :2].square().sum(-1, keepdim=True).clamp_min(1e-200).rsqrt()
     r = (ends * l[..., None, :]).sum(-1) * scale
     stretch = (l[..., :2, None] * moved[..., :2, :]).sum(-2) * scale.square()

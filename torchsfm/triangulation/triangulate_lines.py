@@ -195,7 +195,10 @@ def _start(views: LineViews) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     depth = torch.where(counted, square, 0.0).sum(-1) / counted.sum(-1).clamp_min(1)
     line, singular = linear_lines(outer, views.w / torch.where(counted.any(-1), depth, 1.0).clamp_min(1e-12))
     largest = singular[:, 3].clamp_min(1e-300)
-    fault = torch.where(singular[:, 2] <= SAME * largest, _why(views), int(LineFault.NONE))
+    # Planes of one centre may well meet in different lines, but only through it.
+    why = _why(views)
+    lost = (singular[:, 2] <= SAME * largest) | (why == LineFault.ONE_CENTRE)
+    fault = torch.where(lost, why, int(LineFault.NONE))
     angle = 2 * torch.atan(singular[:, 2] / largest)
     inner_origin, inner_unit = frame_of_line(outer, line)
     line = in_frame(line, inner_origin, inner_unit)
