@@ -187,6 +187,12 @@ def _of_each(s: Scene, n: int) -> Tensor:
     return s.rand(n + 12 * (s.generator.initial_seed() % 2), low=0.2, high=1.0)
 
 
+def _round_picture(s: Scene) -> Tensor:
+    """A bright disc with noise."""
+    y, x = torch.meshgrid(torch.arange(32.0) - 15.3, torch.arange(40.0) - 19.6, indexing="ij")
+    return s.rand(1, 32, 40, high=0.02) + 0.6 * (9.7 - (x * x + y * y).sqrt()).clamp(0, 1)
+
+
 def _picture(s: Scene) -> Tensor:
     """A bright rectangle with noise."""
     image = s.rand(1, 32, 40, high=0.05)
@@ -275,6 +281,7 @@ FUNCTIONS: dict[str, Function] = {
     "images.describe_images": Function({"features": _features, "words": 4, "generator": _generator}, batched=False),
     "images.detect_corners": Function({"image": lambda s: s.rand(1, 32, 40)}, {"h": 32, "w": 40}),
     "images.detect_edges": Function({"image": lambda s: _picture(s), "max_edgels": 500}, {"h": 32, "w": 40}),
+    "images.detect_ellipses": Function({"image": _round_picture, "max_ellipses": 3}, {"h": 32, "w": 40}),
     "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
     "images.fit_ellipse": Function({"x": _edge_points}, {"n": 24}),
     "images.detect_segments": Function({"image": lambda s: _picture(s), "max_segments": 20}, {"h": 32, "w": 40}),
@@ -378,6 +385,16 @@ FUNCTIONS: dict[str, Function] = {
     "simulation.orbit_poses": Function({"views": 3}),
     "simulation.random_bundle_problem": Function(
         {"num_cameras": 3, "num_points": 8, "num_observations": 16, "generator": _generator}
+    ),
+    "simulation.paint_shapes": Function(
+        {
+            "shapes": lambda s: [s.rand(1, 2, high=30.0) + torch.tensor([[0.0, 0], [9, 0], [0, 9]])], "width": 32, "height": 24,
+            "levels": lambda s: s.rand(2),
+        },
+        batched=False,
+    ),
+    "simulation.render_shapes": Function(
+        {"shape": (2,), "ellipses": 3, "polygons": 1, "width": 32, "height": 24, "fine": 2, "generator": _generator}
     ),
     "simulation.random_intrinsics": Function({"shape": (2,), "generator": _generator}),
     "simulation.random_points": Function({"shape": (2,), "generator": _generator}),

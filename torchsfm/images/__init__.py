@@ -2,6 +2,7 @@
 
 from torchsfm.images.corners import Corners, detect_corners
 from torchsfm.images.edges import Edges, detect_edges
+from torchsfm.images.ellipses import Ellipses, detect_ellipses
 from torchsfm.images.exif import Exif, parse_exif
 from torchsfm.images.features import Features, detect_features
 from torchsfm.images.fit_ellipse import EllipseFit, fit_ellipse
@@ -21,6 +22,7 @@ __all__ = [
     "Corners",
     "Edges",
     "EllipseFit",
+    "Ellipses",
     "Exif",
     "Features",
     "HoughLines",
@@ -36,6 +38,7 @@ __all__ = [
     "describe_segments",
     "detect_corners",
     "detect_edges",
+    "detect_ellipses",
     "detect_features",
     "detect_segments",
     "fit_ellipse",

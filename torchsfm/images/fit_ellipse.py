@@ -9,8 +9,9 @@ from torch import Tensor
 from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import Ellipse, normalizing_similarity, transform_points
 from torchsfm.geometry.conic_distance import foot_normal, signed_distance, square_root
-from torchsfm.geometry.conics import ellipse_of_shape, shape_of_dual_conic
-from torchsfm.linalg import adjugate_3x3, eigh, inverse
+from torchsfm.geometry.conics import ellipse_of_shape
+from torchsfm.images.ellipse_moments import extreme, monomials, shape_of_conic
+from torchsfm.linalg import eigh, inverse
 from torchsfm.optim import levenberg_marquardt
 
 _UNSURE = 0.2
@@ -199,9 +200,9 @@ def _start(y: Tensor, w: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Centre and shape matrix of the algebraic ellipse, and whether the points are on no line."""
     count = seen.sum(-1).clamp_min(1)[..., None, None]
     w = (w * count[..., 0] / w.sum(-1, keepdim=True).clamp_min(1e-300))[..., None]
+    xi = monomials(y)
     x, z = y.unbind(-1)
     one, zero = torch.ones_like(x), torch.zeros_like(x)
-    xi = torch.stack((x * x, 2 * x * z, z * z, 2 * x, 2 * z, one), -1)
     slopes = (2 * x, 2 * z, zero, 2 * one, zero, zero), (zero, 2 * x, 2 * z, zero, 2 * one, zero)
     gradient = torch.stack([torch.stack(row, -1) for row in slopes], -1)
     M = xi.mT @ (w * xi) / count
@@ -222,29 +223,14 @@ def _start(y: Tensor, w: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     cross = (w[..., None] * mixed * xi[..., None, :]).sum(-3)
     weighted = (w * length)[..., None] * gradient @ gradient.mT
     N = N - (xi.mT @ (w * trace * xi) + weighted.sum(-3) + cross + cross.mT) / count.square()
-    hyper = _extreme(whiten, N, largest=False)
+    hyper = extreme(whiten, N, signed=False)
     ellipses = torch.zeros(6, 6, dtype=y.dtype, device=y.device)
     ellipses[[0, 2], [2, 0]] = 0.5
     ellipses[1, 1] = -1.0
-    direct = _extreme(whiten, ellipses.expand_as(N), largest=True)
-    centre, D, good = _shape_of(hyper)
-    other_centre, other_D, other = _shape_of(direct)
+    direct = extreme(whiten, ellipses.expand_as(N), signed=True)
+    centre, D, good = shape_of_conic(hyper)
+    other_centre, other_D, other = shape_of_conic(direct)
     centre = torch.where(good[..., None], centre, torch.where(other[..., None], other_centre, 0.0))
     circle = torch.eye(2, dtype=y.dtype, device=y.device)
     D = torch.where(good[..., None, None], D, torch.where(other[..., None, None], other_D, circle))
     return centre, D, values[..., 1] > 1e-15 * values[..., -1]
-
-
-def _extreme(whiten: Tensor, N: Tensor, *, largest: bool) -> Tensor:
-    """The vector that makes v'Nv / v'Mv largest, or largest in size, where `whiten` is a root of the inverse of M."""
-    values, vectors, _ = eigh(whiten.mT @ N @ whiten)
-    index = (values if largest else values.abs()).argmax(-1)
-    best = vectors.gather(-1, index[..., None, None].expand(*index.shape, 6, 1))
-    return (whiten @ best)[..., 0]
-
-
-def _shape_of(theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centre and shape matrix of a conic `a x^2 + 2 b x y + c y^2 + 2 d x + 2 e y + f`."""
-    a, b, c, d, e, f = theta.unbind(-1)
-    C = torch.stack([torch.stack(row, -1) for row in ((a, b, d), (b, c, e), (d, e, f))], -2)
-    return shape_of_dual_conic(adjugate_3x3(C))

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from torchsfm._types import check_options
 from torchsfm.images.edges import detect_edges
+from torchsfm.images.false_alarms import aligned, log_tail
+from torchsfm.images.slots import lay_in_slots
 from torchsfm.images.straight_runs import Runs, axis, moments, straight_runs
 
-_ALIGNED = math.pi / 8
-"""Angle between gradient and normal; an eighth of all directions, of both signs together, is nearer."""
-_CHANCE = 1 / 8
 _ROUNDED = 3
 """Edge points at each end that a corner may have bent."""
 _BESIDE = 0.7
@@ -94,7 +93,7 @@ def detect_segments(
     )
     edges = detect_edges(image, blur=blur, low=low, high=high, noise=noise, mask=mask)
     batch, slots = edges.valid.shape[:-1], edges.valid.shape[-1]
-    images, pixels = batch.numel(), image.shape[-1] * image.shape[-2]
+    pixels = image.shape[-1] * image.shape[-2]
     place = edges.valid.flatten().nonzero()[:, 0]
     of_image = place // slots
     x, gradient = (v.reshape(-1, 2)[place] for v in (edges.x, edges.gradient))
@@ -107,7 +106,7 @@ def detect_segments(
     tests = 2.5 * math.log10(pixels)
     good = (found["length"] >= min_length) & (found["log_nfa"] + tests <= 0) & (found["count"] > 2)
     found["log_nfa"] = found["log_nfa"] + tests
-    return _laid(found, good, of_run, images, batch, max_segments, image.dtype)
+    return Segments(**lay_in_slots(found, good, found["length"], of_run, batch, max_segments, image.dtype))
 
 
 def _fit(x: Tensor, gradient: Tensor, sigma: Tensor, runs: Runs, tied: float) -> dict[str, Tensor]:
@@ -144,8 +143,7 @@ def _fit(x: Tensor, gradient: Tensor, sigma: Tensor, runs: Runs, tied: float) ->
     count = sums[:, 0].clamp_min(1)
     scatter = (square / count).sqrt()
     across = (gradient * normal[number]).sum(-1)
-    aligned = across >= math.cos(_ALIGNED) * gradient.square().sum(-1).sqrt()
-    k = total(aligned.double())
+    k = total(aligned(across, gradient).double())
     members = runs.sums[:, 0]
     # Further points of the chain, up to a corner, that lie on the line.
     low, high = span(((x - middle[number]) * direction[number]).sum(-1), number)
@@ -153,7 +151,7 @@ def _fit(x: Tensor, gradient: Tensor, sigma: Tensor, runs: Runs, tied: float) ->
         host = neighbour[number]
         larger = (members[host] > members[number]) & (host != number)
         away = ((x - middle[host]) * normal[host]).sum(-1).abs()
-        slope = (gradient * normal[host]).sum(-1) >= math.cos(_ALIGNED) * gradient.square().sum(-1).sqrt()
+        slope = aligned((gradient * normal[host]).sum(-1), gradient)
         joins = larger & (away <= _BESIDE) & slope
         more = span(((x[joins] - middle[host[joins]]) * direction[host[joins]]).sum(-1), host[joins])
         near = float(3 * _ROUNDED)
@@ -172,40 +170,10 @@ def _fit(x: Tensor, gradient: Tensor, sigma: Tensor, runs: Runs, tied: float) ->
         "support": torch.stack((middle - half, middle + half), -2),
         "line": torch.cat((normal, -(normal * middle).sum(-1, keepdim=True)), -1),
         "length": high - low,
-        "count": members,
+        "count": members.long(),
         "scatter": scatter,
         "sigma": torch.maximum(scatter * (count / (count - 2).clamp_min(1)).sqrt(), noise),
         "independent": (count / tied).clamp_min(1.0),
         "contrast": total(across) / members.clamp_min(1),
-        "log_nfa": _log_tail(k, members),
+        "log_nfa": log_tail(k, members),
     }
-
-
-def _log_tail(k: Tensor, n: Tensor) -> Tensor:
-    """Decimal logarithm of a bound of the chance that k or more of n directions are aligned (Hoeffding)."""
-    share = (k / n.clamp_min(1)).clamp(_CHANCE, 1)
-    rest = (1 - share).clamp_min(1e-300)
-    return -n * (share * (share / _CHANCE).log() + rest * (rest / (1 - _CHANCE)).log()) / math.log(10)
-
-
-def _laid(
-    found: dict[str, Tensor], good: Tensor, image: Tensor, images: int, batch: torch.Size, slots: int, dtype: torch.dtype
-) -> Segments:
-    """The good ones in slots, the longest first."""
-    rows = good.nonzero()[:, 0]
-    for key in (-found["length"], image):
-        rows = rows[key[rows].argsort(stable=True)]
-    image = image[rows]
-    number = torch.zeros(images, dtype=torch.long, device=image.device).index_add(0, image, torch.ones_like(image))
-    slot = torch.arange(len(rows), device=image.device) - (number.cumsum(0) - number)[image]
-    fits = slot < slots
-    place, rows = (image * slots + slot)[fits], rows[fits]
-
-    def lay(values: Tensor) -> Tensor:
-        values = values[rows]
-        out = values.new_zeros((images * slots, *values.shape[1:])).index_copy(0, place, values)
-        return out.reshape(*batch, slots, *values.shape[1:])
-
-    valid = lay(torch.ones_like(good))
-    laid = {name: lay(values).to(torch.long if name == "count" else dtype) for name, values in found.items()}
-    return Segments(**laid, valid=valid)

@@ -1,0 +1,130 @@
+"""Which edge points are on an ellipse, and how much of its outline do they cover?"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.geometry import Ellipse
+from torchsfm.geometry.conics import shape_of_ellipse
+from torchsfm.images.false_alarms import aligned
+
+_BENT = 3
+"""How far edges are bent by others that they meet, in pixels."""
+_BORDER = 4.0
+"""Where there are no edges, in pixels from the border."""
+
+
+class EdgeMap(NamedTuple):
+    """Edge points of images, and which one each pixel has."""
+
+    x: Float[Tensor, "n 2"]
+    gradient: Float[Tensor, "n 2"]
+    at: Int[Tensor, "images h w"]
+    """-1 where there is none."""
+
+
+class Support(NamedTuple):
+    """Edge points near ellipses, one row for each of them and each ellipse, by ellipse."""
+
+    ellipse: Int[Tensor, " rows"]
+    edgel: Int[Tensor, " rows"]
+    aligned: Bool[Tensor, " rows"]
+    """Whether the gradient points along the ellipse's normal, to whichever side."""
+    inner: Bool[Tensor, " rows"]
+    """Whether it is aligned and not where what is seen of the outline ends: there other edges bend it."""
+    outward: Float[Tensor, " rows"]
+    """The gradient's part along the outward normal."""
+    coverage: Float[Tensor, " ellipses"]
+    """The share of the outline, by length, next to aligned edge points."""
+
+    def chosen(self, rows: Bool[Tensor, " rows"]) -> "Support":
+        """Of some rows only."""
+        return Support(
+            self.ellipse[rows], self.edgel[rows], self.aligned[rows], self.inner[rows], self.outward[rows], self.coverage
+        )
+
+
+def edge_map(
+    x: Float[Tensor, "n 2"], gradient: Float[Tensor, "n 2"], image: Int[Tensor, " n"], shape: tuple[int, int, int]
+) -> EdgeMap:
+    """A map of edge points at (images, height, width)."""
+    column, row = x.detach().round().long().unbind(-1)
+    place = (image * shape[1] + row.clamp(0, shape[1] - 1)) * shape[2] + column.clamp(0, shape[2] - 1)
+    at = torch.full((math.prod(shape),), -1, dtype=torch.long, device=x.device)
+    own = torch.arange(len(x), device=x.device)
+    # Of two at one pixel the later one, on every device.
+    at = at.scatter_reduce(0, place, own, "amax")
+    return EdgeMap(x, gradient, at.reshape(shape))
+
+
+def find_support(ellipses: Ellipse, image: Int[Tensor, " n"], edges: EdgeMap, reach: int) -> Support:
+    """Walk along ellipses, a pixel at a time, and take the edge points that are met within so many pixels to both sides."""
+    h, w = edges.at.shape[1:]
+    axes = ellipses.semi_axes
+    steps = (2 * math.pi * axes[:, 0]).ceil().long().clamp_min(16)
+    of = torch.repeat_interleave(torch.arange(len(steps), device=steps.device), steps)
+    rank = torch.arange(len(of), device=of.device) - (steps.cumsum(0) - steps)[of]
+    t = rank * (2 * math.pi / steps[of])
+    x = Ellipse(ellipses.centre[of], axes[of], ellipses.angle[of]).points(t[:, None])[:, 0]
+    weight = ((axes[of, 0] * t.sin()).square() + (axes[of, 1] * t.cos()).square()).sqrt()
+    inside = ((x >= _BORDER) & (x <= x.new_tensor([w, h]) - 1 - _BORDER)).all(-1)
+    total = weight.new_zeros(len(steps)).index_add(0, of, weight)
+    of, x, weight = of[inside], x[inside], weight[inside]
+    inverse = torch.linalg.inv_ex(shape_of_ellipse(ellipses)).inverse
+    normal = torch.nn.functional.normalize((inverse[of] @ (x - ellipses.centre[of])[..., None])[..., 0], dim=-1)
+    offset = torch.arange(-reach, reach + 1, device=x.device)
+    column, row = (x[:, None] + offset[:, None] * normal[:, None]).round().long().unbind(-1)
+    place = (image[of, None] * h + row.clamp(0, h - 1)) * w + column.clamp(0, w - 1)
+    edgel = edges.at.flatten()[place]
+    met = edgel >= 0
+    edgel = edgel.clamp_min(0)
+    away = ((edges.x[edgel] - x[:, None]) * normal[:, None]).sum(-1)
+    met &= away.abs() <= reach
+    gradient = edges.gradient[edgel]
+    outward = (gradient * normal[:, None]).sum(-1)
+    along = aligned(outward.abs(), gradient)
+    hit = (met & along).any(-1)
+    # Edge points of slanted edges are more than a step apart.
+    before, after = hit.roll(1) & (of.roll(1) == of), hit.roll(-1) & (of.roll(-1) == of)
+    hit = hit | before | after
+    ends = ~hit
+    for k in range(1, _BENT + 1):
+        ends |= (~hit.roll(k) & (of.roll(k) == of)) | (~hit.roll(-k) & (of.roll(-k) == of))
+    coverage = total.new_zeros(total.shape).index_add(0, of, weight * hit) / total
+    number = len(edges.x)
+    key = (of[:, None] * number + edgel)[met]
+    key, back = torch.unique(key, return_inverse=True)
+    # Next to each other on the ellipse, several steps meet an edge point: any that it is aligned with will do.
+    agrees = torch.zeros(len(key), dtype=torch.long, device=x.device).index_add(0, back, along[met].long()) > 0
+    count = torch.zeros(len(key), dtype=x.dtype, device=x.device).index_add(0, back, met[met].to(x.dtype))
+    mean = torch.zeros_like(count).index_add(0, back, outward[met]) / count
+    inner = (
+        torch.zeros(len(key), dtype=torch.long, device=x.device).index_add(0, back, (along & ~ends[:, None])[met].long()) > 0
+    )
+    return Support(key // max(number, 1), key % max(number, 1), agrees, inner, mean, coverage)
+
+
+def keep_the_best(rank: Int[Tensor, " n"], support: Support, edgels: int, most: float) -> Bool[Tensor, " n"]:
+    """Going by rank, the ellipses of whose edge points no more than the share `most` is on better ones that stay."""
+    n = len(rank)
+    size = support.ellipse.bincount(minlength=n)
+    undecided = size > 0
+    kept = torch.zeros_like(undecided)
+    taken = torch.zeros(edgels, dtype=torch.bool, device=rank.device)
+    while bool(undecided.any()):
+        rows = undecided[support.ellipse] & ~taken[support.edgel]
+        ellipse, edgel = support.ellipse[rows], support.edgel[rows]
+        first = torch.full((edgels,), n, dtype=torch.long, device=rank.device)
+        first = first.scatter_reduce(0, edgel, rank[ellipse], "amin")
+        beaten = torch.zeros(n, dtype=torch.long, device=rank.device)
+        beaten = beaten.index_add(0, ellipse, (first[edgel] < rank[ellipse]).long())
+        best = undecided & (beaten == 0)
+        kept |= best
+        undecided = undecided & ~best
+        taken[support.edgel[best[support.ellipse]]] = True
+        lost = torch.zeros(n, dtype=torch.long, device=rank.device).index_add(0, support.ellipse, taken[support.edgel].long())
+        undecided &= lost <= most * size
+    return kept
