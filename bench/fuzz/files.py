@@ -13,7 +13,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from torchsfm.formats import (
     write_bal,
     write_colmap,
     write_database,
+    write_model,
     write_nerfstudio,
     write_ply,
 )
@@ -208,6 +209,19 @@ def _formats() -> list[Format]:
         write_nerfstudio(model, folder / "transforms.json")
         nerfstudio = _files(folder, "transforms.json") | _files(folder, "points.ply")
         formats.append(Format("nerfstudio", nerfstudio, read_model))
+        K = model.cameras.K.clone()
+        K[:, :2, 2] -= 0.5
+        middle = replace(model, cameras=Camera(K, model.cameras.distortion))
+        straight = replace(model, cameras=Camera(K))
+        for name, stem, one in (
+            ("bundler", "bundle.out", middle),
+            ("nvm", "model.nvm", straight),
+            ("openmvg", "sfm_data.json", middle),
+            ("opensfm", "reconstruction.json", middle),
+        ):
+            (folder / name).mkdir()
+            write_model(one, folder / name / stem, name)
+            formats.append(Format(name, _files(folder, name), read_model))
         keypoints = tuple(x.float() for x in torch.split(model.x, [6, 6, 6]))
         pairs, rows = torch.tensor([[0, 1], [1, 2]]), torch.arange(6)[:, None].expand(6, 2)
         matched = MatchedImages(model.names[:3], model.image_size[:3], keypoints, pairs, (rows, rows))

@@ -420,8 +420,11 @@ EXCEPTIONS: dict[str, str] = {
     "bundle.bundle_adjust_model": "hands a model to bundle_adjust",
     "cli.main": "a program; its options and files are tested in tests/test_cli.py",
     **{f"formats.read_{name}": FILES for name in (
-        "bal", "colmap", "database", "hloc", "libmv", "model", "nerfstudio", "ply", "vgg")},
-    **{f"formats.write_{name}": FILES for name in ("bal", "colmap", "database", "model", "nerfstudio", "ply")},
+        "bal", "bundler", "colmap", "database", "hloc", "libmv", "model", "nerfstudio", "nvm", "openmvg", "opensfm", "ply",
+        "vgg")},
+    **{f"formats.write_{name}": FILES for name in (
+        "bal", "bundler", "colmap", "database", "gltf", "kitti", "model", "nerfstudio", "nvm", "openmvg", "opensfm", "ply",
+        "tum")},
     "formats.export_model": FILES,
     "formats.undistorted_model": "hands a model to undistorted_cameras",
     **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},

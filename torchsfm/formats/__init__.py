@@ -1,15 +1,21 @@
 """How does a model come from other programs, and how do they get it?"""
 
 from torchsfm.formats.bal import read_bal, write_bal
+from torchsfm.formats.bundler import read_bundler, write_bundler
 from torchsfm.formats.colmap import read_colmap, write_colmap
 from torchsfm.formats.colmap_database import read_database, write_database
 from torchsfm.formats.export import TARGETS, export_model
+from torchsfm.formats.gltf import write_gltf
 from torchsfm.formats.hloc import read_hloc
 from torchsfm.formats.libmv import read_libmv
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
+from torchsfm.formats.nvm import read_nvm, write_nvm
+from torchsfm.formats.openmvg import read_openmvg, write_openmvg
+from torchsfm.formats.opensfm import read_opensfm, write_opensfm
 from torchsfm.formats.pictures import undistorted_model
 from torchsfm.formats.ply import PointCloud, read_ply, write_ply
 from torchsfm.formats.registry import FORMATS, read_model, write_model
+from torchsfm.formats.trajectory import write_kitti, write_tum
 from torchsfm.formats.vgg import VggScene, read_vgg
 
 __all__ = [
@@ -19,19 +25,30 @@ __all__ = [
     "VggScene",
     "export_model",
     "read_bal",
+    "read_bundler",
     "read_colmap",
     "read_database",
     "read_hloc",
     "read_libmv",
     "read_model",
     "read_nerfstudio",
+    "read_nvm",
+    "read_openmvg",
+    "read_opensfm",
     "read_ply",
     "read_vgg",
     "undistorted_model",
     "write_bal",
+    "write_bundler",
     "write_colmap",
     "write_database",
+    "write_gltf",
+    "write_kitti",
     "write_model",
     "write_nerfstudio",
+    "write_nvm",
+    "write_openmvg",
+    "write_opensfm",
     "write_ply",
+    "write_tum",
 ]

@@ -10,8 +10,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from torchsfm.formats.bundler import write_bundler
 from torchsfm.formats.colmap import SPLATTING, write_colmap
+from torchsfm.formats.gltf import write_gltf
 from torchsfm.formats.nerfstudio import write_nerfstudio
+from torchsfm.formats.nvm import write_nvm
+from torchsfm.formats.openmvg import write_openmvg
+from torchsfm.formats.opensfm import write_opensfm
 from torchsfm.formats.pictures import picture_names, registered_only, undistorted_model, write_pictures
 from torchsfm.formats.ply import write_ply
 from torchsfm.reconstruction.files import PARTIAL
@@ -58,6 +63,16 @@ TARGETS: dict[str, Target] = {
     ),
     "colmap": Target("sparse/0/, binary", _in("sparse/0", write_colmap)),
     "colmap-text": Target("sparse/0/, text", _in("sparse/0", partial(write_colmap, text=True))),
+    "openmvg": Target("sfm_data.json", _in("sfm_data.json", write_openmvg)),
+    "opensfm": Target("reconstruction.json and tracks.csv", _in("reconstruction.json", write_opensfm)),
+    "bundler": Target(
+        "undistorted pictures in images/, bundle.out and list.txt",
+        _in("bundle.out", write_bundler),
+        pictures=True,
+        centred=True,
+    ),
+    "nvm": Target("undistorted pictures in images/, model.nvm", _in("model.nvm", write_nvm), pictures=True, centred=True),
+    "blender": Target("undistorted pictures in images/, model.glb", _in("model.glb", write_gltf), pictures=True, centred=True),
     "meshlab": Target("points.ply with cameras", _in("points.ply", write_ply)),
 }
 """The programs by name."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
 from torchsfm.geometry import (
     DISTORTION_MODELS,
@@ -153,7 +154,7 @@ class Rows:
         )
 
 
-def nearby_rotation(R: NDArray[np.float64]) -> torch.Tensor:
+def nearby_rotation(R: NDArray[np.float64]) -> Tensor:
     """Rotations from matrices that are rotations but for the digits of a file.
 
     Raises:
@@ -190,10 +191,52 @@ def numbers(values: Any, *shape: int) -> NDArray[np.float64]:
 def reading(path: Path, what: str) -> Iterator[None]:
     """Say in one line which file is not what it should be."""
     try:
-        yield
+        # What is not finite in the end is found in the end.
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError, StopIteration) as error:
         detail = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path}: not {what} ({' '.join(detail.split())[:120] or 'it ends too early'})") from None
+
+
+def centred_cameras(
+    model: Reconstruction, format: str, lens: type[Distortion]
+) -> tuple[Reconstruction, NDArray[np.float64], NDArray[np.float64]]:
+    """A model for a format that has one focal length a camera, and the principal point at the centre of the image.
+
+    Returns:
+        The model in double precision, the focal length of each camera, and the centre of each image.
+
+    Raises:
+        ValueError: A camera is not so, or has distortion that is no case of `lens`.
+    """
+    kind = type(model.cameras.distortion)
+    if not lens.includes(kind):
+        wanted = ", ".join(lens.parameter_names) or "no distortion"
+        raise ValueError(f"{format} holds {wanted}, not {kind.__name__}; undistorted pictures have none")
+    model = model.to("cpu", torch.float64)
+    K = model.cameras.K[model.camera_index]
+    centre = (model.image_size.double() - 1) / 2
+    if bool((K[:, 0, 1].abs() > 1e-9 * K[:, 0, 0]).any()) or bool(((K[:, 1, 1] - K[:, 0, 0]).abs() > 1e-9 * K[:, 0, 0]).any()):
+        raise ValueError(f"{format} has one focal length a camera, and these pixels are not square")
+    if bool(((K[:, :2, 2] - centre).abs() > 1e-6).any()):
+        raise ValueError(f"{format} has the principal point at the centre of the image; undistort the pictures, centred")
+    return model, model.cameras.K[:, 0, 0].numpy(), centre.numpy()
+
+
+def running_numbers(view: Tensor) -> list[int]:
+    """A number for each observation: how many there were before in the same image."""
+    order = torch.argsort(view, stable=True)
+    counts = torch.bincount(view)
+    number = torch.empty_like(view)
+    number[order] = torch.arange(len(view)) - (counts.cumsum(0) - counts)[view[order]]
+    return list(number.tolist())
+
+
+def symmetric_size(x: NDArray[np.float64]) -> tuple[int, int]:
+    """The least odd size of an image that holds points given relative to its centre."""
+    reach = np.abs(x).max(0, initial=0).clip(max=MAX_SIDE / 4)
+    return 2 * int(np.ceil(reach[0])) + 1, 2 * int(np.ceil(reach[1])) + 1
 
 
 def picture_size(path: Path) -> tuple[int, int] | None:

@@ -12,11 +12,17 @@ from functools import partial
 from pathlib import Path
 
 from torchsfm.formats.bal import read_bal, write_bal
+from torchsfm.formats.bundler import read_bundler, write_bundler
 from torchsfm.formats.colmap import TABLES, read_colmap, write_colmap
+from torchsfm.formats.gltf import write_gltf
 from torchsfm.formats.libmv import read_libmv
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
+from torchsfm.formats.nvm import read_nvm, write_nvm
+from torchsfm.formats.openmvg import read_openmvg, write_openmvg
+from torchsfm.formats.opensfm import read_opensfm, write_opensfm
 from torchsfm.formats.ply import write_ply
 from torchsfm.formats.problem import Model, as_problem, as_reconstruction
+from torchsfm.formats.trajectory import write_kitti, write_tum
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 HEAD = 2**20
@@ -50,8 +56,18 @@ FORMATS: tuple[Format, ...] = (
     Format("torchsfm", "a saved model", (".npz",), Reconstruction.load, Reconstruction.save, re.compile(rb"PK[\x03\x05]")),
     Format("colmap", "COLMAP's folder of binary files", (), read_colmap, write_colmap),
     Format("colmap-text", "COLMAP's folder of text files", (), None, partial(write_colmap, text=True)),
+    Format("openmvg", "OpenMVG's sfm_data.json", ("sfm_data.json",), read_openmvg, write_openmvg,
+           re.compile(rb'\s*\{.*"sfm_data_version"', re.DOTALL)),
+    Format("opensfm", "OpenSfM's reconstruction.json, with tracks.csv", ("reconstruction.json",), read_opensfm, write_opensfm,
+           re.compile(rb'\s*\[\s*\{.*"(cameras|shots|points)"', re.DOTALL)),
     Format("nerfstudio", "transforms.json of nerfstudio", ("transforms.json",), read_nerfstudio, write_nerfstudio,
            re.compile(rb'\s*\{.*"(frames|camera_angle_x|fl_x)"\s*:', re.DOTALL)),
+    Format("bundler", "Bundler's bundle.out, with list.txt", ("bundle.out", ".out"), read_bundler, write_bundler,
+           re.compile(rb"# Bundle")),
+    Format("nvm", "VisualSFM's NVM_V3", ("model.nvm", ".nvm"), read_nvm, write_nvm, re.compile(rb"NVM_V3")),
+    Format("gltf", "points and cameras as binary glTF", (".glb",), None, write_gltf),
+    Format("tum", "camera poses in the form of TUM", (".tum",), None, write_tum),
+    Format("kitti", "camera poses in the form of KITTI", (".kitti",), None, write_kitti),
     Format("libmv", "a libmv problem", (".bin",), read_libmv, None, re.compile(rb"[vV][PN]")),
     Format("ply", "points and cameras for viewers", (".ply",), None, write_ply),
     Format("bal", "a problem of Bundle Adjustment in the Large", (".txt", ".txt.gz", ".txt.bz2", ".gz", ".bz2"), read_bal, _bal,
