@@ -155,6 +155,20 @@ def test_the_pictures_are_those_of_the_pinhole(photographs: Path, tmp_path: Path
         assert np.abs(mine.astype(int) - theirs).max() <= 1
 
 
+@pytest.mark.parametrize("target", ["bundler", "nvm", "openmvg", "opensfm", "colmap", "colmap-text"])
+def test_what_is_exported_comes_back(target: str, photographs: Path, tmp_path: Path) -> None:
+    """With the sizes of the pictures, where the format does not tell them."""
+    model = small_model.make("radial")
+    out = export_model(model, target, tmp_path / "scene", images=photographs)
+    wanted = undistorted_model(model, centred=True) if TARGETS[target].pictures else model
+    again = read_model(out)
+    assert again.num_registered == 3
+    assert again.image_size[:3].equal(wanted.image_size[:3])
+    for name in ("X", "x", "view", "point"):
+        torch.testing.assert_close(getattr(again, name), getattr(wanted, name), rtol=0, atol=1e-9)
+    torch.testing.assert_close(again.projections(), wanted.projections(), rtol=0, atol=1e-9)
+
+
 def test_an_export_replaces_an_earlier_one_and_nothing_else(photographs: Path, tmp_path: Path) -> None:
     model, out = small_model.make("radial"), tmp_path / "scene"
     export_model(model, "nerfstudio", out, images=photographs)

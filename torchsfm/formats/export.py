@@ -40,6 +40,8 @@ class Target:
     """Whether it wants pictures, which then are undistorted if not asked for otherwise."""
     centred: bool = False
     """Whether its cameras have their principal point at the centre of the picture."""
+    paths: bool = False
+    """Whether it looks for pictures under their names from the folder on, and not in `images`."""
 
 
 def _in(name: str, write: Callable[[Reconstruction, Path], None]) -> Callable[[Reconstruction, Path], None]:
@@ -70,8 +72,11 @@ TARGETS: dict[str, Target] = {
         _in("bundle.out", write_bundler),
         pictures=True,
         centred=True,
+        paths=True,
     ),
-    "nvm": Target("undistorted pictures in images/, model.nvm", _in("model.nvm", write_nvm), pictures=True, centred=True),
+    "nvm": Target(
+        "undistorted pictures in images/, model.nvm", _in("model.nvm", write_nvm), pictures=True, centred=True, paths=True
+    ),
     "blender": Target("undistorted pictures in images/, model.glb", _in("model.glb", write_gltf), pictures=True, centred=True),
     "meshlab": Target("points.ply with cameras", _in("points.ply", write_ply)),
 }
@@ -127,7 +132,8 @@ def export_model(
             posed = undistorted_model(model, alpha=alpha, centred=centred or chosen.centred) if undistort else model
             renamed = replace(posed, names=picture_names(model.names, kept=not undistort))
             # What the format cannot hold is found before the work with the pictures.
-            chosen.write(renamed, partial_folder)
+            named = tuple(f"{PICTURES}/{name}" for name in renamed.names) if chosen.paths else renamed.names
+            chosen.write(replace(renamed, names=named), partial_folder)
             write_pictures(model, renamed if undistort else None, Path(images), partial_folder / PICTURES, progress)
         else:
             chosen.write(model, partial_folder)
