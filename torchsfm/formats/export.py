@@ -77,8 +77,6 @@ TARGETS: dict[str, Target] = {
     "nvm": Target(
         "undistorted pictures in images/, model.nvm", _in("model.nvm", write_nvm), pictures=True, centred=True, paths=True
     ),
-        "undistorted pictures in images/, model.nvm", _in("model.nvm", write_nvm), pictures=True, centred=True, paths=True
-    ),
     "blender": Target("undistorted pictures in images/, model.glb", _in("model.glb", write_gltf), pictures=True, centred=True),
     "meshlab": Target("points.ply with cameras", _in("points.ply", write_ply)),
 }
