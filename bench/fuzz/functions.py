@@ -441,6 +441,15 @@ EXCEPTIONS: dict[str, str] = {
 }  # fmt: skip
 """Public functions that are not tried, and why."""
 
+INNER = {
+    "geometry.curve_crossings", "geometry.curve_from_samples", "geometry.foot_points", "geometry.least_number_off",
+    "geometry.line_and_plane_distances", "images.describe_images", "images.describe_segments", "images.list_skipped",
+    "images.parse_exif", "optim.loss_slope", "optim.marginal_covariance", "optim.rotation_exponential",
+    "optim.wants_derivative", "robust.check_counts", "robust.check_door", "robust.constant_weights",
+    "robust.estimate_robustly",
+}  # fmt: skip
+"""Functions that rooms export for each other, as all of `linalg`: they know what they pass."""
+
 
 def public_functions() -> dict[str, Callable[..., Any]]:
     """All functions that rooms export, by room and name."""

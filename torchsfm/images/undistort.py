@@ -43,8 +43,8 @@ def undistorted_cameras(
         old picture is wide and high, as no pinhole shows all that a very wide lens does.
     """
     batch = check_tensors(size=(size, "2: int"))
+    check_options(cameras=(cameras, Camera), alpha=(alpha, "0 <= float <= 1"), centred=(centred, bool))
     check_tensors(K=(cameras.K, "3 3"))
-    check_options(alpha=(alpha, "0 <= float <= 1"), centred=(centred, bool))
     if batch != cameras.shape:
         raise ValueError(f"size: wanted shape {(*cameras.shape, 2)}, one for each camera, got {tuple(size.shape)}")
     K = cameras.K.detach().double()
@@ -94,8 +94,8 @@ def undistort_images(
         The new pictures; 0 where the old ones show nothing.
     """
     check_tensors(images=(images, "c h>=1 w>=1"))
+    check_options(cameras=(cameras, Camera), pinholes=(pinholes, Camera), size=(size, "2 int >= 1"))
     check_tensors(cameras=(cameras.K, "3 3"), pinholes=(pinholes.K, "3 3"))
-    check_options(size=(size, "2 int >= 1"))
     batch = images.shape[:-3]
     lenses = broadcast_shapes(cameras.shape, pinholes.shape)
     if broadcast_shapes(batch, lenses) != batch:

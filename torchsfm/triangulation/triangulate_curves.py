@@ -84,11 +84,11 @@ def triangulate_curves(
     Raises:
         ValueError: Wrong shape, dtype, device or option.
     """
+    check_options(curves=(curves, Curve), samples=(samples, "int >= 4"), threshold=(threshold, "float > 0"))
     batch = check_tensors(
         x=(curves.x, "v>=1 n>=2 2"), valid=(curves.valid, "v n: bool"), closed=(curves.closed, "v: bool"),
         P=(P, "v 3 4"), visible=(visible, "?v: bool"),
     )  # fmt: skip
-    check_options(samples=(samples, "int >= 4"), threshold=(threshold, "float > 0"))
     v, n = curves.x.shape[-3:-1]
     x = curves.x.double().expand(*batch, v, n, 2).reshape(-1, v, n, 2)
     valid = curves.valid.expand(*batch, v, n).reshape(-1, v, n)
