@@ -11,6 +11,7 @@ from torchsfm.geometry import (
     BrownConrady,
     Camera,
     KannalaBrandt,
+    NoDistortion,
     Pose,
     Radial,
     camera_centre,
@@ -161,6 +162,33 @@ def test_cameras_are_gathered_by_index(generator):
     assert Camera(K)[1:].shape == (2,)
     half = tensor_map(lambda tensor: tensor.float(), cameras)
     assert half.K.dtype == half.distortion.k2.dtype == torch.float32
+
+
+def test_cameras_are_stacked_and_project_points_from_poses(generator):
+    def make(lens):
+        K = intrinsics(torch.rand(4, generator=generator, dtype=torch.float64) + 1, torch.zeros(2, dtype=torch.float64))
+        return Camera(K, lens(*(0.01 * torch.randn(4, generator=generator, dtype=torch.float64) for _ in lens.parameter_names)))
+
+    for lens in (NoDistortion, BrownConrady):
+        cameras = [make(lens) for _ in range(3)]
+        stacked = Camera.stack(cameras)
+        assert stacked.shape == (3, 4)
+        pose = Pose(
+            random_rotation(3, 4, generator=generator, dtype=torch.float64),
+            torch.tensor([0, 0, 5], dtype=torch.float64).expand(3, 4, 3),
+        )
+        X = torch.randn(10, 3, generator=generator, dtype=torch.float64)
+        x = project_points(pose, X, stacked)
+        for i, camera in enumerate(cameras):
+            torch.testing.assert_close(x[i], camera.project(pose[i].transform(X)))
+        torch.testing.assert_close(project_points(pose.matrix(), X, stacked), x)
+        single = project_points(pose.to(dtype=torch.float32), X.float(), stacked.to(dtype=torch.float32))
+        torch.testing.assert_close(single.double(), x, rtol=1e-3, atol=1e-3)
+        if lens is NoDistortion:
+            torch.testing.assert_close(project_points(stacked.K @ pose.matrix(), X), x)
+    torch.testing.assert_close(project_points(pose, X), project_points(pose.matrix(), X))
+    with pytest.raises(ValueError, match=r"cameras\[1\]: wanted distortion BrownConrady"):
+        Camera.stack([cameras[0], make(NoDistortion)])
 
 
 def test_degenerate_intrinsics_and_pixels_are_masked(generator):

@@ -67,6 +67,21 @@ def test_retract_has_the_derivative_it_should_at_zero(generator):
     torch.testing.assert_close(J, torch.tensor(expected, dtype=torch.float64))
 
 
+@pytest.mark.parametrize("shape", [(), (2, 3), (0,)])
+def test_stacks_are_indexed_apart_again(shape, generator):
+    poses = [make(*shape, generator=generator) for _ in range(3)]
+    stacked = Pose.stack(poses)
+    assert stacked.shape == (3, *shape)
+    for i, pose in enumerate(poses):
+        assert stacked[i].matrix().equal(pose.matrix())
+    assert stacked.to(dtype=torch.float32).matrix().equal(stacked.matrix().float())
+    assert stacked.to(device="cpu").t is stacked.t
+    with pytest.raises(ValueError, match=r"poses\[1\]: wanted batch dimensions \(3,"):
+        Pose.stack([stacked, stacked[:1]])
+    with pytest.raises(ValueError, match="poses: wanted at least one"):
+        Pose.stack([])
+
+
 def test_tensor_map_and_identity_options():
     pose = tensor_map(lambda tensor: tensor.double(), Pose.identity(2))
     assert pose.R.dtype == torch.float64

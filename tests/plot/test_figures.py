@@ -12,6 +12,7 @@ from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Pose
+from torchsfm.images import Photograph
 from torchsfm.plot import (
     plot_cameras,
     plot_epipolar_lines,
@@ -55,6 +56,18 @@ def test_show_image_puts_pixel_centres_at_integers(shape: tuple[int, ...]) -> No
     assert tuple(shown.get_extent()) == (-0.5, 5.5, 3.5, -0.5)
     assert shown.get_clim() == (0, 1)
     assert ax.get_title() == "t"
+
+
+def test_photographs_are_shown_as_their_pixels_are() -> None:
+    pixels, x = torch.rand(3, 4, 5), torch.tensor([[1.0, 2.0]])
+    photograph = Photograph(pixels, "a.png")
+    for draw in (
+        show_image,
+        lambda image: plot_matches(image, image, x, x),
+        lambda image: plot_epipolar_lines(torch.eye(3), x, x, image, image)[1],
+    ):
+        first, second = (draw(image).images[0].get_array() for image in (photograph, pixels))
+        assert (first == second).all()
 
 
 def test_show_scaled_stretches_and_says_the_range() -> None:

@@ -1,5 +1,6 @@
 """Cameras: intrinsics with distortion, and 3x4 camera matrices."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +11,7 @@ from torchsfm._types import broadcast_shapes, check_options, check_tensors, tens
 from torchsfm.geometry.distortion import NoDistortion
 from torchsfm.geometry.distortion_model import Distortion
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
-from torchsfm.geometry.poses import Index, index_batch
+from torchsfm.geometry.poses import Index, Pose, check_alike, index_batch
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,27 @@ class Camera:
     def in_domain(self, X_cam: Float[Tensor, "*#batch n 3"]) -> Bool[Tensor, "*#batch n"]:
         """Tell which points lie in front of the camera and within the valid radius of its distortion."""
         return self.distortion.in_domain(X_cam)
+
+    def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> "Camera":
+        """The cameras in another dtype or on another device."""
+        return tensor_map(lambda t: t.to(dtype=dtype, device=device), self)
+
+    @classmethod
+    def stack(cls, cameras: Sequence["Camera"]) -> "Camera":
+        """Put cameras of equal batch dimensions and one kind of distortion along a new first dimension.
+
+        Raises:
+            ValueError: There are none, or their shapes or kinds differ.
+        """
+        check_alike("cameras", [camera.K for camera in cameras])
+        lenses = [camera.distortion for camera in cameras]
+        kind = type(lenses[0])
+        for i, lens in enumerate(lenses):
+            if type(lens) is not kind:
+                wanted = kind.__name__
+                raise ValueError(f"cameras[{i}]: wanted distortion {wanted} as cameras[0] has, got {type(lens).__name__}")
+        parameters = {name: torch.stack([getattr(lens, name) for lens in lenses]) for name in kind.parameter_names}
+        return cls(torch.stack([camera.K for camera in cameras]), kind(**parameters))
 
     def __getitem__(self, index: Index | tuple[Index, ...]) -> "Camera":
         """Index the batch dimensions."""
@@ -191,20 +213,28 @@ def camera_centre(P: Float[Tensor, "*batch 3 4"], *, homogeneous: bool = False) 
     return divide_safely(centre[..., :3], centre[..., 3])
 
 
-def project_points(P: Float[Tensor, "*#batch 3 4"], X: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n 2"]:
-    """Project points by camera matrices.
+def project_points(
+    P: Float[Tensor, "*#batch 3 4"] | Pose, X: Float[Tensor, "*#batch n 3"], camera: Camera | None = None
+) -> Float[Tensor, "*batch n 2"]:
+    """Project points by camera matrices, or by poses and what is inside the cameras.
 
     Args:
-        P: Camera matrix.
+        P: Camera matrix; or a pose, `Pose` or `[R | t]`, if there is a `camera`.
         X: Points as rows.
+        camera: Intrinsics and lens of the camera at the pose; that of the matrix `[I | 0]` if not given.
 
     Returns:
         Image points, finite always: a point in the focal plane is returned very far away in its own direction (about 1 /
         machine epsilon), and one with NaN or inf as the image of the origin.
     """
-    check_tensors(P=(P, "3 4"), X=(X, "n 3"))
-    y = finite_or_zero(X) @ P[..., :3].mT + P[..., None, :, 3]
-    return divide_safely(y[..., :2], y[..., 2])
+    matrix = P.matrix() if isinstance(P, Pose) else P
+    check_tensors(P=(matrix, "3 4"), X=(X, "n 3"))
+    y = finite_or_zero(X) @ matrix[..., :3].mT + matrix[..., None, :, 3]
+    if camera is None:
+        return divide_safely(y[..., :2], y[..., 2])
+    check_options(camera=(camera, Camera))
+    check_tensors(P=(matrix, "3 4"), X=(X, "n 3"), camera=(camera.K, "3 3"))
+    return camera.project(y)
 
 
 def point_depths(P: Float[Tensor, "*#batch 3 4"], X: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n"]:

@@ -1,5 +1,6 @@
 """Poses: rigid motions from world to camera coordinates."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import EllipsisType
 from typing import Any, TypeAlias
@@ -8,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import check_tensors, tensor_map
 from torchsfm.geometry.rotations import rotation_from_rotvec
 
 Index: TypeAlias = int | slice | EllipsisType | Tensor | list[int] | None
@@ -18,6 +19,21 @@ def index_batch(tensor: Tensor, index: Index | tuple[Index, ...], trailing: int)
     """Index the leading dimensions of a tensor, all but the last `trailing` ones."""
     items: tuple[Any, ...] = index if isinstance(index, tuple) else (index,)
     return tensor[(*items, *(slice(None),) * trailing)]
+
+
+def check_alike(name: str, matrices: Sequence[Float[Tensor, "*_ 3 3"]]) -> None:
+    """Check that there are some, of one batch shape, dtype and device.
+
+    Raises:
+        ValueError: They are not.
+    """
+    if not matrices:
+        raise ValueError(f"{name}: wanted at least one, got none")
+    check_tensors(**{f"{name}[{i}]": (matrix, "3 3") for i, matrix in enumerate(matrices)})
+    wanted = tuple(matrices[0].shape[:-2])
+    for i, matrix in enumerate(matrices):
+        if matrix.shape[:-2] != wanted:
+            raise ValueError(f"{name}[{i}]: wanted batch dimensions {wanted} as {name}[0] has, got {tuple(matrix.shape[:-2])}")
 
 
 @dataclass(frozen=True)
@@ -85,6 +101,16 @@ class Pose:
         R = turn @ self.R
         t = (turn @ self.t[..., None]).squeeze(-1) + delta[..., 3:]
         return Pose(R, t)
+
+    def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> "Pose":
+        """The poses in another dtype or on another device."""
+        return tensor_map(lambda t: t.to(dtype=dtype, device=device), self)
+
+    @classmethod
+    def stack(cls, poses: Sequence["Pose"]) -> "Pose":
+        """Put poses of equal batch dimensions along a new first one; `pose[i]` takes them out again."""
+        check_alike("poses", [pose.R for pose in poses])
+        return cls(torch.stack([pose.R for pose in poses]), torch.stack([pose.t for pose in poses]))
 
     def __getitem__(self, index: Index | tuple[Index, ...]) -> "Pose":
         """Index the batch dimensions."""

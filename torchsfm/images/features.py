@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsfm._types import check_options
-from torchsfm.images.reading import Photograph
+from torchsfm.images.reading import Photograph, pixels_of
 
 _SCALE = 0.5 * 2 ** (1 / 6)
 """OpenCV gives twice the smaller of two Gaussians, of ratio 2^(1/3), whose difference answers most to what lies between."""
@@ -82,7 +82,7 @@ def detect_features(
         max_features=(max_features, "int >= 1"), contrast=(contrast, "float >= 0"), edge=(edge, "float > 0"),
         max_size=(max_size, "int >= 1"),
     )  # fmt: skip
-    gray = _gray_bytes(image.pixels if isinstance(image, Photograph) else image)
+    gray = _gray_bytes(pixels_of(image))
     height, width = gray.shape
     shrink = min(1.0, max_size / max(height, width))
     if shrink < 1:

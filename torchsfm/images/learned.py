@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchsfm.images.features import Features
 from torchsfm.images.matching import unit_descriptors
-from torchsfm.images.reading import Photograph
+from torchsfm.images.reading import Photograph, pixels_of
 
 DetectorName = Literal["disk", "dedode-b", "dedode-g"]
 MatcherName = Literal["disk", "dedode-b", "dedode-g", "sift"]
@@ -47,7 +47,7 @@ class LearnedDetector:
         Raises:
             ValueError: The shape of the image is wrong.
         """
-        pixels = image.pixels if isinstance(image, Photograph) else image
+        pixels = pixels_of(image)
         if pixels.ndim != 3 or pixels.shape[0] not in (1, 3) or 0 in pixels.shape:
             raise ValueError(f"image: wanted shape (1, h, w) or (3, h, w), got {tuple(pixels.shape)}")
         weight = next(self.network.parameters())

@@ -68,6 +68,11 @@ class Photograph:
         return int(self.pixels.shape[-2])
 
 
+def pixels_of(image: Photograph | Float[Tensor, "*channels h w"]) -> Float[Tensor, "*channels h w"]:
+    """The values of an image, which may come with what its file says of the camera or without."""
+    return image.pixels if isinstance(image, Photograph) else image
+
+
 def read_image(
     path: str | os.PathLike[str], *, gray: bool = False, max_size: int | None = None, max_pixels: int = MAX_PIXELS
 ) -> Photograph:

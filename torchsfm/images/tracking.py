@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsfm._types import broadcast_shapes, check_one_problem, check_options, check_tensors
 from torchsfm.images.alignment import align, cut_templates
 from torchsfm.images.corners import box_maximum, detect_corners, to_gray
-from torchsfm.images.reading import Photograph
+from torchsfm.images.reading import Photograph, pixels_of
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def track_sequence(
     _check_tracking(window, levels, max_error)
     follower: _Follower | None = None
     for number, image in enumerate(images):
-        pixels = image.pixels if isinstance(image, Photograph) else image
+        pixels = pixels_of(image)
         check_one_problem(images=(pixels, "c h>=1 w>=1"))
         gray = to_gray(pixels.detach().to("cpu", torch.float32))[0]
         if follower is None:

@@ -7,16 +7,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
-from torchsfm.images import scale_image
+from torchsfm.images import Photograph, scale_image
+from torchsfm.images.reading import pixels_of
 from torchsfm.plot.axes import Axes, array, flat_axes, pyplot
 from torchsfm.tensors.bifocal import epipolar_lines
 
 
-def show_image(image: Float[Tensor, "*channels h w"], *, title: str | None = None, ax: Axes | None = None) -> Axes:
+def show_image(image: Photograph | Float[Tensor, "*channels h w"], *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Show an image as it is: 0 is black, 1 is white, and the centre of the top-left pixel is at (0, 0).
 
     Args:
-        image: Grey (h, w) or (1, h, w), or red, green, blue (3, h, w). Values are clamped to [0, 1].
+        image: Grey (h, w) or (1, h, w), or red, green, blue (3, h, w), or a photograph. Values are clamped to [0, 1].
         title: Written above.
         ax: Where to draw; a new figure where not given.
 
@@ -27,6 +28,7 @@ def show_image(image: Float[Tensor, "*channels h w"], *, title: str | None = Non
         ValueError: The shape is none of these.
         ImportError: matplotlib is not installed.
     """
+    image = pixels_of(image)
     check_tensors(image=(image, "h w"))
     if image.ndim > 3 or (image.ndim == 3 and image.shape[0] not in (1, 3)):
         raise ValueError(f"image: wanted shape (h, w), (1, h, w) or (3, h, w), got {tuple(image.shape)}")
@@ -110,8 +112,8 @@ def plot_points_2d(
 
 
 def plot_matches(
-    image1: Float[Tensor, "*channels1 h1 w1"],
-    image2: Float[Tensor, "*channels2 h2 w2"],
+    image1: Photograph | Float[Tensor, "*channels1 h1 w1"],
+    image2: Photograph | Float[Tensor, "*channels2 h2 w2"],
     x1: Float[Tensor, "n 2"],
     x2: Float[Tensor, "n 2"],
     *,
@@ -138,6 +140,7 @@ def plot_matches(
         ImportError: matplotlib is not installed.
     """
     check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), inliers=(inliers, "?n: bool"))
+    image1, image2 = pixels_of(image1), pixels_of(image2)
     check_tensors(image1=(image1, "h1 w1"), image2=(image2, "h2 w2"))
     if every < 1:
         raise ValueError(f"every: wanted at least 1, got {every}")
@@ -165,8 +168,8 @@ def plot_epipolar_lines(
     F: Float[Tensor, "3 3"],
     x1: Float[Tensor, "n 2"],
     x2: Float[Tensor, "n 2"],
-    image1: Float[Tensor, "*channels1 h1 w1"],
-    image2: Float[Tensor, "*channels2 h2 w2"],
+    image1: Photograph | Float[Tensor, "*channels1 h1 w1"],
+    image2: Photograph | Float[Tensor, "*channels2 h2 w2"],
     *,
     axes: tuple[Axes, Axes] | None = None,
 ) -> tuple[Axes, Axes]:
@@ -196,7 +199,7 @@ def plot_epipolar_lines(
         (second, image2, x2, epipolar_lines(F, x1)),
     ):
         show_image(image, ax=ax)
-        height, width = image.shape[-2:]
+        height, width = pixels_of(image).shape[-2:]
         ends, meets = clip_lines(lines, width, height)
         for i, color in enumerate(colors):
             if bool(meets[i]):
