@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +28,7 @@ from command_line import (
 from torchsfm.cli.inputs import read_intrinsics, warn_about_intrinsics
 from torchsfm.cli.job import Job
 from torchsfm.cli.results import VERSION
+from torchsfm.formats import read_lines, read_ply
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.simulation import look_at
@@ -75,6 +77,31 @@ def test_photographs_become_a_model_a_page_and_a_report(finished: tuple[Path, st
     written = (out / "report.md").read_text()
     assert "| view3.png | yes |" in written
     assert "| view0.png | view1.png |" in written
+
+
+def test_lines_are_found_written_and_reported(finished: tuple[Path, str], courtyard: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished[0], tmp_path / "out")
+    out = tmp_path / "out"
+    status, text, _ = torchsfm("reconstruct", courtyard, "--out", out, "--seed", 3, "--lines", "--resume")
+    assert status == 0
+    model = Reconstruction.load(out / "model.npz")
+    assert model.lines is not None
+    assert len(model.lines) > 0
+    assert (model.lines.support() >= 3).all()
+    assert float(model.line_residuals().mean()) < 1
+    assert f"{len(model.lines)} lines" in text
+    assert torch.equal(read_lines(out / "lines.txt").view, model.lines.view)
+    assert len(read_ply(out / "lines.ply").X) == 2 * len(model.lines)
+    assert len(read_ply(out / "points.ply").X) == model.num_points
+    record = json.loads((out / "report.json").read_text())
+    assert record["models"][0]["lines"]["count"] == len(model.lines)
+    assert {"segments", "lines"} <= set(record["seconds"])
+    assert f"| lines | {len(model.lines)} of" in (out / "report.md").read_text()
+    # Results without lines leave none behind.
+    status, _, _ = torchsfm("reconstruct", courtyard, "--out", out, "--seed", 3, "--resume")
+    assert status == 0
+    assert not list(out.glob("lines*"))
+    assert same_model(out / "model.npz", finished[0] / "model.npz")
 
 
 def test_info_describes_a_saved_model(finished: tuple[Path, str]) -> None:

@@ -31,6 +31,7 @@ from torchsfm.formats import (
     read_colmap,
     read_database,
     read_libmv,
+    read_lines,
     read_model,
     read_ply,
     read_vgg,
@@ -232,6 +233,7 @@ def _formats() -> list[Format]:
         np.savez(folder / "stage.npz", a=np.arange(5), b=np.array("text"))
         formats.append(Format("arrays", _files(folder, "stage.npz"), _load, _in_zip))
         formats.append(Format("intrinsics", {"K.txt": b"500 0 320\n0 500 240\n0 0 1\n"}, read_intrinsics))
+        formats.append(Format("lines", {"lines.txt": b"0 0 1 1 0 1 .5 .5 .5 2 0 10 10 50 12 4 3 11 9 52 13 4\n"}, read_lines))
         for suffix in (".png", ".jpg", ".bmp", ".tif", ".webp", ".ppm", ".pgm"):
             save_image(folder / f"a{suffix}", torch.rand(1 if suffix == ".pgm" else 3, 20, 24, generator=g))
             fix = (lambda data, damage: mend_png(damage(data))) if suffix == ".png" else None

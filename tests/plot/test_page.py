@@ -21,6 +21,7 @@ from torchsfm.geometry.similarity import Similarity
 from torchsfm.images import save_image
 from torchsfm.plot import up_direction, write_page
 from torchsfm.plot.framing import frame
+from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, Report
 from torchsfm.simulation import look_at, orbit_poses
@@ -257,3 +258,20 @@ def test_framing_ignores_wild_points(model: Reconstruction) -> None:
     assert clean.direction[2] > 0.2
     assert torch.allclose(clean.R @ clean.R.mT, torch.eye(3, dtype=torch.float64))
     assert float(torch.linalg.det(clean.R)) == pytest.approx(1)
+
+
+def test_lines_are_drawn_and_can_be_hidden(model: Reconstruction, tmp_path: Path, generator: torch.Generator) -> None:
+    plain = content(write_page(model, tmp_path / "plain.html"))["models"][0]
+    assert unpack(plain["lineEnds"], "<f4").size == 0
+    points = torch.randint(len(model.X), (6, 2), generator=generator)
+    color, none = torch.rand(6, 3, generator=generator, dtype=torch.float64), torch.zeros(0, dtype=torch.long)
+    ends = model.X[points]
+    ends[2, 1, 0] = torch.nan
+    lines = Lines(ends, color, model.x.new_zeros(0, 2, 2), model.x.new_zeros(0), none, none)
+    path = write_page(replace(model, lines=lines), tmp_path / "page.html")
+    shown, keep = content(path)["models"][0], torch.arange(6) != 2
+    positions = unpack(shown["positions"], "<f4").reshape(-1, 3)
+    assert np.allclose(unpack(shown["lineEnds"], "<f4").reshape(-1, 2, 3), positions[points[keep].numpy()], atol=1e-6)
+    assert np.array_equal(unpack(shown["lineColors"], "u1").reshape(-1, 3), (color[keep] * 255).round().numpy().astype("u1"))
+    assert "5 lines" in shown["summary"]
+    assert 'id="lines"' in path.read_text()

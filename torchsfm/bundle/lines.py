@@ -16,8 +16,10 @@ from torch import Tensor
 
 from torchsfm._types import check_index, check_options, check_tensors
 from torchsfm.bundle.structure import Sight
-from torchsfm.geometry import Line3D, Similarity, transform_lines
+from torchsfm.geometry import Camera, Line3D, Pose, Similarity, transform_lines
+from torchsfm.geometry.intrinsic_parameters import row_from_camera
 from torchsfm.geometry.line_manifold import world_covariance
+from torchsfm.geometry.projection import PixelProjection
 from torchsfm.linalg import cross
 from torchsfm.optim import Block, Loss, Term
 
@@ -111,6 +113,19 @@ class BundleLines:
         return replace(self, L=torch.where(moved, L.to(self.L.dtype), self.L))
 
 
+def segment_distances(poses: Pose, cameras: Camera, lines: BundleLines) -> Float[Tensor, "k 2"]:
+    """Signed distances of both ends of segments from the images of their lines, pixels, by the pose and camera of each view."""
+    model = type(cameras.distortion)
+    pose, camera = poses[lines.view], cameras[lines.view]
+    rays, valid = camera.unproject(lines.x)
+    L = lines.L[lines.line]
+    d = torch.linalg.vecdot(pose.R, L[:, None, :3])
+    normal = torch.linalg.vecdot(pose.R, L[:, None, 3:]) + cross(pose.t, d)
+    rows = row_from_camera(camera).double().mT
+    x, rays = lines.x.double().permute(2, 1, 0), torch.where(valid[..., None], rays, torch.nan).double().permute(2, 1, 0)
+    return _distances(PixelProjection(model).pixels, rows, normal.double().mT, x, rays).to(lines.x.dtype)
+
+
 @dataclass(frozen=True)
 class LocalLine:
     """Lines (d, m) about an origin of their own, moments in a unit of their own, both of which stay: `(d, m, origin, unit)`."""
@@ -160,7 +175,7 @@ def _projected(
     pixels: Callable[[Tensor, Tensor], Tensor], camera: Tensor, ray: Float[Tensor, "3 *n"], along: Float[Tensor, "3 *n"]
 ) -> tuple[Float[Tensor, "2 *n"], Float[Tensor, "2 *n"]]:
     """Image points of rays, and how they move where the rays move along a direction."""
-    follow = torch.is_grad_enabled()
+    follow = torch.is_grad_enabled() and any(t.requires_grad for t in (camera, ray, along))
     with torch.enable_grad():
         ray = ray if ray.requires_grad else ray.detach().requires_grad_()
         place = pixels(ray, camera)

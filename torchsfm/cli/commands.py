@@ -119,6 +119,9 @@ def reconstruct(
         Method,
         typer.Option(help="From two images on, or all together without calibration and then autocalibration."),
     ] = Method.incremental,
+    lines: Annotated[
+        bool, typer.Option("--lines", help="Find straight lines too, and adjust cameras by points and lines together.")
+    ] = False,
     max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
     max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,
     targets: Annotated[
@@ -141,6 +144,8 @@ def reconstruct(
         folder = photograph_folder(images) if matched is None else None
         if targets and folder is None:
             raise UserError("--for: wants a folder of images; torchsfm export has the option --images")
+        if lines and matched is not None:
+            raise UserError("--lines: wants images, in which line segments are found")
         check_exports(out, targets or [])
         K = None if intrinsics is None else read_intrinsics(intrinsics)
         options = {
@@ -152,8 +157,9 @@ def reconstruct(
         else:
             source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
             result = job.run(
-                source, threads, sequence=sequence, max_features=max_features, max_pixels=max_pixels, resume=resume, **options
-            )
+                source, threads, sequence=sequence, lines=lines, max_features=max_features, max_pixels=max_pixels,
+                resume=resume, **options,
+            )  # fmt: skip
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
         finish(job, result, folder, {}, max_pixels)

@@ -27,6 +27,7 @@ LABELS = {
     "track": "tracking corners",
     "verify": "checking epipolar geometry",
     "map": "building the model",
+    "segments": "finding line segments",
     "refine": "refining the model",
     "bundle": "adjusting",
     "write": "writing results",

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchsfm.cli.export import PHOTOGRAPHS
 from torchsfm.cli.job import NOTHING, Job
 from torchsfm.cli.output import replacing_results
-from torchsfm.formats import write_colmap, write_ply
+from torchsfm.formats import write_colmap, write_lines, write_ply
 from torchsfm.geometry import Pose
 from torchsfm.images import MAX_PIXELS
 from torchsfm.plot import write_page
@@ -88,7 +88,7 @@ def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path, ma
     """Write the page of all models, and each model in all formats that can hold it; return what to look at."""
     if not result.models:
         return []
-    total = 1 + 3 * len(result.models)
+    total = 1 + 3 * len(result.models) + 2 * sum(model.lines is not None for model in result.models)
     job.progress("write", 0, total)
     write_page(result.models, out / "page.html", report=result.report, images=folder, max_pixels=max_pixels)
     written = [("page.html", "open it in a browser and turn the model with the mouse")]
@@ -97,9 +97,13 @@ def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path, ma
         ("points", ".ply", write_ply, "coloured points and cameras for viewers"),
         ("colmap", "", write_colmap, "the model for COLMAP"),
     ]
+    of_lines = [
+        ("lines", ".ply", write_lines, "coloured lines for viewers"),
+        ("lines", ".txt", write_lines, "the lines and the segments that show them, for torchsfm.formats.read_lines"),
+    ]
     for i, model in enumerate(result.models):
-        for k, (stem, suffix, write, what) in enumerate(formats):
-            job.progress("write", 1 + 3 * i + k, total)
+        for stem, suffix, write, what in formats + (of_lines if model.lines is not None else []):
+            job.progress("write", len(written), total)
             name = f"{stem}{suffix}" if i == 0 else f"{stem}-{i}{suffix}"
             try:
                 write(model, out / name)

@@ -8,6 +8,7 @@ from torchsfm.formats.export import TARGETS, export_model
 from torchsfm.formats.gltf import write_gltf
 from torchsfm.formats.hloc import read_hloc
 from torchsfm.formats.libmv import read_libmv
+from torchsfm.formats.lines import read_lines, write_lines
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchsfm.formats.nvm import read_nvm, write_nvm
 from torchsfm.formats.openmvg import read_openmvg, write_openmvg
@@ -30,6 +31,7 @@ __all__ = [
     "read_database",
     "read_hloc",
     "read_libmv",
+    "read_lines",
     "read_model",
     "read_nerfstudio",
     "read_nvm",
@@ -44,6 +46,7 @@ __all__ = [
     "write_database",
     "write_gltf",
     "write_kitti",
+    "write_lines",
     "write_model",
     "write_nerfstudio",
     "write_nvm",

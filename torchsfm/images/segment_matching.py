@@ -119,14 +119,15 @@ def epipolar_overlap(
     """
     check_tensors(ends1=(ends1, "n 2 2"), ends2=(ends2, "m 2 2"), F=(F, "3 3"))
     h = torch.nn.functional.pad(ends1, (0, 1), value=1.0)
-    epipolar = (h @ F.mT)[:, None]
+    epipolar = h @ F.mT
+    normal, offset = epipolar[..., :2], epipolar[..., 2:]
     start, d = ends2[:, 0], ends2[:, 1] - ends2[:, 0]
-    slope = (epipolar[..., :2] * d[:, None]).sum(-1)
-    size = epipolar[..., :2].square().sum(-1).sqrt() * d.square().sum(-1).sqrt()[:, None]
+    slope = normal @ d.mT
+    size = normal.square().sum(-1, keepdim=True).sqrt() * d.square().sum(-1).sqrt()
     # Less than three degrees: where they meet is chance.
     steep = slope.abs() > 0.05 * size
-    at = -((epipolar[..., :2] * start[:, None]).sum(-1) + epipolar[..., 2]) / torch.where(steep, slope, 1.0)
-    low, high = at.amin(-1), at.amax(-1)
+    at = -(normal @ start.mT + offset) / torch.where(steep, slope, 1.0)
+    low, high = at.amin(1), at.amax(1)
     common = (high.clamp_max(1) - low.clamp_min(0)).clamp_min(0)
     whole = high.clamp_min(1) - low.clamp_max(0)
-    return torch.where(steep.all(-1), common / whole, 0.0)
+    return torch.where(steep.all(1), common / whole, 0.0)

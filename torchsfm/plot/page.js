@@ -103,7 +103,7 @@ function unpack(text, Type) {
 
 // ---- the model shown, and how
 let model = null, view = null, home = null, flight = null, looking = -1, hovered = -1, pointed = -1, wanted = false;
-const set = { mode: 0, size: 2.5, track: 2, error: Infinity, frustum: 1, photos: false };
+const set = { mode: 0, size: 2.5, track: 2, error: Infinity, frustum: 1, photos: false, lines: true };
 const cssColor = name => { const h = getComputedStyle(document.documentElement).getPropertyValue(name).trim(); return [1, 3, 5].map(i => parseInt(h.slice(i, i + 2), 16) / 255); };
 const eye = v => add(v.pivot, turn(v.q, [0, 0, 1]), v.distance);
 
@@ -127,6 +127,13 @@ function load(index) {
     attribute(2, m.tracks, 1, source.large ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT);
     attribute(3, m.errors, 1, gl.FLOAT);
     m.marks = attribute(4, new Uint8Array(m.count), 1, gl.UNSIGNED_BYTE);
+    const ends = unpack(source.lineEnds, Float32Array), shades = unpack(source.lineColors, Uint8Array), count = ends.length / 6;
+    m.lines = { count, arrays: [new Float32Array(3 * count), new Float32Array(3 * count), new Float32Array(4 * count).fill(1)] };
+    for (let i = 0; i < count; i++) for (let k = 0; k < 3; k++) {
+      m.lines.arrays[0][3 * i + k] = ends[6 * i + k];
+      m.lines.arrays[1][3 * i + k] = ends[6 * i + 3 + k];
+      m.lines.arrays[2][4 * i + k] = shades[3 * i + k] / 255;
+    }
     for (const c of m.images) if (c.pose) {
       c.axes = [c.pose.slice(3, 6), c.pose.slice(6, 9), c.pose.slice(9, 12)];
       c.centre = c.pose.slice(0, 3);
@@ -137,6 +144,7 @@ function load(index) {
   flight = null;
   tip.style.display = $("through").style.display = "none";
   $("summary").textContent = model.summary;
+  $("lines").style.display = model.lines.count ? "" : "none";
   const [low, high] = model.trackRange, [, worst] = model.errorRange;
   set.size = Math.round(4 * Math.min(4, Math.max(1.5, 2.75 * Math.pow(3e4 / Math.max(model.count, 1), 0.2)))) / 4;
   $("size").value = set.size;
@@ -283,6 +291,7 @@ function paint(now) {
   gl.uniform4f(dots.range, ...model.trackRange, ...model.errorRange);
   gl.uniform3f(dots.back, ...back);
   gl.drawArrays(gl.POINTS, 0, model.count);
+  if (set.lines) drawStrokes(model.lines, 0.9, m);
   if (set.frustum > 0) {
     drawStrokes(allFrusta(line), 0.6, m);
     if (hovered >= 0 && hovered != looking) drawStrokes(packStrokes(frustumStrokes(model.images[hovered], [...accent, 1])), 1.4, m);
@@ -531,6 +540,7 @@ $("model").onchange = () => load(+$("model").value);
 $("reset").onclick = () => leave(true);
 $("leave").onclick = () => leave(true);
 $("photos").onclick = () => { set.photos = !set.photos; $("photos").setAttribute("aria-pressed", set.photos); draw(); };
+$("lines").onclick = () => { set.lines = !set.lines; $("lines").setAttribute("aria-pressed", set.lines); draw(); };
 $("theme").onclick = () => { const root = document.documentElement; root.dataset.theme = root.dataset.theme == "dark" ? "light" : "dark"; draw(); };
 $("bare").onclick = () => { document.body.classList.toggle("bare"); draw(); };
 $("picture").onclick = () => {

@@ -37,9 +37,10 @@ def write_page(
 ) -> Path:
     """Write a self-contained interactive page of one model or of several.
 
-    It shows the coloured points and the cameras, upright; hovering names an image or tells a point's track; clicking a camera
-    looks through it; points can be coloured and filtered by track length and error; a table lists every image. It needs a
-    browser with WebGL 2 and nothing else. Points and cameras are stored as 32-bit floats.
+    It shows the coloured points, lines if there are any, and the cameras, upright; hovering names an image or tells a point's
+    track; clicking a camera looks through it; points can be coloured and filtered by track length and
+    error; a table lists every image. It needs a browser with WebGL 2 and nothing else. Points, lines and cameras are stored as
+    32-bit floats.
 
     Args:
         reconstruction: The model, or models to choose from, the most interesting first.
@@ -143,6 +144,19 @@ def _model(
         track = model.num_observations / max(model.num_points, 1)
         summary.append(f"{model.num_observations:,} observations, mean track {track:.1f}")
         summary.append(f"residuals: mean {float(residuals.mean()):.3g}, median {_quantile(residuals, 0.5):.3g} px")
+    line_ends, line_color = model.X.new_zeros(0, 2, 3), model.X.new_zeros(0, 3)
+    if model.lines is not None:
+        drawn = model.lines.ends.isfinite().flatten(1).all(-1)
+        line_ends, line_color = model.lines.ends[drawn], model.lines.color[drawn]
+        views_of_line, apart = model.lines.support().double(), model.line_residuals().nan_to_num()
+        summary.append(
+            f"{len(line_ends):,} lines"
+            + (
+                f", in {float(views_of_line.mean()):.1f} images, mean error {float(apart.mean()):.3g} px"
+                if len(line_ends)
+                else ""
+            )
+        )
     if found is not None and found.status != Status.OK:
         summary.append(f"the last adjustment did not converge in {found.iterations} steps")
     return {
@@ -153,6 +167,8 @@ def _model(
         "tracks": _pack(shown, index_type),
         "errors": _pack(errors[good], np.float32),
         "views": _pack(views, index_type),
+        "lineEnds": _pack(line_ends @ framing.R.mT - framing.centre, np.float32),
+        "lineColors": _pack((line_color.clamp(0, 1) * 255).round(), np.uint8),
         "large": large,
         "images": [
             entry | ({"pose": _numbers(_moved(entry["pose"], framing.centre))} if entry["pose"] is not None else {})

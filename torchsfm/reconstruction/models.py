@@ -1,6 +1,6 @@
 """From a view graph to finished models: first cameras, tracks, one model per component."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +15,7 @@ from torchsfm.reconstruction.adjust import LOSS
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.doubt import Standing, examine
+from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
 from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.projective import projective_start
@@ -51,6 +52,7 @@ def build_models(
     generator: torch.Generator,
     stages: Stages,
     progress: Progress,
+    segments: Callable[[], FoundSegments] | None = None,
 ) -> SfmResult:
     """Reconstruct every component of a view graph.
 
@@ -69,6 +71,7 @@ def build_models(
         generator: Source of randomness.
         stages: Timing and saving.
         progress: Called as images are registered.
+        segments: Finds the segments of all images where lines are wanted.
     """
     if camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
@@ -123,13 +126,18 @@ def build_models(
                 model, uncertain = unfolded.model, unfolded.uncertain
                 # What is left is mapped without the relations that were given up.
                 empty = replace(empty, graph=model.graph, track=model.track)
+            lines = None
+            if segments is not None:
+                with stages.timed("lines"):
+                    model, lines = find_lines(model, segments(), known.prior(model))
             if not found:
                 reasons |= failed
             taken = taken | model.registered
             standing = examine(
                 model, open_numbers=free, prior=known.prior(model), threshold=options.reprojection, uncertain=uncertain
             )
-            found.append((model.reconstruction(), standing, calibration_of(model, known.prior(model), loss=LOSS)))
+            finished = replace(model.reconstruction(), lines=lines)
+            found.append((finished, standing, calibration_of(model, known.prior(model), loss=LOSS)))
             if stages.folder is not None:
                 _save_model(found[-1][0], stages.folder, len(found) - 1)
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))

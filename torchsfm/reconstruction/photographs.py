@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 
@@ -11,9 +12,11 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS, ImageError, list_images, list_skipped, match_features, retrieve_pairs
+from torchsfm.reconstruction.find_lines import FoundSegments
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all, image_names, unpack
 from torchsfm.reconstruction.models import METHODS, build_models
 from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult, describe_skipped
+from torchsfm.reconstruction.segments import detect_all_segments
 from torchsfm.reconstruction.sequence import add_corners, sequence_pairs, track_corners
 from torchsfm.reconstruction.stages import Arrays, Stages, fingerprint, one_thread
 from torchsfm.reconstruction.view_graph import ViewGraph, verify_pairs
@@ -31,6 +34,7 @@ def reconstruct(
     K: Float[Tensor, "3 3"] | None = None,
     free_principal_point: bool = True,
     method: str = "incremental",
+    lines: bool = False,
     max_features: int = 8192,
     max_pixels: int = MAX_PIXELS,
     neighbours: int = 20,
@@ -60,6 +64,8 @@ def reconstruct(
         method: "incremental" starts from two images and a first focal length; "projective" reconstructs all images together
             without calibration, by factorisation of the longest tracks, and finds the camera by autocalibration. It refuses
             rather than guesses where the images do not determine the focal length (`report.autocalibration` says why).
+        lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
+            points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
         max_features: Features per image.
         max_pixels: Larger images are left out, as a small file can hold more than the memory does.
         neighbours: Images each one is matched with when there are many.
@@ -92,6 +98,10 @@ def reconstruct(
     generator = torch.Generator().manual_seed(seed)
     points = unpack(stages.run("features", lambda: detect_all(files, max_features, max_pixels, report)), files, names)
     graph = _view_graph(points, stages, report, generator, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels)
+
+    def segments() -> FoundSegments:
+        return FoundSegments.of(stages.run("segments", lambda: detect_all_segments(points.files, max_pixels, report)))
+
     result = build_models(
         graph,
         None,
@@ -107,6 +117,7 @@ def reconstruct(
         generator=generator,
         stages=stages,
         progress=report,
+        segments=cache(segments) if lines else None,
     )
     return replace(result, report=replace(result.report, skipped=tuple(skipped)))
 

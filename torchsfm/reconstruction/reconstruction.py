@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsfm._types import tensor_map
+from torchsfm.bundle.lines import segment_distances
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, Similarity
 from torchsfm.reconstruction.files import load_arrays, whole_file
+from torchsfm.reconstruction.lines import Lines
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Reconstruction:
         x: Observed image points in pixels, the centre of the top-left pixel at (0, 0).
         view: Image of each observation.
         point: Point of each observation.
+        lines: Lines and the segments that show them, where lines were looked for.
     """
 
     names: tuple[str, ...]
@@ -47,6 +50,7 @@ class Reconstruction:
     x: Float[Tensor, "m 2"]
     view: Int[Tensor, "m"]
     point: Int[Tensor, "m"]
+    lines: Lines | None = None
 
     @property
     def num_registered(self) -> int:
@@ -96,6 +100,12 @@ class Reconstruction:
         total = self.X.new_zeros(self.num_points).index_add(0, self.point, self.residuals())
         return total / self.track_lengths().clamp(min=1)
 
+    def line_residuals(self) -> Float[Tensor, "k 2"]:
+        """Distances of both ends of each segment from the image of its line, in pixels."""
+        if self.lines is None:
+            return self.X.new_zeros(0, 2)
+        return segment_distances(self.poses, self.cameras[self.camera_index], self.lines.bundle(ends=True)).abs()
+
     def transform(self, similarity: Similarity) -> "Reconstruction":
         """The same model in another world frame, `X' = s R X + t`; reprojections do not change."""
         poses = similarity.transform_pose(self.poses)
@@ -103,7 +113,8 @@ class Reconstruction:
         poses = Pose(
             R=torch.where(keep[:, None, None], poses.R, self.poses.R), t=torch.where(keep[:, None], poses.t, self.poses.t)
         )
-        return replace(self, X=similarity.transform(self.X), poses=poses)
+        lines = None if self.lines is None else self.lines.transform(similarity)
+        return replace(self, X=similarity.transform(self.X), poses=poses, lines=lines)
 
     def summary(self) -> str:
         """A few lines for people: what was registered, how many points, how well they fit, the cameras found."""
@@ -114,6 +125,11 @@ class Reconstruction:
                 f"mean track length {self.num_observations / self.num_points:.2f}",
                 f"mean reprojection error {float(self.residuals().mean()):.3f} px",
             ]
+        if self.lines is not None and len(self.lines):
+            views, error = self.lines.support().double().mean(), self.line_residuals().mean()
+            lines.append(
+                f"{len(self.lines)} lines, {len(self.lines.x)} segments, in {views:.2f} images each, {error:.3f} px off"
+            )
         used = torch.unique(self.camera_index[self.registered]).tolist()
         for index in used:
             camera = self.cameras[index]
@@ -133,6 +149,8 @@ class Reconstruction:
             for f in fields(self)
             if isinstance(getattr(self, f.name), Tensor)
         }
+        if self.lines is not None:
+            arrays |= {f"line_{f.name}": getattr(self.lines, f.name).detach().cpu().numpy() for f in fields(self.lines)}
         distortion = self.cameras.distortion
         model = next(name for name, cls in DISTORTION_MODELS.items() if type(distortion) is cls)
         count = len(self.cameras.K)
@@ -162,11 +180,13 @@ class Reconstruction:
         except ValueError as error:
             raise ValueError(f"{path} is not a saved reconstruction ({error})") from None
         tensors = {name: torch.from_numpy(arrays[name]) for name in LAYOUT if name not in ("names", "camera_model")}
+        lines = {name.removeprefix("line_"): torch.from_numpy(arrays[name]) for name in LINES if "line_ends" in arrays}
         distortion = DISTORTION_MODELS[str(arrays["camera_model"])].from_parameters(tensors.pop("camera_distortion"))
         return cls(
             names=tuple(arrays["names"].tolist()),
             cameras=Camera(tensors.pop("camera_K"), distortion),
             poses=Pose(tensors.pop("pose_R"), tensors.pop("pose_t")),
+            lines=Lines(**lines) if lines else None,
             **tensors,
         )
 
@@ -188,6 +208,15 @@ LAYOUT = {
     "point": ("m", "integers"),
 }
 """The arrays of a saved model: shape, where a letter is the same number everywhere, and contents."""
+LINES = {
+    "line_ends": ("l 2 3", "numbers"),
+    "line_color": ("l 3", "numbers"),
+    "line_x": ("k 2 2", "numbers"),
+    "line_weight": ("k", "numbers"),
+    "line_view": ("k", "integers"),
+    "line_line": ("k", "integers"),
+}
+"""Those of a model with lines."""
 KINDS = {"text": "U", "integers": "i", "numbers": "f", "yes or no": "b"}
 
 
@@ -198,7 +227,8 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
         ValueError: One is missing, has the wrong shape or type, is not finite where it must be, or points at what is not there.
     """
     sizes: dict[str, int] = {}
-    for name, (shape, kind) in LAYOUT.items():
+    layout = LAYOUT | (LINES if "line_ends" in arrays else {})
+    for name, (shape, kind) in layout.items():
         if name not in arrays:
             raise ValueError(f"it has no array '{name}'")
         array = arrays[name]
@@ -209,12 +239,13 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
             raise ValueError(f"{name}: wanted shape ({shape}){f' with {sizes}' if sizes else ''}, got {array.shape}")
         if array.dtype.kind != KINDS[kind]:
             raise ValueError(f"{name}: wanted {kind}, got {array.dtype}")
-        if kind == "numbers" and name != "color" and array.size and array.dtype != arrays["camera_K"].dtype:
+        if kind == "numbers" and not name.endswith("color") and array.size and array.dtype != arrays["camera_K"].dtype:
             raise ValueError(f"{name}: wanted {arrays['camera_K'].dtype} as camera_K has, got {array.dtype}")
     model = DISTORTION_MODELS.get(str(arrays["camera_model"]))
     if model is None or model.num_parameters != sizes["p"]:
         raise ValueError(f"camera_model: there is no {str(arrays['camera_model'])[:40]!r} with {sizes['p']} parameters")
-    for name, limit in (("camera_index", sizes["c"]), ("view", sizes["v"]), ("point", sizes["n"])):
+    limits = {"camera_index": "c", "view": "v", "point": "n", "line_view": "v", "line_line": "l"}
+    for name, limit in ((name, sizes[letter]) for name, letter in limits.items() if name in layout):
         bad = (arrays[name] < 0) | (arrays[name] >= limit)
         if bad.any():
             raise ValueError(f"{name}: there is no number {arrays[name][bad][0]} among {limit}")

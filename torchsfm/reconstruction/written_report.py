@@ -173,6 +173,21 @@ def _model_record(model: Reconstruction, found: Calibration | None) -> Record:
         "mean_error_px": float(model.residuals().mean()) if model.num_observations else 0.0,
         "cameras": cameras,
         **adjustment,
+        **_lines_record(model),
+    }
+
+
+def _lines_record(model: Reconstruction) -> Record:
+    if model.lines is None:
+        return {}
+    support, apart = model.lines.support(), model.line_residuals()
+    return {
+        "lines": {
+            "count": len(model.lines),
+            "segments": len(model.lines.x),
+            "mean_images": float(support.double().mean()) if len(support) else 0.0,
+            "mean_error_px": float(apart.mean()) if len(apart) else 0.0,
+        }
     }
 
 
@@ -190,6 +205,10 @@ def _models_text(record: Record) -> list[str]:
             ["mean track length", f"{model['mean_track_length']:.2f}"],
             ["mean reprojection error", f"{model['mean_error_px']:.3f} px"],
         ]
+        if found := model.get("lines"):
+            rows.append(["lines", f"{found['count']:,} of {found['segments']:,} segments"])
+            rows.append(["images of a line, mean", f"{found['mean_images']:.2f}"])
+            rows.append(["ends of segments off their lines, mean", f"{found['mean_error_px']:.3f} px"])
         if "converged" in model:
             ending = "converged" if model["converged"] else "**did not converge**"
             rows.append(["last adjustment", f"{ending} in {model['adjustment_steps']} steps"])
