@@ -372,8 +372,14 @@ FUNCTIONS: dict[str, Function] = {
     "resection.estimate_camera_projective": Function(ROBUST, {"n": 20}),
     "resection.refine_camera": Function(
         {"pose": lambda s: _poses(s)[..., 0], "camera": lambda s: Camera(s.parameters(1)[0][..., 0, :, :])}
+        | {"l": _sometimes_lines(_segments), "L": _sometimes_lines(_space_lines), "weights": lambda s: _of_each(s, 12)}
     ),
-    "resection.resect_cameras": Function({"max_iterations": 64, "generator": _generator}, {"n": 20}),
+    "resection.resect_cameras": Function(
+        {"max_iterations": 64, "generator": _generator, "K": _sometimes_lines(lambda s: s.parameters(4)[0])}
+        | {"l": _sometimes_lines(_all_segments), "L": _sometimes_lines(_space_lines)}
+        | {"visible": lambda s: torch.stack([_of_each(s, 20) < 0.95 for _ in range(4)], -2)},
+        {"n": 20},
+    ),
     "robust.find_structures": Function(
         TWO_VIEWS | {"estimator": HomographyEstimator(), "threshold": 2.0, "generator": _generator, "slots": 2},
         {"n": 30},

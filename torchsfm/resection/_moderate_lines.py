@@ -14,8 +14,8 @@ _RIDGE = 1e-6
 """How much the middle of all feet counts where lines leave the point nearest to them open."""
 
 
-def line_data(l: Tensor | None, L: Tensor | None) -> dict[str, tuple[Tensor | None, str]]:  # noqa: E741
-    """Segments or image lines and lines of the world, with the shapes that `check_tensors` should see.
+def line_data(l: Tensor | None, L: Tensor | None, view: str = "") -> dict[str, tuple[Tensor | None, str]]:  # noqa: E741
+    """Segments or image lines, of several views if so named, and lines of the world, with the shapes for `check_tensors`.
 
     Raises:
         ValueError: Only one of them is given.
@@ -23,7 +23,7 @@ def line_data(l: Tensor | None, L: Tensor | None) -> dict[str, tuple[Tensor | No
     if l is None or L is None:
         raise ValueError(f"l, L: wanted both or neither, got {'l' if L is None else 'L'} alone")
     segments = isinstance(l, Tensor) and l.ndim > 2 and l.shape[-2:] == (2, 2)
-    return {"l": (l, "k 2 2" if segments else "k 3"), "L": (L, "k 6")}
+    return {"l": (l, view + ("k 2 2" if segments else "k 3")), "L": (L, "k 6")}
 
 
 def moderate_structure(X: Tensor, L: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -70,21 +70,34 @@ def image_rows(x: Tensor, l: Tensor, centre: Tensor, unit: Tensor) -> Tensor:  #
     """
     batch = broadcast_shapes(x.shape[:-2], l.shape[: -3 if is_segments(l) else -2], unit.shape)
     x = moved_and_scaled(x.expand(*batch, *x.shape[-2:]), centre, unit)
+    ends = segment_ends(l, centre, unit)
+    ends = ends.expand(*batch, *ends.shape[-3:])
+    none = ((ends[..., 0, :] == ends[..., 1, :]).all(-1) | ~ends.isfinite().flatten(-2).all(-1))[..., None]
+    ends = moved_and_scaled(ends.flatten(-3, -2), centre, unit).reshape(*ends.shape[:-2], 4)
+    return torch.cat((torch.cat((x, x), -1), torch.where(none, torch.nan, ends)), -2)
+
+
+def segment_ends(l: Tensor, centre: Tensor, unit: Tensor) -> Tensor:  # noqa: E741
+    """Segments (*batch, k, 2, 2) as they are, or two points of homogeneous lines, a unit off the nearest to the centre.
+
+    NaN for what is no line.
+    """
     if is_segments(l):
-        l = l.expand(*batch, *l.shape[-3:])  # noqa: E741
-        ends = moved_and_scaled(l.flatten(-3, -2), centre, unit).reshape(l.shape)
-        none = (ends[..., 0, :] == ends[..., 1, :]).all(-1)
-    else:
-        none = ~(l.isfinite().all(-1) & (l[..., :2] != 0).any(-1))
-        l = torch.where(none[..., None], 1.0, l)  # noqa: E741
-        offset = (l[..., :2] * centre[..., None, :]).sum(-1, keepdim=True) + l[..., 2:]
-        length = torch.linalg.vector_norm(l[..., :2], dim=-1, keepdim=True)
-        normal = l[..., :2] / length
-        foot = -normal * (offset / (unit[..., None, None] * length))
-        along = torch.stack((-normal[..., 1], normal[..., 0]), -1)
-        ends = torch.stack((foot - along, foot + along), -2).expand(*batch, -1, 2, 2)
-    ends = torch.where(none[..., None], torch.nan, ends.flatten(-2))
-    return torch.cat((torch.cat((x, x), -1), ends), -2)
+        return l
+    none = ~(l.isfinite().all(-1, keepdim=True) & (l[..., :2] != 0).any(-1, keepdim=True))
+    l = torch.where(none, 1.0, l)  # noqa: E741
+    offset = (l[..., :2] * centre[..., None, :]).sum(-1, keepdim=True) + l[..., 2:]
+    length = torch.linalg.vector_norm(l[..., :2], dim=-1, keepdim=True)
+    normal = l[..., :2] / length
+    foot = centre[..., None, :] - normal * (offset / length)
+    along = torch.stack((-normal[..., 1], normal[..., 0]), -1) * unit[..., None, None]
+    return torch.where(none[..., None], torch.nan, torch.stack((foot - along, foot + along), -2))
+
+
+def pixel_ends(l: Tensor, K: Tensor) -> Tensor:  # noqa: E741
+    """Segments, or of lines two points a focal length to each side of the one nearest to the principal point."""
+    K = K.detach()
+    return segment_ends(l, K[..., :2, 2], (K[..., 0, 0] * K[..., 1, 1]).abs().sqrt())
 
 
 def kinds(n: int, l: Tensor) -> Tensor:  # noqa: E741

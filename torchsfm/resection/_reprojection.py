@@ -1,4 +1,4 @@
-"""The least-squares problem of reprojection errors over a pose and the inside of a camera."""
+"""The least-squares problem of distances in the image over a pose and the inside of a camera."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from torchsfm.geometry.intrinsic_parameters import intrinsic_columns, move_camer
 from torchsfm.geometry.projection import PixelProjection, turn_slopes
 from torchsfm.linalg import eigh
 from torchsfm.optim import Loss, attach_optimum, loss_slope, wants_derivative
+from torchsfm.resection._line_chords import chord_distances
 
 State = tuple[Pose, Tensor]
 """A pose, and the displacements of the free parameters."""
@@ -25,6 +26,9 @@ class Reprojection:
     """Numbers that are free."""
     skew: bool
     """Whether any camera has skew; False saves time."""
+    points: int | None = None
+    """How many points there are before the lines, each of which is two image points and four of the world (`line_chords`); all
+    if not given."""
 
     def inside(self, camera: Camera) -> "Inside":
         return Inside(camera, self.free, self.skew)
@@ -32,11 +36,30 @@ class Reprojection:
     def residual(self, state: State, x: Tensor, X: Tensor, camera: Camera) -> Tensor:
         pose, theta = state
         inside = self.inside(camera)
-        return inside.projection.pixels(camera_frame(pose, X.mT), inside.row(theta)).movedim(0, -1) - x
+        pixels = inside.projection.pixels(camera_frame(pose, X.mT), inside.row(theta)).movedim(0, -1)
+        if self.points is None:
+            return pixels - x
+        n = self.points
+        away, _ = chord_distances(pixels[..., n:, :], x[..., n:, :])
+        return torch.cat((pixels[..., :n, :] - x[..., :n, :], away), -2)
 
     def linearize(self, state: State, x: Tensor, X: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
         pose, theta = state
-        return linearize(pose, x, X, theta, self.inside(camera))
+        if self.points is None:
+            return linearize(pose, x, X, theta, self.inside(camera))
+        n = self.points
+        pixels, J = linearize(pose, torch.zeros_like(X[..., :2]), X, theta, self.inside(camera))
+        away, slopes = chord_distances(pixels[..., n:, :], x[..., n:, :])
+        lines = (slopes[..., None] * J[..., n:, :, :].reshape(*slopes.shape, -1)).sum((-3, -2))
+        return torch.cat((pixels[..., :n, :] - x[..., :n, :], away), -2), torch.cat((J[..., :n, :, :], lines), -3)
+
+    def in_front(self, pose: Pose, X: Tensor) -> Tensor:
+        """Whether points, and all of what is seen of lines, have positive depths."""
+        ahead = pose.transform(X)[..., 2] > 0
+        if self.points is None:
+            return ahead
+        lines = ahead[..., self.points :]
+        return torch.cat((ahead[..., : self.points], lines.reshape(*lines.shape[:-1], -1, 4).all(-1)), -1)
 
     def retract(self, state: State, delta: Tensor) -> State:
         pose, theta = state

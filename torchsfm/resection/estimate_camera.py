@@ -1,7 +1,7 @@
 """The pose of a calibrated camera from correspondences with known points and lines, of which many are wrong."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Unpack
+from typing import Any, ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -149,7 +149,8 @@ def estimate_camera(
         batch = check_door(data, threshold, options)
     else:
         batch = check_door(data | line_data(l, L), threshold, options, of_datum="m")
-        check_counts(options, x.shape[-2] + L.shape[-2])  # type: ignore[union-attr]
+        of_each: Any = {name: options.get(name) for name in ("mask", "quality", "weights")}
+        check_counts(x.shape[-2] + L.shape[-2], **of_each)  # type: ignore[union-attr]
     dtype = x.dtype
     x, X, K = x.double(), X.double(), K.double()
     intrinsics, middle, focal = _in_focal_lengths(K)

@@ -1,4 +1,4 @@
-"""The pose, and on request the inside, of cameras whose reprojection error is smallest."""
+"""The pose, and on request the inside, of cameras whose distances in the image are smallest."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,11 +12,14 @@ from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry import Camera, Pose
 from torchsfm.geometry.intrinsic_parameters import SKEW, intrinsic_columns
 from torchsfm.optim import Loss, levenberg_marquardt
+from torchsfm.resection._line_chords import line_chords
+from torchsfm.resection._moderate_lines import line_data, pixel_ends
 from torchsfm.resection._reprojection import Reprojection, inverse, like
 from torchsfm.resection._squares import minimise_squares
+from torchsfm.robust import check_counts
 
 Data = tuple[Tensor, Tensor, Tensor, Camera]
-"""Image points, points, weights, cameras."""
+"""Image points and ends of segments, points and chords of lines, weights, cameras."""
 PIECE = 16384
 """Points at a time: what is in use stays in the cache."""
 
@@ -34,8 +37,8 @@ class CameraRefinement:
     parameters in the order given: logarithms of focal length and aspect, skew in focal lengths, principal point in pixels,
     distortion. For
     independent noise of variance 1 / weight in every image coordinate; zero where not determined."""
-    in_front: Bool[Tensor, "*batch n"]
-    """Which points have positive depth."""
+    in_front: Bool[Tensor, "*batch m"]
+    """Which points, and then lines where they are seen, have positive depth."""
     error: Float[Tensor, "*batch"]
     """Weighted root-mean-square reprojection error in pixels, whatever the loss."""
     cost: Float[Tensor, "*batch"]
@@ -56,27 +59,35 @@ def refine_camera(
     X: Float[Tensor, "*#batch n 3"],
     pose: Pose,
     camera: Camera,
+    l: Float[Tensor, "*#batch k 2 2"] | Float[Tensor, "*#batch k 3"] | None = None,  # noqa: E741
+    L: Float[Tensor, "*#batch k 6"] | None = None,
     *,
     free: Sequence[str] = (),
-    weights: Float[Tensor, "*#batch n"] | Bool[Tensor, "*#batch n"] | None = None,
+    weights: Float[Tensor, "*#batch m"] | Bool[Tensor, "*#batch m"] | None = None,
     loss: Loss | None = None,
     max_iterations: int = 50,
 ) -> CameraRefinement:
-    """Minimise reprojection errors over the pose of every camera of a batch, and over chosen parameters of its inside.
+    """Minimise distances in the image over the pose of every camera of a batch, and over chosen parameters of its inside.
 
     Batched Levenberg-Marquardt, each camera with its own damping and its own stop. `pose` is the start, and so is
-    `camera` for the parameters that are free. The pose carries the derivative of the optimum with respect to x, X,
-    weights and what of the camera is held fixed. Points whose image or position is not finite make their camera
-    NOT_FINITE unless their weight is 0.
+    `camera` for the parameters that are free. The pose carries the derivative of the optimum with respect to x, X, l, L,
+    weights and what of the camera is held fixed. Data that are not finite make their camera NOT_FINITE unless their weight is
+    0.
+
+    With lines the sum of losses goes over points and lines, and so do `weights` and `in_front`: n points, then k lines. The
+    squared distance of a line is the sum of those of both ends of its segment from its image, which distortion bends.
 
     Args:
-        x: Image points in pixels, distorted as the camera distorts.
+        x: Image points in pixels, distorted as the camera distorts; there may be none with lines.
         X: The points in the world.
         pose: Starting poses.
         camera: The cameras.
+        l: Segments, two image points each, distorted as the camera distorts; or homogeneous lines, whose errors then count a
+            focal length to each side of the point nearest to the principal point.
+        L: The lines in the world, Pluecker vectors (d, m).
         free: Any of "focal" (one factor for both focal lengths), "aspect" (their ratio), "skew", "principal_point" and the
             names of the distortion's parameters ("k1", ...).
-        weights: Factors of the points' losses, 0 or False for absent.
+        weights: Factors of the losses of points, or of points and lines, 0 or False for absent.
         loss: A robust loss of squared distances in pixels (see `torchsfm.optim.loss`); squared error by default.
         max_iterations: Most steps for each camera.
 
@@ -84,7 +95,8 @@ def refine_camera(
         Poses, cameras, covariances, errors and a status per camera.
 
     Raises:
-        ValueError: Shapes, dtypes or devices do not fit, or `free` names what the camera does not have.
+        ValueError: Shapes, dtypes or devices do not fit, only one of `l` and `L` is given, or `free` names what the camera
+            does not have.
     """
     check_options(
         pose=(pose, Pose), camera=(camera, Camera), free=(free, Sequence), loss=(loss, Callable | None),
@@ -93,38 +105,50 @@ def refine_camera(
     columns = intrinsic_columns(free, type(camera.distortion))
     if len(set(free)) != len(free):
         raise ValueError(f"free: wanted distinct names, got {tuple(free)}")
-    kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
-    batch = check_tensors(x=(x, "n 2"), X=(X, "n 3"), R=(pose.R, "3 3"), K=(camera.K, "3 3"), weights=(weights, kind))
+    lined = l is not None or L is not None
+    kind = ("?m" if lined else "?n") + (": bool" if getattr(weights, "dtype", None) == torch.bool else "")
+    lines = line_data(l, L) if lined else {}
+    batch = check_tensors(x=(x, "n 2"), X=(X, "n 3"), R=(pose.R, "3 3"), K=(camera.K, "3 3"), weights=(weights, kind), **lines)
+    if lined:
+        check_counts(x.shape[-2] + L.shape[-2], weights=weights)  # type: ignore[union-attr]
     x, X = x.expand(*batch, *x.shape[-2:]), X.expand(*batch, *X.shape[-2:])
     pose = Pose(pose.R.expand(*batch, 3, 3), pose.t.expand(*batch, 3))
     camera = _expand(camera, batch)
-    w = (
-        torch.ones(x.shape[:-1], dtype=x.dtype, device=x.device)
-        if weights is None
-        else weights.to(x.dtype).expand(x.shape[:-1])
-    )
+    n, dtype = x.shape[-2], x.dtype
+    finite = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1)
+    if l is not None and L is not None:
+        l, L = pixel_ends(l, camera.K).expand(*batch, -1, 2, 2), L.expand(*batch, *L.shape[-2:])  # noqa: E741
+        good = torch.isfinite(l).flatten(-2).all(-1) & torch.isfinite(L).all(-1)
+        good = good & (l[..., 0, :] != l[..., 1, :]).any(-1) & (L[..., :3] != 0).any(-1)
+        finite = torch.cat((finite, good), -1)
+    w = torch.ones_like(finite, dtype=dtype) if weights is None else weights.to(dtype).expand(finite.shape)
     wanted = ~(w <= 0)
-    finite = torch.isfinite(x).all(-1) & torch.isfinite(X).all(-1) & torch.isfinite(w)
+    finite = finite & torch.isfinite(w)
     bad = (wanted & ~finite).any(-1) | ~(torch.isfinite(pose.R).all(-1).all(-1) & torch.isfinite(pose.t).all(-1))
     bad = bad | ~torch.isfinite(camera.K).all(-1).all(-1)
     use = wanted & finite & ~bad[..., None]
     w = torch.where(use, w, 0.0)
-    x, X = torch.where(use[..., None], x, 0.0), torch.where(use[..., None], X, 0.0)
-    dtype = x.dtype
+    x, X = (torch.where(use[..., :n, None], v, 0.0) for v in (x, X))
     x, X, w, pose, camera = tensor_map(torch.Tensor.double, (x, X, w, pose, camera))
-
-    # The origin of the world goes to the points: far coordinates must not cost digits.
-    total = w.detach().sum(-1, keepdim=True)
-    middle = (w.detach()[..., None] * X.detach()).sum(-2) / torch.where(total > 0, total, 1.0)
-    local = X - middle[..., None, :]
-    t = (pose.R @ middle[..., None])[..., 0] + pose.t
-    start = Pose(torch.where(bad[..., None, None], torch.eye(3, dtype=x.dtype, device=x.device), pose.R), t)
+    if l is not None and L is not None:
+        l = torch.where(use[..., n:, None, None], l, l.new_tensor([[0.0, 0.0], [1.0, 0.0]])).double()  # noqa: E741
+        L = torch.where(use[..., n:, None], L, L.new_tensor([1.0, 0, 0, 0, 0, 0])).double()
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    pose = Pose(torch.where(bad[..., None, None], eye, pose.R), torch.where(bad[..., None], 0.0, pose.t))
     skew = SKEW in columns or camera.K.requires_grad or bool((camera.K[..., 0, 1] != 0).any())
-    problem = Reprojection(tuple(free), loss, len(columns), skew)
+    problem = Reprojection(tuple(free), loss, len(columns), skew, None if l is None else n)
     theta = torch.zeros(*batch, problem.size, dtype=x.dtype, device=x.device)
-    data = (x, local, w, camera)
-    with torch.no_grad():
-        fit = _fit(problem, *tensor_map(torch.Tensor.detach, (start, theta, data)), max_iterations)
+    bends = l is not None and camera.distortion.parameter_names
+    lens = camera
+    # Where on a line its ends are seen matters only where straight lines are bent, and then little.
+    for _ in range(2 if bends else 1):
+        seen, local, middle = _centred(x, X, w, pose, lens, l, L)
+        data = (seen, local, w, camera)
+        start = Pose(pose.R, (pose.R @ middle[..., None])[..., 0] + pose.t)
+        with torch.no_grad():
+            fit = _fit(problem, *tensor_map(torch.Tensor.detach, (start, theta, data)), max_iterations)
+        pose = Pose(fit.pose.R, fit.pose.t - (fit.pose.R @ middle[..., None])[..., 0])
+        theta, lens = fit.theta, problem.inside(camera).moved(fit.theta)
     refined, theta = problem.attach((fit.pose, fit.theta), data, (fit.status == Status.OK) & ~bad)
     inside = problem.inside(camera)
     ahead = torch.where(fit.in_front, w, 0.0).sum(-1)
@@ -134,7 +158,7 @@ def refine_camera(
     bad = bad | ~torch.isfinite(place.to(dtype)).all(-1)
     status = fit.status
     for condition, code in (
-        ((status == Status.OK) & (2 * ahead <= total[..., 0]), Status.BEHIND),
+        ((status == Status.OK) & (2 * ahead <= w.detach().sum(-1)), Status.BEHIND),
         ((status != Status.TOO_FEW) & ~fit.determined, Status.DEGENERATE),
         (bad, Status.NOT_FINITE),
     ):
@@ -151,6 +175,30 @@ def refine_camera(
         fit.iterations,
         status,
     )
+
+
+def _centred(
+    x: Tensor,
+    X: Tensor,
+    w: Tensor,
+    pose: Pose,
+    camera: Camera,
+    l: Tensor | None,  # noqa: E741
+    L: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Image points with the ends of segments, points with the chords of lines about their middle, and that (*batch, 3).
+
+    The origin of the world goes to the points: far coordinates must not cost digits.
+    """
+    w = w.detach()
+    if l is not None and L is not None:
+        n = x.shape[-2]
+        chords = line_chords(tensor_map(torch.Tensor.detach, pose), tensor_map(torch.Tensor.detach, camera), l.detach(), L)
+        x, X = torch.cat((x, l.flatten(-3, -2)), -2), torch.cat((X, chords.flatten(-4, -2)), -2)
+        w = torch.cat((w[..., :n], w[..., n:].repeat_interleave(4, -1)), -1)
+    total = w.sum(-1, keepdim=True)
+    middle = (w[..., None] * X.detach()).sum(-2) / torch.where(total > 0, total, 1.0)
+    return x, X - middle[..., None, :], middle
 
 
 class _Fit(NamedTuple):
@@ -190,14 +238,13 @@ def _fit(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_iter
 
 def _minimum(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_iterations: int) -> _Fit:
     x, X, w, camera = data
-    plain = problem.loss is None
-    if plain:
+    if problem.loss is None and problem.points is None:
         fit = minimise_squares(start, theta, x, X, w, problem.inside(camera), max_iterations)
         pose, theta = fit.x
         covariance, determined = inverse(fit.end.metric)
         total = w.sum(-1)
         error = (2 * fit.cost / torch.where(total > 0, total, 1.0)).clamp_min(0).sqrt()
-        in_front = pose.transform(X)[..., 2] > 0
+        in_front = problem.in_front(pose, X)
         return _Fit(pose, theta, fit.cost, fit.iterations, fit.status, covariance, determined, in_front, error)
     result = levenberg_marquardt(
         problem.residual, (start, theta), x, X, camera, retract=problem.retract, size=6 + problem.size, weights=w,
@@ -212,7 +259,7 @@ def _minimum(problem: Reprojection, start: Pose, theta: Tensor, data: Data, max_
     total = w.sum(-1)
     square = (w * (r * r).sum(-1)).sum(-1)
     error = (square / torch.where(total > 0, total, 1.0)).sqrt()
-    in_front = pose.transform(X)[..., 2] > 0
+    in_front = problem.in_front(pose, X)
     return _Fit(pose, theta, result.cost, result.iterations, result.status, covariance, determined, in_front, error)
 
 

@@ -1,4 +1,4 @@
-"""All cameras of a list at once, from the points that each of them sees."""
+"""All cameras of a list at once, from the points and lines that each of them sees."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,14 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import Camera, Pose, point_line_distance, project_lines
+from torchsfm.resection._moderate_lines import is_segments, line_data, pixel_ends
 from torchsfm.resection.camera_dlt import camera_dlt
 from torchsfm.resection.camera_pnp import camera_pnp
 from torchsfm.resection.estimate_camera import estimate_camera
 from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
 from torchsfm.resection.refine_camera import refine_camera
-from torchsfm.robust import constant_weights
+from torchsfm.robust import check_counts, constant_weights
 from torchsfm.robust.moderation import middle_and_size
 
 _STEPS = 8
@@ -25,10 +26,12 @@ class ResectedCameras:
 
     model: Float[Tensor, "*batch v 3 4"]
     """`[R | t]` where K was given, otherwise P with `|P[2, :3]| = 1`; finite always."""
-    inliers: Bool[Tensor, "*batch v n"]
-    """The observations that count: nearer than the threshold, or all that are wanted where there is none."""
+    inliers: Bool[Tensor, "*batch v m"]
+    """The observations that count, of the n points and then of the k lines: nearer than the threshold, or all that are wanted
+    where there is none."""
     error: Float[Tensor, "*batch v"]
-    """Root-mean-square reprojection error of the inliers in pixels."""
+    """Root-mean-square distance of the inliers in pixels: reprojection error of points, of lines the root of the sum of the
+    squared distances of both ends."""
     status: Int8[Tensor, "*batch v"]
     """OK; TOO_FEW points for the camera; NOT_FINITE; DEGENERATE: the points do not determine it (in a line, for an uncalibrated
     camera in a plane); BEHIND; NOT_CONVERGED; NO_CONSENSUS."""
@@ -38,24 +41,29 @@ def resect_cameras(
     x: Float[Tensor, "*#batch v n 2"],
     X: Float[Tensor, "*#batch n 3"],
     K: Float[Tensor, "*#batch v 3 3"] | None = None,
+    l: Float[Tensor, "*#batch v k 2 2"] | Float[Tensor, "*#batch v k 3"] | None = None,  # noqa: E741
+    L: Float[Tensor, "*#batch k 6"] | None = None,
     *,
     threshold: float | Float[Tensor, "*#batch v"] | None = None,
-    visible: Bool[Tensor, "*#batch v n"] | None = None,
+    visible: Bool[Tensor, "*#batch v m"] | None = None,
     generator: torch.Generator | None = None,
     max_iterations: int = 10_000,
 ) -> ResectedCameras:
     """Every camera of a list of images of the same points, calibrated or not, in one batched call.
 
     With a threshold each camera is found among wrong correspondences (`estimate_camera`, `estimate_camera_projective`); without
-    one all observations count, and the camera is the minimum of squared reprojection errors, from `camera_pnp` or `camera_dlt`.
+    one all observations count, and the camera is the minimum of squared distances, from `camera_pnp` or `camera_dlt`, or with
+    lines from the pose that half of them agree on best.
     Each image has its own points, sampling and stop.
 
     Args:
         x: Image points in pixels, without distortion.
         X: The points in the world.
-        K: Intrinsics of each image, upper triangular with last row (0, 0, 1); None for uncalibrated cameras.
-        threshold: Largest reprojection error of an inlier in pixels; None to trust all observations.
-        visible: Which image sees which point; all by default.
+        K: Intrinsics of each image, upper triangular with last row (0, 0, 1); None for uncalibrated cameras, without lines.
+        l: Segments in the images, two image points each, without distortion; or homogeneous lines of any scale.
+        L: The lines in the world, Pluecker vectors (d, m), the same ones in all images.
+        threshold: Largest distance of an inlier in pixels (see `estimate_camera`); None to trust all observations.
+        visible: Which image sees which of the n points, and then of the k lines; all by default.
         generator: Source of randomness.
         max_iterations: Most samples to draw for an image.
 
@@ -63,45 +71,70 @@ def resect_cameras(
         The cameras, inliers, errors and a status for each.
 
     Raises:
-        ValueError: Shapes, dtypes or devices do not fit.
+        ValueError: Shapes, dtypes or devices do not fit, only one of `l` and `L` is given, or lines without K.
     """
     limit = threshold if isinstance(threshold, Tensor) else None
     if limit is None:
         check_options(threshold=(threshold, "?float > 0"))
     check_options(max_iterations=(max_iterations, "int >= 1"))
+    lined = l is not None or L is not None
+    lines = line_data(l, L, "v ") if lined else {}
     batch = check_tensors(
-        x=(x, "v n 2"), X=(X, "n 3"), K=(K, "?v 3 3"), threshold=(limit, "?v"), visible=(visible, "?v n: bool")
-    )
+        x=(x, "v n 2"), X=(X, "n 3"), K=(K, "?v 3 3"), threshold=(limit, "?v"),
+        visible=(visible, "?v m: bool" if lined else "?v n: bool"), **lines,
+    )  # fmt: skip
+    if lined and K is None:
+        raise ValueError("K: wanted intrinsics, as there are lines, got None")
     v, n = x.shape[-3:-1]
-    shape = (*batch, v)
+    shape, m = (*batch, v), n
     x, X = x.expand(*shape, n, 2), X[..., None, :, :].expand(*shape, n, 3)
-    seen = torch.ones(*shape, n, dtype=torch.bool, device=x.device) if visible is None else visible.expand(*shape, n)
+    if l is not None and L is not None:
+        m = n + L.shape[-2]
+        check_counts(m, visible=visible)
+        l = l.expand(*shape, *l.shape[-3 if is_segments(l) else -2 :])  # noqa: E741
+        L = L[..., None, :, :].expand(*shape, *L.shape[-2:])
+    seen = torch.ones(*shape, m, dtype=torch.bool, device=x.device) if visible is None else visible.expand(*shape, m)
     K = None if K is None else K.expand(*shape, 3, 3)
     if threshold is not None:
         options = {"mask": seen, "generator": generator, "max_iterations": max_iterations}
         if K is not None:
-            found = estimate_camera(x, X, K, threshold=threshold, **options)  # type: ignore[arg-type]
+            found = estimate_camera(x, X, K, l, L, threshold=threshold, **options)  # type: ignore[arg-type]
         else:
             found = estimate_camera_projective(x, X, threshold=threshold, **options)  # type: ignore[arg-type]
         model, inliers, status = found.model, found.inliers, found.status.to(torch.int8)
     elif K is not None:
-        model, status = _calibrated(x, X, K, seen)
+        model, status = _calibrated(x, X, K, l, L, seen, max_iterations)
         inliers = seen
     else:
         model, status = _uncalibrated(x, X, seen)
         inliers = seen
-    return ResectedCameras(model, inliers, _error(model if K is None else K @ model, x, X, inliers), status)
+    return ResectedCameras(model, inliers, _error(model, K, x, X, l, L, inliers), status)
 
 
-def _calibrated(x: Tensor, X: Tensor, K: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-    """The pose of each camera from all its points."""
-    h = torch.cat((x, torch.ones_like(x[..., :1])), -1)
-    d = h @ torch.linalg.inv_ex(K)[0].mT
+def _calibrated(
+    x: Tensor,
+    X: Tensor,
+    K: Tensor,
+    l: Tensor | None,  # noqa: E741
+    L: Tensor | None,
+    seen: Tensor,
+    most: int,
+) -> tuple[Tensor, Tensor]:
+    """The pose of each camera from all that it sees."""
     with torch.no_grad():
-        start = camera_pnp(d.detach(), X.detach(), weights=seen.to(x.dtype))
-    refined = refine_camera(x, X, Pose.from_matrix(start.model), Camera(K), weights=seen)
+        if l is None or L is None:
+            h = torch.cat((x, torch.ones_like(x[..., :1])), -1)
+            found = camera_pnp(h @ torch.linalg.inv_ex(K)[0].mT, X, weights=seen.to(x.dtype))
+            start, known = found.model, found.status
+        else:
+            # The same start each time: nothing here is random to the caller.
+            generator = torch.Generator(x.device).manual_seed(0)
+            robust = estimate_camera(x, X, K, l, L, threshold=None, mask=seen, generator=generator, max_iterations=most)
+            start = robust.model
+            known = torch.where(robust.status == Status.NO_CONSENSUS, int(Status.OK), robust.status).to(torch.int8)
+    refined = refine_camera(x, X, Pose.from_matrix(start), Camera(K), l, L, weights=seen)
     # What the start knows of the data stands: too few points, not determined.
-    status = torch.where(start.status == Status.OK, refined.status, start.status)
+    status = torch.where(known == Status.OK, refined.status, known)
     return refined.model, status.to(torch.int8)
 
 
@@ -144,9 +177,21 @@ def _uncalibrated(x: Tensor, X: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(good, P, start.model), start.status
 
 
-def _error(P: Tensor, x: Tensor, X: Tensor, inliers: Tensor) -> Tensor:
+def _error(
+    model: Tensor,
+    K: Tensor | None,
+    x: Tensor,
+    X: Tensor,
+    l: Tensor | None,  # noqa: E741
+    L: Tensor | None,
+    inliers: Tensor,
+) -> Tensor:
+    P = model if K is None else K @ model
     h = X @ P[..., :3].mT + P[..., None, :, 3]
     square = (h[..., :2] / h[..., 2:] - x).square().sum(-1)
+    if l is not None and L is not None and K is not None:
+        away = point_line_distance(pixel_ends(l, K), project_lines(P, L)[..., None, :])
+        square = torch.cat((square, away.square().sum(-1)), -1)
     use = inliers & torch.isfinite(square)
     mean = torch.where(use, square, 0.0).sum(-1) / use.sum(-1).clamp_min(1)
     return torch.where(mean > 0, torch.where(mean > 0, mean, 1.0).sqrt(), 0.0)

@@ -98,16 +98,19 @@ def check_door(
     return batch
 
 
-def check_counts(options: Any, count: int) -> None:
+def check_counts(count: int, **given: Tensor | None) -> None:
     """Check that what is said of each datum is said of all, where these come in several tensors.
 
+    Args:
+        count: The number of data.
+        **given: What is said of them, the last dimension for the data, under the names the caller knows it by; or None.
+
     Raises:
-        ValueError: It names the option, and the numbers wanted and given.
+        ValueError: It names the argument, and the numbers wanted and given.
     """
-    for name in ("mask", "quality", "weights"):
-        given = options.get(name)
-        if given is not None and given.shape[-1] != count:
-            raise ValueError(f"{name}: wanted {count} in the last dimension, for all data, got shape {tuple(given.shape)}")
+    for name, t in given.items():
+        if t is not None and t.shape[-1] != count:
+            raise ValueError(f"{name}: wanted {count} in the last dimension, for all data, got shape {tuple(t.shape)}")
 
 
 def _check_radians(threshold: float | Tensor | None) -> None:
