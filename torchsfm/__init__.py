@@ -33,6 +33,7 @@ from torchsfm.autocalibration import (
 from torchsfm.bundle import (
     AdjustedModel as AdjustedModel,
     BundleCovariance as BundleCovariance,
+    BundleLines as BundleLines,
     BundleModel as BundleModel,
     BundleResult as BundleResult,
     CentrePrior as CentrePrior,
@@ -60,6 +61,7 @@ from torchsfm.formats import (
     read_nvm as read_nvm,
     read_openmvg as read_openmvg,
     read_opensfm as read_opensfm,
+    read_lines as read_lines,
     read_ply as read_ply,
     write_bal as write_bal,
     write_bundler as write_bundler,
@@ -72,6 +74,7 @@ from torchsfm.formats import (
     write_nvm as write_nvm,
     write_openmvg as write_openmvg,
     write_opensfm as write_opensfm,
+    write_lines as write_lines,
     write_ply as write_ply,
     write_tum as write_tum,
 )
@@ -148,6 +151,7 @@ from torchsfm.plot import (
 )
 from torchsfm.reconstruction import (
     MatchedImages as MatchedImages,
+    Lines as Lines,
     Reconstruction as Reconstruction,
     ReconstructionError as ReconstructionError,
     Report as Report,

@@ -1,5 +1,6 @@
 """How do images become a model? The `Reconstruction`, and the doors from photographs and from tracks."""
 
+from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
 from torchsfm.reconstruction.models import reconstruct_tracks
 from torchsfm.reconstruction.photographs import reconstruct
@@ -9,6 +10,7 @@ from torchsfm.reconstruction.view_graph import Verdict
 
 __all__ = [
     "ImageReport",
+    "Lines",
     "MatchedImages",
     "PairReport",
     "Reconstruction",
