@@ -174,8 +174,8 @@ class _Sines(Problem[_System]):
         return self.linearize(_unit(P + moved, u + move))
 
     def rounding(self, here: _System) -> Tensor:
-        """What rounding of unit rays makes of the misfit; in their products with cameras some of it grows by cancellation."""
-        return torch.full_like(here.cost, (30 * self.epsilon) ** 2)
+        """What rounding makes of the misfit: predictions are products of units that may cancel, steps come of normal equations."""
+        return (100 * self.epsilon) ** 2 * here.linear.alpha.sum((-2, -1)) / here.total
 
 
 def sine_cost(rays: Rays, P: Tensor, u: Tensor) -> Float[Tensor, "p"]:
@@ -317,6 +317,8 @@ def _step(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Tensor
     """A damped Gauss-Newton step of cameras and points, and where it could be solved."""
     p, v, _ = system.alpha.shape
     S, right, F, rest = _reduced(system, damping, points)
+    if points:
+        _hold_frame(S, system.P)
     factor, info = torch.linalg.cholesky_ex(S)
     step = -torch.cholesky_solve(right[..., None], factor)
     solved = (info == 0) & torch.isfinite(step).all(-1).all(-1)
@@ -325,6 +327,14 @@ def _step(system: _Linearisation, damping: Tensor, points: bool) -> tuple[Tensor
     # The model: right' step + step' S step / 2 and what the points alone bring; twice that in units of the cost.
     promise = -(right * step[..., 0]).sum(-1) + g.square().sum((-2, -1))
     return step.reshape(p, v, 3, system.P.shape[-1]), move, solved, promise
+
+
+def _hold_frame(S: Tensor, P: Tensor) -> None:
+    """No change of frame gains anything; what rounding leaves of its slope, divided by the damping, would be all that is promised."""
+    p, v, _, r = P.shape
+    Q = _orthonormal(P)[0].reshape(p, 3 * v, r)
+    size = S.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
+    S.view(p, 3 * v, r, 3 * v, r).diagonal(dim1=2, dim2=4).add_((size * (Q @ Q.mT))[..., None])
 
 
 def _back(F: Tensor, rest: Tensor, step: Tensor) -> Float[Tensor, "p r n"]:
