@@ -161,15 +161,14 @@ def test_weighing_beats_not_weighing(generator):
     """The classical constraints on noisy cameras are near the truth, and farther from it than the weighed ones."""
     from torchsfm.autocalibration import autocalibrate_points
 
-    scene = stack([projective_scene(generator, 6, noise=1.0, offset=0.0) for _ in range(30)])
+    scene = stack([projective_scene(generator, 6, noise=1.0, offset=0.0) for _ in range(60)])
     plain = constant_intrinsics(scene.P, scene.X, image_size=SIZE, visible=scene.visible, assume=FOCAL)
     best = autocalibrate_points(scene.P, scene.X, scene.x, image_size=SIZE, visible=scene.visible, assume=FOCAL)
     truth = scene.K[:, 0, 0, 0]
     plain_error = (plain.K[:, 0, 0] / truth - 1).abs()
     error = (best.K[:, 0, 0, 0] / truth - 1).abs()
     assert plain_error.median() < 0.05
-    # On average over many scenes a quarter; thirty may be kind to those that do not weigh.
-    assert error.square().mean() < 1.5 * plain_error.square().mean()
+    assert error.square().mean() < plain_error.square().mean()
 
 
 def test_wrong_input(unchecked):

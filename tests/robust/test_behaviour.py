@@ -42,7 +42,8 @@ def test_the_number_of_threads_does_not_matter(door: Door, generator: torch.Gene
 def test_extremes_in_one_batch(door: Door, generator: torch.Generator) -> None:
     """Each has its status, finite numbers, and what it gets alone, after as many samples."""
     scene, mask, sizes = extremes(door, generator)
-    options = {"max_iterations": 300}
+    # Of six random points few samples have cameras with all in front: the more are drawn, the surer one says so.
+    options = {"max_iterations": 1000 if door is DOORS["trifocal"] else 300}
     batch = door(scene, mask=mask, **options)
     for i, (name, size) in enumerate(sizes.items()):
         alone = door(scene.at(i, slice(size)), **options)
