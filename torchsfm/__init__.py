@@ -159,6 +159,7 @@ from torchsfm.reconstruction import (
     reconstruct as reconstruct,
     reconstruct_matches as reconstruct_matches,
     reconstruct_tracks as reconstruct_tracks,
+    triangulate_photographs as triangulate_photographs,
 )
 from torchsfm.resection import (
     CameraEstimate as CameraEstimate,

@@ -438,6 +438,7 @@ EXCEPTIONS: dict[str, str] = {
     **{f"images.{name}": FILES for name in ("parse_exif", "read_image", "save_image")},
     "optim.wants_derivative": "a question about tensors, not their values",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
+    "reconstruction.triangulate_photographs": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.reconstruct_matches": "lists of tensors; its stages are tried by reconstruct_tracks",
     **{f"robust.{name}": "what doors have in common; each door is tried" for name in ("check_door", "estimate_robustly")},
     "simulation.courtyard_scene": "takes no data, and seconds",

@@ -13,6 +13,7 @@ from torchsfm.cli.bundle import bundle
 from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
 from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched, warn_about_intrinsics
 from torchsfm.cli.job import Job, UserError, told
+from torchsfm.cli.known_poses import register, triangulate
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.results import VERSION, compare, finish
 from torchsfm.formats import TARGETS
@@ -221,5 +222,5 @@ def info(
             typer.echo("")
 
 
-for command in (bundle, export, convert):
+for command in (triangulate, register, bundle, export, convert):
     app.command()(command)

@@ -1,5 +1,6 @@
 """How do images become a model? The `Reconstruction`, and the doors from photographs and from tracks."""
 
+from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
 from torchsfm.reconstruction.models import reconstruct_tracks
@@ -21,4 +22,5 @@ __all__ = [
     "reconstruct",
     "reconstruct_matches",
     "reconstruct_tracks",
+    "triangulate_photographs",
 ]

@@ -121,7 +121,7 @@ def extend_model(
     adjusted_at = int(model.registered.sum())
     second_try = False
     while True:
-        images = _next_images(model, elsewhere, failed)
+        images = next_images(model, elsewhere, failed)
         if not len(images):
             # What failed against fewer points, or before the cameras were refined, is tried once more.
             if second_try or not failed:
@@ -157,7 +157,7 @@ def extend_model(
     return _refine(model, options), failed
 
 
-def _next_images(model: Mapping, elsewhere: Bool[Tensor, "v"], failed: dict[int, str]) -> Int[Tensor, "k"]:
+def next_images(model: Mapping, elsewhere: Bool[Tensor, "v"], failed: dict[int, str]) -> Int[Tensor, "k"]:
     """The unregistered images that see the model best: those with at least half the best score, at most eight."""
     count, score = visibility_scores(model)
     able = ~model.registered & ~elsewhere & (count >= MIN_VISIBLE)

@@ -145,7 +145,7 @@ def build_models(
     unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[camera_index]
     verdict = graph.verdicts(cameras.K[camera_index], unknown_focal)
     pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
-    images = _image_reports(graph, [(model, standing) for model, standing, _ in found], reasons, failures, order)
+    images = image_reports(graph, [(model, standing) for model, standing, _ in found], reasons, failures, order)
     calibrations = tuple(calibration for _, _, calibration in found)
     course = Report(images, pairs, dict(stages.seconds), source, tuple(autocalibration), calibrations=calibrations)
     return SfmResult(tuple(model for model, _, _ in found), course)
@@ -156,13 +156,22 @@ def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
     model.save(folder / "stages" / f"model-{number}.npz")
 
 
-def _image_reports(
+def image_reports(
     graph: ViewGraph,
     found: Sequence[tuple[Reconstruction, Standing]],
     reasons: dict[int, str],
     failures: dict[str, str],
     order: Sequence[str],
 ) -> tuple[ImageReport, ...]:
+    """What became of each file, in the order of the input.
+
+    Args:
+        graph: Image points and verified matches of the images that could be read.
+        found: The models, and what is thought of their cameras.
+        reasons: Why images are in none of them, by index.
+        failures: Files that could not be read, with the reason.
+        order: All files.
+    """
     features = torch.bincount(graph.view, minlength=len(graph.names)).tolist()
     related = graph.pairs[torch.maximum(graph.fundamental_inliers, graph.homography_inliers) >= MIN_INLIERS].flatten()
     linked = torch.bincount(related, minlength=len(graph.names)).tolist()

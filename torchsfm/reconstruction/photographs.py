@@ -1,7 +1,7 @@
 """The main job: photographs in, cameras and points out."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
@@ -89,37 +89,80 @@ def reconstruct(
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
     report = progress or (lambda stage, done, total: None)
-    files, skipped = _files(images)
-    names = image_names(files)
-    model = camera or ("pinhole" if K is not None else "radial")
-    # What is saved depends on these alone; cameras and models are made from it each time.
-    options = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
-    stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
     generator = torch.Generator().manual_seed(seed)
-    points = unpack(stages.run("features", lambda: detect_all(files, max_features, max_pixels, report)), files, names)
-    graph = _view_graph(points, stages, report, generator, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels)
+    seen = match_photographs(
+        images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
+        resume=resume, generator=generator, progress=report,
+    )  # fmt: skip
 
     def segments() -> FoundSegments:
-        return FoundSegments.of(stages.run("segments", lambda: detect_all_segments(points.files, max_pixels, report)))
+        found = seen.stages.run("segments", lambda: detect_all_segments(seen.points.files, max_pixels, report))
+        return FoundSegments.of(found)
 
     result = build_models(
-        graph,
+        seen.graph,
         None,
-        labels=points.labels,
-        exif_focal=points.focal,
-        failures=points.failures,
-        order=names,
-        camera=model,
+        labels=seen.points.labels,
+        exif_focal=seen.points.focal,
+        failures=seen.points.failures,
+        order=seen.names,
+        camera=camera or ("pinhole" if K is not None else "radial"),
         shared_camera=shared_camera,
         K=K,
         free_principal_point=free_principal_point,
         method=method,
         generator=generator,
-        stages=stages,
+        stages=seen.stages,
         progress=report,
         segments=cache(segments) if lines else None,
     )
-    return replace(result, report=replace(result.report, skipped=tuple(skipped)))
+    return replace(result, report=replace(result.report, skipped=seen.skipped))
+
+
+@dataclass(frozen=True)
+class MatchedPhotographs:
+    """What photographs say before any camera is known.
+
+    Attributes:
+        names: All files in the order of the input.
+        skipped: What was passed over in their folder, with the reason.
+        points: The features of those that could be read, and what the files say of the cameras.
+        graph: Verified matches.
+        stages: Where the time went, and finished stages.
+    """
+
+    names: tuple[str, ...]
+    skipped: tuple[tuple[str, str], ...]
+    points: ImagePoints
+    graph: ViewGraph
+    stages: Stages
+
+
+def match_photographs(
+    images: str | Path | Sequence[str | Path],
+    *,
+    sequence: bool,
+    max_features: int,
+    max_pixels: int,
+    neighbours: int,
+    out: str | Path | None,
+    resume: bool,
+    generator: torch.Generator,
+    progress: Progress,
+) -> MatchedPhotographs:
+    """Read photographs, find their features and match them; the arguments are those of `reconstruct`.
+
+    Raises:
+        ReconstructionError: No such folder, or fewer than two readable images.
+    """
+    files, skipped = _files(images)
+    names = image_names(files)
+    # What is saved depends on these alone; cameras and models are made from it each time.
+    options = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
+    stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
+    points = unpack(stages.run("features", lambda: detect_all(files, max_features, max_pixels, progress)), files, names)
+    graph = _view_graph(points, stages, progress, generator, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels)
+    return MatchedPhotographs(tuple(names), tuple(skipped), points, graph, stages)
 
 
 def _files(images: str | Path | Sequence[str | Path]) -> tuple[list[Path], list[tuple[str, str]]]:

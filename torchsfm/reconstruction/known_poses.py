@@ -1,0 +1,240 @@
+"""Photographs of which the poses are known: points for them, and poses for further photographs of the same scene."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.bundle import bundle_adjust
+from torchsfm.geometry import DISTORTION_MODELS, BundleProblem, Camera, Pose, similarity_from_points
+from torchsfm.images import MAX_PIXELS
+from torchsfm.reconstruction.adjust import LOSS, about_cameras, adjust
+from torchsfm.reconstruction.calibration import choose_free
+from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
+from torchsfm.reconstruction.doubt import examine
+from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE, UNKNOWN_FOCAL, MappingOptions, next_images
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.models import image_reports
+from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
+from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.register import register_images
+from torchsfm.reconstruction.report import Progress, ReconstructionError, Report, SfmResult, pair_report
+from torchsfm.reconstruction.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
+from torchsfm.reconstruction.tracks import build_tracks
+
+ROUNDS = 4
+"""Of triangulation, completion and adjustment; little changes after the second."""
+
+
+def triangulate_photographs(
+    images: str | Path | Sequence[str | Path],
+    poses: Reconstruction,
+    *,
+    refine_poses: bool = False,
+    register: bool = False,
+    sequence: bool = False,
+    max_features: int = 8192,
+    max_pixels: int = MAX_PIXELS,
+    neighbours: int = 20,
+    seed: int = 0,
+    out: str | Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> SfmResult:
+    """Find the points that photographs with known cameras and poses show, and place further photographs among them.
+
+    Features are matched as `reconstruct` does; tracks are triangulated with the poses given, and points moved to the least
+    robust reprojection error. World frame and scale stay those of the poses.
+
+    Args:
+        images: A folder or image files, see `reconstruct`.
+        poses: A model with the poses and cameras of these photographs, by their names; its points are not used.
+        refine_poses: Adjust the poses together with the points, the cameras held; the result is moved back to where the camera
+            centres fit those given best.
+        register: Also place the photographs that are not in the model, in the frame that the others make. Those that the files
+            say the same camera took as others of the model get its intrinsics; the intrinsics of other cameras are estimated.
+            The poses and cameras given stay as they are.
+        sequence: The images are consecutive frames of a video.
+        max_features: Features per image.
+        max_pixels: Larger images are left out.
+        neighbours: Images each one is matched with when there are many.
+        seed: The same seed gives the same model.
+        out: Folder in which finished stages are saved.
+        resume: Use the stages that an earlier run with the same images and options saved there.
+        progress: Called as the work goes on.
+
+    Returns:
+        One model of all photographs, unless nothing could be triangulated, and a report.
+
+    Raises:
+        ReconstructionError: Wrong input: no such folder, fewer than two photographs that the model has poses for, or
+            photographs of other sizes than the model says.
+    """
+    report = progress or (lambda stage, done, total: None)
+    generator = torch.Generator().manual_seed(seed)
+    seen = match_photographs(
+        images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
+        resume=resume, generator=generator, progress=report,
+    )  # fmt: skip
+    place = _places(seen, poses)
+    reasons = dict.fromkeys((place < 0).nonzero()[:, 0].tolist(), "has no pose in the given model")
+    with seen.stages.timed("map"):
+        report("map", 0, len(place))
+        mapping, options, own = _start(seen, poses.to("cpu", torch.float64), place, generator)
+        given = mapping
+        mapping = _structure(mapping, options)
+        if refine_poses:
+            for _ in range(2):
+                mapping = _structure(adjust(mapping, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE), options)
+            mapping = _moved_back(mapping, given)
+        if register and len(mapping.X):
+            mapping, reasons = _register(mapping, options, own, report)
+        report("map", int(mapping.registered.sum()), len(place))
+        graph = mapping.graph
+        names = mapping.cameras.distortion.parameter_names
+        standing = examine(mapping, open_numbers=("focal", *names) if bool(own.any()) else (), prior=options.prior(mapping),
+                           threshold=options.reprojection)  # fmt: skip
+    found = [(mapping.reconstruction(), standing)] if len(mapping.X) else []
+    verdict = graph.verdicts(mapping.cameras.K[mapping.camera_index], torch.zeros(len(place), dtype=torch.bool))
+    pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
+    reports = image_reports(graph, found, reasons, seen.points.failures, seen.names)
+    course = Report(reports, pairs, dict(seen.stages.seconds), skipped=seen.skipped)
+    return SfmResult(tuple(model for model, _ in found), course)
+
+
+def _places(seen: MatchedPhotographs, poses: Reconstruction) -> Int[Tensor, "v"]:
+    """Which image of the model each photograph is, or -1; of the model's only those with a pose count.
+
+    Raises:
+        ReconstructionError: Fewer than two are there, or one has another size.
+    """
+    posed = {name: i for i, name in enumerate(poses.names) if bool(poses.registered[i])}
+    place = torch.tensor([posed.get(name, -1) for name in seen.points.names], dtype=torch.long)
+    for i, name in enumerate(seen.points.names):
+        size, wanted = seen.points.image_size[i].tolist(), poses.image_size[place[i]].tolist()
+        if place[i] >= 0 and size != wanted:
+            sizes = f"{size[0]} x {size[1]} pixels, in the model of the poses {wanted[0]} x {wanted[1]}"
+            raise ReconstructionError(f"{name}: {sizes}")
+    if int((place >= 0).sum()) < 2:
+        first = next(iter(posed), "none")
+        raise ReconstructionError(
+            f"{int((place >= 0).sum())} of {len(place)} photographs have a pose in the model, two are the least"
+            f" (the model has {first!r}, the photographs {seen.points.names[0]!r})"
+        )
+    return place
+
+
+def _start(
+    seen: MatchedPhotographs, poses: Reconstruction, place: Int[Tensor, "v"], generator: torch.Generator
+) -> tuple[Mapping, MappingOptions, Bool[Tensor, "g"]]:
+    """The photographs with the poses and cameras of the model, without points; and which cameras are not the model's."""
+    graph, points = seen.graph, seen.points
+    group = group_cameras(points.image_size, points.labels, None)
+    kind = type(poses.cameras.distortion)
+    name = next(name for name, model in DISTORTION_MODELS.items() if model is kind)
+    guessed, source = guess_cameras(graph, group, model=name, K=None, exif_focal=points.focal)
+    camera = torch.where(place >= 0, poses.camera_index[place.clamp(min=0)], -1)
+    for i in (place < 0).nonzero()[:, 0].tolist():
+        like = ((group == group[i]) & (place >= 0)).nonzero()[:, 0]
+        camera[i] = camera[like[0]] if len(like) else len(poses.cameras.K) + group[i]
+    used, index = torch.unique(camera, return_inverse=True)
+    K = torch.cat([poses.cameras.K, guessed.K])[used]
+    both = (poses.cameras, guessed)
+    numbers = [one.distortion.parameters().reshape(len(one.K), kind.num_parameters).to(K) for one in both]
+    cameras = Camera(K, kind.from_parameters(torch.cat(numbers)[used]))
+    own = used >= len(poses.cameras.K)
+    sigma = torch.cat([torch.full((len(poses.cameras.K),), 0.01, dtype=K.dtype), focal_uncertainty(source)])[used]
+    track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
+    mapping = Mapping.start(graph, track, cameras, index)
+    known = place >= 0
+    chosen = poses.poses[place.clamp(min=0)]
+    R = torch.where(known[:, None, None], chosen.R, mapping.poses.R)
+    mapping = replace(mapping, poses=Pose(R, torch.where(known[:, None], chosen.t, 0.0)), registered=known)
+    return mapping, MappingOptions(free=(), expected=cameras, focal_sigma=sigma, generator=generator), own
+
+
+def _structure(mapping: Mapping, options: MappingOptions) -> Mapping:
+    """Points of all tracks, with the poses and cameras as they are."""
+    for _ in range(ROUNDS):
+        before = mapping.point
+        mapping = triangulate_tracks(mapping, threshold=options.reprojection, min_angle=options.min_angle)
+        mapping = complete_tracks(mapping, threshold=options.reprojection)
+        mapping = merge_points(mapping, threshold=options.reprojection)
+        mapping = filter_points(mapping, threshold=options.reprojection, min_angle=options.min_angle)
+        mapping = _adjust(mapping, moving=torch.zeros_like(mapping.registered))
+        mapping = filter_points(mapping, threshold=options.reprojection, min_angle=options.min_angle)
+        if int(((before >= 0) != (mapping.point >= 0)).sum()) <= 0.01 * int((before >= 0).sum()):
+            break
+    return mapping
+
+
+def _adjust(
+    mapping: Mapping,
+    *,
+    moving: Bool[Tensor, "v"],
+    own: Bool[Tensor, "g"] | None = None,
+    options: MappingOptions | None = None,
+) -> Mapping:
+    """Move all points, some of the poses, and of some cameras what the images determine."""
+    node = mapping.observations()
+    if not len(node):
+        return mapping
+    cameras = {}
+    if own is not None and options is not None and bool(own.any()):
+        prior = options.prior(mapping)
+        names = ("focal", *mapping.cameras.distortion.parameter_names)
+        free = {name: mask & own for name, mask in choose_free(mapping, names, prior, loss=LOSS).items()}
+        cameras = about_cameras(mapping, free, prior)
+    result = bundle_adjust(
+        BundleProblem(
+            mapping.poses, mapping.cameras, mapping.camera_index, mapping.X, mapping.graph.x[node], mapping.graph.view[node],
+            mapping.point[node],
+        ),
+        fixed_poses=~moving,
+        loss=LOSS,
+        max_iterations=LAST_ITERATIONS,
+        tolerance=LAST_TOLERANCE,
+        **({"free": ()} | cameras),
+    )  # fmt: skip
+    if result.status == Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X)
+
+
+def _moved_back(mapping: Mapping, given: Mapping) -> Mapping:
+    """The mapping where its camera centres fit the given ones best; as it is where these do not tell."""
+    keep = mapping.registered
+    back = similarity_from_points(mapping.poses.centre[keep], given.poses.centre[keep])
+    if back.status != Status.OK:
+        return mapping
+    poses = back.transform_pose(mapping.poses)
+    R = torch.where(keep[:, None, None], poses.R, mapping.poses.R)
+    return replace(mapping, X=back.transform(mapping.X), poses=Pose(R, torch.where(keep[:, None], poses.t, mapping.poses.t)))
+
+
+def _register(
+    mapping: Mapping, options: MappingOptions, own: Bool[Tensor, "g"], progress: Progress
+) -> tuple[Mapping, dict[int, str]]:
+    """Poses for the images that have none, and why some get none."""
+    given, failed = mapping.registered, dict[int, str]()
+    nowhere = torch.zeros_like(given)
+    focal_known = options.focal_sigma < UNKNOWN_FOCAL
+    while len(images := next_images(mapping, nowhere, failed)):
+        before = mapping.registered
+        mapping, count, inliers = register_images(
+            mapping, images, threshold=options.registration, focal_known=focal_known, generator=options.generator
+        )
+        new = mapping.registered & ~before
+        for i, n, k in zip(images.tolist(), count.tolist(), inliers.tolist(), strict=True):
+            if not new[i]:
+                failed[i] = f"a pose fits only {k} of the {n} points it sees"
+        if bool(new.any()):
+            focal_known[mapping.camera_index[new]] = True
+            mapping = _adjust(mapping, moving=mapping.registered & ~given, own=own, options=options)
+            mapping = _structure(mapping, options)
+            progress("map", int(mapping.registered.sum()), len(given))
+    return _adjust(mapping, moving=mapping.registered & ~given, own=own, options=options), failed
