@@ -15,7 +15,7 @@ from full_disk import full_disk
 from torchsfm.formats import TARGETS, export_model, read_colmap, read_model, read_nerfstudio, undistorted_model
 from torchsfm.geometry import NoDistortion
 from torchsfm.images import read_image, save_image
-from torchsfm.reconstruction import Reconstruction
+from torchsfm.reconstruction import Lines, Reconstruction
 
 LENSES = ("pinhole", "radial", "opencv", "fisheye")
 
@@ -57,6 +57,33 @@ def test_undistorted_models_have_the_same_rays(lens: str, alpha: float, centred:
     if centred:
         middle = (new.image_size[0] - 1).double() / 2
         torch.testing.assert_close(new.cameras.K[0, :2, 2], middle)
+
+
+def test_segments_of_lines_move_with_the_pictures() -> None:
+    model, n = model_of("radial"), 20
+    ends = torch.stack([model.X[:n], model.X[n // 2 : n + n // 2]], 1)
+    view, line = torch.arange(3).repeat(n), torch.arange(n).repeat_interleave(3)
+    x = model.poses[view].transform(ends[line])
+    x = model.cameras[model.camera_index[view]].project(x)
+    lines = Lines(ends, torch.rand(n, 3, generator=seeded(), dtype=x.dtype), x, torch.ones(3 * n, dtype=x.dtype), view, line)
+    # The image without a pose stands in front, so that all others get other numbers.
+    order = torch.tensor([3, 0, 1, 2])
+    moved = replace(
+        model,
+        names=tuple(model.names[i] for i in order),
+        image_size=model.image_size[order],
+        camera_index=model.camera_index[order],
+        poses=model.poses[order],
+        registered=model.registered[order],
+        view=model.view + 1,
+        lines=replace(lines, view=view + 1),
+    )
+    new = undistorted_model(moved)
+    assert new.lines is not None
+    assert new.lines.view.equal(view)
+    torch.testing.assert_close(new.line_residuals(), torch.zeros(3 * n, 2, dtype=x.dtype), rtol=0, atol=1e-9)
+    projected = new.cameras[new.camera_index[view]].project(new.poses[view].transform(ends[line]))
+    torch.testing.assert_close(new.lines.x, projected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -9,9 +9,12 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from torchsfm.geometry import Pose
+from torchsfm.geometry import Camera, Pose
 from torchsfm.images import ImageError, Photograph, parse_exif, read_image, save_image, undistort_images, undistorted_cameras
+from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 KEPT = frozenset((".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm"))
@@ -25,6 +28,7 @@ def registered_only(model: Reconstruction) -> Reconstruction:
     keep = model.registered
     number = keep.cumsum(0) - 1
     seen = keep[model.view]
+    lines = None if model.lines is None else segments_where(model.lines, keep[model.lines.view])
     return replace(
         model,
         names=tuple(name for name, kept in zip(model.names, keep.tolist(), strict=True) if kept),
@@ -35,7 +39,13 @@ def registered_only(model: Reconstruction) -> Reconstruction:
         x=model.x[seen],
         view=number[model.view[seen]],
         point=model.point[seen],
+        lines=None if lines is None else replace(lines, view=number[lines.view]),
     )
+
+
+def segments_where(lines: Lines, keep: Bool[Tensor, "k"]) -> Lines:
+    """All lines, with some of their segments."""
+    return replace(lines, **{name: getattr(lines, name)[keep] for name in ("x", "weight", "view", "line")})
 
 
 def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: bool = False) -> Reconstruction:
@@ -47,8 +57,8 @@ def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: boo
         centred: Put principal points at the centre of the pictures.
 
     Returns:
-        The same points and poses, a camera for each camera and size of image, and the observations where they come to lie;
-        those outside of the new pictures are left out. Images without a pose are left out, too.
+        The same points, lines and poses, a camera for each camera and size of image, and the observations where they come to
+        lie; image points outside of the new pictures are left out. Images without a pose are left out, too.
     """
     model = registered_only(model)
     keys = torch.cat([model.camera_index[:, None], model.image_size.to(model.camera_index.dtype)], -1)
@@ -56,13 +66,23 @@ def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: boo
     lenses = model.cameras[used[:, 0]]
     pinholes, size = undistorted_cameras(lenses, used[:, 1:], alpha=alpha, centred=centred)
     camera = index[model.view]
-    d, valid = lenses[camera].unproject(model.x[:, None])
-    x = pinholes[camera].project(d)[:, 0]
-    shown = valid[:, 0] & (d[:, 0, 2] > 0) & ((x >= -0.5) & (x < size[camera] - 0.5)).all(-1)
+    x, there = _moved(model.x[:, None], lenses[camera], pinholes[camera])
+    x = x[:, 0]
+    shown = there & ((x >= -0.5) & (x < size[camera] - 0.5)).all(-1)
+    lines = model.lines
+    if lines is not None:
+        ends, there = _moved(lines.x, lenses[index[lines.view]], pinholes[index[lines.view]])
+        lines = segments_where(replace(lines, x=ends), there)
     return replace(
         model, cameras=pinholes, camera_index=index, image_size=size[index], x=x[shown], view=model.view[shown],
-        point=model.point[shown],
+        point=model.point[shown], lines=lines,
     )  # fmt: skip
+
+
+def _moved(x: Float[Tensor, "k n 2"], lenses: Camera, pinholes: Camera) -> tuple[Float[Tensor, "k n 2"], Bool[Tensor, "k"]]:
+    """Image points where other cameras in the same place show them, and where these show all of a row."""
+    d, valid = lenses.unproject(x)
+    return pinholes.project(d), (valid & (d[..., 2] > 0)).all(-1)
 
 
 def picture_names(names: tuple[str, ...], *, kept: bool) -> tuple[str, ...]:
