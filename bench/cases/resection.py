@@ -12,6 +12,9 @@ from bench.cases.case import Case, Peer, Sample, pose_error
 from torchsfm import (
     Solutions,
     Status,
+    camera_1p2l,
+    camera_2p1l,
+    camera_3l,
     camera_dlt,
     camera_gp3p,
     camera_p3p,
@@ -21,6 +24,7 @@ from torchsfm import (
     camera_pnp,
     camera_up2p,
 )
+from torchsfm.geometry import pluecker_from_points
 from torchsfm.resection.camera_gp3p import equations as gp3p_equations
 from torchsfm.resection.camera_p3p import equations as p3p_equations
 from torchsfm.resection.camera_p4pf import equations as p4pf_equations
@@ -36,6 +40,37 @@ def rays_and_points(n: int) -> Callable[[str, int, torch.Generator, torch.dtype]
         return (torch.nn.functional.normalize(Y, dim=-1).to(dtype), X.to(dtype)), P
 
     return scene
+
+
+def sights(points: int) -> Callable[[str, int, torch.Generator, torch.dtype], tuple[Sample, Tensor]]:
+    """Samples of three rays and planes of sight, and what they go to: so many points, and lines; and the pose."""
+
+    def scene(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+        Y, X, P = scenes.camera(family, batch, 6, generator)
+        l = torch.linalg.cross(Y[:, points:3], Y[:, points + 3 :])  # noqa: E741
+        L = pluecker_from_points(X[:, points:3], X[:, points + 3 :])
+        rays = torch.nn.functional.normalize(Y[:, :points], dim=-1)
+        return tuple(v.to(dtype) for v in ((rays, X[:, :points]) if points else ()) + (l, L)), P
+
+    return scene
+
+
+def poselib_lines(name: str) -> Callable[[], Callable[..., Any]]:
+    """PoseLib's solver for rays and points, image lines and lines by a point and a direction."""
+
+    def make() -> Callable[..., Any]:
+        import poselib
+
+        def solve(*sample: Any) -> Any:
+            *rest, l, L = sample  # noqa: E741
+            length = np.linalg.norm(L[:, :3], axis=-1, keepdims=True)
+            V = L[:, :3] / length
+            l = l / np.linalg.norm(l, axis=-1, keepdims=True)  # noqa: E741
+            return [pose.Rt for pose in getattr(poselib, name)(*rest, l, np.cross(V, L[:, 3:] / length), V)]
+
+        return solve
+
+    return make
 
 
 def focal_points(n: int) -> Callable[[str, int, torch.Generator, torch.dtype], tuple[Sample, Tensor]]:
@@ -185,6 +220,24 @@ CASES: tuple[Case, ...] = (
         degenerate=("repeated points", "collinear", "all at infinity", "pure rotation", "zero baseline"),
         peers={"PoseLib": Peer("poselib", poselib_p3p), "OpenCV": Peer("cv2", opencv_p3p)},
         published=4.5e6,
+    ),
+    *(
+        Case(
+            name,
+            size=3,
+            slots=slots,
+            solve=solve,
+            scene=sights(points),
+            error=pose_error,
+            families=("near planar", "coplanar", "narrow view", "90 degree rotation", "far points"),
+            degenerate=("repeated points", "collinear", "all at infinity", "pure rotation", "zero baseline"),
+            peers={"PoseLib": Peer("poselib", poselib_lines(peer))},
+        )
+        for name, solve, points, slots, peer in (
+            ("camera_2p1l", camera_2p1l, 2, 2, "p2p1ll"),
+            ("camera_1p2l", camera_1p2l, 1, 4, "p1p2ll"),
+            ("camera_3l", camera_3l, 0, 8, "p3ll"),
+        )
     ),
     Case(
         "camera_up2p",

@@ -1,0 +1,158 @@
+"""Poses of cameras from lines, and from points and lines, of which many are wrong, beside PoseLib on the same data.
+
+`python -m bench.line_cameras` prints the tables; one thread, seconds of the processor. It needs the folder that TORCHSFM_DATA
+names.
+"""
+
+import argparse
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsfm import Status
+from torchsfm.formats import read_vgg
+from torchsfm.geometry import krt_from_camera, pluecker_from_points, point_depths, rotation_angle
+from torchsfm.resection import estimate_camera
+
+F64 = torch.float64
+THRESHOLD = 3.0
+BAD = (5.0, 0.1)
+"""Degrees, and distances of the camera from the structure, beyond which a pose is called lost."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What one image shows of points and lines of the world."""
+
+    x: Tensor
+    X: Tensor
+    l: Tensor  # noqa: E741
+    ends: Tensor
+    K: Tensor
+    pose: Tensor
+
+
+def oxford(folder: Path, name: str) -> Iterator[View]:
+    """The views of a sequence, in a world that is in front of them."""
+    data = read_vgg(folder / "vgg" / name)
+    for i in range(len(data.P)):
+        seen, lines = data.visible[i], data.segments_visible[i]
+        P, X, L = data.P[i], data.X[seen], data.L[lines]
+        if float(point_depths(P, L.flatten(0, 1)).median()) < 0:
+            # A mirrored world, seen the right way round.
+            P, X, L = P * P.new_tensor([1.0, 1, 1, -1]), -X, -L
+        K, R, t = krt_from_camera(P)
+        yield View(data.x[i, seen], X, data.segments[i, lines], L, K, torch.cat((R, t[:, None]), 1))
+
+
+def spoiled(view: View, share: float, generator: torch.Generator) -> View:
+    """With a share of the image points and of the segments exchanged among each other."""
+
+    def mixed(x: Tensor) -> Tensor:
+        chosen = torch.randperm(len(x), generator=generator)[: round(share * len(x))]
+        x = x.clone()
+        x[chosen] = x[chosen.roll(1)]
+        return x
+
+    return View(mixed(view.x), view.X, mixed(view.l), view.ends, view.K, view.pose)
+
+
+def ours(view: View, points: bool, threshold: float) -> tuple[Tensor, bool]:
+    """The pose, and whether it is called good."""
+    n = len(view.x) if points else 0
+    L = pluecker_from_points(view.ends[:, 0], view.ends[:, 1])
+    found = estimate_camera(
+        view.x[:n], view.X[:n], view.K, view.l, L, threshold=threshold, generator=torch.Generator().manual_seed(0)
+    )  # fmt: skip
+    return found.model, bool(found.status == Status.OK)
+
+
+def poselib(view: View, points: bool, threshold: float) -> tuple[Tensor, bool]:
+    """The same of PoseLib."""
+    import poselib
+
+    n = len(view.x) if points else 0
+    (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
+    camera = {"model": "PINHOLE", "width": int(2 * cx), "height": int(2 * cy), "params": [fx, fy, cx, cy]}
+    pose, report = poselib.estimate_absolute_pose_pnpl(
+        view.x[:n].numpy(), view.X[:n].numpy(), *(view.l[:, j].numpy() for j in (0, 1)),
+        *(view.ends[:, j].numpy() for j in (0, 1)), camera, {"max_reproj_error": threshold, "max_epipolar_error": threshold}, {},
+    )  # fmt: skip
+    return torch.tensor(np.asarray(pose.Rt)), bool(report["num_inliers"] > 3)
+
+
+PROGRAMS: dict[str, Any] = {"torchsfm": ours, "PoseLib": poselib}
+
+
+def errors(pose: Tensor, view: View) -> tuple[float, float]:
+    """Degrees, and the distance of the centres over that of the camera from the middle of the structure."""
+    centre, truth = (-P[:, :3].mT @ P[:, 3] for P in (pose, view.pose))
+    away = float((truth - view.ends.flatten(0, 1).median(0).values).norm())
+    return float(torch.rad2deg(rotation_angle(pose[:, :3] @ view.pose[:, :3].mT))), float((centre - truth).norm()) / away
+
+
+def sequences(folder: Path, repeats: int, generator: torch.Generator) -> None:
+    """Medians over views and repetitions, and the share of lost poses."""
+    print("Oxford lines    wrong  with    program   rotation deg  centre/distance  lost    ms")
+    for name in ("model_house", "corridor", "merton1", "library"):
+        views = list(oxford(folder, name))
+        for share in (0.3, 0.5, 0.7):
+            tried = [spoiled(view, share, generator) for view in views for _ in range(repeats)]
+            for points in (False, True):
+                for program, solve in PROGRAMS.items():
+                    start = time.process_time()
+                    found = [solve(view, points, THRESHOLD)[0] for view in tried]
+                    seconds = (time.process_time() - start) / len(tried)
+                    turn, shift = np.array([errors(P, view) for P, view in zip(found, tried, strict=True)]).T
+                    lost = ((turn > BAD[0]) | (shift > BAD[1])).mean()
+                    what = "both" if points else "lines"
+                    print(
+                        f"{name:14}  {share:5.0%}  {what:6}  {program:8}  {np.median(turn):12.4f}  {np.median(shift):15.5f}  "
+                        f"{lost:5.1%}  {1e3 * seconds:5.1f}"
+                    )
+
+
+def stairs(folder: Path, repeats: int) -> None:
+    """Two queries of which three quarters of the matches are wrong: worst and median errors over shuffled data."""
+    print("\nStairs   threshold  program   rotation deg: median  worst   centre cm: median  worst")
+    for query in (1, 2):
+        data = np.load(folder / "absolute_pose" / "stairs_points_lines" / f"localization_test_data_stairs_{query}.npz")
+        x, X, l, K = (torch.tensor(data[k].astype(np.float64)) for k in ("p2ds", "p3ds", "l2ds", "K"))  # noqa: E741
+        ends = torch.tensor(data["l3ds"].astype(np.float64))[torch.tensor(data["l3d_ids"].astype(np.int64))]
+        truth = torch.cat((torch.tensor(data["R_gt"]).double(), torch.tensor(data["t_gt"]).double()[:, None]), 1)
+        for threshold in (3.0, 6.0, 12.0):
+            for program, solve in PROGRAMS.items():
+                result = []
+                for repeat in range(repeats):
+                    g = torch.Generator().manual_seed(repeat)
+                    i, j = torch.randperm(len(x), generator=g), torch.randperm(len(l), generator=g)
+                    view = View(x[i], X[i], l[j], ends[j], K, truth)
+                    pose, _ = solve(view, True, threshold)
+                    turn = float(torch.rad2deg(rotation_angle(pose[:, :3] @ truth[:, :3].mT)))
+                    centre, right = (-P[:, :3].mT @ P[:, 3] for P in (pose, truth))
+                    result.append((turn, 100 * float((centre - right).norm())))
+                (a, b), (c, d) = np.median(result, 0), np.max(result, 0)
+                print(f"query {query}  {threshold:9}  {program:8}  {a:20.3f}  {c:5.3f}  {b:18.2f}  {d:5.2f}")
+
+
+def main() -> None:
+    """Print all tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    folder = Path(os.environ["TORCHSFM_DATA"])
+    stairs(folder, options.repeats)
+    sequences(folder, options.repeats, torch.Generator().manual_seed(options.seed))
+
+
+if __name__ == "__main__":
+    main()
