@@ -81,9 +81,10 @@ def poselib(view: View, points: bool, threshold: float) -> tuple[Tensor, bool]:
     n = len(view.x) if points else 0
     (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
     camera = {"model": "PINHOLE", "width": int(2 * cx), "height": int(2 * cy), "params": [fx, fy, cx, cy]}
+    both = {"max_reproj_error": threshold, "max_epipolar_error": threshold}
     pose, report = poselib.estimate_absolute_pose_pnpl(
         view.x[:n].numpy(), view.X[:n].numpy(), *(view.l[:, j].numpy() for j in (0, 1)),
-        *(view.ends[:, j].numpy() for j in (0, 1)), camera, {"max_reproj_error": threshold, "max_epipolar_error": threshold}, {},
+        *(view.ends[:, j].numpy() for j in (0, 1)), camera, both, {},
     )  # fmt: skip
     return torch.tensor(np.asarray(pose.Rt)), bool(report["num_inliers"] > 3)
 

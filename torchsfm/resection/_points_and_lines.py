@@ -97,8 +97,9 @@ def solve_poses(
             pieces.append(_finish(sample, *candidates(sample)))
         model, valid = (torch.cat(parts) for parts in zip(*pieces, strict=True))
         # What is small against far points need not be so against a near line.
-        left = equations(model, *(t[:, None] for t in flat)).abs().amax(-1)
-        valid = valid & (left <= _LEFT)
+        item, slot = valid.nonzero().unbind(-1)
+        left = equations(model[item, slot], *(t[item] for t in flat)).abs().amax(-1)
+        valid = valid.index_put((item, slot), left <= _LEFT)
         model = model.to(dtype)
         valid = valid & model.isfinite().flatten(-2).all(-1)
         model = torch.where(valid[..., None, None], model, torch.eye(3, 4, dtype=dtype, device=L.device))
@@ -155,9 +156,10 @@ def _finish(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     model = torch.zeros(*there.shape, 3, 4, dtype=pose.dtype, device=pose.device)
     model[item, slot] = pose
     valid = there.index_put((item, slot), good)
+    # Of two that are one the first; a slot that is not valid is none.
+    gap = torch.cdist(model.flatten(2), model.flatten(2), p=torch.inf)
     for k in range(1, there.shape[1]):
-        gap = (model[:, k, None] - model[:, :k]).abs().amax((-1, -2))
-        valid[:, k] &= ~((gap < _TWICE) & valid[:, :k]).any(-1)
+        valid[:, k] &= ~((gap[:, k, :k] < _TWICE) & valid[:, :k]).any(-1)
     R, t = model[..., :3], model[..., 3]
     t = s.unit[:, None, None] * t - (R @ s.origin[:, None, :, None])[..., 0]
     return torch.cat((R, t[..., None]), -1), valid
@@ -165,41 +167,44 @@ def _finish(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 def _polished(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Newton's method where rounding has left something: poses, and the largest equation of each."""
-    r, J = _linearized(s, R, t)
-    left = r.abs().amax(-1)
+    left = _rows(s, R, t)[0].abs().amax(-1)
     for _ in range(_STEPS):
         rough = (left > _ROUNDING).nonzero()[:, 0]
+        if not len(rough):
+            break
         part = Sample(*(v[rough] for v in s))
-        step = torch.linalg.solve_ex(J[rough], -r[rough, :, None])[0][..., 0]
+        step = torch.linalg.solve_ex(*_linearized(part, R[rough], t[rough]))[0][..., 0]
         step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
         new_R, new_t = rotation_exponential(step[:, :3]) @ R[rough], t[rough] + step[:, 3:]
-        new_r, new_J = _linearized(part, new_R, new_t)
-        new_left = new_r.abs().amax(-1)
+        new_left = _rows(part, new_R, new_t)[0].abs().amax(-1)
         better = new_left < left[rough]
         rough = rough[better]
-        R, t, r, J, left = (
-            old.index_copy(0, rough, new[better])
-            for old, new in zip((R, t, r, J, left), (new_R, new_t, new_r, new_J, new_left), strict=True)
+        R, t, left = (
+            old.index_copy(0, rough, new[better]) for old, new in zip((R, t, left), (new_R, new_t, new_left), strict=True)
         )
     return R, t, left
 
 
-def _linearized(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """The six equations (n, 6) and their derivatives (n, 6, 6) along a turn from the left and a shift."""
-    rows, slopes = [], []
-    t = t[:, None]
+def _rows(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, Tensor]]:
+    """The six equations (n, 6), and what their derivatives are made of: X, two vectors across d; V, A; all turned."""
+    X, V, A = (v @ R.mT for v in (s.X, s.V, s.A))
+    rows, across, t = [], _across(s.d), t[:, None]
     if s.X.shape[1]:
-        turned = s.X @ R.mT
-        Y = turned + t
-        for e in _across(s.d):
-            rows.append((e * Y).sum(-1))
-            slopes.append(torch.cat((cross(turned, e), e), -1))
+        Y = X + t
+        rows += [(e * Y).sum(-1) for e in across]
     if s.V.shape[1]:
-        V, turned = s.V @ R.mT, s.A @ R.mT
-        rows += [(s.l * V).sum(-1), (s.l * (turned + t)).sum(-1)]
+        rows += [(s.l * V).sum(-1), (s.l * (A + t)).sum(-1)]
+    return torch.cat(rows, -1), (X, *across), (V, A)
+
+
+def _linearized(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives (n, 6, 6) of the equations along a turn from the left and a shift, and the equations' negatives (n, 6, 1)."""
+    r, (X, *across), (V, A) = _rows(s, R, t)
+    slopes = [torch.cat((cross(X, e), e), -1) for e in across] if s.X.shape[1] else []
+    if s.V.shape[1]:
         slopes.append(torch.cat((cross(V, s.l), torch.zeros_like(V)), -1))
-        slopes.append(torch.cat((cross(turned, s.l), s.l), -1))
-    return torch.cat(rows, -1), torch.cat(slopes, -2)
+        slopes.append(torch.cat((cross(A, s.l), s.l), -1))
+    return torch.cat(slopes, -2), -r[..., None]
 
 
 def frame(a: Tensor, b: Tensor) -> Tensor:
