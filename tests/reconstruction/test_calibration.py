@@ -173,7 +173,7 @@ def test_an_adjustment_that_was_given_up_is_told_everywhere(
     assert record["models"][0]["converged"] is False
     page = write_page(result.model, tmp_path / "page.html", report=result.report).read_text()
     for text in (result.report.summary(), report_markdown(record), page):
-        assert "did not converge" in text.replace("*", "")
+        assert "did not converge" in text
 
 
 def test_deviations_are_in_the_report(generator: torch.Generator, tmp_path: Path) -> None:

@@ -210,7 +210,7 @@ def _models_text(record: Record) -> list[str]:
             rows.append(["images of a line, mean", f"{found['mean_images']:.2f}"])
             rows.append(["ends of segments off their lines, mean", f"{found['mean_error_px']:.3f} px"])
         if "converged" in model:
-            ending = "converged" if model["converged"] else "**did not converge**"
+            ending = "converged" if model["converged"] else "did not converge"
             rows.append(["last adjustment", f"{ending} in {model['adjustment_steps']} steps"])
         for camera in model["cameras"]:
             rows.append([f"camera of {camera['images']} images ({camera['model']})", _camera_text(camera)])
