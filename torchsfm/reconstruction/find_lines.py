@@ -14,6 +14,7 @@ from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
+from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
 from torchsfm.reconstruction.line_tracks import Cameras, ViewSegments, link_lines, propose_lines
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
@@ -98,7 +99,7 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
         problem,
         structure=[lines.bundle(unit=noise / max(scale, 1.0), loss=LINE_LOSS)],
         loss=LOSS,
-        **({"max_iterations": 30, "tolerance": 1e-5} | known | limits),
+        **({"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE} | known | limits),
     )
     if result.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
