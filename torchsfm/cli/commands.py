@@ -9,6 +9,7 @@ from typing import Annotated
 import torch
 import typer
 
+from torchsfm.cli.align import align
 from torchsfm.cli.bundle import bundle
 from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
 from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched, warn_about_intrinsics
@@ -222,5 +223,5 @@ def info(
             typer.echo("")
 
 
-for command in (triangulate, register, bundle, export, convert):
+for command in (triangulate, register, align, bundle, export, convert):
     app.command()(command)
