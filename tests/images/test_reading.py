@@ -74,6 +74,18 @@ def picture() -> np.ndarray:
     return np.stack([255 * x, 200 * y + 40 * x, 255 * (1 - x) * (1 - y)], 2).astype(np.uint8)
 
 
+@pytest.mark.parametrize("white", [255, 65535])
+@pytest.mark.parametrize("gray", [False, True])
+def test_what_is_transparent_is_black_in_proportion(tmp_path: Path, gray: bool, white: int) -> None:
+    drawn = np.full((12, 20, 4), white, dtype=np.uint8 if white == 255 else np.uint16)
+    opacity = np.linspace(0, white, 20).round().astype(drawn.dtype)
+    drawn[:, :, 3] = opacity
+    assert cv2.imwrite(str(tmp_path / "a.png"), drawn)
+    pixels = read_image(tmp_path / "a.png", gray=gray).pixels
+    assert pixels.shape == (1 if gray else 3, 12, 20)
+    torch.testing.assert_close(pixels, torch.from_numpy(opacity / white).float().expand_as(pixels), rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".ppm"])
 def test_lossless_formats_give_the_exact_pixels(tmp_path: Path, picture: np.ndarray, suffix: str) -> None:
     (tmp_path / f"a{suffix}").write_bytes(encode(picture, suffix))

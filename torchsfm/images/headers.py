@@ -26,6 +26,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     return netpbm_size(data)
 
 
+def is_transparent_png(data: bytes) -> bool:
+    """Whether this is a PNG whose pixels have an opacity each."""
+    return data[:8] == b"\x89PNG\r\n\x1a\n" and data[25:26] in (b"\4", b"\6")
+
+
 def is_complete(data: bytes) -> bool | None:
     """Whether the file holds all of its image; None where it is no image known here."""
     if data[:3] == b"\xff\xd8\xff":

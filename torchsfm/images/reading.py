@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchsfm._types import check_options, check_tensors
 from torchsfm.images.exif import parse_exif
-from torchsfm.images.headers import guess_contents, image_size, is_complete
+from torchsfm.images.headers import guess_contents, image_size, is_complete, is_transparent_png
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
 
 MAX_PIXELS = 2**28
@@ -79,7 +79,8 @@ def read_image(
     """Read one image file.
 
     JPEG, PNG, PGM and PPM (8 and 16 bits), TIFF, BMP and WebP. The orientation in the Exif tags is applied, so that the image
-    stands upright. Transparency is dropped.
+    stands upright. What is transparent in a PNG is black in proportion, as colours there are those of the whole pixel; that of
+    other kinds is dropped.
 
     Args:
         path: The file.
@@ -238,15 +239,21 @@ def _decode(data: bytes, path: Path, *, gray: bool, part: int) -> tuple[NDArray[
         if gray:
             return cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if values.ndim == 3 else values, white
         return values if values.ndim == 3 else np.repeat(values[:, :, None], 3, 2), white
+    opaque = not is_transparent_png(data)
     flags = cv2.IMREAD_ANYDEPTH | (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
     if part > 1:
         flags = getattr(cv2, f"IMREAD_REDUCED_{'GRAYSCALE' if gray else 'COLOR'}_{part}")
+    flags = flags | cv2.IMREAD_IGNORE_ORIENTATION if opaque else cv2.IMREAD_UNCHANGED
     try:
-        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        array = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise ImageError(f"{path}: cannot be decoded ({' '.join(str(error).split())[:200]})") from None
     if array is None or array.size == 0:
         raise ImageError(f"{path}: damaged, cannot be decoded")
     if array.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path}: pixels of type {array.dtype}; 8 or 16 bit integers are wanted")
-    return array if gray else array[:, :, ::-1], 255.0 if array.dtype == np.uint8 else 65535.0
+    white = 255.0 if array.dtype == np.uint8 else 65535.0
+    if array.ndim == 3 and array.shape[2] == 4:
+        array = np.rint(array[:, :, :3] * (array[:, :, 3:] / white)).astype(array.dtype)
+        array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY) if gray else array
+    return array if gray else array[:, :, ::-1], white
