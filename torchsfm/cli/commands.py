@@ -11,6 +11,7 @@ import typer
 
 from torchsfm.cli.align import align
 from torchsfm.cli.bundle import bundle
+from torchsfm.cli.curves import curves
 from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
 from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched, warn_about_intrinsics
 from torchsfm.cli.job import Job, UserError, told
@@ -225,3 +226,4 @@ def info(
 
 for command in (triangulate, register, align, bundle, export, convert):
     app.command()(command)
+app.command()(curves)

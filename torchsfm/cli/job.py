@@ -30,6 +30,8 @@ LABELS = {
     "segments": "finding line segments",
     "refine": "refining the model",
     "bundle": "adjusting",
+    "edges": "finding edges",
+    "follow": "following edges through images",
     "write": "writing results",
     "pictures": "writing pictures",
 }

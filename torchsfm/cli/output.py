@@ -19,7 +19,7 @@ from torchsfm.reconstruction.files import PARTIAL
 
 LOCK, WRITING, WRITTEN, ARRIVING = ".lock", ".writing", ".written", ".arriving"
 RESULTS = re.compile(
-    r"report\.(json|md)|page\.html|(model|points|lines)(-\d+)?\.(npz|ply|txt)"
+    r"report\.(json|md)|page\.html|curves\.(ply|json)|(model|points|lines)(-\d+)?\.(npz|ply|txt)"
     r"|colmap(-\d+)?/((cameras|frames|images|points3D|rigs)\.bin|unregistered\.txt)"
 )
 """The files that a run leaves, as paths within the folder."""

@@ -4,6 +4,7 @@ from torchsfm.formats.bal import read_bal, write_bal
 from torchsfm.formats.bundler import read_bundler, write_bundler
 from torchsfm.formats.colmap import read_colmap, write_colmap
 from torchsfm.formats.colmap_database import read_database, write_database
+from torchsfm.formats.curves import write_curves_json, write_curves_ply
 from torchsfm.formats.export import TARGETS, export_model
 from torchsfm.formats.gltf import write_gltf
 from torchsfm.formats.hloc import read_hloc
@@ -43,6 +44,8 @@ __all__ = [
     "write_bal",
     "write_bundler",
     "write_colmap",
+    "write_curves_json",
+    "write_curves_ply",
     "write_database",
     "write_gltf",
     "write_kitti",

@@ -81,6 +81,7 @@ from torchsfm.geometry.rotations import (
 )
 from torchsfm.geometry.shape import affine_shape, balanced_frame, depth_space, normalize_shape, principal_angles
 from torchsfm.geometry.similarity import Similarity, similarity_from_points
+from torchsfm.geometry.splines import Spline, fit_spline
 
 __all__ = [
     "DISTORTION_MODELS",
@@ -101,6 +102,7 @@ __all__ = [
     "Radial",
     "Similarity",
     "SimpleRadial",
+    "Spline",
     "affine_shape",
     "balanced_frame",
     "camera_centre",
@@ -118,6 +120,7 @@ __all__ = [
     "ellipse_from_conic",
     "ellipsoid_from_dual_quadric",
     "epipolar_distance",
+    "fit_spline",
     "foot_points",
     "from_homogeneous",
     "intersect_conics",

@@ -14,15 +14,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.geometry import Curve
 from torchsfm.images import MAX_PIXELS, read_image, save_image
 from torchsfm.plot.framing import frame
 from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Report
+
+_CURVES = torch.tensor([0.95, 0.55, 0.15])
+"""Red, green and blue of curves."""
 
 
 def write_page(
@@ -32,6 +37,7 @@ def write_page(
     title: str = "Reconstruction",
     report: Report | None = None,
     images: str | Path | None = None,
+    curves: Curve | None = None,
     thumbnail: int = 320,
     max_pixels: int = MAX_PIXELS,
 ) -> Path:
@@ -49,6 +55,7 @@ def write_page(
         report: Tells why images were not registered, and of files that could not be read.
         images: Folder with the photographs under their names. If given, small copies are put into the page, to be shown at
             the cameras; photographs that cannot be read are left out.
+        curves: Curves in space (c, n) to draw with the first model.
         thumbnail: Longer side of these copies in pixels.
         max_pixels: Photographs that have more are left out too.
 
@@ -70,7 +77,10 @@ def write_page(
         photos = {name: _thumbnail(Path(images) / name, thumbnail, max_pixels) for name in sorted(names)}
     content = {
         "title": title,
-        "models": [_model(model, number, report, photos, len(models)) for number, model in enumerate(models)],
+        "models": [
+            _model(model, number, report, photos, len(models), None if number else curves)
+            for number, model in enumerate(models)
+        ],
     }
     # Inside a script element only "<" could end the data early.
     text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
@@ -104,7 +114,12 @@ def _quantile(values: Tensor, q: float) -> float:
 
 
 def _model(
-    model: Reconstruction, number: int, report: Report | None, photos: dict[str, str | None], count: int
+    model: Reconstruction,
+    number: int,
+    report: Report | None,
+    photos: dict[str, str | None],
+    count: int,
+    curves: Curve | None,
 ) -> dict[str, Any]:
     """Everything the script needs to draw one model."""
     model = model.to("cpu", torch.float64)
@@ -157,6 +172,13 @@ def _model(
                 else ""
             )
         )
+    if curves is not None:
+        segments = _segments(curves).to(line_ends)
+        line_ends, line_color = (
+            torch.cat((line_ends, segments)),
+            torch.cat((line_color, _CURVES.to(segments).expand(len(segments), 3))),
+        )
+        summary.append(f"{len(curves.x):,} curves")
     if found is not None and found.status != Status.OK:
         summary.append(f"the last adjustment did not converge in {found.iterations} steps")
     return {
@@ -180,6 +202,15 @@ def _model(
         "trackRange": [low, max(low + 1, int(_quantile(shown, 0.98)))],
         "errorRange": [0, float(f"{max(_quantile(errors[good], 0.95), 1e-3):.3g}")],
     }
+
+
+def _segments(curves: Curve) -> Float[Tensor, "s 2 3"]:
+    """From each sample of curves to the next."""
+    x, valid, number = curves.x.detach().cpu(), curves.valid.cpu(), curves.number.cpu()
+    after = (torch.arange(x.shape[-2]) + 1) % number[:, None].clamp(min=1)
+    there = valid & ((after > 0) | curves.closed.cpu()[:, None])
+    following = x.gather(1, torch.where(valid, after, 0)[..., None].expand_as(x))
+    return torch.stack((x[there], following[there]), 1)
 
 
 def _moved(pose: Tensor, centre: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """How do images become a model? The `Reconstruction`, and the doors from photographs and from tracks."""
 
+from torchsfm.reconstruction.curves import CurveReconstruction, reconstruct_curves
 from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
@@ -10,6 +11,7 @@ from torchsfm.reconstruction.report import ImageReport, PairReport, Reconstructi
 from torchsfm.reconstruction.view_graph import Verdict
 
 __all__ = [
+    "CurveReconstruction",
     "ImageReport",
     "Lines",
     "MatchedImages",
@@ -20,6 +22,7 @@ __all__ = [
     "SfmResult",
     "Verdict",
     "reconstruct",
+    "reconstruct_curves",
     "reconstruct_matches",
     "reconstruct_tracks",
     "triangulate_photographs",

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm.geometry import Curve, curve_from_samples, foot_points
+from torchsfm.geometry import Curve, foot_points
 from torchsfm.geometry.homogeneous import divide_safely
 from torchsfm.linalg import inverse
-from torchsfm.triangulation.curve_views import CurveDistances, CurveViews
+from torchsfm.triangulation.curve_views import CurveDistances, CurveViews, Sight, project_all
 
 _STEPS = 8
 """Gauss-Newton steps of samples: they begin within the threshold."""
@@ -16,7 +16,7 @@ _BLUR = 0.05
 
 
 def refine_samples(
-    views: CurveViews, X: Float[Tensor, "p m 3"], found: Bool[Tensor, "p m"], around: Bool[Tensor, "p"]
+    views: Sight, X: Float[Tensor, "p m 3"], found: Bool[Tensor, "p m"], around: Bool[Tensor, "p"]
 ) -> tuple[Tensor, Float[Tensor, "p m 3 2"], CurveDistances, Bool[Tensor, "p m"]]:
     """Samples at the least squares of distances, directions across the curve, distances, and which samples are determined."""
     far = _depth(views, X)
@@ -42,15 +42,19 @@ def refine_samples(
     return X, basis, near, measured
 
 
-def _depth(views: CurveViews, X: Tensor) -> Float[Tensor, "p m"]:
+def _depth(views: Sight, X: Tensor) -> Float[Tensor, "p m"]:
     """Distance from the nearest camera that is used."""
-    depth = views.project(X)[1].abs()
+    depth = project_all(views.P, X)[1].abs()
     return torch.where(views.used[..., None], depth, torch.inf).amin(1).clamp(max=1e300)
 
 
 def _across(X: Tensor, found: Tensor, around: Tensor) -> Float[Tensor, "p m 3 2"]:
     """Two unit vectors across the curve through the samples found; any at others."""
-    tangent = foot_points(curve_from_samples(X, valid=found, closed=around), X).tangent
+    order = found.to(torch.int8).argsort(dim=-1, descending=True, stable=True)
+    there = found.gather(-1, order)
+    packed = torch.where(there[..., None], X.gather(-2, order[..., None].expand_as(X)), 0)
+    place = (found.cumsum(-1) - 1).clamp(min=0)[..., None].expand_as(X)
+    tangent = Curve(packed, there, around).tangents().gather(-2, place) * found[..., None]
     some = (tangent != 0).any(-1, keepdim=True)
     tangent = torch.where(some, tangent, tangent.new_tensor([1.0, 0.0, 0.0]))
     helper = torch.zeros_like(tangent).scatter_(-1, tangent.abs().argmin(-1, keepdim=True), 1.0)
@@ -69,7 +73,7 @@ def _normal(J: Tensor, weight: Tensor) -> Float[Tensor, "p m 2 2"]:
     return (weight[..., None, None] * J[..., :, None] * J[..., None, :]).sum(1)
 
 
-def covariance_across(views: CurveViews, X: Tensor, basis: Tensor, near: CurveDistances) -> Float[Tensor, "p m 3 3"]:
+def covariance_across(views: Sight, X: Tensor, basis: Tensor, near: CurveDistances) -> Float[Tensor, "p m 3 3"]:
     """The inverse of the normal matrix, in the world: views that agree count alike."""
     counted = (near.weight > 0).to(X.dtype)
     back, _ = inverse(_normal(_slopes(views.P, near, basis), counted))

@@ -1,6 +1,6 @@
 """Image curves in known views, and how far from them the images of points are."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,6 +23,22 @@ class CurveDistances(NamedTuple):
     """The biweight; 0 beyond the threshold, behind a camera and beyond an open end."""
 
 
+@runtime_checkable
+class Sight(Protocol):
+    """What views say of points on curves."""
+
+    @property
+    def P(self) -> Float[Tensor, "p v 3 4"]:
+        """Cameras, scaled so that depths are those in the world, positive in front."""
+
+    @property
+    def used(self) -> Bool[Tensor, "p v"]:
+        """Which views count."""
+
+    def distances(self, X: Float[Tensor, "p m 3"]) -> CurveDistances:
+        """How far the images of points are from image curves."""
+
+
 class CurveViews(NamedTuple):
     """Image curves and their cameras."""
 
@@ -36,8 +52,7 @@ class CurveViews(NamedTuple):
 
     def project(self, X: Float[Tensor, "p m 3"]) -> tuple[Float[Tensor, "p v m 2"], Float[Tensor, "p v m"]]:
         """Image points and depths."""
-        y = X[:, None] @ self.P[..., :3].mT + self.P[:, :, None, :, 3]
-        return divide_safely(y[..., :2], y[..., 2]), y[..., 2]
+        return project_all(self.P, X)
 
     def others(self, reference: Int[Tensor, "p"]) -> Bool[Tensor, "p v"]:
         """The views in use but one."""
@@ -74,6 +89,14 @@ def viewing_rays(
     back, _ = inverse(P[..., :3])
     rays = torch.cat((x, torch.ones_like(x[..., :1])), -1) @ back.mT
     return -(back @ P[..., 3:])[..., 0], torch.nn.functional.normalize(rays, dim=-1)
+
+
+def project_all(
+    P: Float[Tensor, "p v 3 4"], X: Float[Tensor, "p m 3"]
+) -> tuple[Float[Tensor, "p v m 2"], Float[Tensor, "p v m"]]:
+    """Image points in all views, and depths."""
+    y = X[:, None] @ P[..., :3].mT + P[:, :, None, :, 3]
+    return divide_safely(y[..., :2], y[..., 2]), y[..., 2]
 
 
 def biweight(r: Float[Tensor, "*batch"], threshold: float) -> Float[Tensor, "*batch"]:

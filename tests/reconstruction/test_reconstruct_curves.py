@@ -1,0 +1,103 @@
+"""Curves from photographs of a box with a disc on it: all of them, in place, whatever the world; and what is missing."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from painted_box import FOCAL, camera, orbit, photograph, true_curves
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Similarity, random_rotation
+from torchsfm.geometry.distortion import Radial
+from torchsfm.reconstruction import CurveReconstruction, reconstruct_curves
+
+VIEWS = 12
+PIXEL = 6.5 / FOCAL
+"""In the world, where the box is."""
+
+
+@pytest.fixture(scope="module")
+def images() -> list[Tensor]:
+    return list(photograph(orbit(VIEWS)))
+
+
+@pytest.fixture(scope="module")
+def found(images: list[Tensor]) -> CurveReconstruction:
+    return reconstruct_curves(images, camera(VIEWS), orbit(VIEWS))
+
+
+def samples(found: CurveReconstruction) -> Tensor:
+    return found.curve.x[found.curve.valid]
+
+
+def test_every_curve_is_found_and_nothing_else(found: CurveReconstruction) -> None:
+    truth, x = true_curves(), samples(found)
+    gap = torch.cdist(x, torch.cat(list(truth.values()))).amin(-1)
+    assert gap.mean() < 0.4 * PIXEL
+    assert (gap < 2 * PIXEL).float().mean() > 0.99
+    for name in ("upper", "upright", "circle"):
+        assert (torch.cdist(truth[name], x).amin(-1) < 4 * PIXEL).float().mean() > 0.95, name
+    # The circle goes around, and each curve is there once.
+    around = found.curve.x[found.curve.closed]
+    assert len(around) == 1
+    assert len(found.curve.x) < 20
+    assert found.curve.length.sum() < 1.05 * sum(len(v) for v in truth.values()) * 0.005
+
+
+def test_what_is_said_of_samples(found: CurveReconstruction) -> None:
+    valid = found.curve.valid
+    assert (found.images[valid] >= 3).all()
+    assert (found.images[~valid] == 0).all()
+    assert torch.isfinite(found.sigma).all()
+    assert 0.1 * PIXEL < found.sigma[valid].median() < 3 * PIXEL
+    assert (found.curve.number.diff() <= 0).all()
+
+
+def test_splines_stay_near_the_samples(found: CurveReconstruction) -> None:
+    splines = found.splines(PIXEL)
+    t = torch.linspace(0, 1, 400, dtype=torch.float64)
+    for i, spline in enumerate(splines):
+        x = found.curve.x[i, : int(found.curve.number[i])]
+        assert spline.closed == bool(found.curve.closed[i])
+        assert torch.cdist(x, spline.at(t)).amin(-1).max() < 3 * PIXEL
+        assert len(spline.control) <= max(4, len(x))
+
+
+def test_the_world_may_be_another_one(images: list[Tensor], found: CurveReconstruction, generator: torch.Generator) -> None:
+    t = 10 * torch.randn(3, generator=generator, dtype=torch.float64)
+    moved = Similarity(torch.tensor(0.02).double(), random_rotation(generator=generator, dtype=torch.float64), t)
+    other = reconstruct_curves(images, camera(VIEWS), moved.transform_pose(orbit(VIEWS)))
+    mapped = moved.transform(samples(found))
+    assert torch.cdist(mapped, samples(other)).amin(-1).max() < 0.02 * 3 * PIXEL
+    assert abs(len(mapped) - len(samples(other))) < 0.05 * len(mapped)
+
+
+def test_an_image_may_be_missing_and_lenses_may_distort(found: CurveReconstruction) -> None:
+    bent = Radial(torch.full((VIEWS,), -0.3).double(), torch.full((VIEWS,), 0.05).double())
+    cameras = replace(camera(VIEWS), distortion=bent)
+    some: list[Tensor | None] = list(photograph(orbit(VIEWS), cameras[0]))
+    some[3] = None
+    other = reconstruct_curves(some, cameras, orbit(VIEWS))
+    gap = torch.cdist(samples(other), torch.cat(list(true_curves().values()))).amin(-1)
+    assert gap.mean() < 0.5 * PIXEL
+    assert (gap < 2 * PIXEL).float().mean() > 0.98
+    assert len(samples(other)) > 0.7 * len(samples(found))
+
+
+def test_nothing_to_see(images: list[Tensor]) -> None:
+    blank = [torch.full_like(image, 0.5) for image in images]
+    for seen in (blank, [None] * VIEWS, [images[0], *blank[1:]]):
+        none = reconstruct_curves(seen, camera(VIEWS), orbit(VIEWS))
+        assert none.curve.x.shape[0] == 0
+        assert none.splines(1.0) == []
+
+
+def test_wrong_arguments(unchecked: None, images: list[Tensor]) -> None:
+    with pytest.raises(ValueError, match=f"images: wanted {VIEWS}"):
+        reconstruct_curves([None] * (VIEWS - 1), camera(VIEWS), orbit(VIEWS))
+    with pytest.raises(ValueError, match=f"images: wanted {VIEWS}"):
+        reconstruct_curves([None] * (VIEWS + 1), camera(VIEWS), orbit(VIEWS))
+    with pytest.raises(ValueError, match="wanted one of each"):
+        reconstruct_curves(images, Camera(camera(1).K), orbit(VIEWS))
+    with pytest.raises(ValueError, match="threshold"):
+        reconstruct_curves(images, camera(VIEWS), orbit(VIEWS), threshold=0.0)

@@ -1,0 +1,131 @@
+"""`torchsfm curves`: the curves that photographs with known cameras show."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from torch import Tensor
+
+from torchsfm.cli.job import NOTHING, Job, UserError, told
+from torchsfm.cli.output import output_folder, replacing_results
+from torchsfm.formats import write_curves_json, write_curves_ply
+from torchsfm.formats.problem import as_reconstruction
+from torchsfm.formats.registry import read_model_or_problem
+from torchsfm.geometry import Camera
+from torchsfm.images import MAX_PIXELS, ImageError, read_image
+from torchsfm.plot import write_page
+from torchsfm.reconstruction import CurveReconstruction, Reconstruction, reconstruct_curves
+from torchsfm.reconstruction.report import printable
+
+
+def curves(
+    images: Annotated[Path, typer.Argument(help="The folder of the photographs, under their names in the model.")],
+    poses: Annotated[
+        Path, typer.Option(help="The model with their cameras: a COLMAP folder, or a saved model (.npz).", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the curves and the page.", show_default=False)],
+    neighbours: Annotated[int, typer.Option(min=2, help="Images in which the edges of an image are sought.")] = 10,
+    threshold: Annotated[float, typer.Option(min=0.1, help="Pixels that an edge may be off.")] = 2.0,
+    max_size: Annotated[int, typer.Option(min=100, help="Larger images are scaled down to this longer side.")] = 1600,
+    max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,
+    threads: Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")] = None,
+) -> None:
+    """Find the curves in space whose images are the edges of photographs with known cameras."""
+    with told(Job(out)) as job, output_folder(out):
+        job.set_threads(threads)
+        model = load(poses)
+        known = model.registered.nonzero()[:, 0]
+        if not images.is_dir():
+            raise UserError(f"{images}: no such folder")
+        files = [images / model.names[i] for i in known.tolist()]
+        there = [file.is_file() for file in files]
+        if sum(there) < 3:
+            raise UserError(f"{images}: wanted three images of {poses} or more, found {sum(there)}")
+        known = known[torch.tensor(there)]
+        files = [file for file, found in zip(files, there, strict=True) if found]
+        read: list[bool] = []
+        found = reconstruct_curves(
+            photographs(files, max_size, max_pixels, read),
+            scaled(model, known, max_size),
+            model.poses[known],
+            points=model.X[torch.isfinite(model.X).all(-1)],
+            neighbours=neighbours,
+            threshold=threshold,
+            progress=job.progress,
+        )
+        job.progress("write", 0, 1)
+        with replacing_results(out) as folder:
+            written = write(found, model, images, folder, max_pixels)
+        job.progress("write", 1, 1)
+        job.close()
+        number = len(found.curve.x)
+        length = float(found.curve.length.sum())
+        typer.echo(f"{number} curves of length {length:.6g} in all, from {sum(read)} of {model.num_registered} images")
+        for name, what in written:
+            typer.echo(f"{out / name}  {what}")
+        if not number:
+            typer.echo("torchsfm: no curves found", err=True)
+            raise typer.Exit(NOTHING)
+
+
+def load(path: Path) -> Reconstruction:
+    """The model that the path holds.
+
+    Raises:
+        UserError: It is not there or no model with image names.
+    """
+    try:
+        return as_reconstruction(read_model_or_problem(path))
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from None
+
+
+def scaled(model: Reconstruction, known: Tensor, max_size: int) -> Camera:
+    """The cameras of images, for the size that they are read in."""
+    size = model.image_size[known].double()
+    small = (size * (max_size / size.amax(-1, keepdim=True)).clamp(max=1)).round().clamp(min=1)
+    share = small / size
+    cameras = model.cameras[model.camera_index[known]]
+    K = cameras.K.clone()
+    # Pixel centres have whole coordinates.
+    K[:, :2] *= share[:, :, None].to(K)
+    K[:, :2, 2] += ((share - 1) / 2).to(K)
+    return replace(cameras, K=K)
+
+
+def photographs(files: list[Path], max_size: int, max_pixels: int, read: list[bool]) -> Iterator[Tensor | None]:
+    """The images one after another, None and a word to the user for one that cannot be read; `read` tells which can."""
+    for file in files:
+        try:
+            pixels = read_image(file, max_size=max_size, max_pixels=max_pixels).pixels
+        except (ImageError, OSError) as error:
+            typer.echo(f"torchsfm: left out: {printable(str(error))}", err=True)
+            read.append(False)
+            yield None
+            continue
+        read.append(True)
+        yield pixels
+
+
+def write(
+    found: CurveReconstruction, model: Reconstruction, images: Path, folder: Path, max_pixels: int
+) -> list[tuple[str, str]]:
+    """Write the curves in all forms; names and what they are."""
+    samples = found.curve.x[found.curve.valid]
+    tolerance = float(found.sigma[found.curve.valid].median()) if len(samples) else 1.0
+    write_curves_ply(found.curve, folder / "curves.ply")
+    write_curves_json(found.splines(tolerance), folder / "curves.json")
+    none = torch.zeros(0, dtype=torch.long)
+    # The page shows the samples as points that no image has observed.
+    shown = replace(
+        model, X=samples.to(model.X), color=torch.full_like(samples, 0.5).to(model.X), x=model.x[:0], view=none, point=none
+    )
+    write_page(shown, folder / "page.html", title="Curves", images=images, curves=found.curve, max_pixels=max_pixels)
+    return [
+        ("page.html", "open it in a browser and turn the curves with the mouse"),
+        ("curves.ply", "samples, and edges between them"),
+        ("curves.json", f"cubic B-splines, {tolerance:.3g} from the samples at most where these are dense"),
+    ]
