@@ -145,6 +145,7 @@ from torchsfm.plot import (
     plot_cameras as plot_cameras,
     plot_epipolar_lines as plot_epipolar_lines,
     plot_matches as plot_matches,
+    plot_lines_3d as plot_lines_3d,
     plot_points_3d as plot_points_3d,
     show_image as show_image,
     write_page as write_page,

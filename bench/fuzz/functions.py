@@ -446,7 +446,7 @@ EXCEPTIONS: dict[str, str] = {
     "simulation.courtyard_scene": "takes no data, and seconds",
     "simulation.render_sequence": "takes no data, and seconds",
     **{f"plot.plot_{name}": "draws" for name in (
-        "cameras", "epipolar_lines", "matches", "points_2d", "points_3d", "residuals", "tracks")},
+        "cameras", "epipolar_lines", "lines_3d", "matches", "points_2d", "points_3d", "residuals", "tracks")},
     **{f"plot.{name}": "draws" for name in ("show_image", "show_scaled", "up_direction", "write_page")},
 }  # fmt: skip
 """Public functions that are not tried, and why."""

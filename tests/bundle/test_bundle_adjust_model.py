@@ -112,9 +112,9 @@ def test_poses_are_eliminated_where_they_are_many() -> None:
         "camera": Block(torch.zeros(30, 7), Subset(7, (0,))),
         "point": Block(torch.zeros(20, 3)),
     }
-    assert cheapest_elimination(blocks) == "pose"
+    assert cheapest_elimination(blocks) == ("pose",)
     blocks["point"] = Block(torch.zeros(60, 3))
-    assert cheapest_elimination(blocks) == "point"
+    assert cheapest_elimination(blocks) == ("point",)
     few = p.point < 20
     fixed = torch.arange(40) < 3
     args = (p.poses, p.cameras, p.X, p.x[few], p.view[few], p.point[few])

@@ -16,6 +16,7 @@ from torchsfm.images import Photograph
 from torchsfm.plot import (
     plot_cameras,
     plot_epipolar_lines,
+    plot_lines_3d,
     plot_matches,
     plot_points_2d,
     plot_points_3d,
@@ -274,3 +275,17 @@ def test_importing_the_room_does_not_import_matplotlib() -> None:
     code = "import sys, torchsfm.plot; print([m for m in ('matplotlib', 'plotly', 'cv2', 'kornia') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_lines_in_space_are_drawn_where_they_are(generator: torch.Generator) -> None:
+    ends, color = torch.randn(2, 6, 2, 3, generator=generator), torch.rand(2, 6, 3, generator=generator)
+    ends[1, 2, 0, 1] = torch.nan
+    ax = plot_lines_3d(ends, color=color)
+    draw(ax)
+    good = ends.isfinite().flatten(2).all(-1)
+    assert np.allclose(segments_of(ax), ends[good].numpy())
+    shown = next(c for c in ax.collections if hasattr(c, "_segments3d"))
+    assert np.allclose(np.asarray(shown.get_colors())[:, :3], color[good].numpy())
+    assert ax.get_xlim3d()[0] <= float(ends[good][..., 0].min())
+    draw(plot_lines_3d(ends[:, :0]))
+    draw(plot_lines_3d(ends[0], color="k", linewidths=2, ax=ax))

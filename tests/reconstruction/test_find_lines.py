@@ -10,6 +10,7 @@ import torch
 from chance import assert_share
 from torch import Tensor
 
+from torchsfm.bundle import bundle_adjust_model
 from torchsfm.geometry import (
     Camera,
     Pose,
@@ -215,3 +216,18 @@ def test_some_of_the_lines(generator: torch.Generator) -> None:
     assert torch.equal(some.lines.support(), model.lines.support()[keep])
     assert torch.equal(some.line_residuals(), model.line_residuals()[keep[model.lines.line]])
     assert torch.allclose(model.lines.moved_to(model.lines.L).ends, model.lines.ends, rtol=0, atol=1e-12)
+
+
+def test_whole_models_are_adjusted_with_their_lines(generator: torch.Generator) -> None:
+    model = with_lines(generator)
+    assert model.lines is not None
+    step = 0.0005 * torch.randn(VIEWS, 6, generator=generator, dtype=F64)
+    moved = dataclasses.replace(model, poses=model.poses.retract(step))
+    assert moved.line_residuals().mean() > 1.2 * model.line_residuals().mean()
+    adjusted = bundle_adjust_model(moved, free=()).model
+    assert adjusted.line_residuals().mean() < 1.1 * model.line_residuals().mean()
+    assert adjusted.residuals().mean() < 1.1 * model.residuals().mean()
+    assert adjusted.lines is not None
+    # Each is still as long as it was seen.
+    length = [(lines.ends[:, 1] - lines.ends[:, 0]).norm(dim=-1) for lines in (model.lines, adjusted.lines)]
+    torch.testing.assert_close(length[1] / length[1].mean(), length[0] / length[0].mean(), rtol=0.05, atol=0)

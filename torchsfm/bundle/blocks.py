@@ -185,9 +185,8 @@ class Bundle:
         return blocks, terms
 
 
-def cheapest_elimination(bundle: Bundle, blocks: Mapping[str, Block]) -> tuple[str, ...]:
+def cheapest_elimination(blocks: Mapping[str, Block], structure: tuple[str, ...] = ("point",)) -> tuple[str, ...]:
     """Points and other structure, unless eliminating poses leaves a system of less than half the size: film of few points."""
-    structure = structure_blocks(bundle)
     sizes = {name: block.x.shape[0] * block.tangent for name, block in blocks.items()}
     seen = sum(sizes[name] for name in structure)
     rest = sum(size for name, size in sizes.items() if name not in ("pose", *structure))

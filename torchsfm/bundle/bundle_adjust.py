@@ -9,7 +9,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Status, check_options
-from torchsfm.bundle.blocks import Bundle, BundleTerms, cheapest_elimination, moved_cameras, moved_poses
+from torchsfm.bundle.blocks import (
+    Bundle,
+    BundleTerms,
+    cheapest_elimination,
+    moved_cameras,
+    moved_poses,
+    structure_blocks,
+)
 from torchsfm.bundle.gauge import Gauge, restore_gauge
 from torchsfm.bundle.rig import Rig
 from torchsfm.bundle.structure import Structure
@@ -96,7 +103,7 @@ def bundle_adjust(
     result = sparse_levenberg_marquardt(
         blocks,
         residuals,
-        eliminate=cheapest_elimination(bundle, blocks),
+        eliminate=cheapest_elimination(blocks, structure_blocks(bundle)),
         max_iterations=max_iterations,
         function_tolerance=tolerance,
         linear_solver=linear_solver,

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, TypeVar, Unpack, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, Unpack, cast, runtime_checkable
 
 from torch import Tensor
 
 from torchsfm.bundle.blocks import BundleTerms
 from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
 from torchsfm.bundle.gauge import Gauge
+from torchsfm.bundle.lines import BundleLines
 from torchsfm.geometry import BundleProblem, Camera, Pose
+from torchsfm.optim import Loss
 from torchsfm.optim.schur import Solver
 from torchsfm.optim.sparse_derivative import Hessian
 
@@ -47,7 +49,22 @@ class BundleModel(Protocol):
         """The point of each observation, (m)."""
 
 
+@runtime_checkable
+class ModelLines(Protocol):
+    """Lines of a model, in its member `lines`."""
+
+    def bundle(self, *, unit: float = 1.0, loss: Loss | None = None) -> BundleLines:
+        """As a part of a bundle in which image points have the standard deviation `unit`, pixels."""
+
+    def moved_to(self, L: Tensor) -> "ModelLines":
+        """The same where they were adjusted to."""
+
+
 M = TypeVar("M", bound=BundleModel)
+MOST_NOISE = 0.5
+"""Standard deviation of image points, pixels, beyond which what they are off is not taken for noise."""
+RAYLEIGH = 1.1774
+"""Median distance of points whose coordinates have the standard deviation 1."""
 
 
 class BundleOptions(BundleTerms, total=False):
@@ -72,7 +89,8 @@ class AdjustedModel(Generic[M]):
 def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedModel[M]:
     """Minimise the reprojection error over all poses, cameras and points of a model; `bundle_adjust` for what holds a bundle.
 
-    Everything else in the model (names, colours, observations) stays. Views without observations keep their poses.
+    Lines, where the model has some in a member `lines`, are adjusted with the points, unless `structure` has others. Everything
+    else in the model (names, colours, observations) stays. Views without observations keep their poses.
 
     Args:
         model: A `Reconstruction`, a `BundleProblem`, or a frozen dataclass with their members.
@@ -85,7 +103,17 @@ def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedM
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
     problem = BundleProblem(model.poses, model.cameras, model.camera_index, model.X, model.x, model.view, model.point)
+    lines, others = getattr(model, "lines", None), options.get("structure", ())
+    own = lines if isinstance(lines, ModelLines) and all(some.block != BundleLines.block for some in others) else None
+    if own is not None:
+        apart = problem.residuals().detach()
+        known = apart[apart.isfinite()]
+        noise = min(MOST_NOISE, float(known.median()) / RAYLEIGH) if len(known) else MOST_NOISE
+        options = {**options, "structure": (*others, own.bundle(unit=noise, loss=options.get("loss")))}
     result = bundle_adjust(problem, **options)
     poses = result.poses if result.rig is None else result.rig.view_poses(result.poses)
-    whole: Any = model
-    return AdjustedModel(replace(whole, poses=poses, cameras=result.cameras, X=result.X), result)
+    whole: Any = replace(cast(Any, model), poses=poses, cameras=result.cameras, X=result.X)
+    if own is not None:
+        (moved,) = (some for some in result.structure if isinstance(some, BundleLines))
+        whole = replace(whole, lines=own.moved_to(moved.L))
+    return AdjustedModel(whole, result)

@@ -4,11 +4,12 @@ from torchsfm.plot.flat import plot_epipolar_lines, plot_matches, plot_points_2d
 from torchsfm.plot.framing import up_direction
 from torchsfm.plot.page import write_page
 from torchsfm.plot.residuals import plot_residuals
-from torchsfm.plot.spatial import plot_cameras, plot_points_3d, plot_tracks
+from torchsfm.plot.spatial import plot_cameras, plot_lines_3d, plot_points_3d, plot_tracks
 
 __all__ = [
     "plot_cameras",
     "plot_epipolar_lines",
+    "plot_lines_3d",
     "plot_matches",
     "plot_points_2d",
     "plot_points_3d",

@@ -1,4 +1,4 @@
-"""Figures in space: points, cameras, and tracks with the image number as the third axis."""
+"""Figures in space: points, lines, cameras, and tracks with the image number as the third axis."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -51,6 +51,44 @@ def plot_points_3d(
     values: Any = array(color.expand_as(X).reshape(-1, 3)[good].clamp(0, 1)) if isinstance(color, Tensor) else color
     options = {"s": 2, "depthshade": False, **style}
     ax.scatter(*array(points[good].T), c=values, **options)
+    return _finish(ax)
+
+
+def plot_lines_3d(
+    ends: Float[Tensor, "*batch l 2 3"],
+    *,
+    color: Float[Tensor, "*batch l 3"] | str | None = None,
+    ax: Axes | None = None,
+    **style: Any,
+) -> Axes:
+    """Draw parts of lines in space, such as `Reconstruction.lines.ends`, all axes at the same scale.
+
+    Args:
+        ends: Both ends of each. Those that are not finite are left out.
+        color: Red, green, blue in [0, 1] of each line, or one of matplotlib's colours for all.
+        ax: 3D axes to draw on; a new figure where not given.
+        **style: Passed on to matplotlib's `Line3DCollection`.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: A shape is wrong.
+        ImportError: matplotlib is not installed.
+    """
+    check_tensors(ends=(ends, "l 2 3"), color=(color if isinstance(color, Tensor) else None, "?l 3"))
+    ax = spatial_axes(ax)
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    segments = ends.detach().reshape(-1, 2, 3)
+    good = segments.isfinite().flatten(1).all(-1)
+    values: Any = color
+    if isinstance(color, Tensor):
+        values = array(color.expand(*ends.shape[:-2], 3).reshape(-1, 3)[good].clamp(0, 1))
+    if good.any():
+        ax.add_collection3d(Line3DCollection(list(array(segments[good])), **{"colors": values, "linewidths": 0.8, **style}))
+    # Collections do not move the limits of the axes; invisible points at the ends do.
+    ax.scatter(*array(segments[good].reshape(-1, 3).T), s=0)
     return _finish(ax)
 
 

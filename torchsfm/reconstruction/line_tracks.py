@@ -22,8 +22,8 @@ PAIR_SIMILARITY, SIMILARITY = 0.7, 0.6
 """Least cosines of descriptors: of a proposed pair, and of a further view and the first."""
 MIN_ANGLE = 0.02
 """Least angle of planes of sight, radians."""
-UNSURE = 0.05
-"""Largest standard deviation of an end across its line, over its distance from the cameras."""
+VAGUE, UNSURE = 0.05, 0.01
+"""Largest standard deviation of an end across its line, over its distance from the cameras: of proposed and of final lines."""
 STEPS = 15
 """Most steps of the least squares of a line."""
 CHUNK = 1 << 20
@@ -90,8 +90,8 @@ def propose_lines(segments: ViewSegments, cameras: Cameras, pairs: int) -> tuple
     couple = torch.cat([torch.zeros(0, 2, dtype=torch.long), *both])
     if not len(couple):
         return P.new_zeros(0, 2, 3), couple[:, 0]
-    found = _triangulate(segments, P, couple)
-    keep = found.good & (_inside(found.ends, segments.view[couple], cameras)).all(1)
+    found = _triangulate(segments, cameras, couple)
+    keep = found.good & (found.spread < VAGUE) & (_inside(found.ends, segments.view[couple], cameras)).all(1)
     return found.ends[keep], couple[keep, 0]
 
 
@@ -117,14 +117,14 @@ def link_lines(
     if not len(member):
         return LineTracks(ends[:0], member, number)
     for _ in range(2):
-        found = _fit(number, member, segments, cameras.P)
-        good = found.good[number] & (found.distance <= tolerance)
+        found = _fit(number, member, segments, cameras)
+        good = (found.good & (found.spread < VAGUE))[number] & (found.distance <= tolerance)
         number, member = _of_enough_views(number[good], member[good], segments)
         if not len(member):
             break
     else:
-        found = _fit(number, member, segments, cameras.P)
-        keep = found.good & _every_view_in_front(found.ends, number, segments.view[member], cameras)
+        found = _fit(number, member, segments, cameras)
+        keep = found.good & (found.spread < UNSURE) & _every_view_in_front(found.ends, number, segments.view[member], cameras)
         rows = keep[number]
         return LineTracks(found.ends[keep], member[rows], (keep.cumsum(0) - 1)[number[rows]])
     return LineTracks(ends[:0], member, number)
@@ -134,6 +134,8 @@ def link_lines(
 class _Fit:
     ends: Tensor
     good: Tensor
+    spread: Tensor
+    """Standard deviation of the ends across the line, over their distance from the first camera."""
     distance: Tensor
     """Of each segment from the image of its line, pixels."""
 
@@ -153,33 +155,29 @@ def _match(segments: ViewSegments, i: int, j: int, F: Tensor) -> Tensor:
 
 
 def _triangulate(
-    segments: ViewSegments, P: Tensor, members: Int[Tensor, "t m"], there: Tensor | None = None, steps: int = 0
+    segments: ViewSegments, cameras: Cameras, members: Int[Tensor, "t m"], there: Tensor | None = None, steps: int = 0
 ) -> _Fit:
     """Lines of segments, a row of them each; two planes need no steps."""
     view = segments.view[members]
     x, weights = fit_points(segments.ends[members]), segments.weight[members]
     visible = torch.ones_like(view, dtype=torch.bool) if there is None else there
+    P = cameras.P[view]
     found = triangulate_lines(
-        x[:, :, None], P[view], visible=visible[:, :, None], weights=weights[:, :, None], loss=Cauchy(1.0), max_iterations=steps
+        x[:, :, None], P, visible=visible[:, :, None], weights=weights[:, :, None], loss=Cauchy(1.0), max_iterations=steps
     )
     ends = found.ends[:, 0]
-    centres = -(P[view][..., :3].inverse() @ P[view][..., 3:])[..., 0]
-    distance = (ends[:, None] - centres[:, :1]).norm(dim=-1).amin((1, 2))
+    distance = (ends - cameras.poses.centre[view[:, 0], None]).norm(dim=-1).amin(1)
     spread = found.end_covariance[:, 0].diagonal(dim1=-2, dim2=-1).sum(-1).amax(-1).sqrt()
     # The adjustment of everything goes on where the steps end.
     status = found.status[:, 0]
-    good = (
-        ((status == Status.OK) | (status == Status.NOT_CONVERGED))
-        & (found.angle[:, 0] > MIN_ANGLE)
-        & (spread < UNSURE * distance)
-    )
-    good &= ends.isfinite().all(-1).all(-1) & ((ends[:, 1] - ends[:, 0]).norm(dim=-1) > 0)
-    h = torch.nn.functional.pad(ends, (0, 1), value=1.0)[:, None] @ P[view].mT
+    good = ((status == Status.OK) | (status == Status.NOT_CONVERGED)) & (found.angle[:, 0] > MIN_ANGLE)
+    good = good & ends.isfinite().all(-1).all(-1) & ((ends[:, 1] - ends[:, 0]).norm(dim=-1) > 0)
+    h = torch.nn.functional.pad(ends, (0, 1), value=1.0)[:, None] @ P.mT
     away = _distance(segments.ends[members], torch.linalg.cross(h[:, :, 0], h[:, :, 1])[:, :, None]).abs().amax(-1)
-    return _Fit(ends, good, torch.where(visible, away, torch.inf))
+    return _Fit(ends, good, spread / distance, torch.where(visible, away, torch.inf))
 
 
-def _fit(number: Tensor, member: Tensor, segments: ViewSegments, P: Tensor) -> _Fit:
+def _fit(number: Tensor, member: Tensor, segments: ViewSegments, cameras: Cameras) -> _Fit:
     """Lines of tracks, distances in the order of their segments."""
     sizes = torch.bincount(number)
     place = torch.arange(len(number)) - (sizes.cumsum(0) - sizes)[number]
@@ -187,8 +185,8 @@ def _fit(number: Tensor, member: Tensor, segments: ViewSegments, P: Tensor) -> _
     there = torch.zeros_like(table, dtype=torch.bool)
     table[number, place], there[number, place] = member, True
     # What is not there stands for any.
-    found = _triangulate(segments, P, table, there, STEPS)
-    return _Fit(found.ends, found.good, found.distance[number, place])
+    found = _triangulate(segments, cameras, table, there, STEPS)
+    return _Fit(found.ends, found.good, found.spread, found.distance[number, place])
 
 
 def _distance(x: Float[Tensor, "*#n 2"], line: Float[Tensor, "*#n 3"]) -> Float[Tensor, "*n"]:
