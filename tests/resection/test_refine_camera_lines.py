@@ -115,6 +115,13 @@ def test_weights_and_bad_lines(generator: torch.Generator) -> None:
     assert torch.equal(found.model[good], again.model[good])
 
 
+def test_no_cameras_are_none(generator: torch.Generator) -> None:
+    x, X, l, L, pose = (v[:0] for v in make(2, 5, 6, generator))  # noqa: E741
+    found = refine_camera(x, X, pose, Camera(K), l, L, free=("focal",))
+    assert found.model.shape == (0, 3, 4)
+    assert found.in_front.shape == (0, 11)
+
+
 def test_a_shift_along_parallel_lines_is_not_determined(generator: torch.Generator) -> None:
     x, X, l, L, pose = make(5, 0, 20, generator, 0.0)  # noqa: E741
     ends = 3 * torch.rand(5, 20, 1, 3, generator=generator, dtype=F64) - 1.5

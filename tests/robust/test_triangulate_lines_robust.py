@@ -129,6 +129,15 @@ def test_no_line_through_the_one_centre_is_called_good(generator: torch.Generato
         assert (triangulate_lines(l[:views], P[:views]).status != Status.OK).all()
 
 
+def test_units_of_image_coordinates_may_differ_by_far(generator: torch.Generator) -> None:
+    """A camera that magnifies one coordinate beyond measure sees no segment where it is."""
+    l, P, _, _ = ring(4, 40, 0.0, generator)  # noqa: E741
+    P[2, 1:] *= torch.tensor([1e-98, 1e-101], dtype=F64)[:, None]
+    result = triangulate_lines_robust(l, P, threshold=2.5, generator=seeded())
+    assert not result.inliers[2].any()
+    assert_share(result.status == Status.OK, 0.9)
+
+
 def test_bad_observations_count_for_nothing(generator: torch.Generator) -> None:
     l, P, _, _ = ring(7, 20, 0.1, generator)  # noqa: E741
     absent = torch.zeros(7, 20, dtype=torch.bool)

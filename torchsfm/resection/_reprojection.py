@@ -50,7 +50,7 @@ class Reprojection:
         n = self.points
         pixels, J = linearize(pose, torch.zeros_like(X[..., :2]), X, theta, self.inside(camera))
         away, slopes = chord_distances(pixels[..., n:, :], x[..., n:, :])
-        lines = (slopes[..., None] * J[..., n:, :, :].reshape(*slopes.shape, -1)).sum((-3, -2))
+        lines = (slopes[..., None] * J[..., n:, :, :].reshape(*slopes.shape, J.shape[-1])).sum((-3, -2))
         return torch.cat((pixels[..., :n, :] - x[..., :n, :], away), -2), torch.cat((J[..., :n, :, :], lines), -3)
 
     def in_front(self, pose: Pose, X: Tensor) -> Tensor:
@@ -59,7 +59,7 @@ class Reprojection:
         if self.points is None:
             return ahead
         lines = ahead[..., self.points :]
-        return torch.cat((ahead[..., : self.points], lines.reshape(*lines.shape[:-1], -1, 4).all(-1)), -1)
+        return torch.cat((ahead[..., : self.points], lines.reshape(*lines.shape[:-1], lines.shape[-1] // 4, 4).all(-1)), -1)
 
     def retract(self, state: State, delta: Tensor) -> State:
         pose, theta = state

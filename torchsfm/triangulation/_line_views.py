@@ -189,10 +189,11 @@ def seen_points(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def line_forms(P: Tensor) -> Tensor:
-    """The matrices (*batch, 3, 6) that take Pluecker vectors to image lines."""
+    """The matrices (*batch, 3, 6) that take Pluecker vectors to image lines, of size 1 whatever the rows of the cameras are."""
     M, p = P[..., :3], P[..., 3]
     direct = torch.stack([cross(p, column) for column in M.unbind(-1)], -1)
-    return torch.cat((direct, adjugate_3x3(M).mT), -1)
+    forms = torch.cat((direct, adjugate_3x3(M).mT), -1)
+    return forms / forms.detach().abs().amax((-2, -1), keepdim=True).clamp_min(1e-300)
 
 
 def through_centre(l: Tensor, line: Tensor, projections: Tensor) -> Tensor:  # noqa: E741
