@@ -54,13 +54,17 @@ def cross_rows(t: Float[Tensor, "*#batch 3"], A: Float[Tensor, "*#batch 3 3"]) -
 
 def product(A: Float[Tensor, "*#batch r q"], B: Float[Tensor, "*#batch q c"]) -> Float[Tensor, "*batch r c"]:
     """A B, without the shapes that broadcasting needs where there is nothing to broadcast."""
-    return torch.bmm(A, B) if A.ndim == 3 == B.ndim and len(A) == len(B) else A @ B
+    if A.shape[:-2] != B.shape[:-2] or A.ndim < 3:
+        return A @ B
+    if A.ndim == 3:
+        return torch.bmm(A, B)
+    return torch.bmm(A.flatten(0, -3), B.flatten(0, -3)).view(*A.shape[:-1], B.shape[-1])
 
 
 def apply_rows(B: Float[Tensor, "*#batch r q"], z: Float[Tensor, "*#batch q n"]) -> Float[Tensor, "*batch r n"]:
     """B z, as one product for several models of the same data."""
     if B.ndim == z.ndim and z.ndim > 2 and z.shape[-3] == 1 and B.shape[-3] > 1:
-        merged: Tensor = B.flatten(-3, -2) @ z[..., 0, :, :]
+        merged = product(B.flatten(-3, -2), z[..., 0, :, :])
         return merged.reshape(*B.shape[:-1], z.shape[-1])
     return product(B, z)
 
@@ -68,7 +72,7 @@ def apply_rows(B: Float[Tensor, "*#batch r q"], z: Float[Tensor, "*#batch q n"])
 def sums_of_products(a: Tensor, z: Tensor) -> Tensor:
     """The sums over the data a z', as one product for several models of the same data."""
     if a.ndim == z.ndim and z.ndim > 2 and z.shape[-3] == 1 and a.shape[-3] > 1:
-        merged: Tensor = a.flatten(-3, -2) @ z[..., 0, :, :].mT
+        merged = product(a.flatten(-3, -2), z[..., 0, :, :].mT)
         return merged.reshape(*a.shape[:-1], z.shape[-2])
     return product(a, z.mT)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.geometry import least_number_off, line_and_plane_distances
 from torchsfm.linalg import damped_solve
-from torchsfm.motion.epipolar_fit import matrices
+from torchsfm.motion.epipolar_fit import matrices, product
 from torchsfm.motion.homography_4pt import homography_4pt
 from torchsfm.motion.normalization import common_scale, largest_positive
 from torchsfm.motion.plane_and_parallax import more_than_chance
@@ -104,14 +104,14 @@ class HomographyEstimator:
         rows = torch.stack((q00, q01, q11, z0, z1, (z0 * u).addcmul_(z1, v), k0, k1, (k0 * u).addcmul_(k1, v)), -2)
         products = torch.stack((x * x, x * y, y * y, x, y, torch.ones_like(x)), -2)
         entries, signs = _constants(H.device)
-        moments = rows @ products.mT * signs
+        moments = product(rows, products.mT) * signs
         A = moments[..., :6, :].flatten(-2).index_select(-1, entries)
         h = H.double().flatten(-2)
         # The unit sphere's normal, as large as the rest.
         size = A[..., ::10].mean(-1, keepdim=True)
         A = torch.addcmul(matrices(A, 9), (size * h)[..., None], h[..., None, :])
         h = h - damped_solve(A, moments[..., 6:, 3:].reshape(*h.shape, 1))[..., 0]
-        return matrices(h / (h * h).sum(-1, keepdim=True).sqrt(), 3).to(x1.dtype)
+        return matrices(h / torch.linalg.vector_norm(h, dim=-1, keepdim=True), 3).to(x1.dtype)
 
     def retract(self, H: Float[Tensor, "*#batch 3 3"], step: Float[Tensor, "*#batch 8"]) -> Float[Tensor, "*batch 3 3"]:
         """H moved along the unit sphere."""

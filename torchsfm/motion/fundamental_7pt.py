@@ -73,20 +73,18 @@ def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tup
     (a, b), c2, size2 = _around_the_first(x2)
     # The first point says that F33 = 0: six equations in eight entries are left.
     N, pivot = nullspace_columns(torch.stack((a * u, a * v, a, b * u, b * v, b, u, v)))
-    n = [pair.unbind(0) for pair in N.unbind(0)]
-    g, h = [pair[0] for pair in n], [pair[1] for pair in n]
-    # det(s G + t H): the coefficients of t^3, s t^2, s^2 t, s^3.
-    C, D = _cofactors(g), _cofactors(h)
-    d0, d3 = combine_rows(D[6:], h[6:]), combine_rows(C[6:], g[6:])
-    d1, d2 = combine_rows(D, g), combine_rows(C, h)
-    some = torch.maximum(torch.maximum(d0.abs(), d1.abs()), torch.maximum(d2.abs(), d3.abs()))
+    # Each row for G and for H.
+    n, crossed = N.unbind(0), N.flip(1).unbind(0)
+    C = _cofactors(n)
+    # det(s G + t H): the coefficients of s^3 and t^3, and of s^2 t and s t^2.
+    outer, inner = combine_rows(C[6:], n[6:]), combine_rows(C, crossed)
+    some = torch.maximum(outer.abs(), inner.abs()).amax(0)
     # The larger of the outer coefficients leads.
-    turn = d0.abs() > d3.abs()
-    roots, real = cubic_rows(
-        torch.where(turn, d3, d0), torch.where(turn, d2, d1), torch.where(turn, d1, d2), torch.where(turn, d0, d3)
-    )
+    turn = outer[1].abs() > outer[0].abs()
+    cubic = torch.cat((outer[:1], inner, outer[1:]))
+    roots, real = cubic_rows(*torch.where(turn, cubic, cubic.flip(0)).unbind(0))
     s, t = torch.where(turn, 1.0, roots), torch.where(turn, roots, 1.0)
-    f0, f1, f2, f3, f4, f5, f6, f7 = (fma(t, y, s * x) for x, y in zip(g, h, strict=True))
+    f0, f1, f2, f3, f4, f5, f6, f7 = fma(N[:, 1:], t, N[:, :1] * s).unbind(0)
     # Back to the coordinates that came: T2' F T1 with T = [I, -c] / size, up to scale.
     f2 = fms(c1[1], f1, fms(c1[0], f0, f2 * size1))
     f5 = fms(c1[1], f4, fms(c1[0], f3, f5 * size1))
@@ -99,9 +97,9 @@ def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tup
     valid = real & (torch.minimum(pivot, some) > _INDEPENDENT) & (square > 0) & (square < torch.inf)
     scale = torch.where(valid, square.rsqrt(), 0.0)
     empty = torch.where(valid, 0.0, 0.5**0.5)
-    rows = [(row * scale).nan_to_num(0.0, 0.0, 0.0) for row in rows]
-    rows[0], rows[4] = rows[0] + empty, rows[4] + empty
-    return torch.stack(rows), valid
+    F = torch.stack(rows).mul_(scale).nan_to_num_(0.0, 0.0, 0.0)
+    F[0:5:4] += empty
+    return F, valid
 
 
 def _around_the_first(x: Tensor) -> tuple[Tensor, Sequence[Tensor], Tensor]:

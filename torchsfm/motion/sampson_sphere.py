@@ -126,8 +126,7 @@ def turned(w: Float[Tensor, "*#batch 3"], R: Float[Tensor, "*#batch 3 3"]) -> Fl
     twice = torch.linalg.cross(half[..., None], once, dim=-2)
     share = 2 / (1 + (half * half).sum(-1))
     R = R + share[..., None, None] * (once + twice)
-    product: Tensor = 1.5 * R - 0.5 * (R @ (R.mT @ R))
-    return product
+    return torch.sub(1.5 * R, product(R, product(R.mT, R)), alpha=0.5)
 
 
 def pose_step(

@@ -72,8 +72,8 @@ def scale_of_noise(
         found, own = _widened(take(estimator), take(model), take(data), limit[rows], counts[rows])
         model, noise = zip_map(lambda t, new: t.index_copy(0, rows, new), (model, noise), (found, own))
     for _ in range(_SCALE_STEPS):
-        model, noise = _scale_step(estimator, model, data, limit, counts, noise)
-    return model, _reach_at(estimator, model, data, limit, counts, noise)
+        model, noise, reach = _scale_step(estimator, model, data, limit, counts, noise)
+    return model, torch.exp2((4 * reach.log2()).round() / 4)
 
 
 def _widened(
@@ -93,8 +93,8 @@ def _first_noise(
     """The likeliest scale of Gaussian noise among evenly spread outliers within the window.
 
     Returns:
-        The logarithm of the likelihood `(g)` against that of outliers alone; the variance and the share of inliers among the
-        data in the window, `(g, 1)`; and whether there are many data beyond the threshold, `(g)`.
+        The logarithm of the likelihood `(g)` against that of outliers alone; the variance, and the odds of an outlier where the
+        model is, `(g, 1)`; and whether there are many data beyond the threshold, `(g)`.
     """
     k = estimator.codimension
     ratio, there, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
@@ -108,7 +108,9 @@ def _first_noise(
     for _ in range(_SHARE_STEPS):
         share = ((there * share * density / (1 + share * gain)).sum(-1, keepdim=True) / some).clamp(max=0.999)
     evidence, index = (there * torch.log1p(share * gain)).sum(-1).max(-1, keepdim=True)
-    return evidence[:, 0], (variance[:, 0][index], share[..., 0].gather(-1, index)), crowd
+    variance = variance[:, 0][index]
+    number = (share[..., 0].gather(-1, index) * total).clamp(min=1)
+    return evidence[:, 0], (variance, _odds_and_reach(total, number, variance, k)[0]), crowd
 
 
 def _scale_step(
@@ -118,36 +120,22 @@ def _scale_step(
     limit: Tensor,
     counts: Tensor,
     noise: tuple[Tensor, Tensor],
-) -> tuple[M, tuple[Tensor, Tensor]]:
-    """A step, and the noise by the distances before it: its variance and the share of inliers in the window, `(g, 1)`."""
-    k, found = estimator.codimension, noise
+) -> tuple[M, tuple[Tensor, Tensor], Tensor]:
+    """A step by the noise that the distances before it show, that noise, and its squared reach `(g)` in squared thresholds."""
+    k, (variance, odds), found = estimator.codimension, noise, limit
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
-        nonlocal found
+        nonlocal variance, odds, found
         ratio, there, total = _within_window(squared, limit, counts)
-        odds, reach = _odds_and_reach(total, *noise, k)
-        likely = there / (1 + odds * torch.exp((0.5 * ratio / noise[0]).clamp(max=60)))
+        likely = there / (1 + odds * torch.exp((0.5 * ratio / variance).clamp(max=60)))
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, _MOST)
-        found = variance, number / total.clamp(min=1)
+        odds, reach = _odds_and_reach(total, number, variance, k)
+        found = reach[:, 0]
         return falling((ratio / reach).clamp(max=1), counts, k)
 
     model = estimator.step(model, *data, weigh=weigh)
-    return model, found
-
-
-def _reach_at(
-    estimator: Estimator[M],
-    model: M,
-    data: Sequence[Tensor],
-    limit: Tensor,
-    counts: Tensor,
-    noise: tuple[Tensor, Tensor],
-) -> Tensor:
-    """The squared reach `(g)` in units of the squared threshold, rounded."""
-    _, _, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
-    _, reach = _odds_and_reach(total, *noise, estimator.codimension)
-    return torch.exp2((4 * reach[:, 0].log2()).round() / 4)
+    return model, (variance, odds), found
 
 
 def _within_window(squared: Tensor, limit: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -158,9 +146,8 @@ def _within_window(squared: Tensor, limit: Tensor, counts: Tensor) -> tuple[Tens
     return torch.where(near, ratio, _WINDOW**2), there, there.sum(-1, keepdim=True)
 
 
-def _odds_and_reach(total: Tensor, variance: Tensor, share: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The odds of an outlier where a model is, and the squared distance at which they are even."""
-    number = (share * total).clamp(min=1)
+def _odds_and_reach(total: Tensor, number: Tensor, variance: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The odds of an outlier where a model is, and the squared distance at which they are even, from the number of inliers."""
     # Never less than half an outlier between two and six thresholds.
     outlying = (total - number).clamp(min=0) / _WINDOW**k + 0.5 / (6**k - 2**k)
     odds = outlying / (number * _peak(k) * variance ** (-k / 2))
