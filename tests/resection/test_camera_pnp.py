@@ -146,6 +146,8 @@ def test_shapes(make_views, solve, batch):
     found = solve(d, X)
     slots = (2,) if solve is camera_planar else ()
     assert found.model.shape == (*batch, *slots, 3, 4)
+    assert found.pose.shape == (*batch, *slots)
+    assert found.pose.matrix().equal(found.model)
     assert found.error.shape == (*batch, *slots)
     assert found.status.shape == batch
     single = solve(d.float(), X.float())

@@ -8,7 +8,7 @@ from robust_doors import DOORS, F64, Door, Scene, rays
 from scenes import make_scene
 
 from torchsfm import motion, resection
-from torchsfm._types import Status
+from torchsfm._types import Status, tensor_map
 from torchsfm.linalg import damped_solve
 from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography, estimate_upright
 from torchsfm.resection import estimate_camera
@@ -29,7 +29,7 @@ every_estimator = pytest.mark.parametrize("kind", ESTIMATORS, ids=lambda kind: k
 def test_what_is_no_model_has_no_score(kind: type, dtype: torch.dtype, generator: torch.Generator) -> None:
     scene = make_scene(kind, (1,), 30, generator)
     data = [d.to(dtype)[:, None] for d in scene.data]
-    estimator = type(scene.estimator)(*(v.to(dtype)[:, None] for v in vars(scene.estimator).values()))
+    estimator = tensor_map(lambda t: t.to(dtype)[:, None], scene.estimator)
     good = scene.model.to(dtype)
     bad = [torch.nan, torch.inf, -torch.inf, 1e37 if dtype == torch.float32 else 1e300]
     if isinstance(scene.estimator, NeverZero):

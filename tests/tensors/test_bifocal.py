@@ -155,6 +155,7 @@ def test_pose_from_essential_finds_the_pose(shape: tuple[int, ...], dtype: torch
     pose = pose_from_essential((-7 * essential_from_pose(R, t)).to(dtype), d1.to(dtype), d2.to(dtype))
     tolerance = 1e-10 if dtype == F64 else 1e-4
     assert pose.model.dtype == dtype
+    assert pose.pose.matrix().equal(pose.model)
     assert (pose.model - torch.cat((R, t[..., None]), -1)).abs().max() < tolerance
     assert pose.in_front.all()
     assert (pose.status == Status.OK).all()

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
+from torchsfm.geometry import Pose
 from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
 from torchsfm.resection._angles import Rays, attach, determined, gauss_newton, in_pieces, status_of
@@ -31,6 +32,11 @@ class PlanarPoses:
     status: Int8[Tensor, "*batch"]
     """OK; NOT_FINITE: data with weight are not finite, or a ray is zero; TOO_FEW: fewer than four points; DEGENERATE: points or
     rays in a line, points that are in no plane; BEHIND: half of the weight or more is behind the camera."""
+
+    @property
+    def pose(self) -> Pose:
+        """The models as poses with a batch dimension of two at the end."""
+        return Pose.from_matrix(self.model)
 
 
 def camera_planar(

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
+from torchsfm.geometry import Pose
 from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
 from torchsfm.resection._angles import Rays, attach, cost, determined, gauss_newton, in_pieces, status_of
@@ -29,6 +30,11 @@ class PoseEstimate:
     status: Int8[Tensor, "*batch"]
     """OK; NOT_FINITE: data with weight are not finite, or a ray is zero; TOO_FEW: fewer than four points; DEGENERATE: the pose
     is not determined (points in a line, rays that coincide); BEHIND: half of the weight or more is behind the camera."""
+
+    @property
+    def pose(self) -> Pose:
+        """The model as a `Pose`."""
+        return Pose.from_matrix(self.model)
 
 
 def camera_pnp(

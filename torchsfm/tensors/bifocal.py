@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions, Status, check_options, check_tensors
+from torchsfm.geometry.poses import Pose
 from torchsfm.geometry.rotations import cross_matrix
 from torchsfm.linalg import adjugate_3x3, cross, determinant_3x3, nearest_rank, nearest_rotation
 
@@ -26,6 +27,11 @@ class RelativePose:
     model: Float[Tensor, "*batch 3 4"]
     in_front: Bool[Tensor, "*batch n"]
     status: Int[Tensor, "*batch"]
+
+    @property
+    def pose(self) -> Pose:
+        """The model as a `Pose`, `cam2_from_cam1`."""
+        return Pose.from_matrix(self.model)
 
 
 def essential_from_pose(R: Float[Tensor, "*#batch 3 3"], t: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
