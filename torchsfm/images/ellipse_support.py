@@ -76,35 +76,42 @@ def find_support(ellipses: Ellipse, image: Int[Tensor, " n"], edges: EdgeMap, re
     inverse = torch.linalg.inv_ex(shape_of_ellipse(ellipses)).inverse
     normal = torch.nn.functional.normalize((inverse[of] @ (x - ellipses.centre[of])[..., None])[..., 0], dim=-1)
     offset = torch.arange(-reach, reach + 1, device=x.device)
-    column, row = (x[:, None] + offset[:, None] * normal[:, None]).round().long().unbind(-1)
-    place = (image[of, None] * h + row.clamp(0, h - 1)) * w + column.clamp(0, w - 1)
+    column, row = ((x[:, None, k] + offset * normal[:, None, k]).round().long() for k in (0, 1))
+    place = (image[of, None] * h + row.clamp_(0, h - 1)) * w + column.clamp_(0, w - 1)
     edgel = edges.at.flatten()[place]
-    met = edgel >= 0
-    edgel = edgel.clamp_min(0)
-    away = ((edges.x[edgel] - x[:, None]) * normal[:, None]).sum(-1)
-    met &= away.abs() <= reach
+    step = (edgel >= 0).nonzero()[:, 0]
+    edgel = edgel[edgel >= 0]
+    met = _dot(edges.x[edgel] - x[step], normal[step]).abs() <= reach
+    step, edgel = step[met], edgel[met]
     gradient = edges.gradient[edgel]
-    outward = (gradient * normal[:, None]).sum(-1)
+    outward = _dot(gradient, normal[step])
     along = aligned(outward.abs(), gradient)
-    hit = (met & along).any(-1)
+    hit = torch.zeros_like(of, dtype=torch.bool).index_fill(0, step[along], True)
     # Edge points of slanted edges are more than a step apart.
-    before, after = hit.roll(1) & (of.roll(1) == of), hit.roll(-1) & (of.roll(-1) == of)
-    hit = hit | before | after
+    hit = hit | _next(hit, of, 1) | _next(hit, of, -1)
     ends = ~hit
     for k in range(1, _BENT + 1):
-        ends |= (~hit.roll(k) & (of.roll(k) == of)) | (~hit.roll(-k) & (of.roll(-k) == of))
+        ends = ends | _next(~hit, of, k) | _next(~hit, of, -k)
     coverage = total.new_zeros(total.shape).index_add(0, of, weight * hit) / total
-    number = len(edges.x)
-    key = (of[:, None] * number + edgel)[met]
-    key, back = torch.unique(key, return_inverse=True)
-    # Next to each other on the ellipse, several steps meet an edge point: any that it is aligned with will do.
-    agrees = torch.zeros(len(key), dtype=torch.long, device=x.device).index_add(0, back, along[met].long()) > 0
-    count = torch.zeros(len(key), dtype=x.dtype, device=x.device).index_add(0, back, met[met].to(x.dtype))
-    mean = torch.zeros_like(count).index_add(0, back, outward[met]) / count
-    inner = (
-        torch.zeros(len(key), dtype=torch.long, device=x.device).index_add(0, back, (along & ~ends[:, None])[met].long()) > 0
-    )
-    return Support(key // max(number, 1), key % max(number, 1), agrees, inner, mean, coverage)
+    number = max(len(edges.x), 1)
+    key, back = torch.unique(of[step] * number + edgel, return_inverse=True)
+
+    def total_of(values: Tensor) -> Tensor:
+        """Next to each other on the ellipse, several steps meet an edge point."""
+        return torch.zeros(len(key), dtype=x.dtype, device=x.device).index_add(0, back, values.to(x.dtype))
+
+    agrees, inner = total_of(along) > 0, total_of(along & ~ends[step]) > 0
+    outward = total_of(outward) / total_of(torch.ones_like(along))
+    return Support(key // number, key % number, agrees, inner, outward, coverage)
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]
+
+
+def _next(flags: Tensor, of: Tensor, steps: int) -> Tensor:
+    """The flag so many steps before on the same ellipse."""
+    return flags.roll(steps) & (of.roll(steps) == of)
 
 
 def keep_the_best(rank: Int[Tensor, " n"], support: Support, edgels: int, most: float) -> Bool[Tensor, " n"]:

@@ -38,6 +38,8 @@ _ROUNDS = 2
 """Fits that are made to leave out edge points, """
 _FEW = 3
 """each with so many steps."""
+_FIRST = 0.5
+"""The part of the coverage wanted in the end that arcs, and first ellipses, must have."""
 _SHARED = 0.5
 """The share of an ellipse's edge points from which on it is another one, seen again."""
 
@@ -119,11 +121,12 @@ def detect_ellipses(
     chain = edges.chain.flatten()[place] + of_image * (slots + 1)
     arcs = find_arcs(x, variance, chain, closed, of_image, tolerance)
     frame = _Frame(x.new_tensor([size[2] - 1, size[1] - 1]) / 2, math.hypot(*size[1:]) / 2)
-    ellipse, of = _from_arcs(x, arcs, frame, min_radius)
+    ellipse, of = _from_arcs(x, arcs, frame, min_radius, _FIRST * min_coverage)
     edgels = edge_map(x, gradient, of_image, size)
     for reach in _REACHES[:-1]:
         support = find_support(ellipse, of, edgels, reach)
         ellipse, good = _again(x, support, len(of), frame, min_radius)
+        good &= support.coverage >= _FIRST * min_coverage
         ellipse, of = _chosen(ellipse, good), of[good]
     support = find_support(ellipse, of, edgels, _REACHES[-1])
     found = _judge(support, len(of), math.log10(size[1] * size[2]))
@@ -158,7 +161,7 @@ class _Frame:
         return Ellipse(self.middle + self.scale * centre, axes, shape.angle), good, v
 
 
-def _from_arcs(x: Tensor, arcs: Arcs, frame: _Frame, min_radius: float) -> tuple[Ellipse, Tensor]:
+def _from_arcs(x: Tensor, arcs: Arcs, frame: _Frame, min_radius: float, least: float) -> tuple[Ellipse, Tensor]:
     """Ellipses of arcs and pairs of arcs, and their images."""
     bent = arcs.turn.abs() >= _LEAST_TURN
     new = bent.long().cumsum(0) - 1
@@ -171,6 +174,10 @@ def _from_arcs(x: Tensor, arcs: Arcs, frame: _Frame, min_radius: float) -> tuple
     ellipse, good, v = frame.ellipses(M[pairs[:, 0]] + torch.where(alone[:, None, None], 0.0, M[pairs[:, 1]]), min_radius)
     off = torch.stack([residual(M[pairs[:, k]], v) for k in (0, 1)]).amax(0) * frame.scale
     good &= off <= _OFF
+    # Edge points are a pixel apart or a little more.
+    around = 2 * math.pi * ellipse.semi_axes.square().mean(-1).sqrt()
+    edgels = arcs.edgels[pairs[:, 0]] + torch.where(alone, 0, arcs.edgels[pairs[:, 1]])
+    good &= edgels >= least * around
     return _chosen(ellipse, good), arcs.image[pairs[good, 0]]
 
 
