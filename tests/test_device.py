@@ -25,7 +25,10 @@ from torchsfm.robust import ransac, soft_ransac
 
 OPENCV = "OpenCV takes images and gives points on the CPU"
 ON_THE_CPU = EXCEPTIONS | {
-    **{f"images.{name}": OPENCV for name in ("detect_corners", "detect_features", "track_points", "track_sequence")},
+    **{
+        f"images.{name}": OPENCV
+        for name in ("detect_chessboard", "detect_corners", "detect_features", "track_points", "track_sequence")
+    },
     "images.list_skipped": "reads a folder",
     "images.retrieve_pairs": "pairs are numbers for the program, not data",
     "linalg.companion_roots": "gives the roots in any order",

@@ -193,6 +193,21 @@ def _round_picture(s: Scene) -> Tensor:
     return s.rand(1, 32, 40, high=0.02) + 0.6 * (9.7 - (x * x + y * y).sqrt()).clamp(0, 1)
 
 
+def _chessboard(s: Scene) -> Tensor:
+    """Squares of eight pixels on white, with noise."""
+    y, x = torch.meshgrid(torch.arange(48) // 8, torch.arange(56) // 8, indexing="ij")
+    inside = (x > 0) & (x < 6) & (y > 0) & (y < 5)
+    return 0.9 - 0.8 * (inside & ((x + y) % 2 == 0)) + s.rand(1, 48, 56, high=0.02)
+
+
+def _circles(s: Scene) -> Tensor:
+    """Three by two dark discs, with noise."""
+    y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    away = ((x - 12).remainder(20) - 10).square() + ((y - 14).remainder(20) - 10).square()
+    inside = (6.3 - away.sqrt()).clamp(0, 1) * ((x > 2) & (x < 62) & (y > 4) & (y < 44))
+    return 0.9 - 0.8 * inside + s.rand(1, 48, 64, high=0.02)
+
+
 def _picture(s: Scene) -> Tensor:
     """A bright rectangle with noise."""
     image = s.rand(1, 32, 40, high=0.05)
@@ -280,6 +295,8 @@ FUNCTIONS: dict[str, Function] = {
     "geometry.point_to_line_distance": Function({"X": lambda s: s.randn(3), "L": lambda s: s.randn(6)}),
     "geometry.random_rotation": Function({"shape": (2,), "generator": _generator}),
     "images.describe_images": Function({"features": _features, "words": 4, "generator": _generator}, batched=False),
+    "images.detect_chessboard": Function({"image": _chessboard, "columns": 4, "rows": 3}, {"h": 48, "w": 56}),
+    "images.detect_circles_grid": Function({"image": _circles, "columns": 3, "rows": 2}, {"h": 48, "w": 64}),
     "images.detect_corners": Function({"image": lambda s: s.rand(1, 32, 40)}, {"h": 32, "w": 40}),
     "images.detect_edges": Function({"image": lambda s: _picture(s), "max_edgels": 500}, {"h": 32, "w": 40}),
     "images.detect_ellipses": Function({"image": _round_picture, "max_ellipses": 3}, {"h": 32, "w": 40}),
@@ -397,6 +414,14 @@ FUNCTIONS: dict[str, Function] = {
         {
             "shapes": lambda s: [s.rand(1, 2, high=30.0) + torch.tensor([[0.0, 0], [9, 0], [0, 9]])], "width": 32, "height": 24,
             "levels": lambda s: s.rand(2),
+        },
+        batched=False,
+    ),
+    "simulation.render_board": Function(
+        {
+            "poses": lambda s: Pose(torch.eye(3).expand(1, 3, 3), torch.tensor([[-1.0, -0.5, 4.0]])),
+            "camera": lambda s: Camera(torch.tensor([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]])),
+            "columns": 3, "rows": 2, "width": 32, "height": 24, "fine": 2, "generator": _generator,
         },
         batched=False,
     ),

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.autocalibration import calibrate_planes
 from torchsfm.geometry import BrownConrady, Camera, NoDistortion, Pose, Radial, rotation_angle, rotation_from_rotvec
+from torchsfm.optim import Cauchy
 
 SIZE = (1000.0, 800.0)
 
@@ -169,3 +170,16 @@ def test_chessboard_like_opencv(chessboard, model):
         assert abs(float(found.camera.K[i, j] / theirs[i, j]) - 1) < 1e-3
     parameters = found.camera.distortion.parameters()
     assert torch.allclose(parameters, torch.from_numpy(lens).flatten()[: len(parameters)], rtol=1e-3, atol=1e-4)
+
+
+def test_a_loss_leaves_out_what_is_wrong(generator: torch.Generator) -> None:
+    x, X, K, _ = views(generator, 10, [-0.2, 0.1, 0, 0, 0], (4,), noise=0.1)
+    wrong = torch.rand(x.shape[:-1], generator=generator) < 0.05
+    x = torch.where(wrong[..., None], x + 40 * torch.randn(x.shape, generator=generator, dtype=x.dtype), x)
+    robust = calibrate_planes(x, X, image_size=SIZE, loss=Cauchy(0.5))
+    assert bool((robust.status == Status.OK).all())
+    off = (robust.camera.K[..., 0, 0] - K[0, 0]).abs()
+    assert float((off / robust.deviation[..., 0]).max()) < 5
+    plain = calibrate_planes(x, X, image_size=SIZE)
+    assert float(off.mean()) < 0.3 * float((plain.camera.K[..., 0, 0] - K[0, 0]).abs().mean())
+    assert float(robust.deviation[..., 0].mean()) < 0.3 * float(plain.deviation[..., 0].mean())

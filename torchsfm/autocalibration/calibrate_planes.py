@@ -5,7 +5,7 @@ absolute conic, `h1' w h2 = 0` and `h1' w h1 = h2' w h2`; then all intrinsics, d
 reprojection error.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -28,7 +28,7 @@ from torchsfm.geometry.intrinsic_parameters import (
 from torchsfm.geometry.projection import PixelProjection, turn_slopes
 from torchsfm.linalg import cross, eigvalsh, nearest_rotation, null_vector, usable
 from torchsfm.motion import homography_dlt
-from torchsfm.optim import levenberg_marquardt, rotation_exponential
+from torchsfm.optim import Loss, levenberg_marquardt, loss_slope, rotation_exponential
 
 _PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Order of the six entries of a conic."""
@@ -81,6 +81,7 @@ def calibrate_planes(
     visible: Bool[Tensor, "*#batch v n"] | None = None,
     distortion: type[Distortion] = Radial,
     free: Sequence[str] = ("focal", "aspect", "principal_point"),
+    loss: Loss | None = None,
     max_iterations: int = 60,
 ) -> PlaneCalibration:
     """Calibrate a camera from views of points on a plane, whose places on it are known.
@@ -96,6 +97,7 @@ def calibrate_planes(
         visible: Which points each view sees; all by default. What stands elsewhere is not looked at.
         distortion: The distortion model.
         free: Which of "focal" (always), "aspect", "skew", "principal_point" are estimated; all of the distortion is.
+        loss: Of squared distances in pixels, see `torchsfm.optim.loss`; the squares if not given.
         max_iterations: Most steps of the optimiser.
 
     Returns:
@@ -105,7 +107,10 @@ def calibrate_planes(
         ValueError: Shapes, dtypes, devices or names do not fit.
     """
     batch = check_tensors(x=(x, "v>=1 n>=4 2"), X=(X, "n 2"), visible=(visible, "?v n : bool"))
-    check_options(image_size=(image_size, "?2 float > 0"), free=(free, Sequence), max_iterations=(max_iterations, "int >= 0"))
+    check_options(
+        image_size=(image_size, "?2 float > 0"), free=(free, Sequence), loss=(loss, Callable | None),
+        max_iterations=(max_iterations, "int >= 0"),
+    )  # fmt: skip
     columns = tuple(sorted(set(intrinsic_columns(free))))
     if "focal" not in free:
         raise ValueError("free: wanted 'focal' among the free parameters")
@@ -132,6 +137,7 @@ def calibrate_planes(
         retract=problem.retract,
         size=q + 6 * v,
         weights=weights,
+        loss=loss,
         linearize=problem.linearize,
         max_iterations=max_iterations,
         function_tolerance=1e-12,
@@ -142,7 +148,9 @@ def calibrate_planes(
         settled = tensor_map(torch.Tensor.detach, found)
         flat = tensor_map(lambda a: a.reshape(-1, *a.shape[len(batch) :]), (settled, x64.detach(), X64.detach(), weights))
         residual, J = problem.linearize(flat[0], flat[1], flat[2])
-        covariance, pose_covariance = _covariance(residual, J, flat[3], q, v, used.reshape(-1, v))
+        # What the loss trusts an observation.
+        trust = flat[3] if loss is None else flat[3] * loss_slope(loss, residual.square().sum(-1))
+        covariance, pose_covariance = _covariance(residual, J, trust, q, v, used.reshape(-1, v))
         square = residual.square().sum(-1) * flat[3]
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
@@ -311,7 +319,7 @@ def _poses(K: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
 
 def _covariance(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, used: Tensor) -> tuple[Tensor, Tensor]:
     """Covariances of intrinsics and of each pose, scaled by the residuals."""
-    J = J * w[..., None, None]
+    J = J * w.sqrt()[..., None, None]
     A = J.flatten(1, 2)
     information = A.mT @ A
     scale = information.diagonal(dim1=-2, dim2=-1)

@@ -11,6 +11,7 @@ import typer
 
 from torchsfm.cli.align import align
 from torchsfm.cli.bundle import bundle
+from torchsfm.cli.calibrate import calibrate
 from torchsfm.cli.curves import curves
 from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
 from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched, warn_about_intrinsics
@@ -224,6 +225,6 @@ def info(
             typer.echo("")
 
 
-for command in (triangulate, register, align, bundle, export, convert):
+for command in (triangulate, register, align, bundle, calibrate, export, convert):
     app.command()(command)
 app.command()(curves)

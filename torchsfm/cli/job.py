@@ -21,6 +21,7 @@ NOTHING, WRONG, INTERRUPTED = 1, 2, 130
 LABELS = {
     "render": "rendering the scene",
     "read": "reading images",
+    "pattern": "finding the pattern",
     "problem": "reading",
     "features": "finding features",
     "match": "matching pairs",

@@ -1,5 +1,6 @@
 """What is in the image, and where? Files, features, corners, tracks and matches; the only room with OpenCV and kornia."""
 
+from torchsfm.images.boards import BoardPoints, detect_chessboard, detect_circles_grid
 from torchsfm.images.corners import Corners, detect_corners
 from torchsfm.images.edges import Edges, detect_edges
 from torchsfm.images.ellipses import Ellipses, detect_ellipses
@@ -19,6 +20,7 @@ from torchsfm.images.undistort import Pinholes, undistort_images, undistorted_ca
 
 __all__ = [
     "MAX_PIXELS",
+    "BoardPoints",
     "Corners",
     "Edges",
     "EllipseFit",
@@ -36,6 +38,8 @@ __all__ = [
     "Tracks",
     "describe_images",
     "describe_segments",
+    "detect_chessboard",
+    "detect_circles_grid",
     "detect_corners",
     "detect_edges",
     "detect_ellipses",

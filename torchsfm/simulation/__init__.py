@@ -1,5 +1,6 @@
 """What would the cameras see? Synthetic scenes, viewpoints, observations and images, with the truth known."""
 
+from torchsfm.simulation.boards import render_board
 from torchsfm.simulation.bundle_problems import SimulatedBundle, random_bundle_problem
 from torchsfm.simulation.conic_scenes import SimulatedConics, simulate_conics
 from torchsfm.simulation.observations import SimulatedImages, random_intrinsics, random_points, simulate_images
@@ -23,6 +24,7 @@ __all__ = [
     "random_intrinsics",
     "random_points",
     "random_poses",
+    "render_board",
     "render_sequence",
     "render_shapes",
     "simulate_conics",

@@ -160,10 +160,7 @@ def paint_shapes(
     if len(levels) != len(shapes) + 1:
         raise ValueError(f"levels: wanted {len(shapes) + 1}, one more than shapes, got {len(levels)}")
     reach = math.ceil(4 * blur * fine)
-    along = [
-        (torch.arange(n * fine + 2 * reach, dtype=levels.dtype, device=levels.device) - reach + 0.5) / fine - 0.5
-        for n in (width, height)
-    ]
+    along = [fine_samples(n, blur, fine, levels) for n in (width, height)]
     maps = levels[:1, None].repeat(len(along[1]), len(along[0]))
     for thing, level in zip(shapes, levels[1:], strict=True):
         low, high = (v.tolist() for v in _box(thing))
@@ -175,12 +172,23 @@ def paint_shapes(
         part = maps[rows, columns]
         covered = (_depth(thing, torch.stack((x, y), -1)) * fine + 0.5).clamp(0, 1)
         part += (level - part) * covered
-    kernel = torch.exp(
-        -0.5 * (torch.arange(-reach, reach + 1, dtype=levels.dtype, device=levels.device) / (blur * fine)).square()
-    )
+    return photograph(maps, width, height, blur, fine)
+
+
+def photograph(maps: Float[Tensor, "h2 w2"], width: int, height: int, blur: float, fine: int) -> Float[Tensor, "1 h w"]:
+    """Blur what was sampled finely, beyond the border by four times the blur, as a lens does, and average it to pixels."""
+    reach = math.ceil(4 * blur * fine)
+    offset = torch.arange(-reach, reach + 1, dtype=maps.dtype, device=maps.device)
+    kernel = torch.exp(-0.5 * (offset / (blur * fine)).square())
     kernel = kernel / kernel.sum()
     maps = conv2d(conv2d(maps[None, None], kernel[:, None][None, None]), kernel[None, None, None])
     return maps.reshape(height, fine, width, fine).mean((1, 3))[None]
+
+
+def fine_samples(size: int, blur: float, fine: int, like: Tensor) -> Float[Tensor, " n"]:
+    """Where the samples that `photograph` wants are along an axis, in pixels."""
+    reach = math.ceil(4 * blur * fine)
+    return (torch.arange(size * fine + 2 * reach, dtype=like.dtype, device=like.device) - reach + 0.5) / fine - 0.5
 
 
 def _ellipse(ellipses: Ellipse, k: int) -> Ellipse:

@@ -1,0 +1,150 @@
+"""Calibration patterns in images: the corners of chessboards, the centres of circles in a grid."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import check_options, check_tensors
+from torchsfm.geometry import Ellipse, conic_from_ellipse, dual_conic
+from torchsfm.geometry.conics import shape_of_ellipse
+from torchsfm.images.corners import to_gray
+from torchsfm.images.ellipses import Ellipses, detect_ellipses
+from torchsfm.images.plane_grids import grid_homography, grid_in_points
+
+_WINDOW = 11
+"""Largest half side of the square around a corner that says where it is, in pixels."""
+_ROUNDS = 4
+"""Improvements of the vanishing line by the centres, and of the centres by the vanishing line."""
+
+
+@dataclass(frozen=True)
+class BoardPoints:
+    """The points of a pattern with `columns` points in a row, row by row; zero where it is not `found`.
+
+    On the board x turns to y as it does in the image: none is seen from behind. A pattern that looks the same when it is turned
+    may be numbered from another of its ends.
+    """
+
+    x: Float[Tensor, "*batch n 2"]
+    """In pixels."""
+    found: Bool[Tensor, "*batch"]
+
+
+def detect_chessboard(image: Float[Tensor, "*batch c h w"], columns: int, rows: int) -> BoardPoints:
+    """Find the inner corners of a chessboard (OpenCV's detector), to a fraction of a pixel by the gradients around them.
+
+    Args:
+        image: Grey (c = 1) or red, green, blue images.
+        columns: Inner corners in a row.
+        rows: Inner corners in a column.
+
+    Returns:
+        The corners, where all of them are seen.
+
+    Raises:
+        ValueError: A shape or an option is wrong.
+    """
+    import cv2
+
+    batch, flat = _gray(image, columns, rows, 3)
+    x = torch.zeros(len(flat), rows * columns, 2, dtype=image.dtype, device=image.device)
+    found = torch.zeros(len(flat), dtype=torch.bool, device=image.device)
+    ending = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for i, gray in enumerate(flat):
+        pixels = (gray.nan_to_num().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        good, corners = cv2.findChessboardCorners(pixels, (columns, rows), flags=flags)
+        if good:
+            # Half of a square and no more has the edges of one corner alone.
+            window = min(_WINDOW, max(2, int(0.5 * _least_distance(corners.reshape(rows, columns, 2)))))
+            corners = cv2.cornerSubPix(pixels, corners, (window, window), (-1, -1), ending)
+            x[i] = _seen_from_the_front(torch.from_numpy(corners.reshape(rows, columns, 2)).to(x)).reshape(-1, 2)
+            found[i] = True
+    return BoardPoints(x.reshape(*batch, rows * columns, 2), found.reshape(batch))
+
+
+def detect_circles_grid(
+    image: Float[Tensor, "*batch c h w"], columns: int, rows: int, *, ratio: float | None = None, max_ellipses: int = 400
+) -> BoardPoints:
+    """Find the centres of circles in a rectangular grid, all circles of one size.
+
+    The ellipses of `detect_ellipses` are linked to a grid. An ellipse's centre is not where the circle's centre is: that is the
+    pole of the vanishing line of the board, which the grid tells. How lenses bend within a circle is not taken into account:
+    with circles nearly as large as can be, a strong distortion moves focal lengths by some thousandths.
+
+    Args:
+        image: Grey (c = 1) or red, green, blue images.
+        columns: Circles in a row.
+        rows: Circles in a column.
+        ratio: Radius of a circle in units of the distance between neighbours, if it is known; others then are not taken for it.
+        max_ellipses: The most ellipses of an image that are looked at.
+
+    Returns:
+        The centres, where all circles are seen and nothing continues the grid.
+
+    Raises:
+        ValueError: A shape or an option is wrong.
+    """
+    check_options(ratio=(ratio, "?0 < float < 1"), max_ellipses=(max_ellipses, "int >= 1"))
+    batch, flat = _gray(image, columns, rows, 2)
+    x = torch.zeros(len(flat), rows * columns, 2, dtype=image.dtype, device=image.device)
+    found = torch.zeros(len(flat), dtype=torch.bool, device=image.device)
+    for i, gray in enumerate(flat):
+        centres = _circles(detect_ellipses(gray[None], max_ellipses), columns, rows, ratio)
+        if centres is not None:
+            x[i], found[i] = centres.to(x), True
+    return BoardPoints(x.reshape(*batch, rows * columns, 2), found.reshape(batch))
+
+
+def _gray(image: Tensor, columns: int, rows: int, least: int) -> tuple[torch.Size, Tensor]:
+    batch = check_tensors(image=(image, "c h>=8 w>=8"))
+    check_options(columns=(columns, f"int >= {least}"), rows=(rows, f"int >= {least}"))
+    if image.shape[-3] not in (1, 3):
+        raise ValueError(f"image: wanted 1 or 3 channels, got {image.shape[-3]}")
+    return batch, to_gray(image.detach().reshape(batch.numel(), *image.shape[-3:]))[:, 0]
+
+
+def _least_distance(x: np.ndarray) -> float:
+    """Of neighbours in a grid (rows, columns, 2)."""
+    return min(float(np.linalg.norm(np.diff(x, axis=k), axis=-1).min()) for k in (0, 1))
+
+
+def _circles(ellipses: Ellipses, columns: int, rows: int, ratio: float | None) -> Tensor | None:
+    """The centres of the circles, row by row."""
+    valid = ellipses.valid
+    each = Ellipse(*(v[valid].double() for v in (ellipses.ellipse.centre, ellipses.ellipse.semi_axes, ellipses.ellipse.angle)))
+    order = grid_in_points(each.centre, shape_of_ellipse(each), columns, rows)
+    if order is None:
+        return None
+    chosen = Ellipse(each.centre[order], each.semi_axes[order], each.angle[order])
+    C_dual, x = dual_conic(conic_from_ellipse(chosen)), chosen.centre
+    for _ in range(_ROUNDS):
+        H = grid_homography(x, columns)
+        infinity = torch.linalg.inv_ex(H).inverse[2]
+        pole = C_dual @ infinity
+        x = pole[:, :2] / pole[:, 2:]
+    if not bool(x.isfinite().all()):
+        return None
+    if ratio is not None and not _of_size(chosen, H, ratio):
+        return None
+    return _seen_from_the_front(x.reshape(rows, columns, 2)).reshape(-1, 2)
+
+
+def _of_size(circles: Ellipse, H: Tensor, ratio: float) -> bool:
+    """Whether areas are those of circles of this radius, within a quarter of the radius."""
+    # On the board, in units of the distance between neighbours: H' C H.
+    on_board = H.mT @ conic_from_ellipse(circles) @ H
+    radius = (on_board[:, :2, :2].det().clamp_min(1e-300).pow(-1.5) * -on_board.det()).clamp_min(0).sqrt()
+    return bool(((radius / ratio).log().abs() < math.log(1.25)).all())
+
+
+def _seen_from_the_front(x: Tensor) -> Tensor:
+    """Rows and columns (rows, columns, 2) so that x turns to y; the end that is nearer to the top left corner is the first."""
+    along, down = x[0, -1] - x[0, 0], x[-1, 0] - x[0, 0]
+    if float(along[0] * down[1] - along[1] * down[0]) < 0:
+        x = x.flip(1)
+    return x if float(x[0, 0].sum()) <= float(x[-1, -1].sum()) else x.flip(0, 1)
