@@ -74,7 +74,13 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
         closed.append(around)
     index = torch.cat(parts) if parts else torch.zeros(0, dtype=torch.long, device=X.device)
     curve = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(p) for p in parts], dtype=torch.long))
-    return FusedCurves(X[index], curve.to(X.device), images[index], pieces.sigma[index], torch.tensor(closed, dtype=torch.bool))
+    return FusedCurves(
+        X[index],
+        curve.to(X.device),
+        images[index],
+        pieces.sigma[index],
+        torch.tensor(closed, dtype=torch.bool, device=X.device),
+    )
 
 
 def piece_tangents(X: Float[Tensor, "n d"], piece: Int[Tensor, "n"]) -> Float[Tensor, "n d"]:

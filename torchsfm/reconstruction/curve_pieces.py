@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.linalg import inverse
-from torchsfm.reconstruction.curve_sweep import Rays, sweep_depths
+from torchsfm.reconstruction.curve_sweep import Candidates, Rays, sweep_depths
 from torchsfm.reconstruction.edge_maps import EdgeMaps, EdgePoints, edge_maps
 from torchsfm.triangulation.curve_path import best_path
 from torchsfm.triangulation.curve_refinement import covariance_across, refine_samples
@@ -21,6 +21,10 @@ _REACH = 2.5
 """Distance of an edge, in pixels, that a pixel of the maps still feels."""
 _FULL = 4.0
 """Votes of a sample that all images agree on, as far as the path is concerned: a leap is as dear among few as among many."""
+_LEAP = 10.0
+"""A step of so many steps across the rays ends a piece."""
+_SLOTS = 1 << 14
+"""Slots of samples that are followed at a time."""
 _ALONG = 0.85
 """Least cosine of the angle between an edge and the image of the tangent of the curve that it belongs to."""
 
@@ -82,23 +86,57 @@ def image_pieces(
         shortest: Samples of the shortest piece.
     """
     maps = edge_maps(points, *size)
+    others = EdgeMaps(maps.table[1:], maps.x, maps.tangent)
+    closeness = others.closeness(_REACH)
     own = points[0]
     rank = torch.arange(len(own.x), device=own.x.device)
-    start = torch.searchsorted(own.chain, own.chain)
-    taken = (rank - start) % _EVERY == 0
-    x, along, chain = own.x[taken], own.tangent[taken], own.chain[taken]
-    x, there = _rows(x, chain)
-    along, _ = _rows(along, chain)
-    p, m = there.shape
-    back, _ = inverse(P[0, :, :3])
-    centre = -(back @ P[0, :, 3])
+    taken = (rank - torch.searchsorted(own.chain, own.chain)) % _EVERY == 0
+    own = EdgePoints(own.x[taken], own.tangent[taken], own.chain[taken])
+    groups, offset = [], 0
+    for part in _groups(own.chain):
+        samples = _samples(EdgePoints(own.x[part], own.tangent[part], own.chain[part]), P[0])
+        there = samples.there
+        rays = Rays(samples.centre, samples.direction[there], samples.across[there])
+        found = sweep_depths(others, closeness, P[1:], rays, _KEPT, threshold)
+        X, sigma, piece = _followed(maps, P, samples, found, threshold, least_views)
+        measured = piece >= 0
+        length = torch.bincount(piece[measured], minlength=1)
+        keep = measured & (length[piece.clamp(min=0)] >= shortest)
+        depth = torch.linalg.vector_norm(X[keep] - samples.centre, dim=-1)
+        number = piece[keep] + offset
+        pixel = depth / torch.linalg.vector_norm(P[0, 0, :3])
+        groups.append(Pieces(X[keep], number, torch.full_like(number, image), sigma[keep], pixel))
+        offset += len(length)
+    return Pieces(*(torch.cat(field) for field in zip(*groups, strict=True)))
+
+
+class _Samples(NamedTuple):
+    """Samples of chains, a chain a row, and their rays."""
+
+    there: Bool[Tensor, "p m"]
+    centre: Float[Tensor, "3"]
+    direction: Float[Tensor, "p m 3"]
+    """Unit vectors."""
+    across: Float[Tensor, "p m 3"]
+    """Unit vectors in the plane of sight of the tangent, across the rays, forwards."""
+
+
+def _samples(own: EdgePoints, P: Float[Tensor, "3 4"]) -> _Samples:
+    x, there = _rows(own.x, own.chain)
+    along, _ = _rows(own.tangent, own.chain)
+    back, _ = inverse(P[:, :3])
     direction = torch.nn.functional.normalize(torch.cat((x, torch.ones_like(x[..., :1])), -1) @ back.mT, dim=-1)
     across = torch.cat((along, torch.zeros_like(along[..., :1])), -1) @ back.mT
     across = across - (across * direction).sum(-1, keepdim=True) * direction
-    across = torch.nn.functional.normalize(across, dim=-1)
-    others = EdgeMaps(maps.table[1:], maps.x, maps.tangent)
-    rays = Rays(centre, direction[there], across[there])
-    found = sweep_depths(others, others.closeness(_REACH).float(), P[1:], rays, _KEPT, threshold)
+    return _Samples(there, -(back @ P[:, 3]), direction, torch.nn.functional.normalize(across, dim=-1))
+
+
+def _followed(
+    maps: EdgeMaps, P: Tensor, samples: _Samples, found: Candidates, threshold: float, least_views: int
+) -> tuple[Float[Tensor, "p m 3"], Float[Tensor, "p m"], Int[Tensor, "p m"]]:
+    """Positions at the least squares of distances along the best paths, deviations, and numbers of pieces; -1 outside all."""
+    there, direction = samples.there, samples.direction
+    p, m = there.shape
 
     def lay(values: Tensor) -> Tensor:
         return values.new_zeros(p, m, *values.shape[1:]).masked_scatter(there.view(p, m, *[1] * (values.ndim - 1)), values)
@@ -108,30 +146,36 @@ def image_pieces(
     path = best_path(depth, share * votes, threshold * blur, direction, _KEPT)
     chosen = (depth - path.depth[..., None]).abs().argmin(-1)[..., None, None].expand(p, m, 1, 3)
     tangent = lay(found.tangent).gather(2, chosen)[:, :, 0]
-    X = centre + path.depth[..., None] * direction
-    sight = _Sight(maps, P.expand(p, *P.shape), torch.ones(p, len(P), dtype=torch.bool), tangent, threshold)
-    sure = path.sure & there
-    X, basis, near, measured = refine_samples(sight, X, sure, torch.zeros(p, dtype=torch.bool))
+    X = samples.centre + path.depth[..., None] * direction
+    used = torch.ones(p, len(P), dtype=torch.bool, device=P.device)
+    sight = _Sight(maps, P.expand(p, *P.shape), used, tangent, threshold)
+    X, basis, near, measured = refine_samples(sight, X, path.sure & there, torch.zeros_like(used[:, 0]))
     measured = measured & ((near.weight > 0.25).sum(1) >= least_views) & torch.isfinite(X).all(-1)
     covariance = covariance_across(sight, X, basis, near)
     sigma = covariance.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=0).sqrt()
-    # A leap ends a piece.
     step = torch.linalg.vector_norm(X[:, 1:] - X[:, :-1], dim=-1)
     stride = torch.linalg.vector_norm(direction[:, 1:] - direction[:, :-1], dim=-1) * path.depth[:, 1:]
-    breaks = torch.nn.functional.pad(~(measured[:, 1:] & measured[:, :-1]) | (step > 10 * stride), (1, 0), value=True)
-    piece = breaks.flatten().cumsum(0)[measured.flatten()]
-    length = torch.bincount(piece, minlength=1)[piece]
-    keep = length >= shortest
-    focal = torch.linalg.vector_norm(P[0, 0, :3])
-    fields = (X[measured], piece, torch.full_like(piece, image), sigma[measured], path.depth[measured] / focal)
-    return Pieces(*(f[keep] for f in fields))
+    breaks = torch.nn.functional.pad(~(measured[:, 1:] & measured[:, :-1]) | (step > _LEAP * stride), (1, 0), value=True)
+    return X, sigma, torch.where(measured, breaks.flatten().cumsum(0).view(p, m) - 1, -1)
+
+
+def _groups(chain: Int[Tensor, "n"]) -> list[slice]:
+    """Samples of consecutive chains that fill not too many slots, where each chain has as many as the longest."""
+    _, number = torch.unique_consecutive(chain, return_counts=True)
+    groups, first, last, longest, count = [], 0, 0, 0, 0
+    for n in number.tolist():
+        if count and (count + 1) * max(longest, n) > _SLOTS:
+            groups.append(slice(first, last))
+            first, longest, count = last, 0, 0
+        last, longest, count = last + n, max(longest, n), count + 1
+    return [*groups, slice(first, last)]
 
 
 def _rows(values: Float[Tensor, "n d"], chain: Int[Tensor, "n"]) -> tuple[Float[Tensor, "p m d"], Bool[Tensor, "p m"]]:
     """Samples of each chain in a row of its own."""
     _, row, number = torch.unique_consecutive(chain, return_inverse=True, return_counts=True)
-    rank = torch.arange(len(chain)) - (number.cumsum(0) - number)[row]
+    rank = torch.arange(len(chain), device=chain.device) - (number.cumsum(0) - number)[row]
     p, m = len(number), int(number.amax()) if len(number) else 0
-    out, there = values.new_zeros(p, m, values.shape[-1]), torch.zeros(p, m, dtype=torch.bool)
+    out, there = values.new_zeros(p, m, values.shape[-1]), torch.zeros(p, m, dtype=torch.bool, device=chain.device)
     out[row, rank], there[row, rank] = values, True
     return out, there

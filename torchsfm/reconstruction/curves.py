@@ -107,7 +107,7 @@ def reconstruct_curves(
                 )
             )
     report("follow", v, v)
-    return _packed(pieces, least_images, poses.R.dtype)
+    return _packed(pieces, least_images, poses.R)
 
 
 def neighbouring_views(
@@ -121,7 +121,7 @@ def neighbouring_views(
     middle = centres + depth[:, None] * axes
     seen = torch.einsum("jab,ib->ija", P[..., :3], middle) + P[:, :, 3]
     y = seen[..., :2] / seen[..., 2:].clamp_min(1e-300)
-    extent = torch.tensor([size[1], size[0]], dtype=P.dtype)
+    extent = torch.tensor([size[1], size[0]], dtype=P.dtype, device=P.device)
     visible = (seen[..., 2] > 0) & ((y > -0.25 * extent) & (y < 1.25 * extent)).all(-1)
     to_own = torch.nn.functional.normalize(centres - middle, dim=-1)[:, None]
     to_other = torch.nn.functional.normalize(centres - middle[:, None], dim=-1)
@@ -134,13 +134,13 @@ def neighbouring_views(
 def _depths(centres: Tensor, axes: Tensor, P: Tensor, size: tuple[int, int], points: Tensor | None) -> Float[Tensor, "v"]:
     """How far along its axis each camera's scene is."""
     v = len(centres)
-    gap = torch.cdist(centres, centres) + torch.where(torch.eye(v, dtype=torch.bool), torch.inf, 0)
+    gap = torch.cdist(centres, centres) + torch.where(torch.eye(v, dtype=torch.bool, device=P.device), torch.inf, 0)
     typical = gap.amin(-1)[torch.isfinite(gap.amin(-1))]
     far = _FAR * (float(typical.median()) if len(typical) else 1.0)
     # The point nearest to all axes, held weakly where the axes are parallel.
-    across = torch.eye(3, dtype=P.dtype) - axes[:, :, None] * axes[:, None]
+    across = torch.eye(3, dtype=P.dtype, device=P.device) - axes[:, :, None] * axes[:, None]
     guess = centres + far * axes
-    weak = 1e-2 * torch.eye(3, dtype=P.dtype)
+    weak = 1e-2 * torch.eye(3, dtype=P.dtype, device=P.device)
     focus = torch.linalg.solve_ex(
         across.sum(0) + v * weak, ((across @ centres[..., None])[..., 0] + guess @ weak).sum(0)
     ).result
@@ -150,7 +150,7 @@ def _depths(centres: Tensor, axes: Tensor, P: Tensor, size: tuple[int, int], poi
         return depth
     y = torch.einsum("vab,nb->vna", P[..., :3], points) + P[:, None, :, 3]
     x = y[..., :2] / y[..., 2:].clamp_min(1e-300)
-    inside = (y[..., 2] > 0) & (x > 0).all(-1) & (x < torch.tensor([size[1], size[0]], dtype=P.dtype)).all(-1)
+    inside = (y[..., 2] > 0) & (x > 0).all(-1) & (x < torch.tensor([size[1], size[0]], dtype=P.dtype, device=P.device)).all(-1)
     scale = torch.linalg.vector_norm(P[:, 2, :3], dim=-1, keepdim=True)
     known = torch.where(inside, y[..., 2] / scale, torch.nan).nanmedian(-1).values
     return torch.where(known.isnan(), depth, known)
@@ -195,17 +195,15 @@ def _straight(edges: Edges | None, camera: Camera) -> EdgePoints:
     return EdgePoints(x, piece_tangents(x, chain), chain)
 
 
-def _packed(pieces: list[Pieces], least_images: int, dtype: torch.dtype) -> CurveReconstruction:
-    """The curves of all pieces, the longest first."""
+def _packed(pieces: list[Pieces], least_images: int, like: Tensor) -> CurveReconstruction:
+    """The curves of all pieces, the longest first, of the dtype and on the device of a tensor."""
     offset, shifted = 0, []
     for p in pieces:
         shifted.append(p._replace(piece=p.piece + offset))
         offset += int(p.piece.amax()) + 1 if len(p.piece) else 0
     if not offset:
-        none = torch.zeros(0, 2, dtype=dtype)
-        return CurveReconstruction(
-            Curve(torch.zeros(0, 2, 3, dtype=dtype), none.bool(), torch.zeros(0, dtype=torch.bool)), none.long(), none
-        )
+        none = like.new_zeros(0, 2)
+        return CurveReconstruction(Curve(like.new_zeros(0, 2, 3), none.bool(), none[:, 0].bool()), none.long(), none)
     together = Pieces(*(torch.cat(field) for field in zip(*shifted, strict=True)))
     fused = fuse_pieces(together, least_images=least_images, shortest=_SHORTEST)
     number = torch.bincount(fused.curve, minlength=len(fused.closed))
@@ -219,7 +217,7 @@ def _packed(pieces: list[Pieces], least_images: int, dtype: torch.dtype) -> Curv
         out[row, slot] = values
         return out
 
-    x, sigma = lay(fused.X).to(dtype), lay(fused.sigma).to(dtype)
+    x, sigma = lay(fused.X).to(like.dtype), lay(fused.sigma).to(like.dtype)
     return CurveReconstruction(
         Curve(x, lay(torch.ones_like(fused.curve, dtype=torch.bool)), fused.closed[order]), lay(fused.images), sigma
     )

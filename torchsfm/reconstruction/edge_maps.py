@@ -48,10 +48,12 @@ class EdgeMaps:
     def closeness(self, threshold: float) -> Float[Tensor, "v h w"]:
         """The biweight of each pixel's distance from an edge: 1 on it, 0 beyond the threshold."""
         h, w = self.table.shape[1:]
-        rows, columns = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
-        pixels = torch.stack((columns, rows), -1).to(self.x)
-        away = pixels - self.x[self.table]
-        return (1 - away.square().sum(-1) / threshold**2).clamp(min=0).square()
+        rows, columns = torch.meshgrid(
+            *(torch.arange(n, device=self.x.device, dtype=self.x.dtype) for n in (h, w)), indexing="ij"
+        )
+        pixels = torch.stack((columns, rows), -1)
+        squares = [(pixels - self.x[table]).square().sum(-1).float() for table in self.table]
+        return (1 - torch.stack(squares) / threshold**2).clamp(min=0).square()
 
     @staticmethod
     def look_up(table: Tensor, y: Float[Tensor, "v *batch 2"], empty: float | int) -> Tensor:
@@ -68,20 +70,22 @@ class EdgeMaps:
 def edge_maps(points: list[EdgePoints], height: int, width: int) -> EdgeMaps:
     """Maps of the edge points of images of one size."""
     x, tangent = torch.cat([p.x for p in points]), torch.cat([p.tangent for p in points])
-    n, v = len(x), len(points)
-    image = torch.repeat_interleave(torch.arange(v), torch.tensor([len(p.x) for p in points]))
-    steps = torch.arange(-_REACH, _REACH + 1)
+    n, device = len(x), x.device
+    steps = torch.arange(-_REACH, _REACH + 1, device=device)
     offset = torch.cartesian_prod(steps, steps)
-    pixel = x.round().long()[:, None] + offset
-    inside = ((pixel >= 0) & (pixel < torch.tensor([width, height]))).all(-1)
-    # The nearest by quarters of a hundredth of a pixel; of equals the first.
-    square = ((pixel.to(x) - x[:, None]).square().sum(-1) * 1600).long()
-    key = square * (n + 1) + torch.arange(n)[:, None]
-    flat = (image[:, None] * height + pixel[..., 1]) * width + pixel[..., 0]
-    best = torch.full((v * height * width,), torch.iinfo(torch.long).max)
-    best.scatter_reduce_(0, flat[inside], key[inside], "amin")
-    table = torch.where(best < torch.iinfo(torch.long).max, best % (n + 1), n)
+    extent, none = torch.tensor([width, height], device=device), torch.iinfo(torch.long).max
+    tables, first = [], 0
+    for own in points:
+        pixel = own.x.round().long()[:, None] + offset
+        inside = ((pixel >= 0) & (pixel < extent)).all(-1)
+        # The nearest, by squares of fortieths of a pixel; of equals the first.
+        square = ((pixel - own.x[:, None]).square().sum(-1) * 1600).long()
+        key = square * (n + 1) + torch.arange(first, first + len(own.x), device=device)[:, None]
+        best = torch.full((height * width,), none, device=device)
+        best.scatter_reduce_(0, (pixel[..., 1] * width + pixel[..., 0])[inside], key[inside], "amin")
+        tables.append(torch.where(best < none, best % (n + 1), n).view(height, width))
+        first += len(own.x)
     # Beyond all edges is one at a great distance.
     return EdgeMaps(
-        table.view(v, height, width), torch.cat((x, x.new_full((1, 2), -1e6))), torch.cat((tangent, tangent.new_zeros(1, 2)))
+        torch.stack(tables), torch.cat((x, x.new_full((1, 2), -1e6))), torch.cat((tangent, tangent.new_zeros(1, 2)))
     )
