@@ -291,7 +291,7 @@ function paint(now) {
   gl.uniform4f(dots.range, ...model.trackRange, ...model.errorRange);
   gl.uniform3f(dots.back, ...back);
   gl.drawArrays(gl.POINTS, 0, model.count);
-  if (set.lines) drawStrokes(model.lines, 0.9, m);
+  if (set.lines) drawStrokes(model.lines, 1.2, m);
   if (set.frustum > 0) {
     drawStrokes(allFrusta(line), 0.6, m);
     if (hovered >= 0 && hovered != looking) drawStrokes(packStrokes(frustumStrokes(model.images[hovered], [...accent, 1])), 1.4, m);

@@ -30,6 +30,8 @@ TOLERANCE = 0.0015
 """Largest distance of a segment from the image of its line, over the longer side of the image, and at least two pixels."""
 NEAR, FAR = 0.5, 3.0
 """Lines are looked for from this part of the depth of near points to this multiple of that of far ones."""
+LEAST_SCALE = 0.2
+"""Residuals smaller than this part of what segments' own variances say are no reason to weigh them more."""
 LINE_LOSS = Cauchy(1.0)
 """The loss of distances of segments, pixels."""
 
@@ -97,7 +99,7 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
     known = about_cameras(mapping, free, prior)
     result = bundle_adjust(
         problem,
-        structure=[lines.bundle(unit=noise / max(scale, 1.0), loss=LINE_LOSS)],
+        structure=[lines.bundle(unit=noise / max(scale, LEAST_SCALE), loss=LINE_LOSS)],
         loss=LOSS,
         **({"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE} | known | limits),
     )
