@@ -16,7 +16,7 @@ from torchsfm.cli.curves import curves
 from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
 from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched, warn_about_intrinsics
 from torchsfm.cli.job import Job, UserError, told
-from torchsfm.cli.known_poses import register, triangulate
+from torchsfm.cli.known_poses import Masks, register, triangulate
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.results import VERSION, compare, finish
 from torchsfm.formats import TARGETS
@@ -91,6 +91,7 @@ def reconstruct(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the model, the page, the report and the finished stages.")],
+    masks: Masks = None,
     sequence: Annotated[bool, typer.Option("--sequence", help="The images are frames of a video, in order.")] = False,
     camera: Annotated[
         str | None,
@@ -161,7 +162,7 @@ def reconstruct(
         else:
             source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
             result = job.run(
-                source, threads, sequence=sequence, lines=lines, max_features=max_features, max_pixels=max_pixels,
+                source, threads, masks=masks, sequence=sequence, lines=lines, max_features=max_features, max_pixels=max_pixels,
                 resume=resume, **options,
             )  # fmt: skip
         if K is not None and result.models:

@@ -10,7 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchsfm._types import tensor_map
 from torchsfm.images import Features, ImageError, Photograph, detect_features, read_image
+from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.report import Progress, ReconstructionError
 from torchsfm.reconstruction.stages import Arrays
 
@@ -50,8 +52,10 @@ def image_names(files: Sequence[Path]) -> list[str]:
     return names
 
 
-def detect_all(files: Sequence[Path], max_features: int, max_pixels: int, progress: Progress) -> Arrays:
-    """Features of all files, as tensors to save; `unpack` reads them."""
+def detect_all(
+    files: Sequence[Path], max_features: int, max_pixels: int, progress: Progress, masks: Masks | None = None
+) -> Arrays:
+    """Features of all files, those that masks admit, as tensors to save; `unpack` reads them."""
 
     def work(path: Path) -> Found | str:
         try:
@@ -59,8 +63,14 @@ def detect_all(files: Sequence[Path], max_features: int, max_pixels: int, progre
         except ImageError as error:
             return str(error)
         features = detect_features(photo, max_features, max_size=DETECTION_SIZE)
-        color = nearest_colors(photo.pixels, features.x)
         zoom = torch.tensor([photo.size[0] / photo.width, photo.size[1] / photo.height])
+        if masks is not None:
+            try:
+                admitted = masks.admit(path, (features.x + 0.5) * zoom - 0.5, photo.size)
+            except ImageError as error:
+                return str(error)
+            features = tensor_map(lambda rows: rows[admitted], features)
+        color = nearest_colors(photo.pixels, features.x)
         focal = None if photo.focal is None else photo.focal * max(photo.size) / max(photo.width, photo.height)
         # The pixels have served; only what the file says of the whole image is kept.
         whole = replace(photo, pixels=torch.zeros(1, 1, 1), focal=focal)

@@ -37,6 +37,7 @@ def triangulate_photographs(
     refine_poses: bool = False,
     register: bool = False,
     sequence: bool = False,
+    masks: str | Path | None = None,
     max_features: int = 8192,
     max_pixels: int = MAX_PIXELS,
     neighbours: int = 20,
@@ -59,6 +60,7 @@ def triangulate_photographs(
             say the same camera took as others of the model get its intrinsics; the intrinsics of other cameras are estimated.
             The poses and cameras given stay as they are.
         sequence: The images are consecutive frames of a video.
+        masks: Folder of masks, see `reconstruct`.
         max_features: Features per image.
         max_pixels: Larger images are left out.
         neighbours: Images each one is matched with when there are many.
@@ -78,7 +80,7 @@ def triangulate_photographs(
     generator = torch.Generator().manual_seed(seed)
     seen = match_photographs(
         images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
-        resume=resume, generator=generator, progress=report,
+        resume=resume, generator=generator, progress=report, masks=masks,
     )  # fmt: skip
     place = _places(seen, poses)
     reasons = dict.fromkeys((place < 0).nonzero()[:, 0].tolist(), "has no pose in the given model")

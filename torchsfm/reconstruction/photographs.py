@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,7 @@ from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS, ImageError, list_images, list_skipped, match_features, retrieve_pairs
 from torchsfm.reconstruction.find_lines import FoundSegments
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all, image_names, unpack
+from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.models import METHODS, build_models
 from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult, describe_skipped
 from torchsfm.reconstruction.segments import detect_all_segments
@@ -35,6 +37,7 @@ def reconstruct(
     free_principal_point: bool = True,
     method: str = "incremental",
     lines: bool = False,
+    masks: str | Path | None = None,
     max_features: int = 8192,
     max_pixels: int = MAX_PIXELS,
     neighbours: int = 20,
@@ -66,6 +69,8 @@ def reconstruct(
             rather than guesses where the images do not determine the focal length (`report.autocalibration` says why).
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
+        masks: Folder of masks, in which nothing counts that is black: see `Masks` for their names. The mask of `view.jpg` is
+            `view.jpg.png` or `view.png`.
         max_features: Features per image.
         max_pixels: Larger images are left out, as a small file can hold more than the memory does.
         neighbours: Images each one is matched with when there are many.
@@ -92,11 +97,11 @@ def reconstruct(
     generator = torch.Generator().manual_seed(seed)
     seen = match_photographs(
         images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
-        resume=resume, generator=generator, progress=report,
+        resume=resume, generator=generator, progress=report, masks=masks,
     )  # fmt: skip
 
     def segments() -> FoundSegments:
-        found = seen.stages.run("segments", lambda: detect_all_segments(seen.points.files, max_pixels, report))
+        found = seen.stages.run("segments", lambda: detect_all_segments(seen.points.files, max_pixels, report, seen.masks))
         return FoundSegments.of(found)
 
     result = build_models(
@@ -129,6 +134,7 @@ class MatchedPhotographs:
         points: The features of those that could be read, and what the files say of the cameras.
         graph: Verified matches.
         stages: Where the time went, and finished stages.
+        masks: Where nothing was looked for, if so wished.
     """
 
     names: tuple[str, ...]
@@ -136,6 +142,7 @@ class MatchedPhotographs:
     points: ImagePoints
     graph: ViewGraph
     stages: Stages
+    masks: Masks | None
 
 
 def match_photographs(
@@ -149,6 +156,7 @@ def match_photographs(
     resume: bool,
     generator: torch.Generator,
     progress: Progress,
+    masks: str | Path | None,
 ) -> MatchedPhotographs:
     """Read photographs, find their features and match them; the arguments are those of `reconstruct`.
 
@@ -158,11 +166,16 @@ def match_photographs(
     files, skipped = _files(images)
     names = image_names(files)
     # What is saved depends on these alone; cameras and models are made from it each time.
-    options = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
+    options: dict[str, Any] = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
+    found = None if masks is None else Masks.of(masks, files)
+    if found is not None:
+        options["masks"] = fingerprint([path for file in files if (path := found.path(file))], {})
     stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
-    points = unpack(stages.run("features", lambda: detect_all(files, max_features, max_pixels, progress)), files, names)
-    graph = _view_graph(points, stages, progress, generator, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels)
-    return MatchedPhotographs(tuple(names), tuple(skipped), points, graph, stages)
+    points = unpack(stages.run("features", lambda: detect_all(files, max_features, max_pixels, progress, found)), files, names)
+    graph = _view_graph(
+        points, stages, progress, generator, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels, masks=found
+    )
+    return MatchedPhotographs(tuple(names), tuple(skipped), points, graph, stages, found)
 
 
 def _files(images: str | Path | Sequence[str | Path]) -> tuple[list[Path], list[tuple[str, str]]]:
@@ -195,6 +208,7 @@ def _view_graph(
     sequence: bool,
     neighbours: int,
     max_pixels: int,
+    masks: Masks | None,
 ) -> ViewGraph:
     """Matches of all pairs worth comparing, verified."""
     features = points.features
@@ -218,7 +232,7 @@ def _view_graph(
     pairs, matches = matched["pairs"], list(torch.split(matched["match"], matched["count"].tolist()))
     x, color = [f.x for f in features], list(points.color)
     if sequence:
-        add_corners(x, color, pairs, matches, stages.run("track", lambda: track_corners(points, max_pixels, progress)))
+        add_corners(x, color, pairs, matches, stages.run("track", lambda: track_corners(points, max_pixels, progress, masks)))
     with stages.timed("verify"), one_thread():
         progress("verify", 0, len(matches))
         graph = verify_pairs(

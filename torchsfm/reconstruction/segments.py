@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm.images import ImageError, describe_segments, detect_segments, read_image
 from torchsfm.reconstruction.image_points import DETECTION_SIZE, nearest_colors
+from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.stages import Arrays
 
@@ -21,8 +22,11 @@ EDGE = 0.3
 """Standard deviation, pixels, with which the edges that views show of one line differ: of rounded corners, shadows, paint."""
 
 
-def detect_all_segments(files: Sequence[Path], max_pixels: int, progress: Progress) -> Arrays:
-    """Segments of all files as tensors to save, those of a file after those of the one before; none of what cannot be read."""
+def detect_all_segments(files: Sequence[Path], max_pixels: int, progress: Progress, masks: Masks | None = None) -> Arrays:
+    """Segments of all files as tensors to save, those of a file after those of the one before; none of what cannot be read.
+
+    Of masked photographs those of which masks admit both ends and the middle.
+    """
 
     def work(path: Path) -> dict[str, Tensor]:
         try:
@@ -30,9 +34,13 @@ def detect_all_segments(files: Sequence[Path], max_pixels: int, progress: Progre
         except ImageError:
             return {}
         found = detect_segments(photo.pixels, MAX_SEGMENTS, min_length=SHORTEST * max(photo.width, photo.height))
-        ends = found.ends[found.valid]
         zoom = torch.tensor([photo.size[0] / photo.width, photo.size[1] / photo.height])
-        variance = zoom.max() ** 2 * (2 * found.sigma.square() / found.independent.clamp_min(1))[found.valid] + EDGE**2
+        valid = found.valid
+        if masks is not None:
+            places = torch.cat([found.ends, found.ends.mean(1, keepdim=True)], 1)
+            valid = valid & masks.admit(path, (places + 0.5) * zoom - 0.5, photo.size).all(-1)
+        ends = found.ends[valid]
+        variance = zoom.max() ** 2 * (2 * found.sigma.square() / found.independent.clamp_min(1))[valid] + EDGE**2
         return {
             "ends": (ends + 0.5) * zoom - 0.5,
             "weight": 1 / variance,

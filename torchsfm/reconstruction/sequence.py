@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm.images import Features, read_image, retrieve_pairs, track_sequence
 from torchsfm.reconstruction.image_points import ImagePoints, nearest_colors
+from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.report import Progress, ReconstructionError
 from torchsfm.reconstruction.stages import Arrays
 
@@ -30,8 +31,8 @@ def sequence_pairs(features: Sequence[Features]) -> Int[Tensor, "p 2"]:
     return pairs
 
 
-def track_corners(points: ImagePoints, max_pixels: int, progress: Progress) -> Arrays:
-    """Corners followed through all frames: tensors `frame`, `track`, `x`, `color`, sorted by frame.
+def track_corners(points: ImagePoints, max_pixels: int, progress: Progress, masks: Masks | None = None) -> Arrays:
+    """Corners followed through all frames, where masks admit them: tensors `frame`, `track`, `x`, `color`, sorted by frame.
 
     Raises:
         ReconstructionError: The frames differ in size.
@@ -41,6 +42,11 @@ def track_corners(points: ImagePoints, max_pixels: int, progress: Progress) -> A
     v = len(points.files)
     tracks = track_sequence(_pixels(points.files, max_pixels), progress=lambda done: progress("track", done, v))
     order = torch.argsort(tracks.frame, stable=True)
+    if masks is not None:
+        size: list[tuple[int, int]] = [(width, height) for width, height in points.image_size.tolist()]
+        parts = torch.split(order, torch.bincount(tracks.frame, minlength=v).tolist())
+        rows = zip(points.files, parts, size, strict=True)
+        order = torch.cat([part[masks.admit(path, tracks.x[part], shape)] for path, part, shape in rows])
     frame, x = tracks.frame[order], tracks.x[order]
     counts = torch.bincount(frame, minlength=v).tolist()
     colors = [

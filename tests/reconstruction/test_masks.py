@@ -1,0 +1,104 @@
+"""Masks: nothing of a model comes from where they are black."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from chance import seeded
+from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, photograph, torchsfm
+
+from torchsfm.images import ImageError, save_image
+from torchsfm.reconstruction import Reconstruction
+from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
+
+
+@pytest.fixture(scope="module")
+def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photograph(tmp_path_factory.mktemp("courtyard"))
+
+
+def mask(*, width: int = WIDTH, height: int = HEIGHT) -> torch.Tensor:
+    """Black at the left and in the middle at the bottom."""
+    picture = torch.ones(height, width)
+    picture[:, : width // 5] = 0
+    picture[height // 2 :, 2 * width // 5 : 3 * width // 5] = 0
+    return picture
+
+
+def black(x: torch.Tensor) -> torch.Tensor:
+    """Whether a place is in the black parts, a pixel from their borders or more."""
+    left = x[..., 0] < WIDTH / 5 - 1.5
+    middle = (x[..., 1] > HEIGHT / 2 + 0.5) & (x[..., 0] > 2 * WIDTH / 5 + 0.5) & (x[..., 0] < 3 * WIDTH / 5 - 1.5)
+    return left | middle
+
+
+def masks_for_all_but_the_last(folder: Path, size: int) -> Path:
+    """Under either name, and of any resolution."""
+    for i in range(VIEWS - 1):
+        save_image(folder / (f"view{i}.png.png" if i % 2 else f"view{i}.png"), mask(width=size * WIDTH, height=size * HEIGHT))
+    return folder
+
+
+def assert_masked(model: Reconstruction) -> None:
+    masked = model.view < VIEWS - 1
+    assert not bool(black(model.x[masked]).any())
+    # The last photograph has no mask and counts as a whole.
+    assert bool(black(model.x[~masked]).any())
+
+
+def test_no_point_and_no_line_comes_from_masked_parts(courtyard: Path, tmp_path: Path) -> None:
+    masks_for_all_but_the_last(tmp_path, 2)
+    status, _, stderr = torchsfm("reconstruct", courtyard, "--masks", tmp_path, "--lines", "--out", tmp_path / "out")
+    assert status == 0, stderr
+    model = Reconstruction.load(tmp_path / "out" / "model.npz")
+    assert_masked(model)
+    assert model.lines is not None
+    assert len(model.lines.x) > 0
+    assert not bool(black(model.lines.x[model.lines.view < VIEWS - 1]).any())
+
+
+def matched(folder: Path, masks: Path | None, *, out: Path | None = None, sequence: bool = False) -> MatchedPhotographs:
+    """Features and matches alone."""
+    return match_photographs(
+        folder, sequence=sequence, max_features=1000, max_pixels=10**7, neighbours=20, out=out, resume=True,
+        generator=seeded(), progress=lambda stage, done, total: None, masks=masks,
+    )  # fmt: skip
+
+
+def test_no_tracked_corner_comes_from_masked_parts(courtyard: Path, tmp_path: Path) -> None:
+    masks_for_all_but_the_last(tmp_path, 1)
+    graph = matched(courtyard, tmp_path, sequence=True).graph
+    assert len(graph.x) > sum(map(len, matched(courtyard, tmp_path).points.features))
+    masked = graph.view < VIEWS - 1
+    assert not bool(black(graph.x[masked]).any())
+    assert bool(black(graph.x[~masked]).any())
+
+
+def test_other_masks_make_other_stages(courtyard: Path, tmp_path: Path) -> None:
+    for i in range(VIEWS):
+        save_image(tmp_path / f"view{i}.png", mask())
+    assert bool(black(matched(courtyard, None, out=tmp_path / "out").graph.x).any())
+    assert not bool(black(matched(courtyard, tmp_path, out=tmp_path / "out").graph.x).any())
+
+
+def test_places_between_pixels(tmp_path: Path) -> None:
+    save_image(tmp_path / "a.png", torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
+    masks = Masks(tmp_path)
+    x = torch.tensor([[-0.4, -0.4], [3.4, 0.0], [3.6, 0.0], [4.0, 3.0], [7.4, 3.4], [7.4, 7.4], [99.0, 99.0]])
+    assert masks.admit(Path("b/a.jpg"), x, (8, 8)).tolist() == [False, False, True, True, True, False, False]
+    assert masks.admit(Path("c.jpg"), x, (8, 8)).all()
+    with pytest.raises(ImageError, match="a mask of 2 x 2 pixels for an image of 8 x 4"):
+        masks.admit(Path("a.jpg"), x, (8, 4))
+
+
+def test_wrong_masks_are_told(courtyard: Path, tmp_path: Path) -> None:
+    status, _, stderr = torchsfm("reconstruct", courtyard, "--masks", tmp_path, "--out", tmp_path / "out")
+    assert status == 2
+    assert_one_line(stderr, "no mask for any image; that of view0.png would be view0.png.png")
+    save_image(tmp_path / "view0.png", torch.ones(HEIGHT, HEIGHT))
+    (tmp_path / "view1.png").write_text("words")
+    failures = matched(courtyard, tmp_path).points.failures
+    assert "a mask of 300 x 300 pixels" in failures["view0.png"]
+    assert "not an image" in failures["view1.png"]
+    assert len(failures) == 2
