@@ -209,6 +209,18 @@ def test_nonsense_is_told(generator: torch.Generator) -> None:
     assert (few.status == Status.TOO_FEW).all()
 
 
+def test_no_threshold_below_single_precision_makes_inliers(generator: torch.Generator) -> None:
+    """In a focal length beyond measure all image points are one, but for what single precision does not see."""
+    scene = make(60, 20, 12, generator, 0.0)
+    far = torch.tensor([[8e10, 0, 5e10], [0, 8e10, 4e10], [0, 0, 1]], dtype=F64)
+    found = estimate_camera(scene.x, scene.X, far, scene.l, scene.L, threshold=2.0, generator=seeded(), max_iterations=64)
+    Y = scene.X @ found.model[..., :3].mT + found.model[..., None, :, 3]
+    # From the principal point, so that nothing cancels.
+    gap = ((far[:2, :2] @ (Y[..., :2] / Y[..., 2:])[..., None])[..., 0] - (scene.x - far[:2, 2])).norm(dim=-1)
+    wrong = found.inliers[:, :20] & (gap > 2.1)
+    assert not wrong[found.status == Status.OK].any()
+
+
 def test_covariance_is_that_of_the_errors(generator: torch.Generator) -> None:
     scene = make(200, 30, 40, generator, 0.2)
     result = scene.estimate(5.0, covariance=True)
