@@ -374,6 +374,12 @@ FUNCTIONS: dict[str, Function] = {
     "resection.camera_1p2l": Function({"l": lambda s: _sight(s, 2)[0], "L": lambda s: _sight(s, 2)[1]}),
     "resection.camera_2p1l": Function({"l": lambda s: _sight(s, 1)[0], "L": lambda s: _sight(s, 1)[1]}),
     "resection.camera_3l": Function({"l": lambda s: _sight(s, 3)[0], "L": lambda s: _sight(s, 3)[1]}),
+    "resection.camera_circle": Function(
+        {
+            "C": lambda s: torch.diag(torch.tensor([1.0, 1.3, -0.2])) + 0.02 * (lambda A: A + A.mT)(s.randn(3, 3)),
+            "radius": lambda s: s.rand(low=0.5, high=2.0),
+        }
+    ),
     "resection.camera_dlt": Function(together=(("l", "L", "line_weights"),)),
     "resection.camera_gp3p": Function({"p": lambda s: s.points(3) - 5 * s.rays(0, 3) - 0.1, "d": lambda s: s.rays(0, 3)}),
     "resection.camera_p4pf": Function(centred=True),
