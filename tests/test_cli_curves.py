@@ -13,7 +13,7 @@ from torchsfm.formats import read_ply, write_colmap
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
 
-VIEWS = 7
+VIEWS = 8
 
 
 @pytest.fixture(scope="module")

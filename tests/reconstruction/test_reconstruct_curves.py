@@ -44,6 +44,16 @@ def test_every_curve_is_found_and_nothing_else(found: CurveReconstruction) -> No
     assert found.curve.length.sum() < 1.05 * sum(len(v) for v in truth.values()) * 0.005
 
 
+def test_edges_are_found_against_changing_backgrounds() -> None:
+    """Of few images: an upright edge is the outline in some, between two faces in others, light on either side."""
+    poses = orbit(8)
+    few = reconstruct_curves(list(photograph(poses)), camera(8), poses)
+    upright = true_curves()["upright"]
+    assert (torch.cdist(upright, samples(few)).amin(-1) < 4 * PIXEL).float().mean() > 0.9
+    gap = torch.cdist(samples(few), torch.cat(list(true_curves().values()))).amin(-1)
+    assert (gap < 2 * PIXEL).float().mean() > 0.99
+
+
 def test_what_is_said_of_samples(found: CurveReconstruction) -> None:
     valid = found.curve.valid
     assert (found.images[valid] >= 3).all()

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.linalg import inverse
-from torchsfm.reconstruction.curve_sweep import Candidates, Rays, sweep_depths
+from torchsfm.reconstruction.curve_sweep import Candidates, Rays, agreement, sweep_depths
 from torchsfm.reconstruction.edge_maps import EdgeMaps, EdgePoints, edge_maps
 from torchsfm.triangulation.curve_path import best_path
 from torchsfm.triangulation.curve_refinement import covariance_across, refine_samples
@@ -58,9 +58,9 @@ class _Sight(NamedTuple):
         edge, r = near.tangent.transpose(0, 1), near.r.transpose(0, 1)
         image = self.tangent[:, None] @ self.P[..., :3].mT
         shown = image[..., :2] - y * image[..., 2:]
-        agrees = (shown * edge).sum(-1) > _ALONG * torch.linalg.vector_norm(shown, dim=-1)
+        agrees = agreement(shown, edge, _ALONG) * (depth > 0)
         normal = torch.stack((-edge[..., 1], edge[..., 0]), -1)
-        weight = torch.where(agrees & (depth > 0), biweight(r, self.threshold), 0)
+        weight = agrees * biweight(r, self.threshold)
         return CurveDistances(torch.where(weight > 0, r, 0), y, depth, normal, weight)
 
 

@@ -24,6 +24,8 @@ _STEPS = 3
 """Gauss-Newton steps of a depth."""
 _TURNED = 0.9
 """Least cosine of the angle between an edge and the image of the tangent that it agrees with."""
+_EXCHANGED = 0.5
+"""What an image counts in which the light and the dark side are exchanged."""
 _STEEP = 0.15
 """Sine of the angle between edge and epipolar line below which an edge says nothing of the depth."""
 
@@ -146,6 +148,15 @@ def _polished(maps: EdgeMaps, P: Tensor, rays: Rays, q: Float[Tensor, "s c"], st
     return Candidates(depth, votes, tangent, blur)
 
 
+def agreement(shown: Float[Tensor, "*batch 2"], edge: Float[Tensor, "*batch 2"], least: float) -> Float[Tensor, "*batch"]:
+    """How well edges run along vectors: 1 where the cosine is more than the least, a part where they run against them.
+
+    The darker side of an edge may be the brighter one in another image: what is behind an outline changes.
+    """
+    along, enough = (shown * edge).sum(-1), least * torch.linalg.vector_norm(shown, dim=-1)
+    return torch.where(along > enough, 1.0, torch.where(along < -enough, _EXCHANGED, 0.0)).to(shown.dtype)
+
+
 def _space_tangents(
     M: Float[Tensor, "v 3 3"],
     edge: Float[Tensor, "v s c 2"],
@@ -153,8 +164,8 @@ def _space_tangents(
     depth: Float[Tensor, "v s c"],
     rays: Rays,
     weight: Float[Tensor, "v s c"],
-) -> tuple[Float[Tensor, "s c 3"], Tensor]:
-    """The tangent that lies in a given plane of sight and best in those of edges, and the images whose edges run along it.
+) -> tuple[Float[Tensor, "s c 3"], Float[Tensor, "v s c"]]:
+    """The tangent that lies in a given plane of sight and best in those of edges, and how well each image's edge agrees.
 
     In its plane it is `along` turned by less than a right angle, so that all images see it run forwards.
     """
@@ -171,6 +182,4 @@ def _space_tangents(
     angle = 0.5 * torch.atan2(-2 * ab, bb - aa)
     cosine, sine = angle.cos(), angle.sin()
     shown = motion[0] * cosine[..., None] + motion[1] * sine[..., None]
-    forwards = (shown * edge).sum(-1)
-    agrees = forwards > _TURNED * torch.linalg.vector_norm(shown, dim=-1)
-    return cosine[..., None] * axes[0] + sine[..., None] * axes[1], agrees
+    return cosine[..., None] * axes[0] + sine[..., None] * axes[1], agreement(shown, edge, _TURNED)

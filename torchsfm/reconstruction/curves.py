@@ -59,9 +59,9 @@ def reconstruct_curves(
     """Find the curves in space that the edges of photographs are images of.
 
     The edges of each image, linked into curves, are followed through the images around it: along the ray of an edge point those
-    depths are candidates at which other images have an edge that runs as the image of the curve must, the brighter side on the
-    same side; of these the path of most votes is taken, and refined to the least squares of distances. Pieces from different
-    images that lie on each other are averaged; what too few images found is dropped; the rest is linked.
+    depths are candidates at which other images have an edge that runs as the image of the curve must, best with the brighter
+    side on the same side; of these the path of most votes is taken, and refined to the least squares of distances. Pieces from
+    different images that lie on each other are averaged; what too few images found is dropped; the rest is linked.
 
     Outlines of smooth surfaces are images of no one curve: pieces of them survive where surfaces are bent much.
 
