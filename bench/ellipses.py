@@ -35,7 +35,7 @@ def ours(image: Tensor) -> Ellipse:
 
 
 def peers() -> dict[str, Callable[[Tensor], Ellipse]]:
-    """OpenCV's detectors, with the settings that their documentation starts from."""
+    """OpenCV's detectors, with their default settings."""
     if not hasattr(cv2, "ximgproc"):
         return {}
 

@@ -114,6 +114,15 @@ def foot_normal(D: Float[Tensor, "*#batch 2 2"], y: Float[Tensor, "*#batch n 2"]
     return n / length.clamp_min(tiny)
 
 
+def root_slopes(n: Float[Tensor, "*batch n 2"], q: Float[Tensor, "*batch n 2"]) -> Float[Tensor, "*batch n 5"]:
+    """How far an ellipse moves along its normals n with its centre and the entries 11, 12 and 22 of the root S of D.
+
+    The support function is |S n|, so that the edge moves by n'dc + n'dS q with q = S n / |S n|.
+    """
+    mixed = n[..., 0] * q[..., 1] + n[..., 1] * q[..., 0]
+    return torch.stack((n[..., 0], n[..., 1], n[..., 0] * q[..., 0], mixed, n[..., 1] * q[..., 1]), -1)
+
+
 def square_root(D: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
     """The symmetric square root of positive definite 2x2 matrices."""
     det = (D[..., 0, 0] * D[..., 1, 1] - D[..., 0, 1] * D[..., 1, 0]).clamp_min(0).sqrt()[..., None, None]

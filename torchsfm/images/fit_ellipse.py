@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import Ellipse, normalizing_similarity, transform_points
-from torchsfm.geometry.conic_distance import foot_normal, signed_distance, square_root
+from torchsfm.geometry.conic_distance import foot_normal, root_slopes, signed_distance, square_root
 from torchsfm.geometry.conics import ellipse_of_shape
 from torchsfm.images.ellipse_moments import extreme, monomials, shape_of_conic
 from torchsfm.linalg import eigh, inverse
@@ -147,8 +147,7 @@ def _residual(p: Tensor, y: Tensor) -> Tensor:
 def _linearize(p: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """The distances and their derivatives: -n by the centre, -n' dS q by the root S, with q = S n / |S n|."""
     n, q, distance = _normals(p, y)
-    J = torch.stack((n[..., 0], n[..., 1], n[..., 0] * q[..., 0], (n * q.flip(-1)).sum(-1), n[..., 1] * q[..., 1]), -1)
-    return distance[..., None], -J[..., None, :]
+    return distance[..., None], -root_slopes(n, q)[..., None, :]
 
 
 def _normals(p: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
