@@ -50,7 +50,11 @@ def test_straight_samples_give_a_straight_spline_and_batches_are_loops(generator
     valid = torch.arange(30) < torch.tensor([30, 12])[:, None]
     curve = curve_from_samples(x, valid=valid)
     spline, gap = fit_spline(curve, 6)
-    assert gap.amax() < 1e-6
+    # What holds a spline together where it has few samples hardly shows, and never beside the line.
+    assert (gap.amax(-1) < 1e-4 * curve.length).all()
+    d = torch.nn.functional.normalize(ends[1] - ends[0], dim=-1)
+    away = spline.control - ends[0]
+    assert (away - (away * d).sum(-1, keepdim=True) * d).abs().max() < 1e-9
     for i in range(2):
         alone, _ = fit_spline(Curve(curve.x[i], curve.valid[i], curve.closed[i]), 6)
         torch.testing.assert_close(alone.control, spline.control[i], rtol=1e-9, atol=1e-12)
