@@ -473,7 +473,8 @@ EXCEPTIONS: dict[str, str] = {
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.triangulate_photographs": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.reconstruct_matches": "lists of tensors; its stages are tried by reconstruct_tracks",
-    **{f"robust.{name}": "what doors have in common; each door is tried" for name in ("check_door", "estimate_robustly")},
+    **{f"robust.{name}": "what doors have in common; each door is tried" for name in (
+        "check_counts", "check_door", "estimate_robustly")},
     "simulation.courtyard_scene": "takes no data, and seconds",
     "simulation.render_sequence": "takes no data, and seconds",
     **{f"plot.plot_{name}": "draws" for name in (
