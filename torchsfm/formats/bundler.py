@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsfm.formats.joining import Lens, Rows, centred_cameras, picture_size, reading, running_numbers, symmetric_size
+from torchsfm.formats.joining import Lens, Rows, centred_cameras, picture_size, reading, symmetric_size, track_rows
 from torchsfm.geometry import Radial
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -47,15 +47,8 @@ def write_bundler(reconstruction: Reconstruction, path: str | Path) -> None:
         rows = [(f[camera], k1[camera], k2[camera]), *R[i], t[i]] if posed else [np.zeros(3)] * 5
         lines += [" ".join(map(str, map(float, row))) for row in rows]
     x = (model.x.numpy() - centre[model.view.numpy()]) * [1, -1]
-    seen = [
-        f"{view} {key} {a} {b}"
-        for view, key, (a, b) in zip(model.view.tolist(), running_numbers(model.view), x.tolist(), strict=True)
-    ]
-    ends = np.cumsum(model.track_lengths().numpy())
-    color = (model.color.clamp(0, 1) * 255).round().int().tolist()
-    for k, (X, rgb) in enumerate(zip(model.X.tolist(), color, strict=True)):
-        views = seen[ends[k - 1] if k else 0 : ends[k]]
-        lines += [" ".join(map(str, X)), " ".join(map(str, rgb)), " ".join([str(len(views)), *views])]
+    for row in track_rows(model, x):
+        lines += row
     names = "".join(f"{name}\n" for name in model.names).encode("utf-8", "surrogateescape")
     text = "\n".join([*lines, ""]).encode("ascii")
     write_whole_files({path.with_name(LIST): names, path: text})

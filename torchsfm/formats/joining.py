@@ -233,6 +233,22 @@ def running_numbers(view: Tensor) -> list[int]:
     return list(number.tolist())
 
 
+def track_rows(model: Reconstruction, x: NDArray[np.float64]) -> Iterator[tuple[str, str, str]]:
+    """Of each point its place, its colour from 0 to 255, and its number of observations with image, number there and place.
+
+    Args:
+        model: The model.
+        x: The observations in the file's coordinates.
+    """
+    columns = zip(model.view.tolist(), running_numbers(model.view), x.tolist(), strict=True)
+    seen = [f"{view} {key} {a} {b}" for view, key, (a, b) in columns]
+    color = (model.color.clamp(0, 1) * 255).round().int().tolist()
+    end = 0
+    for X, rgb, count in zip(model.X.tolist(), color, model.track_lengths().tolist(), strict=True):
+        start, end = end, end + count
+        yield " ".join(map(str, X)), " ".join(map(str, rgb)), " ".join([str(count), *seen[start:end]])
+
+
 def symmetric_size(x: NDArray[np.float64]) -> tuple[int, int]:
     """The least odd size of an image that holds points given relative to its centre."""
     reach = np.abs(x).max(0, initial=0).clip(max=MAX_SIDE / 4)

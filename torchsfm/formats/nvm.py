@@ -19,8 +19,8 @@ from torchsfm.formats.joining import (
     numbers,
     picture_size,
     reading,
-    running_numbers,
     symmetric_size,
+    track_rows,
 )
 from torchsfm.formats.pictures import registered_only
 from torchsfm.geometry import NoDistortion, quaternion_wxyz_from_rotation, rotation_from_quaternion_wxyz
@@ -51,15 +51,7 @@ def write_nvm(reconstruction: Reconstruction, path: str | Path) -> None:
         lines.append(" ".join([name.replace(" ", '"'), str(float(f[camera])), *map(str, row), "0", "0"]))
     lines += ["", str(model.num_points)]
     x = model.x.numpy() - centre[model.view.numpy()]
-    seen = [
-        f"{view} {key} {a} {b}"
-        for view, key, (a, b) in zip(model.view.tolist(), running_numbers(model.view), x.tolist(), strict=True)
-    ]
-    ends = np.cumsum(model.track_lengths().numpy())
-    color = (model.color.clamp(0, 1) * 255).round().int().tolist()
-    for k, (X, rgb) in enumerate(zip(model.X.tolist(), color, strict=True)):
-        views = seen[ends[k - 1] if k else 0 : ends[k]]
-        lines.append(" ".join([*map(str, X), *map(str, rgb), str(len(views)), *views]))
+    lines += [" ".join(row) for row in track_rows(model, x)]
     with whole_file(path) as file:
         file.write("\n".join([*lines, "", "0", ""]).encode("utf-8", "surrogateescape"))
 
