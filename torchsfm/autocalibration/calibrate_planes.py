@@ -56,7 +56,8 @@ class PlaneCalibration:
     """Of each pose, rotation vector and translation from the left."""
     iterations: Int[Tensor, "*batch"]
     status: Int8[Tensor, "*batch"]
-    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance); TOO_FEW: no view,
+    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance), or the dtype cannot
+    hold how badly they determine a pose; TOO_FEW: no view,
     or fewer measurements than unknowns; NOT_CONVERGED."""
 
     @property
@@ -157,6 +158,8 @@ def calibrate_planes(
         focal = settled.row[..., FOCAL].abs().clamp_min(1e-12)
         unsure = ~(covariance[..., 0, 0].reshape(batch).clamp_min(0).sqrt() <= MAX_DEVIATION * focal)
         measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
+        held = [torch.isfinite(c.to(x.dtype)).flatten(1).all(-1).reshape(batch) for c in (covariance, pose_covariance)]
+        unsure = unsure | ~(held[0] & held[1])
         status = torch.where(unsure, int(Status.DEGENERATE), result.status)
         status = torch.where((measured < unknowns) | ~used.any(-1), int(Status.TOO_FEW), status).to(torch.int8)
     dtype = x.dtype

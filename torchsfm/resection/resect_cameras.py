@@ -128,7 +128,7 @@ def _calibrated(
             start, known = found.model, found.status
         else:
             # The same start each time: nothing here is random to the caller.
-            generator = torch.Generator(x.device).manual_seed(0)
+            generator = torch.Generator().manual_seed(0)
             robust = estimate_camera(x, X, K, l, L, threshold=None, mask=seen, generator=generator, max_iterations=most)
             start = robust.model
             known = torch.where(robust.status == Status.NO_CONSENSUS, int(Status.OK), robust.status).to(torch.int8)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from torchsfm._types import check_options
+from torchsfm._types import check_options, check_tensors
 from torchsfm.geometry import Ellipse, conic_from_ellipse
 
 _SAMPLES = 720
@@ -155,8 +155,23 @@ def paint_shapes(
 
     Returns:
         The image; edges are within about a hundredth of a sample's size of where they should be.
+
+    Raises:
+        ValueError: Wrong kind, shape, number or dtype.
     """
-    check_options(width=(width, "int >= 1"), height=(height, "int >= 1"), blur=(blur, "float > 0"), fine=(fine, "int >= 1"))
+    check_options(
+        shapes=(shapes, Sequence), width=(width, "int >= 1"), height=(height, "int >= 1"), blur=(blur, "float > 0"),
+        fine=(fine, "int >= 1"),
+    )  # fmt: skip
+    check_tensors(levels=(levels, "n>=1"))
+    for i, thing in enumerate(shapes):
+        check_options(**{f"shapes[{i}]": (thing, Ellipse | Tensor)})
+        single = (
+            thing.ndim == 2 and thing.shape[1] == 2 and len(thing) > 2 if isinstance(thing, Tensor) else thing.centre.ndim == 1
+        )
+        if not single:
+            got = tuple(thing.shape) if isinstance(thing, Tensor) else f"a batch {tuple(thing.centre.shape[:-1])}"
+            raise ValueError(f"shapes[{i}]: wanted a single ellipse or three corners (k, 2) or more, got {got}")
     if len(levels) != len(shapes) + 1:
         raise ValueError(f"levels: wanted {len(shapes) + 1}, one more than shapes, got {len(levels)}")
     reach = math.ceil(4 * blur * fine)
