@@ -56,9 +56,8 @@ class PlaneCalibration:
     """Of each pose, rotation vector and translation from the left."""
     iterations: Int[Tensor, "*batch"]
     status: Int8[Tensor, "*batch"]
-    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance), or the dtype cannot
-    hold how badly they determine a pose; TOO_FEW: no view,
-    or fewer measurements than unknowns; NOT_CONVERGED."""
+    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance), or a pose so badly
+    that the dtype cannot hold its covariance; TOO_FEW: no view, or fewer measurements than unknowns; NOT_CONVERGED."""
 
     @property
     def deviation(self) -> Float[Tensor, "*batch q"]:
