@@ -47,9 +47,9 @@ def data_folder() -> Path | None:
     return Path(folder) if folder and Path(folder).is_dir() else None
 
 
-def fountain(data: Path) -> PhotographSet:
-    """Strecha et al., fountain-P11 at half size; poses from a laser scan, in metres."""
-    folder = data / "images/fountain-P11"
+def strecha(data: Path, name: str) -> PhotographSet:
+    """Strecha et al. 2008 at half size; poses from a laser scan, in metres."""
+    folder = data / "images" / name
     paths = sorted((folder / "images").glob("*.jpg"))
     K = np.zeros((3, 3))
     poses = {}
@@ -57,7 +57,7 @@ def fountain(data: Path) -> PhotographSet:
         rows = [[float(v) for v in line.split()] for line in (folder / "gt" / f"{path.stem}.txt").read_text().splitlines()]
         K = np.array(rows[:3])
         poses[path.name] = np.array(rows[3:6])
-    return PhotographSet("fountain-P11", paths, poses, float(K[0, 0] + K[1, 1]) / 2, 1000.0)
+    return PhotographSet(name, paths, poses, float(K[0, 0] + K[1, 1]) / 2, 1000.0)
 
 
 def sceaux(data: Path) -> PhotographSet:
@@ -115,7 +115,8 @@ def model_house(data: Path) -> PhotographSet:
 
 
 SETS: dict[str, Callable[[Path], PhotographSet]] = {
-    "fountain": fountain,
+    "fountain": lambda data: strecha(data, "fountain-P11"),
+    "castle": lambda data: strecha(data, "castle-P19"),
     "sceaux": sceaux,
     "temple": temple,
     "temple-K": lambda data: temple(data, known_K=True),

@@ -1,10 +1,11 @@
 """The main job, photographs to model, against COLMAP on the same photographs with the same threads.
 
-    TORCHSFM_DATA=/path/to/data python -m bench.reconstruction [--sets fountain sceaux ...] [--threads 2] [--no-colmap]
+    TORCHSFM_DATA=/path/to/data python -m bench.reconstruction [--sets fountain sceaux ...] [--threads 2] [--lines]
 
-prints one markdown table. Each run is a process of its own, so that its peak memory is its own; both programs start from the
-same knowledge: one shared camera, its focal length from the EXIF header where there is one, else unknown, or K where the set
-gives it. `pytest bench/reconstruction.py` times the whole job with pytest-benchmark instead.
+prints one markdown table; with `--lines` also of points and lines together. Each run is a process of its own, so that its peak
+memory is its own; both programs start from the same knowledge: one shared camera, its focal length from the EXIF header where
+there is one, else unknown, or K where the set gives it. `pytest bench/reconstruction.py` times the whole job with
+pytest-benchmark instead.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ Result = dict[str, Any]
 STAGES = ("start", "extract", "match", "verify", "map")
 
 
-def run_torchsfm(photographs: PhotographSet, threads: int, seed: int) -> Result:
+def run_torchsfm(photographs: PhotographSet, threads: int, seed: int, lines: bool = False) -> Result:
     """Reconstruct with this library; the seconds of its stages are those of its own report."""
     clock = time.perf_counter()
     torch.set_num_threads(threads)
@@ -42,10 +44,17 @@ def run_torchsfm(photographs: PhotographSet, threads: int, seed: int) -> Result:
     K = None if photographs.K is None else torch.from_numpy(photographs.K)
     start = time.perf_counter() - clock
     clock = time.perf_counter()
-    result = reconstruct(photographs.paths, sequence=photographs.sequence, shared_camera=True, K=K, seed=seed)
+    result = reconstruct(photographs.paths, sequence=photographs.sequence, shared_camera=True, K=K, seed=seed, lines=lines)
     total = time.perf_counter() - clock
     model = result.models[0]
-    group = {"read": "extract", "features": "extract", "match": "match", "track": "match", "verify": "verify"}
+    group = {
+        "read": "extract",
+        "features": "extract",
+        "segments": "extract",
+        "match": "match",
+        "track": "match",
+        "verify": "verify",
+    }
     seconds = dict.fromkeys(STAGES, 0.0)
     seconds["start"] = start
     for stage, value in result.report.seconds.items():
@@ -123,7 +132,11 @@ def run_colmap(photographs: PhotographSet, threads: int, seed: int) -> Result:
     }
 
 
-PROGRAMS: dict[str, Callable[[PhotographSet, int, int], Result]] = {"torchsfm": run_torchsfm, "colmap": run_colmap}
+PROGRAMS: dict[str, Callable[[PhotographSet, int, int], Result]] = {
+    "torchsfm": run_torchsfm,
+    "torchsfm with lines": partial(run_torchsfm, lines=True),
+    "colmap": run_colmap,
+}
 
 
 def run_apart(program: str, name: str, data: Path, threads: int, seed: int) -> Result:
@@ -194,6 +207,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--sets", nargs="+", choices=sorted(SETS), default=list(SETS))
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--lines", action="store_true", help="also reconstruct with lines")
     parser.add_argument("--no-colmap", action="store_true")
     parser.add_argument("--no-torchsfm", action="store_true")
     parser.add_argument("--worker", nargs=2, metavar=("PROGRAM", "SET"), help=argparse.SUPPRESS)
@@ -208,16 +222,17 @@ def main(arguments: list[str] | None = None) -> None:
         result["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
         print(json.dumps(result))
         return
+    wanted = {"torchsfm": not options.no_torchsfm, "torchsfm with lines": options.lines, "colmap": not options.no_colmap}
+    chosen = [program for program in PROGRAMS if wanted[program]]
     print(HEADER, "|---" * 12 + "|", sep="\n", flush=True)
     remarks = []
     for name in options.sets:
         photographs = SETS[name](options.data)
         if photographs.remark:
             remarks.append(f"{photographs.name}: {photographs.remark}.")
-        for program in PROGRAMS:
-            if not getattr(options, f"no_{program}"):
-                result = run_apart(program, name, options.data, options.threads, options.seed)
-                print(row(program, result, photographs), flush=True)
+        for program in chosen:
+            result = run_apart(program, name, options.data, options.threads, options.seed)
+            print(row(program, result, photographs), flush=True)
     print(f"\n{options.threads} threads, seed {options.seed}; mean error over observations. COLMAP verifies while it matches.")
     print(*remarks, sep="\n")
 
