@@ -16,6 +16,7 @@ from torchsfm._types import broadcast_shapes
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.linalg import damped_solve
 from torchsfm.linalg.constants import Constant
+from torchsfm.optim import rotation_exponential
 from torchsfm.robust import Weigh
 
 _PRODUCTS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)]
@@ -173,3 +174,9 @@ def moved_pose(
     R = moved[..., :3]
     mended = torch.baddbmm(R, R, R.mT @ R, beta=1.5, alpha=-0.5)
     return torch.cat((mended, moved[..., 3:]), -1).view(*batch, 3, 4)
+
+
+def retracted_pose(pose: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3 4"]:
+    """[R | t] <- exp(w) [R | t] + [0 | v], differentiable, as `Pose.retract`."""
+    moved = rotation_exponential(step[..., :3]) @ pose
+    return torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:, None]), -1)

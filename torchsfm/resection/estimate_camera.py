@@ -8,10 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
 from torchsfm.resection._moderate_lines import image_rows, kinds, line_data, moderate_structure
-from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
+from torchsfm.resection._reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
 from torchsfm.resection.point_line_camera import PointLineCameraEstimator
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_counts, check_door, estimate_robustly
@@ -68,8 +67,7 @@ class CameraEstimator:
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3 4"]:
         """[R | t] <- exp(w) [R | t] + [0 | v], as `Pose.retract`."""
-        moved = rotation_exponential(step[..., :3]) @ model
-        return torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:, None]), -1)
+        return retracted_pose(model, step)
 
     def may_be_degenerate(
         self,

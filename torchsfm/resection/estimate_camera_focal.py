@@ -8,9 +8,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._reprojection_step import camera_step, moved_pose, squared_reprojection
+from torchsfm.resection._reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
 from torchsfm.resection.estimate_camera import world_pose
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
@@ -67,9 +66,7 @@ class FocalCameraEstimator:
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
         """[R | t] <- exp(w) [R | t] + [0 | v], f <- exp(g) f for steps (w, v, g)."""
         f, pose = _split(model)
-        moved = rotation_exponential(step[..., :3]) @ pose
-        moved = torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:6, None]), -1)
-        return _join(f * step[..., 6].exp(), moved)
+        return _join(f * step[..., 6].exp(), retracted_pose(pose, step[..., :6]))
 
     def may_be_degenerate(
         self,

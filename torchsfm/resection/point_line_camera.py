@@ -11,9 +11,8 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.geometry import to_homogeneous
 from torchsfm.linalg import cross, eigh
-from torchsfm.optim import rotation_exponential
 from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._reprojection_step import moved_pose
+from torchsfm.resection._reprojection_step import moved_pose, retracted_pose
 from torchsfm.resection._sights import SEGMENT, look, seen_ends, sight_step, slopes, squared_distance
 from torchsfm.resection.camera_1p2l import camera_1p2l
 from torchsfm.resection.camera_2p1l import camera_2p1l
@@ -115,8 +114,7 @@ class PointLineCameraEstimator:
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3 4"]:
         """[R | t] <- exp(w) [R | t] + [0 | v], as `Pose.retract`."""
-        moved = rotation_exponential(step[..., :3]) @ model
-        return torch.cat((moved[..., :3], moved[..., 3:] + step[..., 3:, None]), -1)
+        return retracted_pose(model, step)
 
     def may_be_degenerate(
         self,
