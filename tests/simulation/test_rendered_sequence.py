@@ -54,6 +54,20 @@ def test_shapes_and_ranges(rendered: RenderedSequence) -> None:
     assert len(torch.unique(rendered.surface)) >= 10
 
 
+def test_another_default_dtype_changes_nothing() -> None:
+    def render() -> RenderedSequence:
+        return render_sequence(views=1, width=64, height=48, points=20, generator=seeded(3))
+
+    plain, usual = render(), torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        other = render()
+    finally:
+        torch.set_default_dtype(usual)
+    assert torch.equal(other.X, plain.X)
+    torch.testing.assert_close(other.images, plain.images, rtol=0, atol=1e-4)
+
+
 def test_points_have_the_depth_of_the_map(rendered: RenderedSequence) -> None:
     X_cam = rendered.poses.transform(rendered.X)
     for i in range(VIEWS):

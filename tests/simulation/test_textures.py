@@ -22,6 +22,17 @@ def test_every_style_is_a_rich_repeatable_picture(style: str) -> None:
         assert (small[:, 1:] - small[:, :-1]).square().mean().sqrt() > 0.012
 
 
+@pytest.mark.parametrize("style", sorted(STYLES))
+def test_every_style_is_the_same_under_another_default_dtype(style: str) -> None:
+    plain = paint(style, 0.5, 0.4, texel=0.006, generator=seeded(3))
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(paint(style, 0.5, 0.4, texel=0.006, generator=seeded(3)), plain)
+    finally:
+        torch.set_default_dtype(usual)
+
+
 def test_a_texture_does_not_repeat(generator: torch.Generator) -> None:
     gray = paint("ground", 4.0, 4.0, texel=0.02, generator=generator).mean(0)
     gray = gray - torch.nn.functional.avg_pool2d(gray[None, None], 15, 1, 7, count_include_pad=False)[0, 0]

@@ -142,14 +142,14 @@ def lookup(
     long = torch.maximum(long, short).sqrt().clamp_min(1e-6)
     wide = (ux * vy - uy * vx).abs() / long
     ratio = long / wide.clamp_min(1.0).minimum(long)
-    color = torch.empty(3, uv.shape[1], device=uv.device)
+    color = torch.empty(3, uv.shape[1], dtype=uv.dtype, device=uv.device)
     wanted = layer * len(PROBES) + torch.log2(ratio).round().clamp(0, len(PROBES) - 1).long()
     for key in torch.bincount(wanted).nonzero()[:, 0].tolist():
         pyramid, probes = thing.sheets[key // len(PROBES)], PROBES[key % len(PROBES)]
         chosen = (wanted == key).nonzero()[:, 0]
         at, along = uv.index_select(1, chosen), step.index_select(1, chosen)
         level = torch.maximum(long.index_select(0, chosen) / probes, wide.index_select(0, chosen)).clamp_min(1.0).log2()
-        shift = (torch.arange(probes, device=uv.device) + 0.5) / probes - 0.5
+        shift = (torch.arange(probes, dtype=uv.dtype, device=uv.device) + 0.5) / probes - 0.5
         every = (at[:, None] + along[:, None] * shift[:, None]).reshape(2, -1)
         color.index_copy_(1, chosen, _trilinear(pyramid, every, level.repeat(probes)).reshape(3, probes, -1).mean(1))
     return color
@@ -158,14 +158,14 @@ def lookup(
 def _trilinear(pyramid: tuple[Tensor, ...], uv: Tensor, level: Tensor) -> Tensor:
     """Read each point between two mip levels; coordinates in texels of level 0 from the sheet's corner."""
     level = level.clamp_max(len(pyramid) - 1)
-    color = torch.zeros(3, uv.shape[1], device=uv.device)
+    color = torch.zeros(3, uv.shape[1], dtype=uv.dtype, device=uv.device)
     for k in range(int(level.min()), math.ceil(float(level.max())) + 1):
         weight = (1 - (level - k).abs()).clamp_min(0)
         chosen = (weight > 0).nonzero()[:, 0]
         if not len(chosen):
             continue
         image = pyramid[k]
-        size = torch.tensor([image.shape[2], image.shape[1]], device=uv.device)
+        size = uv.new_tensor([image.shape[2], image.shape[1]])
         grid = uv.index_select(1, chosen).T * (2.0 / 2**k / size) - 1
         value = functional.grid_sample(
             image[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False

@@ -120,7 +120,7 @@ def render_sequence(
     x_points, visible = _see_points(scene, X, poses, cameras, height, width)
     images = clean
     if noise > 0:
-        grain = torch.randn(clean.shape, generator=generator, device=clean.device)
+        grain = torch.randn(clean.shape, generator=generator, dtype=clean.dtype, device=clean.device)
         images = (clean + grain * noise * (0.5 + 0.5 * clean).sqrt()).clamp(0, 1)
     return RenderedSequence(images, depth, surface, cameras, poses, X, color, x_points, visible)
 

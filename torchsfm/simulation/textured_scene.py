@@ -63,7 +63,7 @@ def courtyard_scene(*, texel: float = 0.006, generator: torch.Generator | None =
         generator: Source of randomness for the textures and small changes of the layout; torch's own where none is given.
     """
     device = generator.device if generator is not None else None
-    wobble = torch.rand(16, generator=generator, device=device).tolist()
+    wobble = torch.rand(16, generator=generator, dtype=torch.float32, device=device).tolist()
 
     def vector(*values: float) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=device)

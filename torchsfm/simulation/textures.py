@@ -43,7 +43,11 @@ PLASTER = ((0.80, 0.74, 0.62), (0.72, 0.66, 0.56), (0.85, 0.80, 0.70), (0.66, 0.
 
 def _rand(*shape: int, generator: Generator) -> Tensor:
     device = generator.device if generator is not None else None
-    return torch.rand(*shape, generator=generator, device=device)
+    return torch.rand(*shape, generator=generator, dtype=torch.float32, device=device)
+
+
+def _texels(count: int, device: torch.device | None) -> Tensor:
+    return torch.arange(count, dtype=torch.float32, device=device)
 
 
 def _uniform(low: float, high: float, generator: Generator) -> float:
@@ -52,7 +56,7 @@ def _uniform(low: float, high: float, generator: Generator) -> float:
 
 def _pick(palette: tuple[tuple[float, float, float], ...], count: int, jitter: float, generator: Generator) -> Tensor:
     """Colours (count, 3): random mixtures of two neighbours in the palette, a little lighter or darker."""
-    colors = torch.tensor(palette, device=generator.device if generator is not None else None)
+    colors = torch.tensor(palette, dtype=torch.float32, device=generator.device if generator is not None else None)
     a = (_rand(count, generator=generator) * len(palette)).long().clamp_max(len(palette) - 1)
     mix = 0.3 * _rand(count, 1, generator=generator)
     chosen = colors[a] * (1 - mix) + colors[(a + 1) % len(palette)] * mix
@@ -80,12 +84,12 @@ def fractal_noise(
         finest: Octaves go down to this spacing, in texels.
         generator: Source of randomness.
     """
-    total = torch.zeros(h, w, device=generator.device if generator is not None else None)
+    total = torch.zeros(h, w, dtype=torch.float32, device=generator.device if generator is not None else None)
     amplitude, power = 1.0, 0.0
     while cell >= finest:
         tall = cell * stretch
         rows, columns = math.ceil(h / tall) + 3, math.ceil(w / cell) + 3
-        grid = torch.randn(1, 1, rows, columns, generator=generator, device=total.device)
+        grid = torch.randn(1, 1, rows, columns, generator=generator, dtype=torch.float32, device=total.device)
         size = (max(h + 2, round(rows * tall)), max(w + 2, round(columns * cell)))
         # Only the rows and columns that are kept need computing.
         fine = _resize(grid[0, 0], size, h, w)
@@ -101,7 +105,7 @@ def _resize(grid: Tensor, size: tuple[int, int], h: int, w: int) -> Tensor:
     for length, kept in ((size[0], h), (size[1], w)):
         first = (length - kept) // 2
         n = out.shape[0]
-        position = (torch.arange(first, first + kept, device=grid.device) + 0.5) * (n / length) - 0.5
+        position = (torch.arange(first, first + kept, dtype=torch.float32, device=grid.device) + 0.5) * (n / length) - 0.5
         base = position.floor()
         f = position - base
         index = (base.long()[:, None] + torch.arange(-1, 3, device=grid.device)).clamp(0, n - 1)
@@ -115,7 +119,7 @@ def _cells(h: int, w: int, cell: float, generator: Generator) -> tuple[Tensor, T
     """Cut the sheet into square cells of a randomly turned lattice: position in the cell (-0.5..0.5), index, count."""
     device = generator.device if generator is not None else None
     angle = _uniform(0.0, 2 * math.pi, generator)
-    y, x = torch.arange(h, device=device)[:, None] / cell, torch.arange(w, device=device)[None] / cell
+    y, x = _texels(h, device)[:, None] / cell, _texels(w, device)[None] / cell
     a, b = math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y
     i, j = a.floor(), b.floor()
     first, columns = i - i.min(), int(j.max() - j.min()) + 1
@@ -154,7 +158,7 @@ def add_spots(
     first = torch.stack((c / major, s / major, -(c * da + s * db) / major), -1)
     second = torch.stack((-s / minor, c / minor, (s * da - c * db) / minor), -1)
     there = (table[:, 5] < density).to(image)
-    kind = (_rand(count, generator=generator) * 3).floor() if corners else torch.zeros(count, device=image.device)
+    kind = (_rand(count, generator=generator) * 3).floor() if corners else torch.zeros_like(table[:, 0])
     color = _pick(palette, count, 0.25, generator)
     chosen = torch.cat((first, second, there[:, None], kind[:, None]), -1)[index]
     p = chosen[..., 0] * a + chosen[..., 1] * b + chosen[..., 2]
@@ -188,8 +192,8 @@ def _bricks(h: int, w: int, unit: float, generator: Generator) -> Tensor:
     device = generator.device if generator is not None else None
     tall, wide, gap = 0.11 * unit, 0.29 * unit, 0.016 * unit
     rough = 0.004 * unit * fractal_noise(h, w, 0.06 * unit, generator=generator)
-    y = torch.arange(h, device=device)[:, None] + rough
-    x = torch.arange(w, device=device)[None] + rough.roll(7, 0)
+    y = _texels(h, device)[:, None] + rough
+    x = _texels(w, device)[None] + rough.roll(7, 0)
     row = (y / tall).floor().clamp_min(0)
     rows = int(row.max()) + 1
     shift = _rand(rows, generator=generator) * wide
@@ -221,12 +225,12 @@ def _plaster(h: int, w: int, unit: float, generator: Generator) -> Tensor:
 def _wood(h: int, w: int, unit: float, generator: Generator) -> Tensor:
     device = generator.device if generator is not None else None
     wide = 0.14 * unit
-    column = (torch.arange(w, device=device) / wide).floor().long()
+    column = (_texels(w, device) / wide).floor()
     count = int(column.max()) + 1
     grain = fractal_noise(h, w, 0.05 * unit, gain=0.8, stretch=6.0, generator=generator)
     color = _pick(WOOD + PAINT[:3], count, 0.25, generator)
-    image = color[column].T[:, None, :] * (1 + 0.2 * grain + 0.1 * fractal_noise(h, w, 0.5 * unit, generator=generator))
-    seam = (torch.arange(w, device=device) - column * wide) < 0.01 * unit
+    image = color[column.long()].T[:, None, :] * (1 + 0.2 * grain + 0.1 * fractal_noise(h, w, 0.5 * unit, generator=generator))
+    seam = _texels(w, device) - column * wide < 0.01 * unit
     image = torch.where(seam, image * 0.35, image)
     add_spots(image, 0.17 * unit, WOOD[1:], density=0.4, relief=0.9, generator=generator)
     add_spots(image, 0.05 * unit, ((0.2, 0.15, 0.1), (0.75, 0.72, 0.7)), density=0.2, generator=generator)
@@ -269,8 +273,8 @@ def _poster(h: int, w: int, unit: float, generator: Generator) -> Tensor:
     top = 0.03 * unit
     while top < h - 0.05 * unit:
         dot = _uniform(0.008, 0.03, generator) * unit
-        y = ((torch.arange(h, device=device) - top) / dot).floor().long()
-        x = ((torch.arange(w, device=device) - 0.04 * unit) / dot).floor().long()
+        y = ((_texels(h, device) - top) / dot).floor().long()
+        x = ((_texels(w, device) - 0.04 * unit) / dot).floor().long()
         letter = (_rand(w, generator=generator) * len(glyphs)).long()[(x // 6).clamp(0, w - 1)]
         on = dots[letter[None], y.clamp(0, 6)[:, None], (x % 6).clamp(0, 4)[None]] > 0
         on &= ((y >= 0) & (y < 7))[:, None] & ((x >= 0) & (x % 6 < 5) & (x < (w - 0.06 * unit) / dot - 2))[None]
