@@ -1,0 +1,66 @@
+"""The notebooks of the course run as scripts, write nothing, and what they print is true."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+COURSE = Path(__file__).parent.parent / "examples" / "course"
+NOTEBOOKS = sorted(path.name for path in COURSE.glob("[0-9][0-9]_*.py"))
+
+TRUTHS: dict[str, list[tuple[str, float, float]]] = {
+    "01_projection_and_cameras.py": [
+        (r"pixels to rays and back: ([\d.e+-]+)", 0, 1e-9),
+        (r"turn about y: correlation of arrows with 1 / depth (-?[\d.]+)", -0.1, 0.1),
+        (r"step 5: rms error +([\d.]+)", 0.45, 0.55),
+        (r"step 5: .* centre off by ([\d.]+)", 0, 0.01),
+    ],
+}
+"""For a notebook, what it prints and between which numbers that must lie."""
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_runs_and_tells_the_truth(name: str, tmp_path: Path) -> None:
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", "PYTHONWARNINGS": "error::UserWarning:__main__"}
+    command = [sys.executable, str(COURSE / name)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert not list(tmp_path.iterdir())
+    for pattern, low, high in TRUTHS.get(name, []):
+        found = re.search(pattern, done.stdout)
+        assert found is not None, (pattern, done.stdout)
+        assert low <= float(found[1]) <= high, found[0]
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_cells_read_the_same_in_editors_and_in_galleries(name: str) -> None:
+    text = (COURSE / name).read_text()
+    title, underline = text.split("\n")[1:3]
+    assert re.fullmatch(r"\d+\. .+", title)
+    assert underline == "=" * len(title)
+    cells = re.split(r"^# %%(.*)\n", text, flags=re.M)
+    for kind, body in zip(cells[1::2], cells[2::2], strict=True):
+        assert kind in ("", " [markdown]")
+        lines = body.strip().split("\n")
+        if kind:
+            assert all(line.startswith("#") for line in lines), lines[0]
+        else:
+            assert not lines[0].startswith("#"), lines[0]
+    assert "plt.show(" not in text
+
+
+def test_figures_are_saved_where_told(tmp_path: Path) -> None:
+    script = str(COURSE / "save_figures.py")
+    done = subprocess.run(
+        [sys.executable, script, str(tmp_path / "figures"), "1"], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert {p.name for p in tmp_path.iterdir()} == {"figures"}
+    assert {p.suffix for p in (tmp_path / "figures").iterdir()} == {".png"}
+
+
+def test_table_of_contents() -> None:
+    assert set(re.findall(r"\((\d\d_\w+\.py)\)", (COURSE / "README.md").read_text())) >= set(NOTEBOOKS)
