@@ -79,6 +79,25 @@ def test_imports_go_down(path: Path) -> None:
     assert used <= ALLOWED[room], f"{room} may not import {sorted(used - ALLOWED[room])}"
 
 
+FLOORS = ("two_views", "three_views", "many_views")
+"""Of `motion`, each of which stands on those before it."""
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_more_views_stand_on_fewer(floor: str) -> None:
+    higher = FLOORS[FLOORS.index(floor) + 1 :]
+    for path in (PACKAGE / "motion" / floor).glob("*.py"):
+        for name in imported_modules(ast.parse(path.read_text())):
+            assert not any(name.startswith(f"torchsfm.motion.{above}") for above in higher), (path.name, name)
+            assert not name.startswith("torchsfm.motion.") or name.split(".")[2] in FLOORS, (path.name, name)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_no_file_is_private(path: Path) -> None:
+    """What a room exports is public and all else is free to change; the names of files say nothing of that."""
+    assert not path.stem.startswith("_") or path.stem in {"__init__", "__main__", "_types"}
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_slow_packages_stay_in_their_rooms(path: Path) -> None:
     tree = ast.parse(path.read_text())
@@ -132,4 +151,4 @@ def test_the_table_has_no_cycle() -> None:
 def test_every_room_has_a_tenant() -> None:
     for room in PACKAGE.iterdir():
         if room.is_dir() and room.name != "__pycache__":
-            assert len(list(room.glob("*.py"))) > 1, f"{room.name} is empty"
+            assert len(list(room.rglob("*.py"))) > 1, f"{room.name} is empty"

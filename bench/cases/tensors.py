@@ -10,7 +10,7 @@ from bench.cases import scenes
 from bench.cases.case import Case, Sample, up_to_scale
 from bench.cases.scenes import K
 from torchsfm import Solutions, Status, quadrifocal_6pt, trifocal_6pt, trifocal_7pt
-from torchsfm.motion.trifocal_6pt import equations
+from torchsfm.motion.three_views.trifocal_6pt import equations
 from torchsfm.tensors import (
     quadrifocal_from_cameras,
     trifocal_from_cameras,

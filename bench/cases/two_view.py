@@ -24,13 +24,13 @@ from torchsfm import (
     relative_upright_3pt,
 )
 from torchsfm.geometry import cross_matrix
-from torchsfm.motion.essential_5pt import equations as essential_equations
-from torchsfm.motion.essential_6pt import equations as essential_6pt_equations
-from torchsfm.motion.fundamental_7pt import equations as fundamental_equations
-from torchsfm.motion.fundamental_affine_4pt import equations as affine_equations
-from torchsfm.motion.homography_4pt import equations as homography_equations
-from torchsfm.motion.relative_6pt_focal import equations as focal_equations
-from torchsfm.motion.relative_upright_3pt import equations as upright_equations
+from torchsfm.motion.two_views.essential_5pt import equations as essential_equations
+from torchsfm.motion.two_views.essential_6pt import equations as essential_6pt_equations
+from torchsfm.motion.two_views.fundamental_7pt import equations as fundamental_equations
+from torchsfm.motion.two_views.fundamental_affine_4pt import equations as affine_equations
+from torchsfm.motion.two_views.homography_4pt import equations as homography_equations
+from torchsfm.motion.two_views.relative_6pt_focal import equations as focal_equations
+from torchsfm.motion.two_views.relative_upright_3pt import equations as upright_equations
 
 Scene = Callable[[str, int, torch.Generator, torch.dtype], tuple[Sample, Tensor]]
 

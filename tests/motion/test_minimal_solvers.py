@@ -11,9 +11,9 @@ from two_view_scenes import F64, FAMILIES, distance, fundamental, pixels, two_vi
 
 from torchsfm._types import Solutions
 from torchsfm.motion import essential_5pt, fundamental_7pt, homography_4pt
-from torchsfm.motion.essential_5pt import equations as essential_equations
-from torchsfm.motion.fundamental_7pt import equations as fundamental_equations
-from torchsfm.motion.homography_4pt import equations as homography_equations
+from torchsfm.motion.two_views.essential_5pt import equations as essential_equations
+from torchsfm.motion.two_views.fundamental_7pt import equations as fundamental_equations
+from torchsfm.motion.two_views.homography_4pt import equations as homography_equations
 from torchsfm.tensors import poses_from_essential
 
 

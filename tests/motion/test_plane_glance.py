@@ -6,8 +6,8 @@ from chance import assert_share
 from torch import Tensor
 
 from torchsfm.geometry import rotation_from_rotvec
-from torchsfm.motion.epipolar_fit import cross_rows
-from torchsfm.motion.plane_glance import plane_suspected
+from torchsfm.motion.two_views.epipolar_fit import cross_rows
+from torchsfm.motion.two_views.plane_glance import plane_suspected
 from torchsfm.robust.degeneracy import GLANCE
 
 F64 = torch.float64

@@ -5,7 +5,8 @@ from chance import assert_share
 from torch import Tensor
 from two_view_scenes import F64, two_views
 
-from torchsfm.motion import essential_5pt, relative_5pt
+from torchsfm.motion import essential_5pt
+from torchsfm.motion.two_views import relative_5pt
 from torchsfm.tensors import essential_from_pose
 
 

@@ -21,11 +21,11 @@ from torchsfm.motion import (
     relative_known_rotation_2pt,
     relative_upright_3pt,
 )
-from torchsfm.motion.essential_6pt import equations as six_equations
-from torchsfm.motion.fundamental_affine_4pt import equations as affine_equations
-from torchsfm.motion.relative_6pt_focal import equations as focal_equations
-from torchsfm.motion.relative_known_rotation_2pt import equations as translation_equations
-from torchsfm.motion.relative_upright_3pt import equations as upright_equations
+from torchsfm.motion.two_views.essential_6pt import equations as six_equations
+from torchsfm.motion.two_views.fundamental_affine_4pt import equations as affine_equations
+from torchsfm.motion.two_views.relative_6pt_focal import equations as focal_equations
+from torchsfm.motion.two_views.relative_known_rotation_2pt import equations as translation_equations
+from torchsfm.motion.two_views.relative_upright_3pt import equations as upright_equations
 from torchsfm.tensors import essential_from_pose, pose_from_essential
 
 EASY = ("random", "roll 90", "convergent 90", "far points", "small baseline")

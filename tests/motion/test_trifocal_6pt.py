@@ -5,7 +5,7 @@ from multiview_scenes import F64, K, cameras, images, points, up_to_scale
 from torch import Tensor
 
 from torchsfm.motion import trifocal_6pt
-from torchsfm.motion.trifocal_6pt import equations
+from torchsfm.motion.three_views.trifocal_6pt import equations
 from torchsfm.tensors import canonical_cameras, transform_trifocal, trifocal_from_cameras
 
 EYE = torch.eye(3, dtype=F64)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.geometry import pluecker_from_points, random_rotation, transform_lines
 from torchsfm.resection import camera_1p2l, camera_2p1l, camera_3l
-from torchsfm.resection._points_and_lines import equations
+from torchsfm.resection.points_and_lines import equations
 
 F64 = torch.float64
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchsfm.geometry.projection import camera_slopes
 from torchsfm.geometry.radial import flatten
-from torchsfm.resection._reprojection_step import normal_equations, squared_reprojection
+from torchsfm.resection.reprojection_step import normal_equations, squared_reprojection
 
 F64 = torch.float64
 

@@ -109,7 +109,7 @@ def test_one_rig_for_many_sets_of_points(make_scene):
 
 
 def test_large_batches_go_in_pieces(make_scene, monkeypatch):
-    import torchsfm.triangulation._observations as observations
+    import torchsfm.triangulation.observations as observations
 
     x, P, _ = make_scene(5, v=4, n=9, noise=1.0)
     whole = triangulate_points_dlt(x, P)

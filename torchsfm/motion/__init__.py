@@ -1,28 +1,33 @@
 """From images alone: how did the camera move?"""
 
-from torchsfm.motion.essential_5pt import essential_5pt
-from torchsfm.motion.essential_6pt import essential_6pt
-from torchsfm.motion.estimate_essential import RelativePoseEstimator, estimate_essential
-from torchsfm.motion.estimate_fundamental import FundamentalEstimator, estimate_fundamental
-from torchsfm.motion.estimate_homography import HomographyEstimator, estimate_homography
-from torchsfm.motion.estimate_structures import estimate_fundamentals, estimate_homographies
-from torchsfm.motion.estimate_trifocal import TrifocalEstimator, estimate_trifocal
-from torchsfm.motion.estimate_upright import UprightPoseEstimator, estimate_upright
-from torchsfm.motion.factorization_affine import AffineFactorization, factorize_affine
-from torchsfm.motion.factorization_points import Factorization, factorize_points
-from torchsfm.motion.fundamental_7pt import fundamental_7pt
-from torchsfm.motion.fundamental_8pt import fundamental_8pt
-from torchsfm.motion.fundamental_affine_4pt import fundamental_affine_4pt
-from torchsfm.motion.fundamental_from_conics import ConicEpipolarFit, fundamental_from_conics
-from torchsfm.motion.homography_4pt import homography_4pt
-from torchsfm.motion.homography_dlt import homography_dlt
-from torchsfm.motion.motions_from_homography import PlaneMotion, SelectedMotion, motion_from_homography, motions_from_homography
-from torchsfm.motion.quadrifocal_6pt import QuadrifocalFit, quadrifocal_6pt
-from torchsfm.motion.relative_6pt_focal import FocalMotion, relative_6pt_focal
-from torchsfm.motion.relative_known_rotation_2pt import relative_known_rotation_2pt
-from torchsfm.motion.relative_upright_3pt import relative_upright_3pt
-from torchsfm.motion.trifocal_6pt import trifocal_6pt
-from torchsfm.motion.trifocal_7pt import TrifocalFit, trifocal_7pt
+from torchsfm.motion.many_views.factorization_affine import AffineFactorization, factorize_affine
+from torchsfm.motion.many_views.factorization_points import Factorization, factorize_points
+from torchsfm.motion.many_views.quadrifocal_6pt import QuadrifocalFit, quadrifocal_6pt
+from torchsfm.motion.three_views.estimate_trifocal import TrifocalEstimator, estimate_trifocal
+from torchsfm.motion.three_views.trifocal_6pt import trifocal_6pt
+from torchsfm.motion.three_views.trifocal_7pt import TrifocalFit, trifocal_7pt
+from torchsfm.motion.two_views.essential_5pt import essential_5pt
+from torchsfm.motion.two_views.essential_6pt import essential_6pt
+from torchsfm.motion.two_views.estimate_essential import RelativePoseEstimator, estimate_essential
+from torchsfm.motion.two_views.estimate_fundamental import FundamentalEstimator, estimate_fundamental
+from torchsfm.motion.two_views.estimate_homography import HomographyEstimator, estimate_homography
+from torchsfm.motion.two_views.estimate_structures import estimate_fundamentals, estimate_homographies
+from torchsfm.motion.two_views.estimate_upright import UprightPoseEstimator, estimate_upright
+from torchsfm.motion.two_views.fundamental_7pt import fundamental_7pt
+from torchsfm.motion.two_views.fundamental_8pt import fundamental_8pt
+from torchsfm.motion.two_views.fundamental_affine_4pt import fundamental_affine_4pt
+from torchsfm.motion.two_views.fundamental_from_conics import ConicEpipolarFit, fundamental_from_conics
+from torchsfm.motion.two_views.homography_4pt import homography_4pt
+from torchsfm.motion.two_views.homography_dlt import homography_dlt
+from torchsfm.motion.two_views.motions_from_homography import (
+    PlaneMotion,
+    SelectedMotion,
+    motion_from_homography,
+    motions_from_homography,
+)
+from torchsfm.motion.two_views.relative_6pt_focal import FocalMotion, relative_6pt_focal
+from torchsfm.motion.two_views.relative_known_rotation_2pt import relative_known_rotation_2pt
+from torchsfm.motion.two_views.relative_upright_3pt import relative_upright_3pt
 
 ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, TrifocalEstimator, UprightPoseEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""

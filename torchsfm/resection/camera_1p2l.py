@@ -13,7 +13,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import cross
 from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.resection._points_and_lines import Sample, frame, solve_poses
+from torchsfm.resection.points_and_lines import Sample, frame, solve_poses
 
 
 def camera_1p2l(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.nullspace import nullspace_rows
-from torchsfm.resection._points_and_lines import Sample, frame, solve_poses
+from torchsfm.resection.points_and_lines import Sample, frame, solve_poses
 
 
 def camera_2p1l(

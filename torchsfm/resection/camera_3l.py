@@ -16,7 +16,7 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import cross, inverse
 from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.resection._points_and_lines import Sample, frame, solve_poses
+from torchsfm.resection.points_and_lines import Sample, frame, solve_poses
 
 CONCURRENT = 1e-7
 """Volume that the unit normals of three planes of sight span, at which they meet in a line but for rounding."""

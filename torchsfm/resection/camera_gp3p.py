@@ -16,7 +16,7 @@ from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.quadric_intersection import intersect_quadrics, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, wants_derivative
-from torchsfm.resection._triangle import ASIDE, NEAREST
+from torchsfm.resection.triangle import ASIDE, NEAREST
 
 _CHUNK = 4096
 """Problems at a time: what is in use stays in the cache."""

@@ -17,7 +17,7 @@ from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.quadric_intersection import cubic_of_forms, intersect_quadrics, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, wants_derivative
-from torchsfm.resection._focal import camera_of, incidence_rows, scaled, world_camera
+from torchsfm.resection.focal import camera_of, incidence_rows, scaled, world_camera
 
 _CHUNK = 4096
 _SLOTS = 10

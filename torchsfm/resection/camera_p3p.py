@@ -12,7 +12,7 @@ from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.vectors import across, cross, dot, fma
 from torchsfm.optim import wants_derivative
-from torchsfm.resection._triangle import Triangle
+from torchsfm.resection.triangle import Triangle
 
 
 def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"]) -> Solutions[Float[Tensor, "*batch 4 3 4"]]:

@@ -18,8 +18,8 @@ from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.quadric_intersection import intersect_quadrics
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_optimum, wants_derivative
-from torchsfm.resection._focal import camera_of, incidence_rows, scaled, world_camera
 from torchsfm.resection.camera_p35pf import structure, sum_of_products
+from torchsfm.resection.focal import camera_of, incidence_rows, scaled, world_camera
 
 _CHUNK = 4096
 _INDEPENDENT = 1e-12

@@ -10,7 +10,7 @@ from torchsfm._types import Status, check_tensors
 from torchsfm.geometry import Pose
 from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
-from torchsfm.resection._angles import Rays, attach, determined, gauss_newton, in_pieces, status_of
+from torchsfm.resection.angles import Rays, attach, determined, gauss_newton, in_pieces, status_of
 
 _STEPS = 12
 _SAME = 1e-6

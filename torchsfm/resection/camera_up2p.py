@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.optim import attach_implicit, wants_derivative
-from torchsfm.resection._triangle import NEAREST
+from torchsfm.resection.triangle import NEAREST
 
 
 def equations(

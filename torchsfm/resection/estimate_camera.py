@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._moderate_lines import image_rows, kinds, line_data, moderate_structure
-from torchsfm.resection._reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
 from torchsfm.resection.camera_p3p import camera_p3p
+from torchsfm.resection.flat_structure import flatness, flatness_suspected
+from torchsfm.resection.moderate_lines import image_rows, kinds, line_data, moderate_structure
 from torchsfm.resection.point_line_camera import PointLineCameraEstimator
+from torchsfm.resection.reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_counts, check_door, estimate_robustly
 from torchsfm.robust.moderation import moderate, moved_and_scaled, present
 

@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
 from torchsfm.resection.camera_p4pf import camera_p4pf
 from torchsfm.resection.estimate_camera import world_pose
+from torchsfm.resection.flat_structure import flatness, flatness_suspected
+from torchsfm.resection.reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.robust.moderation import middle_and_size, moderate, moved_and_scaled, present
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import damped_solve, nullspace_rows
 from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
-from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._focal import incidence_rows
-from torchsfm.resection._reprojection_step import normal_equations, squared_reprojection
+from torchsfm.resection.flat_structure import flatness, flatness_suspected
+from torchsfm.resection.focal import incidence_rows
+from torchsfm.resection.reprojection_step import normal_equations, squared_reprojection
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.robust.moderation import moderate, present
 

@@ -11,13 +11,13 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.geometry import to_homogeneous
 from torchsfm.linalg import cross, eigh
-from torchsfm.resection._flat_structure import flatness, flatness_suspected
-from torchsfm.resection._reprojection_step import moved_pose, retracted_pose
-from torchsfm.resection._sights import SEGMENT, look, seen_ends, sight_step, slopes, squared_distance
 from torchsfm.resection.camera_1p2l import camera_1p2l
 from torchsfm.resection.camera_2p1l import camera_2p1l
 from torchsfm.resection.camera_3l import camera_3l
 from torchsfm.resection.camera_p3p import camera_p3p
+from torchsfm.resection.flat_structure import flatness, flatness_suspected
+from torchsfm.resection.reprojection_step import moved_pose, retracted_pose
+from torchsfm.resection.sights import SEGMENT, look, seen_ends, sight_step, slopes, squared_distance
 from torchsfm.robust import Degeneracy, Weigh
 
 _SOLVERS: tuple[Callable[..., Solutions[Tensor]], ...] = (

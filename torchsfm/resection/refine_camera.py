@@ -12,10 +12,10 @@ from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry import Camera, Pose
 from torchsfm.geometry.intrinsic_parameters import SKEW, intrinsic_columns
 from torchsfm.optim import Loss, levenberg_marquardt
-from torchsfm.resection._line_chords import line_chords
-from torchsfm.resection._moderate_lines import line_data, pixel_ends
-from torchsfm.resection._reprojection import Reprojection, inverse, like
-from torchsfm.resection._squares import minimise_squares
+from torchsfm.resection.line_chords import line_chords
+from torchsfm.resection.moderate_lines import line_data, pixel_ends
+from torchsfm.resection.reprojection import Reprojection, inverse, like
+from torchsfm.resection.squares import minimise_squares
 from torchsfm.robust import check_counts
 
 Data = tuple[Tensor, Tensor, Tensor, Camera]

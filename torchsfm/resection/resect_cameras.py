@@ -8,11 +8,11 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry import Camera, Pose, point_line_distance, project_lines
-from torchsfm.resection._moderate_lines import is_segments, line_data, pixel_ends
 from torchsfm.resection.camera_dlt import camera_dlt
 from torchsfm.resection.camera_pnp import camera_pnp
 from torchsfm.resection.estimate_camera import estimate_camera
 from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
+from torchsfm.resection.moderate_lines import is_segments, line_data, pixel_ends
 from torchsfm.resection.refine_camera import refine_camera
 from torchsfm.robust import check_counts, constant_weights
 from torchsfm.robust.moderation import middle_and_size

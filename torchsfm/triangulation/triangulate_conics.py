@@ -11,9 +11,9 @@ from torchsfm.geometry import Ellipsoid, PlaneConic, dual_quadric_from_ellipsoid
 from torchsfm.geometry.quadrics import dual_of_shape
 from torchsfm.linalg import eigh, inverse
 from torchsfm.optim import levenberg_marquardt
-from torchsfm.triangulation._conic_images import ConicImages, first_guess, prepare
-from torchsfm.triangulation._outlines import Shape
+from torchsfm.triangulation.conic_images import ConicImages, first_guess, prepare
 from torchsfm.triangulation.conics_2view import in_front
+from torchsfm.triangulation.outlines import Shape
 
 _RANK = 1e-12
 """Eigenvalues of the normal equations below this, in units in which their diagonal is one, are nothing."""

@@ -13,7 +13,7 @@ from torchsfm.geometry import Line3D
 from torchsfm.geometry.line_manifold import line_tangents, world_covariance
 from torchsfm.linalg import cross, eigvalsh, inverse
 from torchsfm.optim import Loss, levenberg_marquardt
-from torchsfm.triangulation._line_views import (
+from torchsfm.triangulation.line_views import (
     SAME,
     LineViews,
     frame_of_centres,

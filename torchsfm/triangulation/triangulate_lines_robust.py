@@ -12,7 +12,7 @@ from torchsfm.geometry import to_homogeneous
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.linalg import cross, damped_solve, determinant_3x3
 from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
-from torchsfm.triangulation._line_views import frame_of_centres, in_world, line_forms, observe, slopes_along, through_centre
+from torchsfm.triangulation.line_views import frame_of_centres, in_world, line_forms, observe, slopes_along, through_centre
 from torchsfm.triangulation.triangulate_lines import triangulate_lines
 
 _PARALLEL = 1e-12

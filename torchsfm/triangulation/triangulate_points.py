@@ -9,9 +9,9 @@ from torch import Tensor
 from torchsfm._types import Status, check_options
 from torchsfm.geometry.projection import quotient_slope
 from torchsfm.optim import wants_derivative
-from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
-from torchsfm.triangulation._symmetric import inverse, symmetric, tangent_step
+from torchsfm.triangulation.observations import Observations, in_pieces, row_dot
 from torchsfm.triangulation.optimal_correction import fundamental_rows, lindstrom
+from torchsfm.triangulation.symmetric import inverse, symmetric, tangent_step
 from torchsfm.triangulation.triangulate_points_dlt import euclidean, linear_points
 
 

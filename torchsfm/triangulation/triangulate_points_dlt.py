@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm.triangulation._observations import Observations, in_pieces, row_dot
-from torchsfm.triangulation._symmetric import smallest_eigenvector, symmetric, tangent_step
+from torchsfm.triangulation.observations import Observations, in_pieces, row_dot
+from torchsfm.triangulation.symmetric import smallest_eigenvector, symmetric, tangent_step
 
 
 def triangulate_points_dlt(

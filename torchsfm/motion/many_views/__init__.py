@@ -1,0 +1,1 @@
+"""Four and many views: the quadrifocal tensor, affine and projective factorisation."""

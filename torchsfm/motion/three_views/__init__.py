@@ -1,0 +1,1 @@
+"""Three views: the trifocal tensor from points, minimal, linear and robust."""

@@ -1,0 +1,1 @@
+"""Two views: fundamental and essential matrices, homographies, relative poses, and how well data determine them."""

@@ -1,0 +1,173 @@
+"""The essential matrix from corresponding rays of which many are wrong."""
+
+from dataclasses import dataclass
+from typing import ClassVar, Unpack
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import Solutions
+from torchsfm.motion.two_views.epipolar_fit import sphere_rows
+from torchsfm.motion.two_views.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, squared_transfer
+from torchsfm.motion.two_views.plane_glance import plane_suspected
+from torchsfm.motion.two_views.relative_5pt import relative_5pt
+from torchsfm.motion.two_views.sampson_sphere import pose_step, squared_distance, step_equations, turned
+from torchsfm.optim import UnitSphere, rotation_exponential
+from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
+from torchsfm.tensors import essential_from_pose
+
+_SLACK = 2e-3
+"""By which angle rays may miss the front where no threshold says how large the noise is, in radians."""
+
+
+@dataclass(frozen=True)
+class RelativePoseEstimator:
+    """The pose [R | t] of the second camera, |t| = 1, from corresponding rays.
+
+    Distances are Sampson's on the sphere of rays, in radians, and infinite for rays that meet behind a camera. Of two rays that
+    meet far away the noise decides on which side: they must miss the front by an angle to count as behind.
+
+    Attributes:
+        slack: That angle in radians, for each problem.
+    """
+
+    slack: Float[Tensor, "*batch"]
+
+    model_name: ClassVar[str] = "relative_pose"
+    data_names: ClassVar[tuple[str, ...]] = ("d1", "d2")
+    sample_size: ClassVar[int] = 5
+    max_solutions: ClassVar[int] = 10
+    codimension: ClassVar[int] = 1
+    dimension: ClassVar[int] = 5
+    never_zero: ClassVar[bool] = True
+
+    def minimal(
+        self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]
+    ) -> Solutions[Float[Tensor, "*batch 10 3 4"]]:
+        """The poses for which five rays meet in front of both cameras; at most one of the four of each E."""
+        return relative_5pt(d1, d2, self.slack)
+
+    def squared_residual(
+        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Squared angular Sampson distance; infinite behind a camera."""
+        return squared_distance(model, d1, d2, self.slack)
+
+    def degenerate(self, d1: Float[Tensor, "*#batch 5 3"], d2: Float[Tensor, "*#batch 5 3"]) -> Bool[Tensor, "*batch"]:
+        """Whether the first two rays coincide in an image."""
+        return ((d1[..., 0, :] == d1[..., 1, :]).all(-1)) | ((d2[..., 0, :] == d2[..., 1, :]).all(-1))
+
+    def step(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        weigh: Weigh,
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """A Gauss-Newton step on Sampson's distance: R <- exp(w) R, and t along the unit sphere."""
+        A, b = step_equations(model, d1, d2, self.slack, weigh)
+        R, t = model[..., :3].double(), model[..., 3].double()
+        step = pose_step(A, b, t)
+        t = t + step[..., 3:]
+        t = t * (t * t).sum(-1, keepdim=True).clamp(min=1e-30).rsqrt()
+        return torch.cat((turned(step[..., :3], R), t[..., None]), -1).to(d1.dtype)
+
+    def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 5"]) -> Float[Tensor, "*batch 3 4"]:
+        """R <- exp(w) R, and t along the unit sphere."""
+        R = rotation_exponential(step[..., :3]) @ model[..., :3]
+        return torch.cat((R, UnitSphere(3).retract(model[..., 3], step[..., 3:])[..., None]), -1)
+
+    def may_be_degenerate(
+        self,
+        model: Float[Tensor, "p 3 4"],
+        d1: Float[Tensor, "p n 3"],
+        d2: Float[Tensor, "p n 3"],
+        *,
+        inliers: Bool[Tensor, "p n"],
+        threshold: Float[Tensor, "p"],
+        chance: Float[Tensor, "p"],
+    ) -> Bool[Tensor, "p"]:
+        """Whether R alone, or R + t n', may relate all inliers but so few as chance explains: a plane at any distance."""
+        h2 = d2.mT
+        h2 = h2 * (h2 * h2).sum(-2, keepdim=True).rsqrt()
+        limit, spare = 4 * threshold * threshold, most_by_chance(chance, 2)
+        return plane_suspected(model[..., :3], model[..., 3], d1.mT, h2, inliers, limit, spare)
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """ROTATION: R alone relates the inliers but so few as chance explains, so that t is open; PLANAR: R + t n' does."""
+        R, t, h1, h2 = model[..., :3], model[..., 3], sphere_rows(d1), sphere_rows(d2)
+        limit = 4 * threshold * threshold
+        turned = inliers & (squared_transfer(R, h1, h2, sphere=True) < limit[..., None])
+        rotation = turned.any(-1) & ~more_than_chance((inliers & ~turned).sum(-1), chance, 2)
+        _, on = dominant_plane(R, t, h1, h2, inliers, limit, sphere=True)
+        planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
+        code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
+        return torch.where(rotation, int(Degeneracy.ROTATION), code).to(torch.int8)
+
+
+def estimate_essential(
+    d1: Float[Tensor, "*#batch n 3"],
+    d2: Float[Tensor, "*#batch n 3"],
+    *,
+    threshold: float | Float[Tensor, "*#batch"] | None,
+    **options: Unpack[RansacOptions],
+) -> RobustResult[Float[Tensor, "*batch 3 3"]]:
+    """The essential matrix of each pair of calibrated cameras, from corresponding rays of which many may be wrong.
+
+    LO-RANSAC over the poses of five-point samples, scored by Sampson's distance for rays that meet in front of both cameras,
+    then a robust minimum of that distance over the poses. `pose_from_essential` turns the result into a pose. After a pure
+    rotation every translation fits, and points of one plane may fit two poses: `degeneracy` says so.
+
+    Args:
+        d1: Rays of the first camera, of any length, pointing to the points.
+        d2: The corresponding rays of the second camera.
+        threshold: Largest Sampson distance of an inlier in radians, at most 0.1: pixels divided by the focal length.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
+        **options: See `RansacOptions`.
+
+    Returns:
+        E with d2' E d1 = 0, |E|^2 = 2 and singular values (1, 1, 0); inliers, support, iterations, status, degeneracy
+        (ROTATION: a rotation relates all inliers but so few as chance explains, and the translation means nothing; PLANAR: a
+        homography does, and a second pose may fit as well), covariance (9 x 9, of rank 5). E carries its derivatives with
+        respect to the inliers (see `ransac`).
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
+    """
+    batch = check_door({"d1": (d1, "n 3"), "d2": (d2, "n 3")}, threshold, options, radians=True)
+    estimator = RelativePoseEstimator(pose_slack(threshold, d1).expand(batch))
+
+    def back(model: Tensor) -> Tensor:
+        return essential_from_pose(model[..., :3], model[..., 3])
+
+    return estimate_robustly(estimator, unit_rays(d1), unit_rays(d2), threshold=threshold, dtype=d1.dtype, back=back, **options)
+
+
+def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:
+    """By which angle rays must miss the front to count as behind: the threshold, where there is one."""
+    if isinstance(threshold, Tensor):
+        return threshold.double()
+    return torch.tensor(_SLACK if threshold is None else threshold, dtype=torch.float64, device=like.device)
+
+
+def unit_rays(d: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:
+    """Rays of length 1 in float64; NaN for those without direction, so that they are left out."""
+    # Coordinates first: sums of three are then taken along the memory.
+    rows = d.double().movedim(-1, 0).contiguous()
+    square = (rows * rows).sum(0)
+    good = (square > 0) & (square < torch.inf)
+    if bool(good.all()):
+        return (rows * square.rsqrt()).movedim(0, -1)
+    safe = torch.where(good, rows, 1)
+    return torch.where(good, safe * (safe * safe).sum(0).rsqrt(), torch.nan).movedim(0, -1)

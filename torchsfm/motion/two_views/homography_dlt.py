@@ -1,0 +1,42 @@
+"""Four points or more in a plane: the homography by normalised linear least squares (Hartley & Zisserman 2004, 4.1, 4.4)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import check_tensors
+from torchsfm.linalg import null_vector
+from torchsfm.motion.two_views.fundamental_8pt import _normalised
+
+
+def homography_dlt(
+    x1: Float[Tensor, "*#batch n 2"],
+    x2: Float[Tensor, "*#batch n 2"],
+    weights: Float[Tensor, "*#batch n"] | None = None,
+) -> Float[Tensor, "*batch 3 3"]:
+    """The homography x2 ~ H x1 of least algebraic error in normalised coordinates, with |H| = 1 (Frobenius).
+
+    Args:
+        x1: At least four points in the first image.
+        x2: The corresponding points in the second image.
+        weights: Weight of each squared error, >= 0; 0 means absent, and what stands there is not looked at. None: all 1.
+
+    Returns:
+        H, always finite, without status. Where the weighted points do not determine it (fewer than four, all but one collinear)
+        it is one of the least-squares solutions; where a coordinate or weight that counts is not finite, I / sqrt(3).
+
+    Raises:
+        ValueError: Wrong shape, dtype or device, or n < 4.
+    """
+    check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
+    y1, y2, w, T1, T2_inverse, finite = _normalised(x1, x2, weights)
+    u1, v1, u2, v2 = y1[..., 0], y1[..., 1], y2[..., 0], y2[..., 1]
+    one, zero = torch.ones_like(u1), torch.zeros_like(u1)
+    first = torch.stack((u1, v1, one, zero, zero, zero, -u2 * u1, -u2 * v1, -u2), -1)
+    second = torch.stack((zero, zero, zero, u1, v1, one, -v2 * u1, -v2 * v1, -v2), -1)
+    root = w[..., None]
+    h, _ = null_vector(torch.cat((root * first, root * second), -2))
+    H = T2_inverse @ h.reshape(*h.shape[:-1], 3, 3) @ T1
+    H = H / (H * H).sum((-2, -1), keepdim=True).sqrt()
+    fallback = torch.eye(3, dtype=H.dtype, device=H.device) / 3**0.5
+    return torch.where(finite[..., None, None], H, fallback).to(x1.dtype)

@@ -1,0 +1,67 @@
+"""Seven points that cameras have in front of them: F with its left epipole (Chum, Werner & Matas 2004).
+
+All arithmetic has the batch in the last dimension.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg.kernel import kernel
+from torchsfm.linalg.rows import combine_rows
+from torchsfm.linalg.vectors import cross, fma, fms
+from torchsfm.motion.two_views.epipolar_fit import MIXTURE, with_left_epipole
+from torchsfm.motion.two_views.fundamental_7pt import batch_last, equations, solve
+from torchsfm.optim import attach_implicit, wants_derivative
+
+
+def oriented_7pt(
+    x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]
+) -> Solutions[Float[Tensor, "*batch 3 3 4"]]:
+    """The [F | e2] of `fundamental_7pt` whose seven points can be in front of both cameras, |F| = |e2| = 1.
+
+    Args:
+        x1: Seven points in the first image, of moderate size around 0.
+        x2: The corresponding points in the second image.
+
+    Returns:
+        Three slots, valid as those of `fundamental_7pt` where e2 x h2 and F h1 point the same way for all seven points.
+    """
+    batch = check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
+    with torch.no_grad():
+        points = batch_last(x1, batch), batch_last(x2, batch)
+        F, valid = solve(*points)
+        rows, valid = _orient(F, valid, *points)
+        model = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 4).to(x1.dtype)
+        valid = valid.mT.reshape(*batch, 3)
+    if wants_derivative(x1, x2):
+        F = attach_implicit(equations, model[..., :3], x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
+        model = with_left_epipole(F, model[..., 3])
+    return Solutions(model, valid)
+
+
+@kernel(chunk=2048)
+def _orient(
+    F: Float[Tensor, "9 3 batch"],
+    valid: Bool[Tensor, "3 batch"],
+    x1: Float[Tensor, "2 7 batch"],
+    x2: Float[Tensor, "2 7 batch"],
+) -> tuple[Tensor, Tensor]:
+    """[F | e2] as (12, 3, batch) and valid as (3, batch)."""
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = F.unbind(0)
+    # The left epipole is across all columns: across two mixtures of them, so that no choice is needed.
+    left = [torch.add(a, b, alpha=MIXTURE[0]) for a, b in ((f0, f2), (f3, f5), (f6, f8))]
+    right = [torch.add(a, b, alpha=MIXTURE[1]) for a, b in ((f1, f2), (f4, f5), (f7, f8))]
+    e0, e1, e2 = cross(tuple(left), tuple(right))
+    e = [e0, e1, e2]
+    scale = combine_rows(e, e).clamp(min=1e-200).rsqrt()
+    e0, e1, e2 = (row * scale for row in e)
+    (u, v), (a, b) = x1[:, :, None].unbind(0), x2[:, :, None].unbind(0)
+    # e2 x h2 and F h1 are parallel: two of their coordinates tell whether they point the same way.
+    same = fms(e2, b, e1) * fma(f0, u, fma(f1, v, f2))
+    same = torch.addcmul(same, fms(-e2, a, -e0), fma(f3, u, fma(f4, v, f5)))
+    plus, minus = same.amin(0) >= 0, same.amax(0) <= 0
+    sign = 2 * plus.to(F.dtype) - 1
+    rows = [f0, f1, f2, e0 * sign, f3, f4, f5, e1 * sign, f6, f7, f8, e2 * sign]
+    return torch.stack(rows), valid & (plus | minus)
