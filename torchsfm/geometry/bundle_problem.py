@@ -16,6 +16,14 @@ class BundleProblem:
     """Views of points, with estimates of everything; the smallest thing that can be adjusted.
 
     A `Reconstruction` has the same members and more (names, sizes, colours).
+
+    Example:
+        >>> import torchsfm
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 150, noise=0.0).truth
+        >>> problem.X.shape, problem.x.shape
+        (torch.Size([50, 3]), torch.Size([150, 2]))
+        >>> bool(problem.residuals().max() < 1e-9)
+        True
     """
 
     poses: Pose

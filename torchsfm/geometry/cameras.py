@@ -19,6 +19,16 @@ class Camera:
     """The inside of a camera: intrinsics K and lens distortion, with any leading batch dimensions.
 
     Index the batch with `camera[i]`; so `camera[camera_index]` gives every view its camera.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> camera = torchsfm.Camera(torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0])))
+        >>> camera.project(torch.tensor([[0.0, 0.0, 2.0], [1.0, -0.5, 4.0]]))
+        tensor([[320., 240.],
+                [520., 140.]])
+        >>> d, valid = camera.unproject(torch.tensor([[520.0, 140.0]]))
+        >>> d
+        tensor([[ 0.2500, -0.1250,  1.0000]])
     """
 
     K: Float[Tensor, "*batch 3 3"]
@@ -124,6 +134,13 @@ def intrinsics(
 
     Returns:
         K, upper triangular.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0]))
+        tensor([[800.,   0., 320.],
+                [  0., 800., 240.],
+                [  0.,   0.,   1.]])
     """
     batch = check_tensors(
         f=(f, ""),
@@ -141,7 +158,16 @@ def intrinsics(
 def camera_from_krt(
     K: Float[Tensor, "*#batch 3 3"], R: Float[Tensor, "*#batch 3 3"], t: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3 4"]:
-    """Multiply out `P = K [R | t]`."""
+    """Multiply out `P = K [R | t]`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(500.0), torch.tensor([320.0, 240.0]))
+        >>> torchsfm.geometry.camera_from_krt(K, torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+        tensor([[500.,   0., 320., 640.],
+                [  0., 500., 240., 480.],
+                [  0.,   0.,   1.,   2.]])
+    """
     check_tensors(K=(K, "3 3"), R=(R, "3 3"), t=(t, "3"))
     left, right = K @ R, K @ t[..., None]
     batch = broadcast_shapes(left.shape[:-2], right.shape[:-2])
@@ -161,6 +187,14 @@ def krt_from_camera(
     Returns:
         K with positive diagonal and last entry 1, R with determinant +1, and t. A camera whose centre is at infinity has no
         such decomposition (`camera_centre(P, homogeneous=True)` tells): there K and R are identities and t is zero.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0]))
+        >>> P = torchsfm.geometry.camera_from_krt(K, torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+        >>> K_found, R, t = torchsfm.geometry.krt_from_camera(-5 * P)  # whatever the scale and sign
+        >>> bool(K_found.allclose(K)), bool(t.allclose(torch.tensor([0.0, 0.0, 2.0])))
+        (True, True)
     """
     check_tensors(P=(P, "3 4"))
     scale = P.detach().abs().amax((-2, -1), keepdim=True)
@@ -200,6 +234,12 @@ def camera_centre(P: Float[Tensor, "*batch 3 4"], *, homogeneous: bool = False) 
 
     Returns:
         The centre (*batch, 3), very far away for a camera at infinity; or (*batch, 4).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torch.tensor([[1.0, 0.0, 0.0, -3.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0]])
+        >>> torchsfm.geometry.camera_centre(P).tolist()
+        [3.0, 0.0, -5.0]
     """
     check_tensors(P=(P, "3 4"))
     p1, p2, p3, p4 = P.unbind(-1)
@@ -226,6 +266,15 @@ def project_points(
     Returns:
         Image points, finite always: a point in the focal plane is returned very far away in its own direction (about 1 /
         machine epsilon), and one with NaN or inf as the image of the origin.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torch.tensor([[1.0, 2.0, 4.0]])
+        >>> torchsfm.project_points(torch.eye(3, 4), X)
+        tensor([[0.2500, 0.5000]])
+        >>> camera = torchsfm.Camera(torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0])))
+        >>> torchsfm.project_points(torchsfm.Pose.identity(), X, camera)
+        tensor([[520., 640.]])
     """
     matrix = P.matrix() if isinstance(P, Pose) else P
     check_tensors(P=(matrix, "3 4"), X=(X, "n 3"))
@@ -246,6 +295,12 @@ def point_depths(P: Float[Tensor, "*#batch 3 4"], X: Float[Tensor, "*#batch n 3"
 
     Returns:
         The distance from the focal plane, positive in front; 0 for cameras at infinity, which have none.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torch.eye(3, 4)
+        >>> torchsfm.geometry.point_depths(P, torch.tensor([[1.0, 2.0, 5.0], [0.0, 0.0, -3.0]]))
+        tensor([ 5., -3.])
     """
     check_tensors(P=(P, "3 4"), X=(X, "n 3"))
     w = (X * P[..., None, 2, :3]).sum(-1) + P[..., 2:, 3]

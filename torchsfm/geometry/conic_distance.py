@@ -25,6 +25,12 @@ def conic_distance(C: Float[Tensor, "*#batch 3 3"], x: Float[Tensor, "*#batch n 
 
     Returns:
         Distances, in the unit of the points. A huge finite number at a centre of the conic, and for points with NaN or inf.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+        >>> torchsfm.geometry.conic_distance(circle, torch.tensor([[1.0, 0.0], [0.0, 1.1]]))
+        tensor([0.0000, 0.0955])
     """
     check_tensors(C=(C, "3 3"), x=(x, "n 2"))
     good = torch.isfinite(x).all(-1)
@@ -50,6 +56,12 @@ def ellipse_distance(ellipse: Ellipse, x: Float[Tensor, "*#batch n 2"]) -> Float
 
     Returns:
         Signed distances, in the unit of the points. Computed in float64. A huge finite number for points with NaN or inf.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ellipse = torchsfm.Ellipse(torch.zeros(2), torch.tensor([2.0, 1.0]), torch.tensor(0.0))
+        >>> torchsfm.geometry.ellipse_distance(ellipse, torch.tensor([[5.0, 0.0], [0.0, 0.5]]))
+        tensor([ 3.0000, -0.5000])
     """
     check_ellipse(ellipse, x=(x, "n 2"))
     good = torch.isfinite(x).all(-1)

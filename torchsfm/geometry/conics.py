@@ -19,7 +19,14 @@ _STEPS = 3
 
 @dataclass(frozen=True)
 class Ellipse:
-    """Ellipses `centre + R(angle) (a cos t, b sin t)`."""
+    """Ellipses `centre + R(angle) (a cos t, b sin t)`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ellipse = torchsfm.Ellipse(torch.tensor([5.0, 1.0]), torch.tensor([3.0, 2.0]), torch.tensor(0.0))
+        >>> ellipse.points(torch.tensor([0.0]))
+        tensor([[8., 1.]])
+    """
 
     centre: Float[Tensor, "*batch 2"]
     semi_axes: Float[Tensor, "*batch 2"]
@@ -72,6 +79,12 @@ def conic_from_ellipse(ellipse: Ellipse) -> Float[Tensor, "*batch 3 3"]:
 
     Returns:
         C with `x'Cx = (distance from the centre in semi-axes)^2 - 1`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ellipse = torchsfm.Ellipse(torch.zeros(2), torch.tensor([2.0, 1.0]), torch.tensor(0.0))
+        >>> torchsfm.geometry.conic_from_ellipse(ellipse).diagonal()
+        tensor([ 0.2500,  1.0000, -1.0000])
     """
     check_ellipse(ellipse)
     a, b = ellipse.semi_axes.unbind(-1)
@@ -91,6 +104,12 @@ def ellipse_from_conic(C: Float[Tensor, "*batch 3 3"]) -> tuple[Ellipse, Bool[Te
 
     Returns:
         The ellipses, and which conics are real ellipses at all; the others get the unit circle. Computed in float64.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ellipse, real = torchsfm.geometry.ellipse_from_conic(torch.diag(torch.tensor([1.0, 4.0, -4.0])))
+        >>> bool(real), ellipse.semi_axes
+        (True, tensor([2., 1.]))
     """
     check_tensors(C=(C, "3 3"))
     good = usable(C).all(-1).all(-1)
@@ -147,6 +166,13 @@ def dual_conic(C: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
 
     Returns:
         The dual, of C brought to unit size.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle = torch.diag(torch.tensor([1.0, 1.0, -4.0]))  # of radius 2
+        >>> tangent = torch.tensor([1.0, 0.0, -2.0])  # the line x = 2
+        >>> bool((tangent @ torchsfm.geometry.dual_conic(circle) @ tangent).abs() < 1e-6)
+        True
     """
     check_tensors(C=(C, "3 3"))
     return adjugate_3x3(C * unit_scale(C))
@@ -161,6 +187,12 @@ def transform_conic(H: Float[Tensor, "*#batch 3 3"], C: Float[Tensor, "*#batch 3
 
     Returns:
         The images, up to a positive factor; finite for a singular H too.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle, wider = torch.diag(torch.tensor([1.0, 1.0, -1.0])), torch.diag(torch.tensor([3.0, 1.0, 1.0]))
+        >>> torchsfm.geometry.ellipse_from_conic(torchsfm.geometry.transform_conic(wider, circle))[0].semi_axes
+        tensor([3., 1.])
     """
     check_tensors(H=(H, "3 3"), C=(C, "3 3"))
     inverse = adjugate_3x3(H * unit_scale(H))
@@ -176,6 +208,12 @@ def polar_lines(C: Float[Tensor, "*#batch 3 3"], x: Float[Tensor, "*#batch n 2"]
 
     Returns:
         Homogeneous lines.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+        >>> torchsfm.geometry.polar_lines(circle, torch.tensor([[2.0, 0.0]]))  # the line x = 1 / 2
+        tensor([[ 2.,  0., -1.]])
     """
     check_tensors(C=(C, "3 3"), x=(x, "n 2"))
     return to_homogeneous(x) @ C.mT
@@ -193,6 +231,13 @@ def tangent_lines(
     Returns:
         Two unit lines for each point, and whether they are real: the point lies outside, and the conic is not singular. A
         point on the conic has its tangent twice, if rounding leaves it outside.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+        >>> l, real = torchsfm.geometry.tangent_lines(circle, torch.tensor([[2.0, 0.0], [0.5, 0.0]]))
+        >>> real, bool((l[0] @ torch.tensor([2.0, 0.0, 1.0])).abs().max() < 1e-6)
+        (tensor([ True, False]), True)
     """
     check_tensors(C=(C, "3 3"), x=(x, "n 2"))
     return _conjugate_on(to_homogeneous(x), dual_conic(C)[..., None, :, :])
@@ -210,6 +255,14 @@ def intersect_line_conic(
 
     Returns:
         Two unit homogeneous points for each line, and whether they are real.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+        >>> l = torch.tensor([[0.0, 1.0, -0.6], [0.0, 1.0, -2.0]])  # y = 0.6 and y = 2
+        >>> x, real = torchsfm.geometry.intersect_line_conic(l, circle)
+        >>> (x[0, :, 0] / x[0, :, 2]).sort().values, real
+        (tensor([-0.8000,  0.8000]), tensor([ True, False]))
     """
     check_tensors(l=(l, "n 3"), C=(C, "3 3"))
     return _conjugate_on(l, C[..., None, :, :])
@@ -230,6 +283,15 @@ def intersect_conics(
     Returns:
         Up to four points as unit homogeneous vectors, at infinity too; none where the conics are one. Points where the conics
         touch come twice, or not at all, as rounding has it. Computed in float64; differentiable (implicit function theorem).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+        >>> lying, standing = torch.diag(torch.tensor([0.25, 4.0, -1.0])), torch.diag(torch.tensor([1.0, 1.0, -9.0]))
+        >>> torchsfm.geometry.intersect_conics(circle, lying).valid.sum()
+        tensor(4)
+        >>> torchsfm.geometry.intersect_conics(circle, standing).valid.sum()  # one inside the other
+        tensor(0)
     """
     check_tensors(C1=(C1, "3 3"), C2=(C2, "3 3"))
     dtype = C1.dtype

@@ -22,7 +22,17 @@ _NEWTON = 4
 
 @dataclass(frozen=True)
 class Curve:
-    """Curves as ordered samples, in slots of which the first ones are `valid`; see `curve_from_samples`."""
+    """Curves as ordered samples, in slots of which the first ones are `valid`; see `curve_from_samples`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        >>> square = torchsfm.geometry.curve_from_samples(corners, closed=True)
+        >>> square.length, square.number
+        (tensor(4.), tensor(4))
+        >>> square.reversed().x[1]
+        tensor([0., 1.])
+    """
 
     x: Float[Tensor, "*batch n d"]
     """Samples, d = 2 in images and 3 in space; zero in empty slots. A closed curve does not repeat its first sample."""
@@ -75,7 +85,10 @@ class Curve:
 
 
 class FootPoints(NamedTuple):
-    """The points of curves nearest to given points."""
+    """The points of curves nearest to given points.
+
+    See the example of `foot_points`.
+    """
 
     x: Float[Tensor, "*batch m d"]
     """The nearest points, on the smooth curves; zero where a curve has fewer than two samples."""
@@ -86,12 +99,17 @@ class FootPoints(NamedTuple):
 
 
 class Crossings(NamedTuple):
-    """Where curves of the plane cross lines, along the curve, in slots of which the first are `valid`."""
+    """Where curves of the plane cross lines, along the curve, in slots of which the first are `valid`.
+
+    See the example of `curve_crossings`.
+    """
 
     x: Float[Tensor, "*batch m k 2"]
+    """The crossings of each line, in the unit of the curve; zero in empty slots."""
     sine: Float[Tensor, "*batch m k"]
     """Of the angle between the curve and the line; 0 in empty slots."""
     valid: Bool[Tensor, "*batch m k"]
+    """Which slots hold a crossing."""
 
 
 def curve_from_samples(
@@ -112,6 +130,13 @@ def curve_from_samples(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> samples = torch.tensor([[0.0, 0.0], [3.0, 0.0], [3.0, 0.0], [3.0, 4.0]])  # one twice
+        >>> curve = torchsfm.geometry.curve_from_samples(samples)
+        >>> curve.number, curve.length
+        (tensor(3), tensor(7.))
     """
     flag = closed if isinstance(closed, Tensor) else None
     check_options(closed=(closed, Tensor | bool))
@@ -143,6 +168,13 @@ def foot_points(curve: Curve, y: Float[Tensor, "*#batch m d"]) -> FootPoints:
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> line = torchsfm.geometry.curve_from_samples(torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]))
+        >>> foot = torchsfm.geometry.foot_points(line, torch.tensor([[0.5, 3.0], [-1.0, 0.0]]))
+        >>> foot.x[0], foot.within
+        (tensor([0.5000, 0.0000]), tensor([ True, False]))
     """
     d = curve.x.shape[-1]
     check_tensors(y=(y, f"m {d}"), curve=(curve.x, f"n {d}"))
@@ -178,6 +210,14 @@ def curve_crossings(curve: Curve, line: Float[Tensor, "*#batch m 3"], most: int)
 
     Raises:
         ValueError: Wrong shape, dtype, device or option.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> zigzag = torchsfm.geometry.curve_from_samples(torch.tensor([[0.0, -1.0], [1.0, 1.0], [2.0, -1.0]]))
+        >>> found = torchsfm.geometry.curve_crossings(zigzag, torch.tensor([[0.0, 1.0, 0.0]]), most=3)  # the line y = 0
+        >>> found.x[found.valid]
+        tensor([[0.5000, 0.0000],
+                [1.5000, 0.0000]])
     """
     check_tensors(line=(line, "m 3"), curve=(curve.x, "n 2"))
     check_options(most=(most, "int >= 1"))

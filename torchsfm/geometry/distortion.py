@@ -32,7 +32,13 @@ from torchsfm.geometry.radial import (
 
 @dataclass(frozen=True)
 class NoDistortion(Distortion):
-    """A pinhole: straight lines stay straight."""
+    """A pinhole: straight lines stay straight.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.NoDistortion().project(torch.tensor([[1.0, 2.0, 4.0]]))
+        tensor([[0.2500, 0.5000]])
+    """
 
     num_parameters: ClassVar[int] = 0
     parameter_names: ClassVar[tuple[str, ...]] = ()
@@ -121,7 +127,14 @@ class _Polynomial(Distortion):
 
 @dataclass(frozen=True)
 class SimpleRadial(_Polynomial):
-    """One radial coefficient: (x, y) (1 + k1 r^2). COLMAP's SIMPLE_RADIAL."""
+    """One radial coefficient: (x, y) (1 + k1 r^2). COLMAP's SIMPLE_RADIAL.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> lens = torchsfm.SimpleRadial(torch.tensor(-0.1))
+        >>> lens.project(torch.tensor([[1.0, 0.0, 1.0]]))
+        tensor([[0.9000, 0.0000]])
+    """
 
     k1: Float[Tensor, "*batch"]
 
@@ -133,7 +146,14 @@ class SimpleRadial(_Polynomial):
 
 @dataclass(frozen=True)
 class Radial(_Polynomial):
-    """Two radial coefficients: (x, y) (1 + k1 r^2 + k2 r^4). COLMAP's RADIAL, Bundler, BAL."""
+    """Two radial coefficients: (x, y) (1 + k1 r^2 + k2 r^4). COLMAP's RADIAL, Bundler, BAL.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> lens = torchsfm.Radial(torch.tensor(0.1), torch.tensor(0.0))
+        >>> lens.project(torch.tensor([[1.0, 0.0, 1.0]]))  # a cushion: away from the centre
+        tensor([[1.1000, 0.0000]])
+    """
 
     k1: Float[Tensor, "*batch"]
     k2: Float[Tensor, "*batch"]
@@ -146,7 +166,14 @@ class Radial(_Polynomial):
 
 @dataclass(frozen=True)
 class BrownConrady(Distortion):
-    """Radial and decentring distortion with the five coefficients of OpenCV, in its order k1, k2, p1, p2, k3 (Brown 1966)."""
+    """Radial and decentring distortion with the five coefficients of OpenCV, in its order k1, k2, p1, p2, k3 (Brown 1966).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> lens = torchsfm.BrownConrady(*torch.tensor([-0.2, 0.05, 0.0, 0.0, 0.0]))
+        >>> lens.project(torch.tensor([[0.5, 0.0, 1.0]]))  # a barrel: towards the centre
+        tensor([[0.4766, 0.0000]])
+    """
 
     k1: Float[Tensor, "*batch"]
     k2: Float[Tensor, "*batch"]
@@ -202,10 +229,16 @@ class BrownConrady(Distortion):
 
 @dataclass(frozen=True)
 class KannalaBrandt(Distortion):
-    """Fisheye: the radius is theta (1 + k1 theta^2 + ... + k4 theta^8), theta the angle to the axis.
+    """Fisheye: the radius is theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), theta the angle to the axis.
 
     OpenCV's fisheye model and COLMAP's OPENCV_FISHEYE (Kannala & Brandt 2006). Here rays may point backwards too, up to the
     valid radius.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> lens = torchsfm.KannalaBrandt(*torch.zeros(4))  # the radius is the angle to the axis
+        >>> lens.project(torch.tensor([[1.0, 0.0, 0.0]]))  # 90 degrees aside
+        tensor([[1.5708, 0.0000]])
     """
 
     k1: Float[Tensor, "*batch"]

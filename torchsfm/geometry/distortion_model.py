@@ -14,7 +14,17 @@ D = TypeVar("D", bound="Distortion")
 
 
 class Distortion(ABC):
-    """What every distortion model offers. Models are frozen dataclasses with one tensor per parameter."""
+    """What every distortion model offers. Models are frozen dataclasses with one tensor per parameter.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> lens = torchsfm.Radial.from_parameters(torch.tensor([-0.25, 0.0]))  # one of the models
+        >>> lens.parameter_names
+        ('k1', 'k2')
+        >>> u = lens.project(torch.tensor([[0.0, 1.0, 2.0]]))
+        >>> u, lens.unproject(u)
+        (tensor([[0.0000, 0.4688]]), (tensor([[0.0000, 0.5000, 1.0000]]), tensor([True])))
+    """
 
     num_parameters: ClassVar[int]
     parameter_names: ClassVar[tuple[str, ...]]

@@ -22,6 +22,13 @@ def line_and_plane_distances(
 
     Returns:
         Distances from the line and from the plane (in two dimensions, both from the line), in the unit of the points.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torch.tensor([[-2.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+        >>> line, plane = torchsfm.geometry.line_and_plane_distances(X, torch.ones(5, dtype=torch.bool), steps=20)
+        >>> bool(line[:4].max() < 0.1), bool(line[4] > 2.9), bool(plane.max() < 1e-4)
+        (True, True, True)
     """
     check_tensors(X=(X, "n d>=2"), present=(present, "n: bool"))
     check_options(steps=(steps, "int >= 1"))
@@ -58,6 +65,12 @@ def least_number_off(
         X: Points.
         present: Which points count.
         tolerance: Of each point, in the unit of the points.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [5.0, 0.0], [6.0, 0.0], [5.0, 1.0]])
+        >>> torchsfm.geometry.least_number_off(x, torch.ones(6, dtype=torch.bool), torch.full((6,), 0.1))  # two triangles
+        tensor(2)
     """
     batch = check_tensors(X=(X, "n d>=1"), present=(present, "n: bool"), tolerance=(tolerance, "k"))
     n, d = X.shape[-2:]

@@ -18,6 +18,11 @@ def to_homogeneous(x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d+1"]:
 
     Returns:
         The same points with one more coordinate, which is 1.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.geometry.to_homogeneous(torch.tensor([[3.0, 4.0]]))
+        tensor([[3., 4., 1.]])
     """
     check_tensors(x=(x, "d"))
     return torch.nn.functional.pad(x, (0, 1), value=1.0)
@@ -34,6 +39,12 @@ def from_homogeneous(x: Float[Tensor, "*batch d"]) -> tuple[Float[Tensor, "*batc
 
     Returns:
         The points, and the mask of those that are finite. Where the mask is False the point is zero, and so is its gradient.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x, finite = torchsfm.geometry.from_homogeneous(torch.tensor([[2.0, 4.0, 2.0], [1.0, 0.0, 0.0]]))
+        >>> x[0], finite
+        (tensor([1., 2.]), tensor([ True, False]))
     """
     check_tensors(x=(x, "d>=2"))
     body, w = x[..., :-1], x[..., -1]
@@ -51,6 +62,12 @@ def normalize_sphere(x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
 
     Returns:
         Unit vectors. The zero vector and vectors with NaN or inf become zero, with zero gradient.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.geometry.normalize_sphere(torch.tensor([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]]))
+        tensor([[0.0000, 0.6000, 0.8000],
+                [0.0000, 0.0000, 0.0000]])
     """
     check_tensors(x=(x, "d"))
     # Dividing by the largest entry first keeps the squares inside the range of the dtype.
@@ -76,6 +93,13 @@ def normalizing_similarity(
     Returns:
         The transformation T, homogeneous, with `T (x, 1) = (x', 1)`. Where the points coincide, only the centroid is moved;
         where none is present, T is the identity.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[100.0, 200.0], [300.0, 200.0], [100.0, 400.0], [300.0, 400.0]])
+        >>> T = torchsfm.geometry.normalizing_similarity(x)
+        >>> torchsfm.geometry.transform_points(T, x)[0]
+        tensor([-1., -1.])
     """
     check_tensors(x=(x, "n d>=1"), weights=(weights, "?n"))
     dimension = x.shape[-1]
@@ -111,6 +135,12 @@ def transform_points(H: Float[Tensor, "*#batch h h"], x: Float[Tensor, "*#batch 
     Returns:
         The transformed points, finite always: a point sent to infinity is returned very far away, in its own direction
         (about 1 / machine epsilon), and a point with NaN or inf as the image of the origin.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> H = torch.tensor([[0.0, -1.0, 10.0], [1.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
+        >>> torchsfm.geometry.transform_points(H, torch.tensor([[2.0, 4.0]]))
+        tensor([[3., 1.]])
     """
     check_tensors(H=(H, "h h"), x=(x, "n d"))
     if H.shape[-1] != x.shape[-1] + 1:

@@ -18,10 +18,21 @@ class Line3D:
     infinity (d = 0) the turn about the vector that is left does nothing, so its place has one direction less until it has
     moved away: put the origin where no line passes. A 6-vector that is no line comes back as one, the shorter part made
     perpendicular to the longer.
+
+    Example:
+        >>> import torch
+        >>> from torchsfm.geometry import Line3D
+        >>> L = torch.tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+        >>> moved = Line3D().retract(L, torch.tensor([0.1, 0.0, 0.2, 0.3]))
+        >>> d, m = moved.split(3)
+        >>> bool((d @ m).abs() < 1e-6)  # a line still
+        True
     """
 
     ambient: int = 6
+    """Numbers stored."""
     tangent: int = 4
+    """Degrees of freedom."""
 
     def retract(self, x: Float[Tensor, "*#b 6"], delta: Float[Tensor, "*#b 4"]) -> Float[Tensor, "*b 6"]:
         """The line after the step."""

@@ -19,6 +19,12 @@ def line_from_points(x1: Float[Tensor, "*#batch 2"], x2: Float[Tensor, "*#batch 
 
     The normal is a quarter turn from y to x ahead of the direction from the first point to the second: seen on the screen,
     distances are positive to the left. Points that coincide give zero.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> l = torchsfm.geometry.line_from_points(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]))
+        >>> torchsfm.geometry.point_line_distance(torch.tensor([2.0, 6.0]), l).abs()
+        tensor(5.)
     """
     check_tensors(x1=(x1, "2"), x2=(x2, "2"))
     along = normalize_sphere(x2 - x1)
@@ -31,13 +37,24 @@ def point_line_distance(x: Float[Tensor, "*#batch 2"], l: Float[Tensor, "*#batch
     """The signed distance of a point of the plane from a line of any scale, positive on the side of its normal.
 
     Zero where the line is none: the line at infinity, and zero.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.geometry.point_line_distance(torch.tensor([3.0, 7.0]), torch.tensor([0.0, 2.0, -4.0]))  # y = 2
+        tensor(5.)
     """
     check_tensors(x=(x, "2"), l=(l, "3"))
     return (x * l[..., :2]).sum(-1).add(l[..., 2]) * _inverse_length(l[..., :2])
 
 
 def pluecker_from_points(X1: Float[Tensor, "*#batch 3"], X2: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 6"]:
-    """The line through two points, its direction `X2 - X1`. Points that coincide give zero."""
+    """The line through two points, its direction `X2 - X1`. Points that coincide give zero.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.geometry.pluecker_from_points(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, 2.0]))
+        tensor([1., 0., 0., 0., 2., 0.])
+    """
     check_tensors(X1=(X1, "3"), X2=(X2, "3"))
     d = X2 - X1
     return torch.cat((d, cross(X1, d)), -1)
@@ -47,6 +64,12 @@ def pluecker_from_planes(plane1: Float[Tensor, "*#batch 4"], plane2: Float[Tenso
     """The line in which two planes meet, its direction the cross product of their normals.
 
     Planes that coincide give zero, parallel ones a line at infinity (d = 0).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> floor, wall = torch.tensor([0.0, 0.0, 1.0, 0.0]), torch.tensor([1.0, 0.0, 0.0, -2.0])  # z = 0 and x = 2
+        >>> torchsfm.geometry.pluecker_from_planes(floor, wall).tolist()  # along y
+        [0.0, 1.0, 0.0, 0.0, 0.0, 2.0]
     """
     check_tensors(plane1=(plane1, "4"), plane2=(plane2, "4"))
     n1, w1, n2, w2 = plane1[..., :3], plane1[..., 3:], plane2[..., :3], plane2[..., 3:]
@@ -54,7 +77,14 @@ def pluecker_from_planes(plane1: Float[Tensor, "*#batch 4"], plane2: Float[Tenso
 
 
 def nearest_pluecker(L: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
-    """The line nearest to a 6-vector that need not be one: the nearest point with `d'm = 0` (the Klein quadric)."""
+    """The line nearest to a 6-vector that need not be one: the nearest point with `d'm = 0` (the Klein quadric).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L = torchsfm.geometry.nearest_pluecker(torch.tensor([1.0, 0.0, 0.0, 0.1, 1.0, 0.0]))
+        >>> bool((L[:3] @ L[3:]).abs() < 1e-6)
+        True
+    """
     check_tensors(L=(L, "6"))
     d, m = L[..., :3], L[..., 3:]
     product = 2 * (d * m).sum(-1, keepdim=True)
@@ -72,7 +102,15 @@ def nearest_pluecker(L: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
 
 
 def transform_lines(H: Float[Tensor, "*#batch 4 4"], L: Float[Tensor, "*#batch n 6"]) -> Float[Tensor, "*batch n 6"]:
-    """Lines whose points a projective map of space moves: that through `H X1` and `H X2` of the line through X1 and X2."""
+    """Lines whose points a projective map of space moves: that through `H X1` and `H X2` of the line through X1 and X2.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 2.0]]))
+        >>> H = torch.diag(torch.tensor([1.0, 1.0, 2.0, 1.0]))  # twice as high
+        >>> torchsfm.geometry.transform_lines(H, L)
+        tensor([[1., 0., 0., 0., 4., 0.]])
+    """
     check_tensors(H=(H, "4 4"), L=(L, "n 6"))
     d, m = L[..., :3], L[..., 3:]
     # X1 X2' - X2 X1' of homogeneous points.
@@ -88,6 +126,13 @@ def project_lines(P: Float[Tensor, "*#batch 3 4"], L: Float[Tensor, "*#batch n 6
     """Images of lines, with the sign and the scale of `l = (P X1) x (P X2)` for a line through X1 and X2 with `d = X2 - X1`.
 
     A line through the camera's centre gives zero.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([[0.0, 2.0, 4.0]]), torch.tensor([[1.0, 2.0, 4.0]]))
+        >>> l = torchsfm.geometry.project_lines(torch.eye(3, 4), L)[0]
+        >>> l / l[1]  # the image line y = 1 / 2
+        tensor([ 0.0000,  1.0000, -0.5000])
     """
     check_tensors(P=(P, "3 4"), L=(L, "n 6"))
     M, p = P[..., :3], P[..., 3]
@@ -97,20 +142,42 @@ def project_lines(P: Float[Tensor, "*#batch 3 4"], L: Float[Tensor, "*#batch n 6
 
 
 def viewing_planes(P: Float[Tensor, "*#batch 3 4"], l: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n 4"]:  # noqa: E741
-    """The planes of all points that a camera sees on image lines, `P'l`."""
+    """The planes of all points that a camera sees on image lines, `P'l`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> l = torch.tensor([[0.0, 1.0, -0.5]])  # the image line y = 1 / 2
+        >>> torchsfm.geometry.viewing_planes(torch.eye(3, 4), l)
+        tensor([[ 0.0000,  1.0000, -0.5000,  0.0000]])
+    """
     check_tensors(P=(P, "3 4"), l=(l, "n 3"))
     return l @ P
 
 
 def intersect_line_plane(L: Float[Tensor, "*#batch 6"], plane: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """The homogeneous point where a line meets a plane; zero where it lies in the plane."""
+    """The homogeneous point where a line meets a plane; zero where it lies in the plane.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([1.0, 2.0, 0.0]), torch.tensor([1.0, 2.0, 1.0]))
+        >>> X = torchsfm.geometry.intersect_line_plane(L, torch.tensor([0.0, 0.0, 1.0, -3.0]))  # z = 3
+        >>> X / X[3]
+        tensor([1., 2., 3., 1.])
+    """
     check_tensors(L=(L, "6"), plane=(plane, "4"))
     d, m, n, w = L[..., :3], L[..., 3:], plane[..., :3], plane[..., 3:]
     return torch.cat((cross(n, m) - w * d, (n * d).sum(-1, keepdim=True)), -1)
 
 
 def nearest_on_line(X: Float[Tensor, "*#batch 3"], L: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3"]:
-    """The foot of the perpendicular from a point to a line; the point itself where the line is at infinity."""
+    """The foot of the perpendicular from a point to a line; the point itself where the line is at infinity.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, 2.0]))
+        >>> torchsfm.geometry.nearest_on_line(torch.tensor([5.0, 4.0, 1.0]), L)
+        tensor([5., 0., 2.])
+    """
     check_tensors(X=(X, "3"), L=(L, "6"))
     d, m = L[..., :3], L[..., 3:]
     scale = _inverse_length(d)[..., None]
@@ -119,13 +186,28 @@ def nearest_on_line(X: Float[Tensor, "*#batch 3"], L: Float[Tensor, "*#batch 6"]
 
 
 def point_to_line_distance(X: Float[Tensor, "*#batch 3"], L: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch"]:
-    """The distance in space between a point and a line; zero where the line is at infinity."""
+    """The distance in space between a point and a line; zero where the line is at infinity.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, 2.0]))
+        >>> torchsfm.geometry.point_to_line_distance(torch.tensor([5.0, 3.0, 6.0]), L)
+        tensor(5.)
+    """
     foot = nearest_on_line(X, L)
     return _length(foot - X)
 
 
 def line_to_line_distance(L1: Float[Tensor, "*#batch 6"], L2: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch"]:
-    """The distance in space between two lines, parallel ones too; zero where one is at infinity."""
+    """The distance in space between two lines, parallel ones too; zero where one is at infinity.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L1 = torchsfm.geometry.pluecker_from_points(torch.tensor([0.0, 0.0, 0.0]), torch.tensor([1.0, 0.0, 0.0]))
+        >>> L2 = torchsfm.geometry.pluecker_from_points(torch.tensor([0.0, 0.0, 3.0]), torch.tensor([0.0, 1.0, 3.0]))
+        >>> torchsfm.geometry.line_to_line_distance(L1, L2)
+        tensor(3.)
+    """
     check_tensors(L1=(L1, "6"), L2=(L2, "6"))
     s1, s2 = (_inverse_length(L[..., :3])[..., None] for L in (L1, L2))
     L1, L2 = L1 * s1, L2 * s2
@@ -147,6 +229,13 @@ def unproject_onto_lines(
 
     That is where the plane through the image point and across the image line meets the line. Zero where the camera's centre
     lies on the line.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([[0.0, 2.0, 4.0]]), torch.tensor([[1.0, 2.0, 4.0]]))
+        >>> X = torchsfm.geometry.unproject_onto_lines(torch.tensor([[0.25, 0.51]]), torch.eye(3, 4), L)
+        >>> (X / X[..., 3:]).round(decimals=3)  # the image line is y = 1 / 2
+        tensor([[1., 2., 4., 1.]])
     """
     check_tensors(x=(x, "n 2"), P=(P, "3 4"), L=(L, "n 6"))
     l = project_lines(P, L)  # noqa: E741

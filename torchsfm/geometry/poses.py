@@ -41,6 +41,15 @@ class Pose:
     """Rigid motion `X_cam = R X + t`, camera from world, with any leading batch dimensions.
 
     Compose with `@` (`cam2_from_cam1 @ cam1_from_world`), index the batch with `pose[i]`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> R = torchsfm.geometry.rotation_from_rotvec(torch.tensor([0.0, 0.0, torch.pi / 2]))
+        >>> pose = torchsfm.Pose(R, torch.tensor([0.0, 0.0, 2.0]))
+        >>> pose.transform(torch.tensor([[1.0, 0.0, 3.0]])).round(decimals=3).abs()
+        tensor([[0., 1., 5.]])
+        >>> bool((pose.inverse() @ pose).R.allclose(torch.eye(3), atol=1e-6))
+        True
     """
 
     R: Float[Tensor, "*batch 3 3"]

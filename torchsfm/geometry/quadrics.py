@@ -19,7 +19,15 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """Ellipsoids `centre + w @ axes`, |w| = 1; ellipses in space, w = (cos t, sin t, 0), where the last axis has no length."""
+    """Ellipsoids `centre + w @ axes`, |w| = 1; ellipses in space, w = (cos t, sin t, 0), where the last axis has no length.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ball = torchsfm.Ellipsoid(torch.tensor([0.0, 0.0, 5.0]), torch.eye(3))
+        >>> disc = torchsfm.Ellipsoid(ball.centre, torch.diag(torch.tensor([2.0, 1.0, 0.0])))  # an ellipse in space
+        >>> disc.plane.abs()
+        tensor([0., 0., 1., 5.])
+    """
 
     centre: Float[Tensor, "*batch 3"]
     axes: Float[Tensor, "*batch 3 3"]
@@ -35,7 +43,10 @@ class Ellipsoid:
 
 @dataclass(frozen=True)
 class PlaneConic:
-    """Conics in space as a plane with a conic in it."""
+    """Conics in space as a plane with a conic in it.
+
+    See the example of `plane_conic_from_dual_quadric`.
+    """
 
     plane: Float[Tensor, "*batch 4"]
     """`n'X + d = 0`, |n| = 1."""
@@ -53,6 +64,13 @@ def dual_quadric(Q: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
 
     Returns:
         The dual, of Q brought to unit size.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> sphere = torch.diag(torch.tensor([1.0, 1.0, 1.0, -4.0]))  # of radius 2
+        >>> plane = torch.tensor([0.0, 0.0, 1.0, -2.0])  # z = 2
+        >>> bool((plane @ torchsfm.geometry.dual_quadric(sphere) @ plane).abs() < 1e-6)
+        True
     """
     check_tensors(Q=(Q, "4 4"))
     return adjugate_4x4(Q * unit_scale(Q))
@@ -67,6 +85,14 @@ def transform_quadric(H: Float[Tensor, "*#batch 4 4"], Q: Float[Tensor, "*#batch
 
     Returns:
         The images, up to a positive factor; finite for a singular H too.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> sphere, wider = torch.diag(torch.tensor([1.0, 1.0, 1.0, -1.0])), torch.diag(torch.tensor([3.0, 1.0, 1.0, 1.0]))
+        >>> Q = torchsfm.geometry.transform_quadric(wider, sphere)
+        >>> X = torch.tensor([3.0, 0.0, 0.0, 1.0])  # once (1, 0, 0)
+        >>> bool((X @ Q @ X).abs() < 1e-5)
+        True
     """
     check_tensors(H=(H, "4 4"), Q=(Q, "4 4"))
     inverse = adjugate_4x4(H * unit_scale(H))
@@ -82,6 +108,13 @@ def project_quadric(P: Float[Tensor, "*#batch 3 4"], Q_dual: Float[Tensor, "*#ba
 
     Returns:
         Dual conics of the images. That of a conic whose plane passes through the camera centre has rank two.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ball = torchsfm.Ellipsoid(torch.tensor([0.0, 0.0, 5.0]), 3 * torch.eye(3))
+        >>> C_dual = torchsfm.geometry.project_quadric(torch.eye(3, 4), torchsfm.geometry.dual_quadric_from_ellipsoid(ball))
+        >>> torchsfm.geometry.ellipse_from_conic(torchsfm.geometry.dual_conic(C_dual))[0].semi_axes  # 3 / sqrt(25 - 9)
+        tensor([0.7500, 0.7500])
     """
     check_tensors(P=(P, "3 4"), Q_dual=(Q_dual, "4 4"))
     return P @ Q_dual @ P.mT
@@ -96,6 +129,12 @@ def viewing_cone(P: Float[Tensor, "*#batch 3 4"], C: Float[Tensor, "*#batch 3 3"
 
     Returns:
         Quadrics of rank three.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> circle = torch.diag(torch.tensor([1.0, 1.0, -1.0]))
+        >>> torchsfm.geometry.viewing_cone(torch.eye(3, 4), circle).diagonal()  # x^2 + y^2 = z^2
+        tensor([ 1.,  1., -1.,  0.])
     """
     check_tensors(P=(P, "3 4"), C=(C, "3 3"))
     return P.mT @ C @ P
@@ -109,6 +148,12 @@ def dual_quadric_from_ellipsoid(ellipsoid: Ellipsoid) -> Float[Tensor, "*batch 4
 
     Returns:
         The dual quadric, with -1 in its last corner.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ball = torchsfm.Ellipsoid(torch.zeros(3), 2 * torch.eye(3))
+        >>> torchsfm.geometry.dual_quadric_from_ellipsoid(ball).diagonal()
+        tensor([ 4.,  4.,  4., -1.])
     """
     check_options(ellipsoid=(ellipsoid, Ellipsoid))
     check_tensors(**{"ellipsoid.centre": (ellipsoid.centre, "3"), "ellipsoid.axes": (ellipsoid.axes, "3 3")})
@@ -131,6 +176,12 @@ def ellipsoid_from_dual_quadric(Q_dual: Float[Tensor, "*batch 4 4"]) -> tuple[El
         The ellipsoids, and which are some: real, with at least two axes; the others get the unit sphere. An axis whose square
         is negative by rounding is zero. Computed in float64. Axes of equal length have no direction of their own, and no
         derivative of it.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ellipsoid, real = torchsfm.geometry.ellipsoid_from_dual_quadric(torch.diag(torch.tensor([9.0, 4.0, 1.0, -1.0])))
+        >>> bool(real), ellipsoid.axes.norm(dim=-1)
+        (True, tensor([3., 2., 1.]))
     """
     check_tensors(Q_dual=(Q_dual, "4 4"))
     good = usable(Q_dual).all(-1).all(-1)
@@ -184,6 +235,14 @@ def plane_conic_from_dual_quadric(Q_dual: Float[Tensor, "*batch 4 4"]) -> tuple[
     Returns:
         Planes with conics, and where they mean something: not for the plane at infinity, nor for a rank of less than three.
         The frame's origin is the point of the plane nearest to the world's.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> disc = torchsfm.Ellipsoid(torch.tensor([0.0, 0.0, 3.0]), torch.diag(torch.tensor([2.0, 1.0, 0.0])))
+        >>> Q_dual = torchsfm.geometry.dual_quadric_from_ellipsoid(disc)
+        >>> found, known = torchsfm.geometry.plane_conic_from_dual_quadric(Q_dual)
+        >>> bool(known), found.plane / found.plane[2]  # the plane z = 3
+        (True, tensor([ 0.,  0.,  1., -3.]))
     """
     check_tensors(Q_dual=(Q_dual, "4 4"))
     good = usable(Q_dual).all(-1).all(-1)

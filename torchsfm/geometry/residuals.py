@@ -26,6 +26,12 @@ def sampson_distance(
     Returns:
         Distances, in the unit of the points. Where F gives no epipolar lines at the pair (both points are epipoles, or F is
         zero), and for pairs with NaN or inf, a huge finite number.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0]))  # moved sideways: lines y2 = y1
+        >>> torchsfm.geometry.sampson_distance(F, torch.tensor([[0.0, 1.0]]), torch.tensor([[7.0, 3.0]]))  # each moves by 1
+        tensor([1.4142])
     """
     error, a, b, good = _epipolar(F, x1, x2)
     return torch.where(good, error.abs() / torch.where(good, a + b, 1.0).sqrt(), _huge(error))
@@ -43,6 +49,12 @@ def epipolar_distance(
 
     Returns:
         Distances, in the unit of the points. Where one is an epipole, and for pairs with NaN or inf, a huge finite number.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0]))  # moved sideways: lines y2 = y1
+        >>> torchsfm.geometry.epipolar_distance(F, torch.tensor([[0.0, 1.0]]), torch.tensor([[7.0, 3.0]]))
+        tensor([2.])
     """
     error, a, b, _ = _epipolar(F, x1, x2)
     good = (a > 0) & (b > 0)
@@ -63,6 +75,12 @@ def transfer_distance(
     Returns:
         Distances, in the unit of the points; huge but finite where a point is sent to infinity, where H is singular, and for
         pairs with NaN or inf.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> shift = torch.tensor([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        >>> torchsfm.geometry.transfer_distance(shift, torch.tensor([[0.0, 0.0]]), torch.tensor([[8.0, 4.0]]))
+        tensor([5.])
     """
     check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), H=(H, "3 3"))
     good = (torch.isfinite(x1) & torch.isfinite(x2)).all(-1)
@@ -89,6 +107,12 @@ def reprojection_distance(
     Returns:
         Distances, in the unit of x; huge but finite for points in the focal plane and for those with NaN or inf. Points behind
         the camera are projected like any other: see `point_depths`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X, x = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[3.0, 4.0]])
+        >>> torchsfm.geometry.reprojection_distance(torch.eye(3, 4), X, x)
+        tensor([5.])
     """
     check_tensors(X=(X, "n 3"), x=(x, "n 2"), P=(P, "3 4"))
     good = torch.isfinite(X).all(-1) & torch.isfinite(x).all(-1)

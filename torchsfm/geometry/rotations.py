@@ -11,7 +11,13 @@ SERIES = 1e-3
 
 
 def cross_matrix(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Write the cross product with v as a matrix: `cross_matrix(v) @ a = v x a`."""
+    """Write the cross product with v as a matrix: `cross_matrix(v) @ a = v x a`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0])) @ torch.tensor([0.0, 1.0, 0.0])
+        tensor([0., 0., 1.])
+    """
     check_tensors(v=(v, "3"))
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)
@@ -28,6 +34,12 @@ def rotation_from_rotvec(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 
 
     Returns:
         Rotation matrices.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> R = torchsfm.geometry.rotation_from_rotvec(torch.tensor([0.0, 0.0, torch.pi / 2]))
+        >>> (R @ torch.tensor([1.0, 0.0, 0.0])).round(decimals=3).abs()
+        tensor([0., 1., 0.])
     """
     check_tensors(w=(w, "3"))
     x, y, z = w.unbind(-1)
@@ -56,6 +68,12 @@ def rotvec_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batc
 
     Returns:
         Rotation vectors, radians, of length at most pi.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> w = torch.tensor([0.1, -0.2, 0.3])
+        >>> torchsfm.geometry.rotvec_from_rotation(torchsfm.geometry.rotation_from_rotvec(w))
+        tensor([ 0.1000, -0.2000,  0.3000])
     """
     q = quaternion_wxyz_from_rotation(R)
     w, v = q[..., 0], q[..., 1:]
@@ -76,6 +94,12 @@ def rotation_from_quaternion_wxyz(q: Float[Tensor, "*batch 4"]) -> Float[Tensor,
 
     Returns:
         Rotation matrices.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> half_turn = torch.tensor([0.0, 0.0, 0.0, 2.0])  # about z
+        >>> torchsfm.geometry.rotation_from_quaternion_wxyz(half_turn).diagonal()
+        tensor([-1., -1.,  1.])
     """
     check_tensors(q=(q, "4"))
     w, x, y, z = q.unbind(-1)
@@ -99,6 +123,12 @@ def quaternion_wxyz_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tenso
 
     Returns:
         Unit quaternions.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # about x
+        >>> torchsfm.geometry.quaternion_wxyz_from_rotation(half_turn).abs()
+        tensor([0., 1., 0., 0.])
     """
     check_tensors(R=(R, "3 3"))
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.flatten(-2).unbind(-1)
@@ -128,6 +158,12 @@ def rotation_from_euler(angles: Float[Tensor, "*batch k"], axes: str) -> Float[T
 
     Raises:
         ValueError: `axes` is not such a string or its length is not the number of angles.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> R = torchsfm.geometry.rotation_from_euler(torch.tensor([torch.pi / 2, 0.0]), "zx")
+        >>> (R @ torch.tensor([1.0, 0.0, 0.0])).round(decimals=3).abs()
+        tensor([0., 1., 0.])
     """
     check_tensors(angles=(angles, "k"))
     moving = isinstance(axes, str) and axes.isupper()
@@ -159,6 +195,12 @@ def random_rotation(
 
     Returns:
         Rotation matrices.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> R = torchsfm.geometry.random_rotation(100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> R.shape, bool((R @ R.mT).allclose(torch.eye(3, dtype=torch.float64)))
+        (torch.Size([100, 3, 3]), True)
     """
     if device is None and generator is not None:
         device = generator.device
@@ -169,6 +211,11 @@ def rotation_angle(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     """Measure the angle of rotations, 0 to pi radians, accurate over the whole range.
 
     The angle between two rotations is `rotation_angle(R1.mT @ R2)`. The derivative at angle 0, where there is none, is 0.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.geometry.rotation_angle(torch.diag(torch.tensor([1.0, -1.0, -1.0])))
+        tensor(3.1416)
     """
     check_tensors(R=(R, "3 3"))
     axis = torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)

@@ -33,6 +33,13 @@ def depth_space(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+        >>> B = torchsfm.geometry.depth_space(x)
+        >>> B.shape, bool((B.mT @ B).allclose(torch.eye(3), atol=1e-6))
+        (torch.Size([4, 3]), True)
     """
     return normalize_shape(x, depths)[0]
 
@@ -51,6 +58,13 @@ def affine_shape(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or fewer than d + 1 points.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])  # corners of a square: a - b - c + d = 0
+        >>> s = torchsfm.geometry.affine_shape(x)
+        >>> s[:, 0] / s[0, 0]
+        tensor([ 1.0000, -1.0000, -1.0000,  1.0000])
     """
     _check_points(x, depths)
     with torch.no_grad():
@@ -73,6 +87,13 @@ def normalize_shape(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or fewer than d + 1 points.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [3.0, 2.0]])
+        >>> y, T = torchsfm.geometry.normalize_shape(x)
+        >>> y.shape, bool((y.mT @ y).allclose(torch.eye(3), atol=1e-5))
+        (torch.Size([5, 3]), True)
     """
     _check_points(x, depths)
     moved = normalizing_similarity(x.detach(), None if depths is None else depths.detach().abs())
@@ -99,6 +120,12 @@ def principal_angles(A: Float[Tensor, "*#batch n p"], B: Float[Tensor, "*#batch 
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> A, B = torch.eye(3)[:, :2], torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0]])
+        >>> torchsfm.geometry.principal_angles(A, B).rad2deg()
+        tensor([45.0000,  0.0000])
     """
     check_tensors(A=(A, "n p"), B=(B, "n q"))
     if A.shape[-1] > B.shape[-1]:
@@ -129,6 +156,14 @@ def balanced_frame(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[0.0, 0.0], [9.0, 0.0], [0.0, 1.0], [9.0, 1.0]])
+        >>> T, balanced = torchsfm.geometry.balanced_frame(x)
+        >>> a = torch.nn.functional.normalize(torchsfm.geometry.to_homogeneous(x) @ T.mT, dim=-1)
+        >>> bool(balanced), bool((a.mT @ a).allclose(4 / 3 * torch.eye(3), atol=1e-3))
+        (True, True)
     """
     batch = check_tensors(x=(x, "n d>=1"), weights=(weights, "?n"))
     with torch.no_grad():

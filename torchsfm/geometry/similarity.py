@@ -13,7 +13,14 @@ from torchsfm.linalg import nearest_rotation, svdvals
 
 @dataclass(frozen=True)
 class Similarity:
-    """The map `Y = scale R X + t` of space, with any leading batch dimensions."""
+    """The map `Y = scale R X + t` of space, with any leading batch dimensions.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> double = torchsfm.Similarity(torch.tensor(2.0), torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
+        >>> double.transform(torch.tensor([[1.0, 1.0, 1.0]]))
+        tensor([[3., 2., 2.]])
+    """
 
     scale: Float[Tensor, "*batch"]
     R: Float[Tensor, "*batch 3 3"]
@@ -61,6 +68,13 @@ def similarity_from_points(
     Returns:
         The similarity, with status: TOO_FEW for fewer than three pairs, DEGENERATE where the points of either set lie on one
         line (the rotation is then one of many, or the identity).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torchsfm.random_points(10, generator=torch.Generator().manual_seed(0))
+        >>> found = torchsfm.geometry.similarity_from_points(X, 2 * X + 1)
+        >>> bool(found.status == torchsfm.Status.OK), round(float(found.scale), 6)
+        (True, 2.0)
     """
     check_tensors(X=(X, "n 3"), Y=(Y, "n 3"), weights=(weights, "?n"))
     present = torch.isfinite(X).all(-1) & torch.isfinite(Y).all(-1)

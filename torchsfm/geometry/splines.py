@@ -16,7 +16,16 @@ _STIFF = 1e-6
 
 @dataclass(frozen=True)
 class Spline:
-    """Uniform cubic B-splines over [0, 1]: open ones begin and end at their first and last control point (clamped)."""
+    """Uniform cubic B-splines over [0, 1]: open ones begin and end at their first and last control point (clamped).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> control = torch.tensor([[0.0, 0.0], [1.0, 2.0], [3.0, 2.0], [4.0, 0.0]])
+        >>> torchsfm.geometry.Spline(control, closed=False).at(torch.tensor([0.0, 0.5, 1.0]))
+        tensor([[0.0000, 0.0000],
+                [2.0000, 1.5000],
+                [4.0000, 0.0000]])
+    """
 
     control: Float[Tensor, "*batch k d"]
     """Control points; a closed spline does not repeat its first ones."""
@@ -71,6 +80,14 @@ def fit_spline(curve: Curve, controls: int, *, closed: bool = False) -> tuple[Sp
 
     Raises:
         ValueError: Wrong shape, dtype, device or option.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, torch.pi, 50)
+        >>> arc = torchsfm.geometry.curve_from_samples(torch.stack((t.cos(), t.sin()), -1))
+        >>> spline, distance = torchsfm.geometry.fit_spline(arc, 8)
+        >>> spline.control.shape, bool(distance.max() < 1e-3)
+        (torch.Size([8, 2]), True)
     """
     check_options(curve=(curve, Curve))
     check_tensors(x=(curve.x, "n>=2 d>=2"), valid=(curve.valid, "n: bool"))
