@@ -22,6 +22,7 @@ from torchsfm.bundle.rig import Rig
 from torchsfm.bundle.structure import Structure
 from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.optim import sparse_levenberg_marquardt
+from torchsfm.optim.ranks import Group
 from torchsfm.optim.schur import Solver
 from torchsfm.optim.sparse_derivative import Hessian
 
@@ -63,6 +64,7 @@ def bundle_adjust(
     linear_solver: Solver = "auto",
     hessian: Hessian = "exact",
     progress: Callable[[int, float], bool | None] | None = None,
+    group: Group | None = None,
     **terms: Unpack[BundleTerms],
 ) -> BundleResult:
     """Minimise the reprojection error over poses, cameras and structure together (Triggs et al. 2000; HZ 18.1).
@@ -83,6 +85,9 @@ def bundle_adjust(
         linear_solver: "dense", "pcg" (for thousands of cameras), or "auto"; see `sparse_levenberg_marquardt`.
         hessian: Used for derivatives only: "exact", or "gauss-newton", cheaper and some percent off where residuals are large.
         progress: Called with the number of steps and the cost after each; False, or an interrupt, ends it with the best so far.
+        group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same problem and share
+            the work and the memory: points and their observations are divided, poses and cameras are known to all. All
+            return the same, which is what one process finds, to rounding; see `sparse_levenberg_marquardt`.
         **terms: What is adjusted, held and known; see `BundleTerms`.
 
     Returns:
@@ -109,6 +114,7 @@ def bundle_adjust(
         linear_solver=linear_solver,
         hessian=hessian,
         progress=progress,
+        group=group,
     )
     used = result.used[0]
     distance = torch.linalg.vector_norm(result.residuals[0], dim=-1)

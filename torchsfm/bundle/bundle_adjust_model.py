@@ -12,6 +12,7 @@ from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.lines import BundleLines
 from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.optim import Loss
+from torchsfm.optim.ranks import Group
 from torchsfm.optim.schur import Solver
 from torchsfm.optim.sparse_derivative import Hessian
 
@@ -76,6 +77,7 @@ class BundleOptions(BundleTerms, total=False):
     linear_solver: Solver
     hessian: Hessian
     progress: Callable[[int, float], bool | None] | None
+    group: Group | None
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsfm.optim.terms import Block, Term, block_names
+from torchsfm.optim.ranks import Ranks
+from torchsfm.optim.terms import Block, Term, block_names, eliminated_block
 
 CHUNK = 10000
 """Residuals linearised at once: few enough for temporaries to stay in the cache. Rows of a power of two would collide."""
@@ -68,16 +69,27 @@ class Layout:
     pieces: list[Piece]
     still: list[Term]
     """Residuals that depend on nothing free."""
+    ranks: Ranks
+    """The processes that share the problem; families and pieces are those of this one."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is."""
+        return next(iter(self.free.values())).device
 
 
-def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None) -> Layout:
+def lay_out(
+    blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None, ranks: Ranks | None = None
+) -> Layout:
     """Decide which variables move, drop residuals without any, and sort the others.
 
     Args:
         blocks: The variables.
         terms: The residuals; those with weight 0 are dropped.
         eliminate: The blocks to eliminate, if any; no residual may depend on two of their variables.
+        ranks: The processes that share the problem; a retained variable is observed if it is on any of them.
     """
+    ranks = ranks or Ranks()
     gone = block_names(eliminate)
     free: dict[str, Tensor] = {}
     number: dict[str, Tensor] = {}
@@ -89,6 +101,8 @@ def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | Se
             for other, index in zip(term.blocks, term.index, strict=True):
                 if other == name and block.tangent > 0:
                     moves[index if term.weights is None else index[term.weights > 0]] = True
+        if name not in gone:
+            moves = ranks.any(moves)
         if block.fixed is not None:
             moves &= ~block.fixed
         free[name] = moves.nonzero()[:, 0]
@@ -107,26 +121,23 @@ def lay_out(blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | Se
                 drafts.append(_find_slots(term, rows[kind], places, kind, blocks, first, size, gone))
         if rows[False, False].numel():
             still.append(term.select(rows[False, False]))
-    ranks: dict[str, Tensor] = {}
+    numbers: dict[str, Tensor] = {}
     for name in gone:
         if free[name].numel():
             order = _order_points([piece for piece in drafts if piece.family == name], free[name].numel())
             free[name] = free[name][order]
-            ranks[name] = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
-    pieces = [_sort(piece, ranks.get(piece.family or "")) for piece in drafts]
+            numbers[name] = torch.empty_like(order).index_copy_(0, order, torch.arange(order.numel(), device=order.device))
+    pieces = [_sort(piece, numbers.get(piece.family or "")) for piece in drafts]
     families = []
-    for name in ranks:
+    for name in numbers:
         own = [piece if piece.family == name else replace(piece, family=None, point=None) for piece in pieces]
         families.append(Family(name, size, blocks[name].tangent, free[name].numel(), own))
-    return Layout(free, first, size, families, pieces, still)
+    return Layout(free, first, size, families, pieces, still, ranks)
 
 
 def _cut(term: Term, number: dict[str, Tensor], gone: tuple[str, ...]) -> dict[tuple[bool, bool], Tensor]:
     """The residuals of a term by whether they have a free retained and a free eliminated variable."""
-    met = [name for name in term.blocks if name in gone]
-    if len(met) > 1:
-        both = " and ".join(repr(name) for name in dict.fromkeys(met))
-        raise ValueError(f"eliminate: a residual depends on two variables of {both}; they cannot be eliminated singly")
+    eliminated_block(term, gone)
     has_point = torch.zeros_like(term.index[0], dtype=torch.bool)
     has_kept = torch.zeros_like(has_point)
     for name, index in zip(term.blocks, term.index, strict=True):

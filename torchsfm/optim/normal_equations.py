@@ -86,12 +86,15 @@ class NormalEquations:
         right = [forward(L, part.gradient()) for part, L in zip(self.eliminated, triangles, strict=True)]
         kept, solved, bent = self._reduced(weight, triangles, right)
         promise = kept @ (weight * kept - self.slope)
+        own, failed = torch.zeros_like(promise), torch.zeros_like(promise)
         points = []
         for part, metric, (L, positive), z in zip(self.eliminated, metrics, factors, right, strict=True):
             point = -backward(L, z if part.coupling is None else z + forward(L, part.coupling.product(extend(kept))))
-            promise = promise + (point * (product(metric, point) - part.gradient())).sum()
-            solved = solved & (positive.all() | (not self.curved))
+            own = own + (point * (product(metric, point) - part.gradient())).sum()
+            failed = failed + (~positive).any() * self.curved
             points.append(point)
+        own, failed = self.layout.ranks.sum(torch.stack((own, failed)))
+        promise, solved = promise + own, solved & (failed == 0)
         return Step(
             self.split(kept, points), torch.where(solved, promise / 2, torch.inf), solved, torch.full_like(solved, bent)
         )
@@ -110,9 +113,10 @@ class NormalEquations:
         if not size:
             return weight, torch.ones_like(weight, dtype=torch.bool).all(), False
         S = self.squares.dense()
-        S.diagonal()[:size] += weight
         for part, L, z in zip(self.eliminated, triangles, right, strict=True):
             part.reduce(S, L, z)
+        S = self.layout.ranks.sum(S)
+        S.diagonal()[:size] += weight
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
         if self.curved and size <= LARGEST_BENT and bool(info):
             return *self._downhill(S[:size, :size], S[:size, size]), True
@@ -177,15 +181,17 @@ class NormalEquations:
 
     def gradient(self) -> Tensor:
         """Largest absolute derivative of the cost."""
-        return torch.cat((self.slope, *(part.gradient().flatten() for part in self.eliminated))).abs().amax()
+        found = torch.cat((self.slope, *(part.gradient().flatten() for part in self.eliminated)))
+        return self.layout.ranks.largest(found.abs().amax())
 
     def along(self, step: dict[str, Tensor]) -> Tensor:
         """The derivative of the cost along a step."""
         kept, points = self.join(step)
         slope = self.slope @ kept
+        own = torch.zeros_like(slope)
         for part, point in zip(self.eliminated, points, strict=True):
-            slope = slope + (part.gradient() * point).sum()
-        return slope
+            own = own + (part.gradient() * point).sum()
+        return slope + self.layout.ranks.sum(own)
 
     def split(self, kept: Tensor, points: list[Tensor]) -> dict[str, Tensor]:
         """A vector of the size of the system by blocks, (free variables, tangent)."""

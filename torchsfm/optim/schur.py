@@ -98,6 +98,7 @@ class Elimination:
         self.current: NormalEquations | None = None
         """What the memory holds."""
         self._exact: Elimination | None = None
+        self.ranks = layout.ranks
         iterative = solver == "pcg" or (solver == "auto" and too_large(layout))
         for family in layout.families:
             V = some.new_empty((family.point_size * (family.point_size + 3) // 2, family.points))
@@ -168,7 +169,7 @@ class Elimination:
     def cost(self, x: dict[str, Tensor]) -> Tensor:
         """The cost of all residuals that depend on something free."""
         costs = [term_cost(part.term, term_residual(part.term, x, self.work)) for part in self.parts]
-        return torch.stack(costs).sum()
+        return self.ranks.sum(torch.stack(costs).sum() if costs else next(iter(x.values())).new_zeros(()))
 
     def shorten(self, x: dict[str, Tensor], step: dict[str, Tensor], trial: dict[str, Tensor]) -> dict[str, Tensor]:
         """The `trial` that `step` leads to from `x`, where each eliminated variable takes the part of its step that is best.
@@ -195,10 +196,8 @@ class Elimination:
         self._clear()
         for part in self.parts:
             self._add(part, x, lifts, None if part.family is None else self.eliminated[part.family].V)
-        squares = self.squares
-        self.current = NormalEquations(
-            self.layout, self.eliminated, squares, self.clusters, squares.diagonal(), squares.gradient()
-        )
+        diagonal, slope = self.ranks.sum(torch.stack((self.squares.diagonal(), self.squares.gradient())))
+        self.current = NormalEquations(self.layout, self.eliminated, self.squares, self.clusters, diagonal, slope)
         return self.current
 
     def settle(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -287,8 +286,8 @@ class Elimination:
 
 def too_large(layout: Layout) -> bool:
     """Whether a dense reduced system takes too much memory or time."""
-    rows = sum(piece.slots.numel() for piece in layout.pieces)
-    return layout.size > LARGEST or layout.size**3 * FLOP > rows * PASS
+    rows = torch.tensor(sum(piece.slots.numel() for piece in layout.pieces), device=layout.device)
+    return layout.size > LARGEST or layout.size**3 * FLOP > int(layout.ranks.sum(rows)) * PASS
 
 
 def _parts(number: int, piece: Piece, x: dict[str, Tensor], families: dict[str, int]) -> list[_Part]:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import Triangle, backward, forward
 from torchsfm.optim.layout import CHUNK, Family, Layout
+from torchsfm.optim.ranks import Ranks
 from torchsfm.optim.retained_blocks import RetainedBlocks, Runs, find_runs
 from torchsfm.optim.terms import Workspace
 
@@ -136,11 +137,12 @@ class Clusters:
     coupled: list[Tensor]
     """The same for the squares of each `RowCoupling`."""
     total: int
+    ranks: Ranks
 
 
 def find_clusters(layout: Layout, couplings: Sequence[RowCoupling]) -> Clusters:
-    """Put variables that occur in the same slots together."""
-    device = layout.pieces[0].columns.device
+    """Put variables that occur in the same slots together, on whichever rank."""
+    device = layout.device
     owner = _owners(layout, device)
     variables = int(owner[-1])
     generator = torch.Generator().manual_seed(0)
@@ -148,14 +150,15 @@ def find_clusters(layout: Layout, couplings: Sequence[RowCoupling]) -> Clusters:
     # The first column of each variable stands for it.
     head = torch.ones_like(owner, dtype=torch.bool)
     head[1:] = owner[1:] != owner[:-1]
-    columns = [coupling.columns for coupling in couplings] or [p.columns for p in layout.pieces]
-    met, keys = [], []
+    coupled = layout.ranks.any(torch.tensor(bool(couplings), device=device))
+    columns = [coupling.columns for coupling in couplings] if bool(coupled) else [p.columns for p in layout.pieces]
+    met, keys = [owner[:0]], [mark[:0]]
     for c in columns:
         counts = head[c] & (c < layout.size)
         key = torch.where(counts, mark[owner[c]], 0).sum(1)
         met.append(owner[c][counts])
         keys.append((key ^ (key >> 31))[:, None].expand_as(c)[counts] * 0x5851F42D4C957F2D)
-    pairs = torch.unique(torch.stack((torch.cat(met), torch.cat(keys))), dim=1)
+    pairs = torch.unique(layout.ranks.gather(torch.stack((torch.cat(met), torch.cat(keys)), 1)), dim=0).mT
     signature = torch.zeros_like(mark).index_add_(0, *pairs)
     alone = torch.ones_like(mark, dtype=torch.bool).index_fill_(0, pairs[0], False)
     _, cluster = torch.unique(torch.where(alone, mark, signature)[:variables], return_inverse=True)
@@ -199,7 +202,7 @@ def _lay_blocks(layout: Layout, couplings: Sequence[RowCoupling], cluster: Tenso
         return torch.where(together, found, total).flatten()
 
     pieces = [places(piece.columns) for piece in layout.pieces]
-    return Clusters(groups, pieces, [places(coupling.columns) for coupling in couplings], total)
+    return Clusters(groups, pieces, [places(coupling.columns) for coupling in couplings], total, layout.ranks)
 
 
 class _SchurJacobi:
@@ -211,6 +214,7 @@ class _SchurJacobi:
             flat.index_add_(0, place, values[:, :-1, :-1].flatten())
         for place, values in zip(clusters.coupled, coupled, strict=True):
             flat.index_add_(0, place, values[:, :-1, :-1].flatten(), alpha=-1)
+        flat = clusters.ranks.sum(flat)
         ends = [0]
         for group in clusters.groups:
             ends.append(ends[-1] + group.numel() * group.shape[1])
@@ -238,7 +242,7 @@ def solve_reduced(
     Args:
         squares: U and the gradient.
         eliminated: W, the factors L of V, and `L^-1 h` of each eliminated family that meets retained variables.
-        clusters: The preconditioner's blocks.
+        clusters: The preconditioner's blocks, and the ranks over which all of this is divided.
         weight: Added to the diagonal, (size).
     """
     size = squares.size
@@ -246,16 +250,17 @@ def solve_reduced(
     coupled = [coupling.squares(L, z) for coupling, L, z in eliminated]
     for (coupling, _, _), values in zip(eliminated, coupled, strict=True):
         right.index_add_(0, coupling.columns.flatten(), values[:, :-1, -1].flatten(), alpha=-1)
+    right = clusters.ranks.sum(right[:size])
     precondition = _SchurJacobi(clusters, squares, coupled, weight)
 
     def apply(x: Tensor) -> Tensor:
-        out = squares.product(x) + weight * x
+        out = squares.product(x)
         for coupling, L, _ in eliminated:
             inner = coupling.product(torch.nn.functional.pad(x, (0, 2)))
             out -= coupling.lift(backward(L, forward(L, inner)))[:size]
-        return out
+        return clusters.ranks.sum(out) + weight * x
 
-    return conjugate_gradients(apply, precondition, -right[:size], FORCING)
+    return conjugate_gradients(apply, precondition, -right, FORCING)
 
 
 def conjugate_gradients(apply: Apply, precondition: Apply, b: Tensor, forcing: float) -> tuple[Tensor, bool]:

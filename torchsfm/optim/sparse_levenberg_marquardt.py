@@ -14,6 +14,7 @@ from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.normal_equations import NormalEquations
 from torchsfm.optim.pytree import Places
+from torchsfm.optim.ranks import Group, Ranks, share
 from torchsfm.optim.schur import Elimination, Solver, move
 from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
 from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_cost, term_residual
@@ -57,6 +58,7 @@ def sparse_levenberg_marquardt(
     linear_solver: Solver = "auto",
     hessian: Hessian = "exact",
     progress: Callable[[int, float], bool | None] | None = None,
+    group: Group | None = None,
 ) -> SparseResult:
     """Minimise a sum of terms over variable blocks.
 
@@ -85,6 +87,11 @@ def sparse_levenberg_marquardt(
         progress: Called with the number of iterations and the cost after each. Returning False ends the minimisation; so does
             an interrupt (Ctrl-C), there or anywhere else in the iterations. Either way the best so far is returned, with
             the status INTERRUPTED: who has more to do after it looks there.
+        group: Processes (of `torch.distributed`) that call this with the same problem, on processors of one kind: each works
+            on some of the eliminated variables and on the residuals that meet them, so that time and memory are divided, and
+            all return the same. They add up what concerns retained variables: their numbers once for each step of conjugate
+            gradients, or the dense system once for each step. `progress` of any of them ends it for all; an interrupt is
+            passed on as it is, since the others wait.
 
     Returns:
         The minimum. Where data, weights or fixed variables require a gradient, `x` and `residuals` carry their derivatives by
@@ -98,6 +105,7 @@ def sparse_levenberg_marquardt(
     """
     _check(blocks, terms, eliminate)
     check_options(linear_solver=(linear_solver, get_args(Solver)), max_iterations=(max_iterations, "int >= 0"))
+    check_options(group=(group, Group | None))
     check_options(
         function_tolerance=(function_tolerance, "float >= 0"), gradient_tolerance=(gradient_tolerance, "float >= 0"),
         step_tolerance=(step_tolerance, "float >= 0"), initial_damping=(initial_damping, "float >= 0"),
@@ -105,28 +113,48 @@ def sparse_levenberg_marquardt(
     wanted = wants_derivative(*followed(dict(blocks), terms))
     if wanted:
         function_tolerance = min(function_tolerance, MINIMUM)
+    ranks = Ranks(group)
     with torch.no_grad():
-        double, counted, used = prepare(blocks, terms)
+        mine = share(blocks, terms, eliminate, ranks)
+        double, counted, used = prepare(mine.blocks, mine.terms)
         x = {name: b.x for name, b in double.items()}
-        layout = lay_out(double, counted, eliminate)
+        layout = lay_out(double, counted, eliminate, ranks)
         # A residual of fixed variables is a constant of the cost.
-        constant = sum((float(term_cost(t, term_residual(t, x))) for t in layout.still), 0.0)
+        still = sum((float(term_cost(t, term_residual(t, x))) for t in layout.still), 0.0)
+        size = sum(_size(term) for term in counted)
+        there, count, pieces = sum(u.numel() for u in used), sum(int(u.sum()) for u in used), len(layout.pieces)
+        some = next(iter(double.values())).x if double else torch.empty(0, dtype=torch.float64)
+        constant, size, there, count, pieces = ranks.sum(some.new_tensor([still, size, there, count, pieces])).tolist()
         cost, initial, iterations, status = constant, constant, 0, Status.TOO_FEW
-        if not math.isfinite(constant) or (any(u.numel() for u in used) and not any(bool(u.any()) for u in used)):
+        if not math.isfinite(constant) or (there and not count):
             status = Status.NOT_FINITE
-        elif layout.pieces:
-            problem = _SparseProblem(Elimination(double, layout, linear_solver), sum(_size(term) for term in counted))
-            tell = None if progress is None else lambda k, cost: progress(k, float(cost) + constant)
+        elif pieces:
+            problem = _SparseProblem(Elimination(double, layout, linear_solver), size)
             limits = (max_iterations, function_tolerance, step_tolerance, gradient_tolerance, initial_damping)
-            found = descend(problem, x, Options(*limits, progress=tell, interruptible=True))
+            tell = None if progress is None and ranks.size == 1 else _shared(progress, constant, ranks)
+            found = descend(problem, x, Options(*limits, progress=tell, interruptible=ranks.size == 1))
             x, iterations, status = found.x, int(found.iterations), Status(int(found.status))
             cost, initial = float(found.cost) + constant, float(found.initial_cost) + constant
+        own, x, used = x, mine.whole(x), mine.rows(used)
     if wanted:
-        x = attach_sparse_optimum(dict(blocks), terms, x, used, eliminate, hessian)
-    plain = [replace(term, data=tuple(_double(d) for d in term.data)) for term in terms]
-    residuals = tuple(term_residual(t, x) for t in plain)
+        own = x = attach_sparse_optimum(dict(blocks), terms, x, used, eliminate, hessian)
+        mine = share(blocks, terms, eliminate, Ranks())
+    plain = [replace(term, data=tuple(_double(d) for d in term.data)) for term in mine.terms]
+    residuals = mine.rows([term_residual(t, own) for t in plain])
     out = {name: x[name].to(b.x.dtype).contiguous() for name, b in blocks.items()}
     return SparseResult(out, cost, initial, residuals, used, iterations, status)
+
+
+def _shared(
+    progress: Callable[[int, float], bool | None] | None, constant: float, ranks: Ranks
+) -> Callable[[int, Tensor], bool]:
+    """The `progress` of a descent, given that of this rank: any of them ends it for all."""
+
+    def tell(number: int, cost: Tensor) -> bool:
+        ends = progress is not None and progress(number, float(cost) + constant) is False
+        return not bool(ranks.any(torch.full_like(cost, ends, dtype=torch.bool)))
+
+    return tell
 
 
 class _Place:
@@ -214,7 +242,8 @@ class _SparseProblem:
             (norm(d, dim=1) <= tolerance * (norm(here.x[name][free[name]], dim=1) + tolerance)).all()
             for name, d in delta.items()
         ]
-        return torch.stack(short).all()
+        none = torch.ones_like(here.cost, dtype=torch.bool)
+        return self.engine.ranks.all(torch.stack([none, *short]).all())
 
 
 def _size(term: Term) -> float:

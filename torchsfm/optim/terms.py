@@ -72,6 +72,19 @@ def block_names(eliminate: str | Sequence[str] | None) -> tuple[str, ...]:
     return () if eliminate is None else (eliminate,) if isinstance(eliminate, str) else tuple(eliminate)
 
 
+def eliminated_block(term: Term, names: tuple[str, ...]) -> str | None:
+    """Which eliminated block a term's residuals depend on.
+
+    Raises:
+        ValueError: They depend on two eliminated variables.
+    """
+    met = [name for name in term.blocks if name in names]
+    if len(met) > 1:
+        both = " and ".join(repr(name) for name in dict.fromkeys(met))
+        raise ValueError(f"eliminate: a residual depends on two variables of {both}; they cannot be eliminated singly")
+    return met[0] if met else None
+
+
 def check_eliminate(blocks: Mapping[str, Block], eliminate: str | Sequence[str] | None) -> None:
     """See that what is to be eliminated is there.
 

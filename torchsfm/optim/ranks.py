@@ -1,0 +1,152 @@
+"""One problem over several processes: each has some of the eliminated variables with their residuals, all have the others.
+
+What residuals say of retained variables is a sum over residuals, so a rank adds up its own and an all-reduce does the rest.
+What belongs to eliminated variables never leaves their rank before the end.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, cast, runtime_checkable
+
+import torch
+import torch.distributed
+from torch import Tensor
+
+from torchsfm.optim.terms import Block, Term, block_names, eliminated_block
+
+
+@runtime_checkable
+class Group(Protocol):
+    """A process group of `torch.distributed`, such as `torch.distributed.group.WORLD`."""
+
+    def rank(self) -> int:
+        """The number of this process."""
+
+    def size(self) -> int:
+        """The number of processes."""
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The processes that share a problem; one alone communicates nothing.
+
+    Every rank must call the same methods in the same order, with tensors of one shape. All get the same bits.
+    """
+
+    group: Group | None = None
+
+    @property
+    def size(self) -> int:
+        """The number of processes."""
+        return 1 if self.group is None else self.group.size()
+
+    @property
+    def rank(self) -> int:
+        """The number of this process."""
+        return 0 if self.group is None else self.group.rank()
+
+    def sum(self, x: Tensor) -> Tensor:
+        """The sum over the ranks, in the memory of `x` where that is contiguous."""
+        return self._reduced(x, "SUM")
+
+    def largest(self, x: Tensor) -> Tensor:
+        """The largest value among the ranks."""
+        return self._reduced(x, "MAX")
+
+    def any(self, x: Tensor) -> Tensor:
+        """Whether it is so on any rank."""
+        return x if self.size == 1 else self.largest(x.to(torch.uint8)).bool()
+
+    def all(self, x: Tensor) -> Tensor:
+        """Whether it is so on all ranks."""
+        return x if self.size == 1 else ~self.any(~x)
+
+    def gather(self, x: Tensor) -> Tensor:
+        """The rows of all ranks, rank by rank; each may have another number of them."""
+        if self.size == 1:
+            return x
+        if x.dtype == torch.bool:
+            return self.gather(x.to(torch.uint8)).bool()
+        count = torch.zeros(self.size, dtype=torch.int64, device=x.device)
+        count[self.rank] = len(x)
+        counts = self.sum(count).tolist()
+        padded = x.new_zeros((max(counts), *x.shape[1:]))
+        padded[: len(x)] = x
+        found = [torch.empty_like(padded) for _ in counts]
+        torch.distributed.all_gather(found, padded, group=cast(Any, self.group))
+        return torch.cat([rows[:number] for rows, number in zip(found, counts, strict=True)])
+
+    def _reduced(self, x: Tensor, how: str) -> Tensor:
+        if self.size == 1:
+            return x
+        x = x.contiguous()
+        operation = getattr(torch.distributed.ReduceOp, how)
+        torch.distributed.all_reduce(x, operation, group=cast(Any, self.group))
+        return x
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one rank has of a problem: a run of the variables of each eliminated block, and the residuals that meet them."""
+
+    blocks: Mapping[str, Block]
+    """All retained variables and its own eliminated ones."""
+    terms: Sequence[Term]
+    eliminated: tuple[str, ...]
+    ranks: Ranks
+    order: Sequence[Tensor] = ()
+    """The rows of each term, those of the first rank first."""
+
+    def whole(self, x: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The variables of all ranks, given those of this one."""
+        return {name: self.ranks.gather(values) if name in self.eliminated else values for name, values in x.items()}
+
+    def rows(self, values: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """One tensor for each term with a row for each of its residuals, given those of this rank."""
+        if self.ranks.size == 1:
+            return tuple(values)
+        whole = [self.ranks.gather(rows) for rows in values]
+        return tuple(torch.empty_like(v).index_copy_(0, order, v) for v, order in zip(whole, self.order, strict=True))
+
+
+def share(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None, ranks: Ranks) -> Share:
+    """Divide a problem that all ranks know, so that each has about as many residuals of each eliminated block.
+
+    Residuals of retained variables alone are divided evenly.
+
+    Raises:
+        ValueError: A residual depends on two eliminated variables.
+    """
+    names = block_names(eliminate)
+    if ranks.size == 1:
+        return Share(blocks, terms, names, ranks)
+    met = [eliminated_block(term, names) for term in terms]
+    owner = {name: _owners(blocks[name], name, terms, ranks.size) for name in names}
+    first = {name: int((found < ranks.rank).sum()) for name, found in owner.items()}
+    own_blocks = dict(blocks)
+    for name, found in owner.items():
+        mine, block = slice(first[name], first[name] + int((found == ranks.rank).sum())), blocks[name]
+        own_blocks[name] = replace(block, x=block.x[mine], fixed=None if block.fixed is None else block.fixed[mine])
+    own_terms, orders = [], []
+    for term, eliminated in zip(terms, met, strict=True):
+        count = len(term.index[0])
+        if eliminated is None:
+            where = torch.arange(count, device=term.index[0].device) * ranks.size // max(count, 1)
+        else:
+            where = owner[eliminated][term.index[term.blocks.index(eliminated)]]
+        own = term.select((where == ranks.rank).nonzero()[:, 0])
+        index = tuple(i - first[n] if n == eliminated else i for n, i in zip(term.blocks, own.index, strict=True))
+        own_terms.append(replace(own, index=index))
+        orders.append(torch.argsort(where, stable=True))
+    return Share(own_blocks, own_terms, names, ranks, orders)
+
+
+def _owners(block: Block, name: str, terms: Sequence[Term], ranks: int) -> Tensor:
+    """The rank of each variable, which never falls from one to the next."""
+    count = torch.zeros(len(block.x), dtype=torch.int64, device=block.x.device)
+    for term in terms:
+        for other, index in zip(term.blocks, term.index, strict=True):
+            if other == name:
+                count += torch.bincount(index, minlength=len(count))
+    end = count.cumsum(0)
+    return ((2 * end - count) * ranks // (2 * count.sum().clamp_min(1))).clamp_max(ranks - 1)
