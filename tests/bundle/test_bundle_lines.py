@@ -28,7 +28,7 @@ from torchsfm.geometry import (
 )
 from torchsfm.geometry.line_manifold import line_tangents
 from torchsfm.optim import Block, Huber, RigidMotion, Term, sparse_levenberg_marquardt
-from torchsfm.optim.terms import term_residual
+from torchsfm.optim.terms import Workspace, lift_of, linearize, prepare, term_residual
 
 F64 = torch.float64
 LENSES = {
@@ -317,3 +317,32 @@ def test_wrong_lines(generator: torch.Generator) -> None:
         bundle_adjust(scene.problem, structure=[lines, lines])
     with pytest.raises(ValueError, match=r"structure\[0\]"):
         bundle_adjust(scene.problem, structure=[lines.L])  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize("rigged", [False, True])
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_written_derivatives_are_those_of_the_residuals(generator: torch.Generator, lens: str, rigged: bool) -> None:
+    """By every variable, where cameras have moved since the rays were taken, with skew and numbers held in some cameras."""
+    scene = make_scene(generator, lens=lens, noise=1.0)
+    problem, lines = disturbed(scene, generator, 0.002)
+    names = ("focal", "aspect", "skew", "principal_point", *problem.cameras.distortion.parameter_names)
+    views = len(problem.poses.t)
+    sensors = Pose.identity(2, dtype=F64).retract(0.1 * torch.randn(2, 6, generator=generator, dtype=F64))
+    rig = Rig(sensors, torch.arange(views) % 2, torch.arange(views)) if rigged else None
+    held = {"skew": torch.tensor([not rigged])}
+    blocks, terms = Bundle(problem, free=names, fixed_intrinsics=held, rig=rig, structure=(lines,)).problem()
+    blocks["camera"] = dataclasses.replace(blocks["camera"], x=blocks["camera"].x * 1.003)
+    blocks, terms, _ = prepare(blocks, terms[1:2])
+    x = {name: block.x for name, block in blocks.items()}
+    found, wanted = [], []
+    for term, slopes in ((terms[0], found), (dataclasses.replace(terms[0], linearize=None), wanted)):
+        sizes = [blocks[name].tangent for name in term.blocks]
+        slopes += [lines.x.new_empty(2, size, len(term.index[0])).permute(2, 0, 1) for size in sizes]
+        lifts = {name: lift_of(block, x[name]) for name, block in blocks.items()}
+        slopes.append(linearize(term, x, lifts, slopes[:], Workspace(lines.x))[0])
+    for mine, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-9 * float(other.abs().max()))
+    # Those of eliminated variables alone.
+    only = [None] * (len(found) - 2) + [torch.empty_like(found[-2])]
+    linearize(terms[0], x, {}, only, Workspace(lines.x))
+    torch.testing.assert_close(only[-1], found[-2])

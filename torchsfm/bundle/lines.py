@@ -1,11 +1,4 @@
-"""Lines of space in a bundle: the two ends of each segment against the image of its line, whatever the lens makes of it.
-
-An image line is the image of the plane through the line and the camera's centre, whose normal in the camera's frame is the
-moment m of the line there. The residual of an end is its distance from that image, a curve where lenses distort: rays in the
-plane are projected through the whole camera, never ends undistorted, so that intrinsics may be free. The foot of the end is
-the ray of the plane nearest to the ray of the end, moved once along the curve: the distance does not change to first order
-with where the foot is, so that the ray may be that of the camera at the start.
-"""
+"""Lines of space in a bundle: the two ends of each segment against the image of its line, whatever the lens makes of it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,11 +8,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_index, check_options, check_tensors
+from torchsfm.bundle.line_images import curve_distances, into_frames, nearest_on_curve, pull_back
+from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.structure import Sight
 from torchsfm.geometry import Camera, Line3D, Pose, Similarity, transform_lines
 from torchsfm.geometry.intrinsic_parameters import row_from_camera
-from torchsfm.geometry.line_manifold import world_covariance
-from torchsfm.geometry.projection import PixelProjection
+from torchsfm.geometry.line_manifold import line_tangents, world_covariance
 from torchsfm.linalg import cross
 from torchsfm.optim import Block, Loss, Term
 
@@ -87,11 +81,23 @@ class BundleLines:
 
         def residual(*rows: Tensor) -> Tensor:
             *poses, camera, line, x, rays = rows
-            R, t = sight.pose(*poses)
-            normal = _moment_in_camera(line.mT, R, t)
-            return _distances(sight.projection.inside.pixels, camera.mT, normal, x.permute(2, 1, 0), rays.permute(2, 1, 0))
+            moment = into_frames(line.mT, sight.motions(*poses))[-1][-1]
+            return curve_distances(sight.projection, camera.mT, moment, _ends_first(x), _ends_first(rays)).mT
 
-        return Term(residual, (*sight.blocks, self.block), index, (x, rays), self.loss, self.weights)
+        def linearize(*rows: Tensor, out: list[Tensor | None]) -> Tensor:
+            *poses, camera, line, x, rays = rows
+            *by_poses, by_camera, by_line = (None if o is None else o.permute(1, 2, 0) for o in out)
+            frames = into_frames(line.mT, sight.motions(*poses))
+            by_free = None if by_camera is None else camera.new_empty(2, by_camera.shape[1], 2, len(camera))
+            nearest = nearest_on_curve(sight.projection, camera.mT, frames[-1][-1], _ends_first(x), _ends_first(rays), by_free)
+            if by_camera is not None and by_free is not None:
+                torch.sum(nearest.across[:, None] * -by_free, 0, out=by_camera.transpose(0, 1))
+            by_d, by_m = pull_back(nearest.by_normal(), frames, by_poses)
+            if by_line is not None:
+                _line_slopes(line, by_d, by_m, by_line)
+            return nearest.distance.mT
+
+        return Term(residual, (*sight.blocks, self.block), index, (x, rays), self.loss, self.weights, linearize)
 
     def covariance(self, x: Tensor, C: Tensor) -> Tensor:
         """Covariances (l, 4, 4) of the steps of `Line3D` from the lines in the world; zero for lines through its origin."""
@@ -122,8 +128,8 @@ def segment_distances(poses: Pose, cameras: Camera, lines: BundleLines) -> Float
     d = torch.linalg.vecdot(pose.R, L[:, None, :3])
     normal = torch.linalg.vecdot(pose.R, L[:, None, 3:]) + cross(pose.t, d)
     rows = row_from_camera(camera).double().mT
-    x, rays = lines.x.double().permute(2, 1, 0), torch.where(valid[..., None], rays, torch.nan).double().permute(2, 1, 0)
-    return _distances(PixelProjection(model).pixels, rows, normal.double().mT, x, rays).to(lines.x.dtype)
+    x, rays = _ends_first(lines.x.double()), _ends_first(torch.where(valid[..., None], rays, torch.nan).double())
+    return curve_distances(Projection(model, ()), rows, normal.double().mT, x, rays).mT.to(lines.x.dtype)
 
 
 @dataclass(frozen=True)
@@ -139,47 +145,12 @@ class LocalLine:
         return torch.cat((line, x[..., 6:].expand(*line.shape[:-1], 4)), -1)
 
 
-def _moment_in_camera(line: Tensor, R: Tensor, t: Tensor) -> Tensor:
-    """The normals (3, k) of the planes of sight, up to scale: the moments of lines (10, k) about the camera's centre."""
-    d, m, origin, unit = line[:3], line[3:6], line[6:9], line[9:]
-    from_origin = (R * origin).sum(1) + t
-    turned, moment = (R * d).sum(1), (R * m).sum(1)
-    normal: Tensor = unit * moment + torch.linalg.cross(from_origin, turned, dim=0)
-    return normal
+def _ends_first(x: Float[Tensor, "k e d"]) -> Float[Tensor, "d e k"]:
+    return x.permute(2, 1, 0)
 
 
-def _distances(
-    pixels: Callable[[Tensor, Tensor], Tensor],
-    camera: Float[Tensor, "c k"],
-    normal: Float[Tensor, "3 k"],
-    x: Float[Tensor, "2 e k"],
-    rays: Float[Tensor, "3 e k"],
-) -> Float[Tensor, "k e"]:
-    """Signed distances of image points from the images of planes through the centre, positive to one side all along."""
-    unit = (normal / normal.square().sum(0).clamp_min(_TINY).sqrt())[:, None]
-    foot = rays - (rays * unit).sum(0) * unit
-    camera = camera[:, None]
-    for last in (False, True):
-        along = torch.linalg.cross(unit.expand_as(foot), foot, dim=0)
-        place, tangent = _projected(pixels, camera, foot, along)
-        square = tangent.square().sum(0).clamp_min(_TINY)
-        away = x - place
-        if last:
-            break
-        foot = foot + ((away * tangent).sum(0) / square) * along
-    distance: Tensor = (tangent[0] * away[1] - tangent[1] * away[0]) / square.sqrt()
-    return distance.mT
-
-
-def _projected(
-    pixels: Callable[[Tensor, Tensor], Tensor], camera: Tensor, ray: Float[Tensor, "3 *n"], along: Float[Tensor, "3 *n"]
-) -> tuple[Float[Tensor, "2 *n"], Float[Tensor, "2 *n"]]:
-    """Image points of rays, and how they move where the rays move along a direction."""
-    follow = torch.is_grad_enabled() and any(t.requires_grad for t in (camera, ray, along))
-    with torch.enable_grad():
-        ray = ray if ray.requires_grad else ray.detach().requires_grad_()
-        place = pixels(ray, camera)
-        ones = torch.ones_like(place[0])
-        slopes = [torch.autograd.grad(row, ray, ones, create_graph=follow, retain_graph=True)[0] for row in place]
-        tangent = torch.stack([(slope * along).sum(0) for slope in slopes])
-    return (place, tangent) if follow else (place.detach(), tangent.detach())
+def _line_slopes(line: Tensor, by_d: Tensor, by_m: Tensor, out: Float[Tensor, "e 4 k"]) -> None:
+    """From derivatives by direction and moment in the world to those by steps in frames of their own."""
+    origin, unit = line.mT[6:9, None].expand_as(by_d), line.mT[9]
+    by_line = torch.cat((by_d + torch.linalg.cross(by_m, origin, dim=0), unit * by_m))
+    torch.sum(line_tangents(line[:, :6]).permute(2, 1, 0)[:, :, None] * by_line, 1, out=out.transpose(0, 1))

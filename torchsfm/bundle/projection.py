@@ -59,10 +59,20 @@ class Projection:
 
     def linearize_at(self, moved: Tensor, camera: Tensor, x: Tensor, by_camera: Tensor, by_intrinsics: Tensor | None) -> Tensor:
         """Residuals of points in camera coordinates (3, m), and their derivatives by those and by free camera numbers."""
-        pixels = self.inside.linearize(moved, camera.mT, by_camera, by_intrinsics)
+        return (self.slopes(moved, camera.mT, by_camera, by_intrinsics) - x.mT).mT
+
+    def slopes(
+        self,
+        moved: Float[Tensor, "3 *n"],
+        camera: Float[Tensor, "k *#n"],
+        by_camera: Float[Tensor, "2 3 *n"],
+        by_intrinsics: Float[Tensor, "2 q *n"] | None,
+    ) -> Float[Tensor, "2 *n"]:
+        """Image points; their derivatives by points in camera coordinates and by free camera numbers."""
+        pixels = self.inside.linearize(moved, camera, by_camera, by_intrinsics)
         if by_intrinsics is not None and self.switched:
-            by_intrinsics *= camera.mT[HEAD + self.model.num_parameters :]
-        return (pixels - x.mT).mT
+            by_intrinsics *= camera[HEAD + self.model.num_parameters :]
+        return pixels
 
 
 def transform(pose: Tensor, point: Tensor) -> Tensor:

@@ -29,13 +29,10 @@ class Sight:
         """The variables between the world and observations in some views."""
         return tuple(index[view] for index in self.index)
 
-    def pose(self, *rows: Float[Tensor, "m 12"]) -> tuple[Float[Tensor, "3 3 m"], Float[Tensor, "3 m"]]:
-        """Camera from world, R and t, by rows of poses from the world to the camera; rows of observations last."""
-        R, t = _parts(rows[0])
-        for row in rows[1:]:
-            S, s = _parts(row)
-            R, t = (S[:, :, None] * R[None]).sum(1), (S * t[None]).sum(1) + s
-        return R, t
+    @staticmethod
+    def motions(*rows: Float[Tensor, "m 12"]) -> list[tuple[Float[Tensor, "3 3 m"], Float[Tensor, "3 m"]]]:
+        """R and t of the motions from the world to the camera; rows of observations last."""
+        return [(row.mT[:9].reshape(3, 3, -1), row.mT[9:]) for row in rows]
 
 
 @runtime_checkable
@@ -67,8 +64,3 @@ class Structure(Protocol):
 
     def moved(self, start: Tensor, end: Tensor, world: Similarity | None) -> "Structure":
         """The same with the variables moved, and then the world of those that did; others keep every bit."""
-
-
-def _parts(row: Float[Tensor, "m 12"]) -> tuple[Tensor, Tensor]:
-    columns = row.mT
-    return columns[:9].reshape(3, 3, -1), columns[9:]
