@@ -24,7 +24,7 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?!\w)")
 NOT_CALLED = {"cli"}
 UNFINISHED = {
     "_types", "autocalibration", "bundle", "formats", "images", "linalg", "motion", "optim", "plot", "reconstruction",
-    "resection", "robust", "simulation", "tensors", "triangulation",
+    "resection", "robust", "simulation",
 }  # fmt: skip
 
 

@@ -22,6 +22,8 @@ class RelativePose:
     `model` is [R | t] with |t| = 1. `in_front` says which rays meet in front of both cameras or at infinity ahead of them.
     `status` is OK, TOO_FEW (no finite ray has weight), BEHIND (half of the weight or less is in front), DEGENERATE (E has rank
     below 2) or NOT_FINITE (E is not finite).
+
+    See the example of `pose_from_essential`.
     """
 
     model: Float[Tensor, "*batch 3 4"]
@@ -43,6 +45,13 @@ def essential_from_pose(R: Float[Tensor, "*#batch 3 3"], t: Float[Tensor, "*#bat
 
     Returns:
         E with d2' E d1 = 0.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.tensors.essential_from_pose(torch.eye(3), torch.tensor([0.0, 0.0, 1.0]))  # straight ahead
+        tensor([[ 0., -1.,  0.],
+                [ 1.,  0.,  0.],
+                [ 0.,  0.,  0.]])
     """
     check_tensors(R=(R, "3 3"), t=(t, "3"))
     return cross_matrix(t) @ R
@@ -60,6 +69,13 @@ def poses_from_essential(E: Float[Tensor, "*batch 3 3"]) -> Solutions[Float[Tens
     Returns:
         Four slots (Ra, t), (Ra, -t), (Rb, t), (Rb, -t). All are valid, or none where E has rank below 2 or is not finite.
         Differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> E = torchsfm.tensors.essential_from_pose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
+        >>> poses = torchsfm.tensors.poses_from_essential(E)
+        >>> poses.model.shape, poses.valid
+        (torch.Size([4, 3, 4]), tensor([True, True, True, True]))
     """
     check_tensors(E=(E, "3 3"))
     finite = torch.isfinite(E).all(-1).all(-1)
@@ -127,6 +143,15 @@ def pose_from_essential(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torchsfm.random_points(20, generator=torch.Generator().manual_seed(0)) + torch.tensor([0, 0, 5])
+        >>> R, t = torch.eye(3, dtype=X.dtype), torch.tensor([0.6, 0.0, 0.8], dtype=X.dtype)
+        >>> E = -torchsfm.tensors.essential_from_pose(R, t)  # of either sign
+        >>> found = torchsfm.tensors.pose_from_essential(E, X, X @ R.mT + t)
+        >>> found.pose.t, int(found.in_front.sum())
+        (tensor([0.6000, 0.0000, 0.8000], dtype=torch.float64), 20)
     """
     kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
     check_options(parallax=(parallax, "0 <= float <= 0.1 radians"))
@@ -178,6 +203,14 @@ def fundamental_from_essential(
 
     Returns:
         F with x2' F x1 = 0 in pixels.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(500.0), torch.tensor([320.0, 240.0]))
+        >>> E = torchsfm.tensors.essential_from_pose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))
+        >>> F = torchsfm.tensors.fundamental_from_essential(E, K, K)
+        >>> torchsfm.geometry.epipolar_distance(F, torch.tensor([[100.0, 50.0]]), torch.tensor([[80.0, 53.0]]))  # pixels
+        tensor([3.])
     """
     check_tensors(E=(E, "3 3"), K1=(K1, "3 3"), K2=(K2, "3 3"))
     return _inverse(K2).mT @ E @ _inverse(K1)
@@ -195,6 +228,14 @@ def essential_from_fundamental(
 
     Returns:
         E with d2' E d1 = 0.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(500.0), torch.tensor([320.0, 240.0]))
+        >>> F = torchsfm.tensors.fundamental_from_pose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), K, K)
+        >>> E = torchsfm.tensors.essential_from_fundamental(F, K, K)
+        >>> torch.linalg.svdvals(E)  # two equal singular values, and a zero
+        tensor([1.0000, 1.0000, 0.0000])
     """
     check_tensors(F=(F, "3 3"), K1=(K1, "3 3"), K2=(K2, "3 3"))
     return K2.mT @ F @ K1
@@ -216,6 +257,13 @@ def fundamental_from_pose(
 
     Returns:
         F with x2' F x1 = 0 in pixels.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(500.0), torch.tensor([320.0, 240.0]))
+        >>> F = torchsfm.tensors.fundamental_from_pose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), K, K)
+        >>> torchsfm.geometry.epipolar_distance(F, torch.tensor([[100.0, 50.0]]), torch.tensor([[80.0, 53.0]]))  # pixels
+        tensor([3.])
     """
     check_tensors(R=(R, "3 3"), t=(t, "3"), K1=(K1, "3 3"), K2=(K2, "3 3"))
     return fundamental_from_essential(essential_from_pose(R, t), K1, K2)
@@ -233,6 +281,14 @@ def poses_from_fundamental(
 
     Returns:
         Four slots as `poses_from_essential` returns them.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(500.0), torch.tensor([320.0, 240.0]))
+        >>> F = torchsfm.tensors.fundamental_from_pose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), K, K)
+        >>> poses = torchsfm.tensors.poses_from_fundamental(F, K, K)
+        >>> poses.model[:, :, 3].abs()[0]  # of each t the first coordinate alone is not zero
+        tensor([1., 0., 0.])
     """
     return poses_from_essential(essential_from_fundamental(F, K1, K2))
 
@@ -269,6 +325,13 @@ def epipoles(F: Float[Tensor, "*batch 3 3"]) -> tuple[Float[Tensor, "*batch 3"],
     Returns:
         The image of the second centre in the first image, and of the first in the second. Where the rank of F is below 2, or F
         is not finite, (0, 0, 1). Differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.tensors.essential_from_pose(torch.eye(3), torch.tensor([1.0, 0.0, 2.0]))
+        >>> e1, e2 = torchsfm.tensors.epipoles(F)
+        >>> e2 / e2[2]  # where the second camera sees the first
+        tensor([0.5000, 0.0000, 1.0000])
     """
     check_tensors(F=(F, "3 3"))
     F = unit_rank_2(F)
@@ -284,6 +347,13 @@ def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x: Float[Tensor, "*#batch n 
 
     Returns:
         Lines with unit normal, so that l2' x2 is the signed distance of x2 in pixels. The zero vector for the epipole itself.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0]))  # moved sideways
+        >>> l = torchsfm.tensors.epipolar_lines(F, torch.tensor([[3.0, 7.0]]))[0]
+        >>> l / l[1]  # the line y = 7
+        tensor([ 0.,  1., -7.])
     """
     check_tensors(F=(F, "3 3"), x=(x, "n 2"))
     line = x @ F[..., :2].mT + F[..., None, :, 2]
@@ -302,6 +372,14 @@ def cameras_from_fundamental(
 
     Returns:
         P1 and P2, one representative of the cameras that differ by a projective map of space. Differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0]))  # moved sideways
+        >>> P1, P2 = torchsfm.tensors.cameras_from_fundamental(F)
+        >>> again = torchsfm.tensors.fundamental_from_cameras(P1, P2)
+        >>> bool((again / again[2, 1]).allclose(F / F[2, 1], atol=1e-6))
+        True
     """
     check_tensors(F=(F, "3 3"))
     F = unit_rank_2(F)
@@ -327,6 +405,15 @@ def fundamental_from_cameras(P1: Float[Tensor, "*#batch 3 4"], P2: Float[Tensor,
 
     Returns:
         F with x2' F x1 = 0, its scale the product of the squares of the cameras' scales. Zero where the centres coincide.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P2 = torch.eye(3, 4)
+        >>> P2[0, 3] = 1.0  # t = (1, 0, 0): x2' F x1 says that y2 = y1
+        >>> torchsfm.tensors.fundamental_from_cameras(torch.eye(3, 4), P2).abs()
+        tensor([[0., 0., 0.],
+                [0., 0., 1.],
+                [0., 1., 0.]])
     """
     check_tensors(P1=(P1, "3 4"), P2=(P2, "3 4"))
     dual = _row_pairs(P2)[..., [5, 4, 3, 2, 1, 0]]
@@ -343,6 +430,13 @@ def bifocal_tensors(P: Float[Tensor, "*batch v 3 4"], index: Int[Tensor, "m 2"])
 
     Returns:
         For each pair, F with xj' F xi = 0.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> F = torchsfm.tensors.bifocal_tensors(P, torch.tensor([[0, 1], [0, 3], [2, 3]]))
+        >>> F.shape, bool(F[1].allclose(torchsfm.tensors.fundamental_from_cameras(P[0], P[3])))
+        (torch.Size([3, 3, 3]), True)
     """
     check_tensors(P=(P, "v>=1 3 4"), index=(index, "m 2: int"))
     return fundamental_from_cameras(P[..., index[:, 0], :, :], P[..., index[:, 1], :, :])

@@ -22,6 +22,14 @@ def canonical_cameras(P: Float[Tensor, "*batch v 3 4"]) -> Float[Tensor, "*batch
     Returns:
         The cameras; finite without meaning where the first two centres coincide, a camera is not of rank 3, or is not finite.
         Differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> world = torch.eye(4, dtype=P.dtype) + 0.1  # any projective change of space
+        >>> canonical = torchsfm.tensors.canonical_cameras
+        >>> bool(canonical(P @ world).allclose(canonical(P)))
+        True
     """
     check_tensors(P=(P, "v>=2 3 4"))
     safe = torch.where(torch.isfinite(P).flatten(-3).all(-1)[..., None, None, None], P, 0)

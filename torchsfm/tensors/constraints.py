@@ -18,6 +18,11 @@ def fundamental_constraint(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*ba
 
     Returns:
         The determinant.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.tensors.fundamental_constraint(torch.diag(torch.tensor([1.0, 1.0, 0.0])))
+        tensor(0.)
     """
     check_tensors(F=(F, "3 3"))
     return determinant_3x3(unit_tensor(F, 2)[0])
@@ -31,6 +36,13 @@ def essential_constraints(E: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*bat
 
     Returns:
         The ten residuals, all zero for two equal singular values and a third that is 0.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> E = torchsfm.tensors.essential_from_pose(torch.eye(3), torch.tensor([1.0, 2.0, 3.0]))
+        >>> residuals = torchsfm.tensors.essential_constraints(E)
+        >>> residuals.shape, bool(residuals.abs().max() < 1e-6)
+        (torch.Size([10]), True)
     """
     check_tensors(E=(E, "3 3"))
     E = unit_tensor(E, 2)[0]
@@ -53,6 +65,13 @@ def trifocal_constraints(T: Float[Tensor, "*batch 3 3 3"]) -> Float[Tensor, "*ba
     Returns:
         64 residuals: 10 for the rank, 27 for the left epipole e2 and 27 for the right epipole e3. Where slices have rank 1 (a
         camera that moves sideways without turning) the last 54 say less, though they are still 0 for trifocal tensors.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> T = torchsfm.tensors.trifocal_from_cameras(*P)
+        >>> bool(torchsfm.tensors.trifocal_constraints(T).abs().max() < 1e-9)
+        True
     """
     check_tensors(T=(T, "3 3 3"))
     T = unit_tensor(T, 3)[0]
@@ -82,6 +101,13 @@ def quadrifocal_constraints(Q: Float[Tensor, "*batch 3 3 3 3"]) -> Float[Tensor,
 
     Returns:
         Q / |Q| less its orthogonal projection on the tensor of `cameras_from_quadrifocal(Q)`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> Q = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> bool(torchsfm.tensors.quadrifocal_constraints(Q).norm() < 1e-6)
+        True
     """
     check_tensors(Q=(Q, "3 3 3 3"))
     unit, _ = unit_tensor(Q, 4)

@@ -34,6 +34,15 @@ def cameras_from_fundamentals(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> F = torchsfm.tensors.bifocal_tensors(P, torch.tensor([[0, 1], [0, 2], [1, 2]]))
+        >>> found = torchsfm.tensors.cameras_from_fundamentals(*F)
+        >>> canonical = torchsfm.tensors.canonical_cameras  # the frame in which cameras can be compared
+        >>> bool(found.status == torchsfm.Status.OK), bool(canonical(found.P).allclose(canonical(P)))
+        (True, True)
     """
     batch = check_tensors(F12=(F12, "3 3"), F13=(F13, "3 3"), F23=(F23, "3 3"))
     F12, F13, F23 = (F.expand(*batch, 3, 3) for F in (F12, F13, F23))
@@ -100,6 +109,14 @@ def trifocal_from_fundamentals(
     Returns:
         T with norm 1, of `cameras_from_fundamentals`, which also says where the result means nothing: three centres on one
         line have tensors that their fundamental matrices do not determine.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> F = torchsfm.tensors.bifocal_tensors(P, torch.tensor([[0, 1], [0, 2], [1, 2]]))
+        >>> T, truth = torchsfm.tensors.trifocal_from_fundamentals(*F), torchsfm.tensors.trifocal_from_cameras(*P)
+        >>> round(float((T * truth).sum().abs() / truth.norm()), 6)  # 1: the same up to scale
+        1.0
     """
     T = trifocal_from_cameras(*cameras_from_fundamentals(F12, F13, F23).P.unbind(-3))
     return unit_tensor(T, 3)[0]
@@ -120,6 +137,14 @@ def reordered_trifocal(T: Float[Tensor, "*batch 3 3 3"], views: tuple[int, int, 
 
     Raises:
         ValueError: Wrong shape or dtype, or `views` is no permutation.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> T = torchsfm.tensors.reordered_trifocal(torchsfm.tensors.trifocal_from_cameras(*P), (2, 0, 1))
+        >>> truth = torchsfm.tensors.trifocal_from_cameras(P[2], P[0], P[1])
+        >>> round(float((T * truth).sum().abs() / truth.norm()), 6)  # 1: the same up to scale
+        1.0
     """
     if not isinstance(views, Sequence) or len(views) != 3 or set(views) != {0, 1, 2}:
         raise ValueError(f"views: wanted a permutation of (0, 1, 2), got {views}")
@@ -143,6 +168,15 @@ def quadrifocal_from_trifocals(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> T123, T124 = torchsfm.tensors.trifocal_tensors(P, torch.tensor([[0, 1, 2], [0, 1, 3]]))
+        >>> Q = torchsfm.tensors.quadrifocal_from_trifocals(T123, T124)
+        >>> truth = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> round(float((Q * truth).sum().abs() / truth.norm()), 6)  # 1: the same up to scale
+        1.0
     """
     batch = check_tensors(T123=(T123, "3 3 3"), T124=(T124, "3 3 3"))
     three, second = cameras_from_trifocal(T123), unit_tensor(T124, 3)[0].expand(*batch, 3, 3, 3)
@@ -165,6 +199,14 @@ def fundamentals_from_quadrifocal(Q: Float[Tensor, "*batch 3 3 3 3"]) -> Float[T
 
     Returns:
         F (*batch, pair, 3, 3) with norm 1, x_j' F x_i = 0 for the pair (i, j), of `cameras_from_quadrifocal`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> F = torchsfm.tensors.fundamentals_from_quadrifocal(torchsfm.tensors.quadrifocal_from_cameras(*P))
+        >>> F34, truth = F[5], torchsfm.tensors.fundamental_from_cameras(P[2], P[3])
+        >>> F.shape, round(float((F34 * truth).sum().abs() / truth.norm()), 6)  # 1: the same up to scale
+        (torch.Size([6, 3, 3]), 1.0)
     """
     check_tensors(Q=(Q, "3 3 3 3"))
     pairs = torch.tensor([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]], device=Q.device)

@@ -23,6 +23,14 @@ def transform_fundamental(
 
     Returns:
         F in the new coordinates, the scale as it comes.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0]))
+        >>> half = torch.diag(torch.tensor([0.5, 0.5, 1.0]))  # images of half the size
+        >>> F_half = torchsfm.tensors.transform_fundamental(F, half, half)
+        >>> torchsfm.geometry.epipolar_distance(F_half, torch.tensor([[50.0, 25.0]]), torch.tensor([[40.0, 28.0]]))
+        tensor([3.])
     """
     check_tensors(F=(F, "3 3"), H1=(H1, "3 3"), H2=(H2, "3 3"))
     return _inverse(H2).mT @ F @ _inverse(H1)
@@ -44,6 +52,15 @@ def transform_trifocal(
 
     Returns:
         T in the new coordinates, the scale as it comes.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> half = torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=P.dtype))  # images of half the size
+        >>> T = torchsfm.tensors.transform_trifocal(torchsfm.tensors.trifocal_from_cameras(*P), half, half, half)
+        >>> truth = torchsfm.tensors.trifocal_from_cameras(*(half @ P))
+        >>> round(float((T * truth).sum().abs() / T.norm() / truth.norm()), 6)  # 1: the same up to scale
+        1.0
     """
     check_tensors(T=(T, "3 3 3"), H1=(H1, "3 3"), H2=(H2, "3 3"), H3=(H3, "3 3"))
     return torch.einsum("...abc,...ai,...jb,...kc->...ijk", T, _inverse(H1), H2, H3)
@@ -67,6 +84,16 @@ def transform_quadrifocal(
 
     Returns:
         Q in the new coordinates, the scale as it comes.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> half = torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=P.dtype))  # images of half the size
+        >>> Q = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> Q = torchsfm.tensors.transform_quadrifocal(Q, half, half, half, half)
+        >>> truth = torchsfm.tensors.quadrifocal_from_cameras(*(half @ P))
+        >>> round(float((Q * truth).sum().abs() / Q.norm() / truth.norm()), 6)  # 1: the same up to scale
+        1.0
     """
     check_tensors(Q=(Q, "3 3 3 3"), H1=(H1, "3 3"), H2=(H2, "3 3"), H3=(H3, "3 3"), H4=(H4, "3 3"))
     return torch.einsum("...abcd,...pa,...qb,...rc,...sd->...pqrs", Q, H1, H2, H3, H4)
@@ -81,6 +108,14 @@ def basis_homography(x: Float[Tensor, "*batch 4 2"]) -> Float[Tensor, "*batch 3 
     Returns:
         H with norm 1; finite without meaning, and singular, where three points are on a line or one is not finite.
         Differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0], [5.0, 5.0]])
+        >>> H = torchsfm.tensors.basis_homography(x)
+        >>> y = H @ torchsfm.geometry.to_homogeneous(x)[3]
+        >>> y / y[2]  # the fourth becomes (1, 1, 1)
+        tensor([1.0000, 1.0000, 1.0000])
     """
     check_tensors(x=(x, "4 2"))
     finite = torch.isfinite(x).all(-1).all(-1)[..., None, None]
@@ -106,6 +141,15 @@ def reduced_fundamental(
 
     Returns:
         The reduced matrix with norm 1.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, X = torchsfm.random_poses(2, generator=g).matrix(), torchsfm.random_points(4, generator=g)
+        >>> F = torchsfm.tensors.fundamental_from_cameras(*P)
+        >>> F = torchsfm.tensors.reduced_fundamental(F, *torchsfm.project_points(P, X))
+        >>> bool(F.diagonal().abs().max() < 1e-9), bool(F.sum().abs() < 1e-9)
+        (True, True)
     """
     check_tensors(F=(F, "3 3"), x1=(x1, "4 2"), x2=(x2, "4 2"))
     return unit_tensor(transform_fundamental(F, basis_homography(x1), basis_homography(x2)), 2)[0]
@@ -122,6 +166,15 @@ def reduced_trifocal(T: Float[Tensor, "*#batch 3 3 3"], x: Float[Tensor, "*#batc
 
     Returns:
         The reduced tensor with norm 1.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, X = torchsfm.random_poses(3, generator=g).matrix(), torchsfm.random_points(4, generator=g)
+        >>> T = torchsfm.tensors.trifocal_from_cameras(*P)
+        >>> T = torchsfm.tensors.reduced_trifocal(T, torchsfm.project_points(P, X))
+        >>> int((T.abs() > 1e-9).sum())
+        15
     """
     check_tensors(T=(T, "3 3 3"), x=(x, "3 4 2"))
     return unit_tensor(transform_trifocal(T, *basis_homography(x).unbind(-3)), 3)[0]
@@ -140,6 +193,15 @@ def reduced_quadrifocal(
 
     Returns:
         The reduced tensor with norm 1.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, X = torchsfm.random_poses(4, generator=g).matrix(), torchsfm.random_points(4, generator=g)
+        >>> Q = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> Q = torchsfm.tensors.reduced_quadrifocal(Q, torchsfm.project_points(P, X))
+        >>> int((Q.abs() > 1e-9).sum())
+        36
     """
     check_tensors(Q=(Q, "3 3 3 3"), x=(x, "4 4 2"))
     return unit_tensor(transform_quadrifocal(Q, *basis_homography(x).unbind(-3)), 4)[0]

@@ -25,6 +25,8 @@ class Focals:
     `sensitivity` is about the factor by which a relative error of F grows in the focal lengths. `status` is OK, DEGENERATE (the
     geometry does not determine them: sensitivity above 1 / sqrt(eps); or no real focal length fits) or NOT_FINITE; where it is
     not OK, `model` is 1 and `sensitivity` infinite.
+
+    See the example of `focals_from_fundamental`.
     """
 
     model: Float[Tensor, "*batch 2"]
@@ -57,6 +59,15 @@ def focals_from_fundamental(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> poses = torchsfm.random_poses(2, generator=torch.Generator().manual_seed(1))
+        >>> f, c = torch.tensor([800.0, 900.0], dtype=torch.float64), torch.tensor([320.0, 240.0], dtype=torch.float64)
+        >>> P = torchsfm.intrinsics(f, c) @ poses.matrix()
+        >>> F = torchsfm.tensors.fundamental_from_cameras(*P)
+        >>> torchsfm.tensors.focals_from_fundamental(F, c, c).model
+        tensor([800.0000, 900.0000], dtype=torch.float64)
     """
     batch = check_tensors(F=(F, "3 3"), c1=(c1, "2"), c2=(c2, "2"))
     F = F.expand(*batch, 3, 3)

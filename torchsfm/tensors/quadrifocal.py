@@ -36,6 +36,14 @@ def quadrifocal_from_cameras(
 
     Returns:
         Q with `Q[p, q, r, s] = det(P1[p], P2[q], P3[r], P4[s])`, its scale the product of those of the cameras.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> x = torchsfm.project_points(P, torch.zeros(1, 3, dtype=P.dtype))
+        >>> Q = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> bool(torchsfm.tensors.quadrifocal_pppp(Q, *x).abs().max() < 1e-9)  # x are images of one point
+        True
     """
     check_tensors(P1=(P1, "3 4"), P2=(P2, "3 4"), P3=(P3, "3 4"), P4=(P4, "3 4"))
     signs = torch.tensor(LAPLACE_SIGNS, dtype=P1.dtype, device=P1.device)
@@ -53,6 +61,12 @@ def quadrifocal_tensors(P: Float[Tensor, "*batch v 3 4"], index: Int[Tensor, "m 
 
     Returns:
         For each quadruplet the tensor of `quadrifocal_from_cameras`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(5, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> torchsfm.tensors.quadrifocal_tensors(P, torch.tensor([[0, 1, 2, 3], [1, 2, 3, 4]])).shape
+        torch.Size([2, 3, 3, 3, 3])
     """
     check_tensors(P=(P, "v>=1 3 4"), index=(index, "m 4: int"))
     return quadrifocal_from_cameras(*(P[..., index[:, k], :, :] for k in range(4)))
@@ -75,6 +89,14 @@ def trifocal_from_quadrifocal(
 
     Raises:
         ValueError: Wrong shape or dtype, or `views` are not three different numbers from 0 to 3.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> T = torchsfm.tensors.trifocal_from_quadrifocal(torchsfm.tensors.quadrifocal_from_cameras(*P), (0, 1, 3))
+        >>> truth = torchsfm.tensors.trifocal_from_cameras(P[0], P[1], P[3])
+        >>> round(float((T * truth).sum().abs() / truth.norm()), 6)  # 1: the same up to scale
+        1.0
     """
     check_tensors(Q=(Q, "3 3 3 3"))
     if not isinstance(views, Sequence) or len(views) != 3 or len(set(views)) != 3 or not set(views) <= {0, 1, 2, 3}:
@@ -116,6 +138,14 @@ def cameras_from_quadrifocal(Q: Float[Tensor, "*batch 3 3 3 3"]) -> ProjectiveCa
 
     Raises:
         ValueError: Wrong shape or dtype.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> Q = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> found = torchsfm.tensors.cameras_from_quadrifocal(Q)
+        >>> bool(found.P.allclose(torchsfm.tensors.canonical_cameras(P)))
+        True
     """
     check_tensors(Q=(Q, "3 3 3 3"))
     unit, finite = unit_tensor(Q.double(), 4)

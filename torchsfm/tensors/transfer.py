@@ -31,6 +31,15 @@ def transfer_points_trifocal(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, X = torchsfm.random_poses(3, generator=g).matrix(), torchsfm.random_points(10, generator=g)
+        >>> x1, x2, x3 = torchsfm.project_points(P, X)
+        >>> T = torchsfm.tensors.trifocal_from_cameras(*P)
+        >>> bool(torchsfm.tensors.transfer_points_trifocal(T, x1, x2).allclose(x3))
+        True
     """
     check_tensors(T=(T, "3 3 3"), x1=(x1, "n 2"), x2=(x2, "n 2"))
     h1 = to_homogeneous(x1)
@@ -60,6 +69,15 @@ def transfer_lines_trifocal(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> L = torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.5, 0.0]], dtype=P.dtype)
+        >>> l = torchsfm.geometry.project_lines(P, L)
+        >>> l1 = torchsfm.tensors.transfer_lines_trifocal(torchsfm.tensors.trifocal_from_cameras(*P), l[1], l[2])
+        >>> bool(torch.linalg.cross(l1, l[0]).norm() < 1e-9)
+        True
     """
     check_tensors(T=(T, "3 3 3"), l2=(l2, "n 3"), l3=(l3, "n 3"))
     T = unit_tensor(T, 3)[0]
@@ -82,6 +100,15 @@ def homographies_from_trifocal(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> x1, x2, x3 = torchsfm.project_points(P, torch.zeros(1, 3, dtype=P.dtype))
+        >>> l2 = torchsfm.geometry.line_from_points(x2, x2 + 1)  # a line through x2: its plane holds the point
+        >>> H = torchsfm.tensors.homographies_from_trifocal(torchsfm.tensors.trifocal_from_cameras(*P), l2)
+        >>> bool(torchsfm.geometry.transform_points(H[0], x1).allclose(x3))
+        True
     """
     check_tensors(T=(T, "3 3 3"), l2=(l2, "n 3"))
     return torch.einsum("...ijk,...nj->...nki", T, l2)
@@ -110,6 +137,15 @@ def transfer_points_quadrifocal(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, X = torchsfm.random_poses(4, generator=g).matrix(), torchsfm.random_points(10, generator=g)
+        >>> x1, x2, x3, x4 = torchsfm.project_points(P, X)
+        >>> Q = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> bool(torchsfm.tensors.transfer_points_quadrifocal(Q, x1, x2, x3).allclose(x4))
+        True
     """
     check_tensors(Q=(Q, "3 3 3 3"), x1=(x1, "n 2"), x2=(x2, "n 2"), x3=(x3, "n 2"))
     L1, L2, L3 = (axis_lines(x) for x in (x1, x2, x3))
@@ -135,6 +171,16 @@ def transfer_lines_quadrifocal(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> L = torch.tensor([[1.0, 0.0, 0.0, 0.0, 0.5, 0.0]], dtype=P.dtype)
+        >>> l = torch.nn.functional.normalize(torchsfm.geometry.project_lines(P, L), dim=-1)
+        >>> Q = torchsfm.tensors.quadrifocal_from_cameras(*P)
+        >>> l3, l4 = torchsfm.tensors.transfer_lines_quadrifocal(Q, l[0], l[1])
+        >>> bool(torch.linalg.cross(l3, l[2]).norm() < 1e-9), bool(torch.linalg.cross(l4, l[3]).norm() < 1e-9)
+        (True, True)
     """
     check_tensors(Q=(Q, "3 3 3 3"), l1=(l1, "n 3"), l2=(l2, "n 3"))
     M = torch.einsum("...pqrs,...np,...nq->...nrs", unit_tensor(Q, 4)[0], normalize_sphere(l1), normalize_sphere(l2))

@@ -23,8 +23,10 @@ from torchsfm.tensors.minors import LAPLACE_SIGNS, cyclic_pairs, split_last, wed
 class ProjectiveCameras:
     """Cameras in some projective frame of space, in the order of the views; the first is [I | 0].
 
-    `status` is OK, DEGENERATE (the input does not determine the cameras) or NOT_FINITE; the cameras are finite always, and
-    mean something only where it is OK.
+    `P` are the cameras. `status` is OK, DEGENERATE (the input does not determine them) or NOT_FINITE; they are finite
+    always, and mean something only where it is OK.
+
+    See the example of `cameras_from_trifocal`.
     """
 
     P: Float[Tensor, "*batch v 3 4"]
@@ -44,6 +46,14 @@ def trifocal_from_cameras(
     Returns:
         T with `T[i, j, k] = det(P1[i + 1], P1[i + 2], P2[j], P3[k])`, rows of P1 counted cyclically. Its scale is the product
         of those of the cameras, that of the first squared. Zero where all centres coincide.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, X = torchsfm.random_poses(3, generator=g).matrix(), torchsfm.random_points(10, generator=g)
+        >>> T = torchsfm.tensors.trifocal_from_cameras(*P)
+        >>> bool(torchsfm.tensors.trifocal_ppp(T, *torchsfm.project_points(P, X)).abs().max() < 1e-9)
+        True
     """
     check_tensors(P1=(P1, "3 4"), P2=(P2, "3 4"), P3=(P3, "3 4"))
     signs = torch.tensor(LAPLACE_SIGNS, dtype=P1.dtype, device=P1.device)
@@ -60,6 +70,12 @@ def trifocal_tensors(P: Float[Tensor, "*batch v 3 4"], index: Int[Tensor, "m 3"]
 
     Returns:
         For each triplet the tensor of `trifocal_from_cameras`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> torchsfm.tensors.trifocal_tensors(P, torch.tensor([[0, 1, 2], [1, 2, 3]])).shape
+        torch.Size([2, 3, 3, 3])
     """
     check_tensors(P=(P, "v>=1 3 4"), index=(index, "m 3: int"))
     return trifocal_from_cameras(*(P[..., index[:, k], :, :] for k in range(3)))
@@ -78,6 +94,14 @@ def trifocal_epipoles(T: Float[Tensor, "*batch 3 3 3"]) -> tuple[Float[Tensor, "
     Returns:
         e2 and e3. Where T does not determine them (a first centre that coincides with another) some unit vectors, and
         (0, 0, 1) where T is not finite or zero. Differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> e2, e3 = torchsfm.tensors.trifocal_epipoles(torchsfm.tensors.trifocal_from_cameras(*P))
+        >>> seen = P[1] @ torchsfm.geometry.camera_centre(P[0], homogeneous=True)  # the first centre in the second view
+        >>> bool(torch.linalg.cross(e2, seen).norm() < 1e-9)
+        True
     """
     check_tensors(T=(T, "3 3 3"))
     e2, e3, _ = epipoles_of_slices(unit_tensor(T, 3)[0])
@@ -101,6 +125,14 @@ def cameras_from_trifocal(T: Float[Tensor, "*batch 3 3 3"]) -> ProjectiveCameras
 
     Raises:
         ValueError: Wrong shape or dtype.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> found = torchsfm.tensors.cameras_from_trifocal(torchsfm.tensors.trifocal_from_cameras(*P))
+        >>> canonical = torchsfm.tensors.canonical_cameras  # the frame in which cameras can be compared
+        >>> found.P.shape, bool(canonical(found.P).allclose(canonical(P)))
+        (torch.Size([3, 3, 4]), True)
     """
     check_tensors(T=(T, "3 3 3"))
     unit, finite = unit_tensor(T, 3)
@@ -123,6 +155,14 @@ def fundamentals_from_trifocal(T: Float[Tensor, "*batch 3 3 3"]) -> Float[Tensor
     Returns:
         F (*batch, pair, 3, 3) with norm 1, x_j' F x_i = 0 for the pair (i, j): zero where two centres coincide, without meaning
         where the first does with another. Differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> F = torchsfm.tensors.fundamentals_from_trifocal(torchsfm.tensors.trifocal_from_cameras(*P))
+        >>> F23, truth = F[2], torchsfm.tensors.fundamental_from_cameras(P[1], P[2])
+        >>> F.shape, round(float((F23 * truth).sum().abs() / truth.norm()), 6)  # 1: the same up to scale
+        (torch.Size([3, 3, 3]), 1.0)
     """
     P = cameras_from_trifocal(T).P
     e2, e3 = P[..., 1, :, 3], P[..., 2, :, 3]

@@ -35,6 +35,15 @@ def conics_2view(
         Both candidates, of unit size; valid where the centres differ, no plane passes through one, the conic does not touch the
         baseline, and the images can belong together. Of one candidate the plane often has the centres on different sides:
         cameras that see the same face have the other. Computed in float64; differentiable.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.simulate_conics((), views=2, generator=torch.Generator().manual_seed(0))
+        >>> found = torchsfm.triangulation.conics_2view(scene.C[0, 0], scene.C[1, 0], *scene.P)
+        >>> truth = torchsfm.geometry.dual_quadric_from_ellipsoid(scene.model)[0]
+        >>> fit = (found.model * truth).sum((-2, -1)).abs() / truth.norm()  # 1: the same up to scale
+        >>> found.valid, bool((fit[found.valid] > 1 - 1e-6).any())
+        (tensor([True, True]), True)
     """
     batch = check_tensors(C1=(C1, "3 3"), C2=(C2, "3 3"), P1=(P1, "3 4"), P2=(P2, "3 4"))
     dtype = C1.dtype

@@ -28,6 +28,12 @@ def correct_matches(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0]))  # moved sideways: y2 = y1
+        >>> torchsfm.triangulation.correct_matches(F, torch.tensor([[0.0, 1.0]]), torch.tensor([[7.0, 3.0]]))
+        (tensor([[0., 2.]]), tensor([[7., 2.]]))
     """
     batch = check_tensors(F=(F, "3 3"), x1=(x1, "n 2"), x2=(x2, "n 2"))
     entries = F.double()[..., None]

@@ -29,7 +29,10 @@ _FLAT = 1e-6
 
 @dataclass(frozen=True)
 class ConicTriangulation:
-    """Ellipses in space, or ellipsoids, and what is known about them."""
+    """Ellipses in space, or ellipsoids, and what is known about them.
+
+    See the example of `triangulate_conics`.
+    """
 
     model: Ellipsoid
     """Centres and semi-axes, finite always; of an ellipse in space the third axis is zero."""
@@ -91,6 +94,13 @@ def triangulate_conics(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or both edge points and covariances are given.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.simulate_conics((), generator=torch.Generator().manual_seed(0))  # a disc, three views
+        >>> found = torchsfm.triangulate_conics(scene.C, scene.P)
+        >>> found.status == torchsfm.Status.OK, bool(found.model.centre.allclose(scene.model.centre))
+        (tensor([True]), True)
     """
     return _triangulate(2, C, P, visible, x, weights, covariance, max_iterations)
 
@@ -123,6 +133,13 @@ def triangulate_quadrics(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or both edge points and covariances are given.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.simulate_conics((), flat=False, generator=torch.Generator().manual_seed(0))
+        >>> found = torchsfm.triangulate_quadrics(scene.C, scene.P)  # an ellipsoid from three outlines
+        >>> found.status == torchsfm.Status.OK, bool(found.model.centre.allclose(scene.model.centre))
+        (tensor([True]), True)
     """
     return _triangulate(3, C, P, visible, x, weights, covariance, max_iterations)
 

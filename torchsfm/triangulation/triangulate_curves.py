@@ -33,7 +33,10 @@ _SHARE = 0.5
 
 @dataclass(frozen=True)
 class CurveTriangulation:
-    """Curves in space, and what is known of their samples."""
+    """Curves in space, and what is known of their samples.
+
+    See the example of `triangulate_curves`.
+    """
 
     curve: Curve
     """The curves, sample by sample as the `reference` view's curve runs, from the first sample that is measured to the last."""
@@ -83,6 +86,17 @@ def triangulate_curves(
 
     Raises:
         ValueError: Wrong shape, dtype, device or option.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, 5, 100, dtype=torch.float64)
+        >>> X = torch.stack((t.cos(), t.sin(), 0.2 * t), -1)  # a helix
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0, dtype=X.dtype), torch.tensor([320.0, 240.0], dtype=X.dtype))
+        >>> P = K @ torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> curves = torchsfm.geometry.curve_from_samples(torchsfm.project_points(P, X))
+        >>> found = torchsfm.triangulate_curves(curves, P, samples=30)
+        >>> found.status == torchsfm.Status.OK, bool(found.error[:, found.measured].max() < 0.1)
+        (tensor(True), True)
     """
     check_options(curves=(curves, Curve), samples=(samples, "int >= 4"), threshold=(threshold, "float > 0"))
     batch = check_tensors(

@@ -37,7 +37,10 @@ _UNSURE = 0.3
 
 
 class LineFault(IntEnum):
-    """Why views do not determine a line."""
+    """Why views do not determine a line.
+
+    See the example of `triangulate_lines`.
+    """
 
     NONE = 0
     TOO_FEW = 1
@@ -54,7 +57,10 @@ class LineFault(IntEnum):
 
 @dataclass(frozen=True)
 class LineTriangulation:
-    """Lines and what is known about them."""
+    """Lines and what is known about them.
+
+    See the example of `triangulate_lines`.
+    """
 
     model: Float[Tensor, "*batch n 6"]
     """Pluecker vectors (d, m) with |d| = 1, d pointing from the first ends of the segments to the second; finite always.
@@ -112,6 +118,17 @@ def triangulate_lines(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P = torchsfm.random_intrinsics(3, generator=g) @ torchsfm.random_poses(3, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, torchsfm.random_points(2, generator=g))  # the ends of a segment
+        >>> found = torchsfm.triangulate_lines(x[:, None], P)
+        >>> found.status == torchsfm.Status.OK, found.fault == torchsfm.triangulation.LineFault.NONE
+        (tensor([True]), tensor([True]))
+        >>> bool(torchsfm.project_points(P, found.ends[0]).allclose(x))
+        True
     """
     segments = isinstance(l, Tensor) and l.ndim > 3 and l.shape[-2:] == (2, 2)
     batch = check_tensors(

@@ -29,6 +29,8 @@ class LineEstimator:
 
     Attributes:
         seen: Whether the ends say what is seen of the line: else they are points of image lines, and nothing is behind.
+
+    See the example of `triangulate_lines_robust`.
     """
 
     seen: bool = True
@@ -122,7 +124,10 @@ def _applied(A: Tensor, v: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RobustLineTriangulation:
-    """Lines and which of their observations they agree with."""
+    """Lines and which of their observations they agree with.
+
+    See the example of `triangulate_lines_robust`.
+    """
 
     model: Float[Tensor, "*batch n 6"]
     """Pluecker vectors (d, m) with |d| = 1, d from the first ends of the segments to the second; finite always. Where `status`
@@ -187,6 +192,16 @@ def triangulate_lines_robust(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P = torchsfm.random_poses(6, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, torchsfm.random_points(2, generator=g))  # the ends of a segment
+        >>> x[5] += 0.5  # wrong in the last view
+        >>> found = torchsfm.triangulate_lines_robust(x[:, None], P, threshold=0.01, generator=g)
+        >>> found.inliers[:, 0]
+        tensor([ True,  True,  True,  True,  True, False])
     """
     segments = isinstance(l, Tensor) and l.ndim > 3 and l.shape[-2:] == (2, 2)
     own = {"l": (l, "v n 2 2" if segments else "v n 3"), "P": (P, "v 3 4"), "visible": (visible, "?v n: bool")}

@@ -17,7 +17,10 @@ from torchsfm.triangulation.triangulate_points_dlt import euclidean, linear_poin
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Points and what is known about them."""
+    """Points and what is known about them.
+
+    See the example of `triangulate_points`.
+    """
 
     model: Float[Tensor, "*batch n 3"]
     """The points, finite always; where `status` is not OK they may mean little."""
@@ -69,6 +72,14 @@ def triangulate_points(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(100, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> found = torchsfm.triangulate_points(torchsfm.project_points(P, X), P)
+        >>> bool(found.model.allclose(X)), bool((found.status == torchsfm.Status.OK).all())
+        (True, True)
     """
     check_options(max_iterations=(max_iterations, "int >= 0"))
 

@@ -42,6 +42,13 @@ def triangulate_points_dlt(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(100, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> bool(torchsfm.triangulation.triangulate_points_dlt(torchsfm.project_points(P, X), P).allclose(X))
+        True
     """
 
     def solve(data: Observations) -> tuple[Tensor, ...]:

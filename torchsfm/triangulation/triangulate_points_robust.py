@@ -22,6 +22,8 @@ class PointEstimator:
 
     Cameras are scaled so that the third coordinate of P X is the depth. Distances are reprojection errors in pixels, and
     infinite behind the camera.
+
+    See the example of `triangulate_points_robust`.
     """
 
     model_name: ClassVar[str] = "point"
@@ -134,7 +136,10 @@ class _Views:
 
 @dataclass(frozen=True)
 class RobustTriangulation:
-    """Points and which of their observations they agree with."""
+    """Points and which of their observations they agree with.
+
+    See the example of `triangulate_points_robust`.
+    """
 
     model: Float[Tensor, "*batch n 3"]
     """The points, finite always; where `status` is not OK they may mean little."""
@@ -191,6 +196,16 @@ def triangulate_points_robust(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(100, generator=g), torchsfm.random_poses(6, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, X)
+        >>> x[5] += 0.5  # all wrong in the last view
+        >>> found = torchsfm.triangulate_points_robust(x, P, threshold=0.01, generator=g)
+        >>> bool(found.model.allclose(X)), found.inliers.sum(1)
+        (True, tensor([100, 100, 100, 100, 100,   0]))
     """
     own = {"x": (x, "v n 2"), "P": (P, "v 3 4"), "visible": (visible, "?v n: bool")}
     batch = check_door(own, threshold, options, SearchOptions, of_problem="n", of_datum="v n")
