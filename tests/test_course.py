@@ -18,6 +18,18 @@ TRUTHS: dict[str, list[tuple[str, float, float]]] = {
         (r"step 5: rms error +([\d.]+)", 0.45, 0.55),
         (r"step 5: .* centre off by ([\d.]+)", 0, 0.01),
     ],
+    "02_homographies_and_panoramas.py": [
+        (r"a hundred others of the wall agree with it to ([\d.e+-]+)", 0, 1e-9),
+        (r"normalised DLT +error on the wall: median ([\d.]+)", 0.5, 1.3),
+        (r"matches, .* the turn is off by ([\d.]+) degrees", 0, 0.1),
+        (r"seed 2: start 2 degrees off, ([\d.]+) degrees", 0, 0.02),
+    ],
+    "03_epipolar_geometry.py": [
+        (r"seven points from the line F x1: ([\d.e+-]+)", 0, 1e-9),
+        (r"distance of exact points from the estimated F: median ([\d.]+)", 0, 0.3),
+        (r"estimated as E .* rotation off by ([\d.]+) degrees", 0, 0.2),
+        (r"band of 2000 trials: ([\d.]+)", 0.9, 1.1),
+    ],
 }
 """For a notebook, what it prints and between which numbers that must lie."""
 
