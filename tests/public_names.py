@@ -1,6 +1,7 @@
 """What the package shows: its names with their signatures, one in a line. Run as a program, it writes them anew."""
 
 import inspect
+import typing
 from enum import EnumMeta
 from pathlib import Path
 from types import ModuleType
@@ -13,11 +14,11 @@ FILE = Path(__file__).with_suffix(".txt")
 
 def public_names() -> dict[str, Any]:
     """The names at the top of the package that are no rooms."""
-    return {name: value for name, value in sorted(vars(torchsfm).items()) if name[0] != "_" and _is_ours(value)}
+    return {name: value for name, value in sorted(vars(torchsfm).items()) if name[0] != "_" and _is_ours(name, value)}
 
 
-def _is_ours(value: Any) -> bool:
-    return not isinstance(value, ModuleType) and value is not Any and value is not None
+def _is_ours(name: str, value: Any) -> bool:
+    return not isinstance(value, ModuleType) and not hasattr(typing, name)
 
 
 def lines() -> list[str]:

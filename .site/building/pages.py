@@ -1,0 +1,44 @@
+"""Pages that are files of the repository: README, benchmark tables, changelog, contributing."""
+
+import re
+from pathlib import Path
+
+from building.files import write_folder
+
+LINKS = {
+    "bench/RESULTS.md": "/generated/pages/results.md",
+    "CHANGELOG.md": "/generated/pages/changelog.md",
+    ".github/CONTRIBUTING.md": "/generated/pages/contributing.md",
+    "examples/fountain.png": "/generated/pages/fountain.png",
+}
+
+
+def write(root: Path, folder: Path) -> None:
+    """Write the pages and the picture on the first."""
+    readme = sections((root / "README.md").read_text())
+    texts = {
+        "parts/start.md": "## Start\n".join((readme["torchsfm"], readme["Start"])),
+        "parts/uses.md": readme["Three uses"],
+        "parts/conventions.md": readme["Conventions"],
+        "parts/rooms.md": readme["The rooms"],
+        "parts/working.md": readme["Working on it"],
+        "results.md": (root / "bench" / "RESULTS.md").read_text(),
+        "changelog.md": (root / "CHANGELOG.md").read_text(),
+        "contributing.md": (root / ".github" / "CONTRIBUTING.md").read_text(),
+    }
+    contents = {name: linked(text).encode() for name, text in texts.items()}
+    contents["fountain.png"] = (root / "examples" / "fountain.png").read_bytes()
+    write_folder(folder, contents)
+
+
+def sections(text: str) -> dict[str, str]:
+    """The parts of a Markdown text by their headings, without these."""
+    parts = re.split(r"^#{1,2} (.+)\n", text, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def linked(text: str) -> str:
+    """Links from file to file as links from page to page."""
+    for file, page in LINKS.items():
+        text = re.sub(rf"\]\((?:\.\./)*{re.escape(file)}", f"]({page}", text)
+    return text
