@@ -3,6 +3,9 @@
 import ast
 import re
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from building.files import write_folder
 
@@ -19,20 +22,31 @@ Multiple-view geometry from the first projection to curves in space, in parts of
 run as a whole or piece by piece, with figures and exercises.
 """,
 }
+LEFT_OUT = re.compile(r"__pycache__|\.md$|^course/\D.*\.py$")
+"""Of the scripts of the course, its parts have a number."""
+HEADER = "/GALLERY_HEADER.rst"
 TITLE = re.compile(r"(.+?)(?::|\.|(?<=[?!]))(?:\s+|$)(.*)", re.DOTALL)
 COMMAND = re.compile(r"^    (python .*)$", re.MULTILINE)
 
 
-def write(examples: Path, folder: Path) -> None:
-    """Copy the examples with what they need."""
-    paths = [path for path in examples.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    contents = {path.relative_to(examples).as_posix(): path.read_bytes() for path in paths}
-    for name, content in contents.items():
-        if name.endswith(".py"):
-            contents[name] = titled(content.decode()).encode()
-    folders = {name.rpartition("/")[0] for name in contents if name.endswith(".py")}
-    contents |= {f"{name}/GALLERY_HEADER.rst".lstrip("/"): HEADERS[name].encode() for name in folders}
-    write_folder(folder, contents)
+def write(examples: Path, folder: Path, gallery: Path) -> None:
+    """Copy the examples with the data that they need, and forget the pages in the gallery of those that are gone."""
+    paths = {path.relative_to(examples).as_posix(): path for path in examples.rglob("*") if path.is_file()}
+    contents = {name: path.read_bytes() for name, path in paths.items() if not LEFT_OUT.search(name)}
+    scripts = [name for name in contents if name.endswith(".py")]
+    for name in scripts:
+        contents[name] = titled(contents[name].decode()).encode()
+        contents[name.rpartition("/")[0] + HEADER] = HEADERS[name.rpartition("/")[0]].encode()
+    write_folder(folder, {name.lstrip("/"): content for name, content in contents.items()})
+    for page in gallery.rglob("*.rst"):
+        if page.stem != "index" and page.relative_to(gallery).with_suffix(".py").as_posix() not in scripts:
+            page.unlink()
+
+
+def forget(gallery: dict[str, Any], script: str) -> None:
+    """What one example leaves behind must not change the next."""
+    torch.set_default_dtype(torch.float32)
+    torch.manual_seed(0)
 
 
 def titled(script: str) -> str:

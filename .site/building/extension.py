@@ -23,5 +23,5 @@ def write(app: Any) -> None:
     """Write all pages that are made of something else."""
     api.write(GENERATED / "api")
     pages.write(ROOT, GENERATED / "pages")
-    examples.write(ROOT / "examples", GENERATED / "examples")
+    examples.write(ROOT / "examples", GENERATED / "examples", GENERATED / "gallery")
     figures.write(GENERATED / "figures")

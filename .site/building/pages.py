@@ -1,10 +1,14 @@
 """Pages that are files of the repository: README, benchmark tables, changelog, contributing."""
 
+import inspect
 import re
 from pathlib import Path
 
 from building.files import write_folder
+from building.names import find
 
+SOURCES = ("homography_4pt", "write_tum", "KannalaBrandt")
+"""Of these the page on additions shows the files."""
 LINKS = {
     "bench/RESULTS.md": "/generated/pages/results.md",
     "CHANGELOG.md": "/generated/pages/changelog.md",
@@ -27,8 +31,16 @@ def write(root: Path, folder: Path) -> None:
         "contributing.md": (root / ".github" / "CONTRIBUTING.md").read_text(),
     }
     contents = {name: linked(text).encode() for name, text in texts.items()}
+    contents |= {f"parts/{name}.py": source(name) for name in SOURCES}
     contents["fountain.png"] = (root / "examples" / "fountain.png").read_bytes()
     write_folder(folder, contents)
+
+
+def source(name: str) -> bytes:
+    """The file that a public name is written in."""
+    found = find(name)
+    assert found is not None
+    return Path(str(inspect.getsourcefile(found.value))).read_bytes()
 
 
 def sections(text: str) -> dict[str, str]:
