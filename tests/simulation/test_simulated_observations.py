@@ -221,3 +221,4 @@ def test_random_intrinsics_have_the_angle_of_view() -> None:
     assert torch.equal(K[:, 0, 0], K[:, 1, 1])
     assert torch.allclose(K[:, :2, 2].mean(0), torch.tensor([499.5, 374.5], dtype=torch.float64), atol=2)
     assert torch.allclose(K[:, :2, 2].std(0), torch.full((2,), 20.0, dtype=torch.float64), rtol=0.1)
+    assert random_intrinsics().shape == (3, 3)

@@ -39,6 +39,16 @@ def camera_1p2l(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(5, generator=g), torchsfm.random_poses(generator=g)
+        >>> L = torchsfm.geometry.pluecker_from_points(X[1:3], X[3:5])  # two lines
+        >>> l = torchsfm.geometry.project_lines(pose.matrix(), L)
+        >>> poses = torchsfm.resection.camera_1p2l(pose.transform(X[:1]), X[:1], l, L)
+        >>> bool((poses.model[poses.valid] - pose.matrix()).abs().amax((-2, -1)).min() < 1e-6)  # the true one is there
+        True
     """
     batch = check_tensors(d=(d, "1 3"), X=(X, "1 3"), l=(l, "2 3"), L=(L, "2 6"))
     return solve_poses(_candidates, 4, batch, d, X, l, L)

@@ -37,6 +37,16 @@ def camera_2p1l(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(4, generator=g), torchsfm.random_poses(generator=g)
+        >>> L = torchsfm.geometry.pluecker_from_points(X[2:3], X[3:4])  # a line
+        >>> l = torchsfm.geometry.project_lines(pose.matrix(), L)
+        >>> poses = torchsfm.resection.camera_2p1l(pose.transform(X[:2]), X[:2], l, L)
+        >>> bool((poses.model[poses.valid] - pose.matrix()).abs().amax((-2, -1)).min() < 1e-6)  # the true one is there
+        True
     """
     batch = check_tensors(d=(d, "2 3"), X=(X, "2 3"), l=(l, "1 3"), L=(L, "1 6"))
     return solve_poses(_candidates, 2, batch, d, X, l, L)

@@ -49,6 +49,15 @@ def camera_3l(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(6, generator=g), torchsfm.random_poses(generator=g)
+        >>> L = torchsfm.geometry.pluecker_from_points(X[:3], X[3:])  # three lines
+        >>> poses = torchsfm.resection.camera_3l(torchsfm.geometry.project_lines(pose.matrix(), L), L)
+        >>> bool((poses.model[poses.valid] - pose.matrix()).abs().amax((-2, -1)).min() < 1e-6)  # the true one is there
+        True
     """
     batch = check_tensors(l=(l, "3 3"), L=(L, "3 6"))
     none = l.new_zeros(0, 3)

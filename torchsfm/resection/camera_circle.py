@@ -37,6 +37,17 @@ def camera_circle(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
+        >>> turn = torch.tensor([0.5, 0.0, 0.0], dtype=t.dtype)
+        >>> P = torchsfm.Pose(torchsfm.geometry.rotation_from_rotvec(turn), t).matrix()  # a circle seen aslant
+        >>> H = torch.stack((P[:, 0], P[:, 1], P[:, 3]), 1)  # rays from the plane z = 0
+        >>> C = torchsfm.geometry.transform_conic(H, torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=t.dtype)))
+        >>> poses = torchsfm.resection.camera_circle(C, torch.tensor(1.0, dtype=t.dtype))
+        >>> poses.valid, bool((poses.model - P).abs().amax((-2, -1)).min() < 1e-6)  # the true one is there
+        (tensor([True, True]), True)
     """
     batch = check_tensors(C=(C, "3 3"), radius=(radius, ""))
     dtype = C.dtype

@@ -18,7 +18,10 @@ BLURRED = 3.0
 
 @dataclass(frozen=True)
 class CameraEstimate:
-    """Cameras and whether the data determine them."""
+    """Cameras and whether the data determine them.
+
+    See the example of `camera_dlt`.
+    """
 
     model: Float[Tensor, "*batch 3 4"]
     """P, finite always. |(P31, P32, P33)| = 1, and most of the structure has positive depth if det P[:, :3] > 0."""
@@ -56,6 +59,14 @@ def camera_dlt(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit; only one of `l` and `L` is given; or fewer than 11 equations in all.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(10, generator=g), torchsfm.random_poses(generator=g).matrix()
+        >>> found = torchsfm.resection.camera_dlt(torchsfm.project_points(P, X), X)
+        >>> bool(torchsfm.geometry.camera_centre(found.model).allclose(torchsfm.geometry.camera_centre(P)))
+        True
     """
     if (l is None) != (L is None) or (l is None and line_weights is not None):
         raise ValueError("l, L: wanted both or neither, and line_weights only with them")

@@ -63,6 +63,15 @@ def camera_gp3p(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(3, generator=g), torchsfm.random_poses(generator=g)
+        >>> p = torch.eye(3, dtype=X.dtype)  # three cameras of a rig
+        >>> poses = torchsfm.resection.camera_gp3p(p, pose.transform(X) - p, X)
+        >>> bool((poses.model[poses.valid] - pose.matrix()).abs().amax((-2, -1)).min() < 1e-6)  # the true one is there
+        True
     """
     batch = check_tensors(p=(p, "3 3"), d=(d, "3 3"), X=(X, "3 3"))
     with torch.no_grad():

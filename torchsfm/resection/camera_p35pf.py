@@ -63,6 +63,15 @@ def camera_p35pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(4, generator=g), torchsfm.random_poses(generator=g)
+        >>> found = torchsfm.resection.camera_p35pf(800 * torchsfm.project_points(pose.matrix(), X), X)
+        >>> f = found.model[found.valid][:, 0, :3].norm(dim=-1)
+        >>> bool((f - 800).abs().min() < 1e-3)  # the true one is there
+        True
     """
     batch = check_tensors(x=(x, "4 2"), X=(X, "4 3"))
     with torch.no_grad():

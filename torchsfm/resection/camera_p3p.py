@@ -34,6 +34,14 @@ def camera_p3p(d: Float[Tensor, "*#batch 3 3"], X: Float[Tensor, "*#batch 3 3"])
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(3, generator=g), torchsfm.random_poses(generator=g)
+        >>> poses = torchsfm.resection.camera_p3p(pose.transform(X), X)
+        >>> bool((poses.model[poses.valid] - pose.matrix()).abs().amax((-2, -1)).min() < 1e-6)  # the true one is there
+        True
     """
     batch = check_tensors(d=(d, "3 3"), X=(X, "3 3"))
     rays, points = (a.double().expand(*batch, 3, 3).reshape(batch.numel(), 9) for a in (d, X))

@@ -57,6 +57,14 @@ def camera_p4pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(4, generator=g), torchsfm.random_poses(generator=g)
+        >>> camera = torchsfm.resection.camera_p4pf(800 * torchsfm.project_points(pose.matrix(), X), X)
+        >>> bool(camera.valid), camera.model[0, 0, :3].norm()  # the focal length
+        (True, tensor(800.0000, dtype=torch.float64))
     """
     batch = check_tensors(x=(x, "4 2"), X=(X, "4 3"))
     with torch.no_grad():

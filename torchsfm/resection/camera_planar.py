@@ -19,7 +19,10 @@ _STILL = 1e-10
 
 @dataclass(frozen=True)
 class PlanarPoses:
-    """Both poses of planar problems, the better one first."""
+    """Both poses of planar problems, the better one first.
+
+    See the example of `camera_planar`.
+    """
 
     model: Float[Tensor, "*batch 2 3 4"]
     """`cam_from_world` as `[R | t]`, finite always."""
@@ -62,6 +65,14 @@ def camera_planar(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(20, kind="plane", generator=g), torchsfm.random_poses(generator=g)
+        >>> found = torchsfm.camera_planar(pose.transform(X), X)
+        >>> bool(found.model[0].allclose(pose.matrix())), found.error[0] < 1e-6
+        (True, tensor(True))
     """
     batch = check_tensors(d=(d, "n 3"), X=(X, "n 3"), weights=(weights, "?n"))
     with torch.no_grad():

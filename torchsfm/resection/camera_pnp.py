@@ -21,7 +21,10 @@ _KEPT = 2
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """Poses and how well they fit."""
+    """Poses and how well they fit.
+
+    See the example of `camera_pnp`.
+    """
 
     model: Float[Tensor, "*batch 3 4"]
     """`cam_from_world` as `[R | t]`, finite always."""
@@ -61,6 +64,14 @@ def camera_pnp(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(8, 20, generator=g), torchsfm.random_poses(8, generator=g)  # eight cameras
+        >>> found = torchsfm.camera_pnp(poses.transform(X), X)
+        >>> bool(found.model.allclose(poses.matrix())), bool((found.status == torchsfm.Status.OK).all())
+        (True, True)
     """
     batch = check_tensors(d=(d, "n 3"), X=(X, "n 3"), weights=(weights, "?n"))
     with torch.no_grad():

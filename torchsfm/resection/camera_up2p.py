@@ -59,6 +59,15 @@ def camera_up2p(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(2, generator=g), torchsfm.random_poses(generator=g)
+        >>> G = torch.tensor([0.0, 0.0, -1.0], dtype=X.dtype)  # down
+        >>> poses = torchsfm.resection.camera_up2p(pose.transform(X), X, pose.R @ G, G)
+        >>> bool((poses.model[poses.valid] - pose.matrix()).abs().amax((-2, -1)).min() < 1e-6)  # the true one is there
+        True
     """
     batch = check_tensors(d=(d, "2 3"), X=(X, "2 3"), g=(g, "3"), G=(G, "3"))
     with torch.no_grad():

@@ -23,6 +23,16 @@ class CameraEstimator:
 
     Attributes:
         K: Intrinsics of the camera of each problem; its last row is (0, 0, 1).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> estimator = torchsfm.resection.CameraEstimator(torch.eye(3, dtype=torch.float64))
+        >>> X = torchsfm.random_points(50, generator=torch.Generator().manual_seed(0)) + torch.tensor([0, 0, 5])
+        >>> x = torchsfm.project_points(torch.eye(3, 4, dtype=X.dtype), X)
+        >>> x[:10] += 0.5  # one in five is wrong
+        >>> found = torchsfm.ransac(estimator, x, X, threshold=0.01, generator=torch.Generator().manual_seed(0))
+        >>> int(found.inliers.sum())
+        40
     """
 
     K: Float[Tensor, "*batch 3 3"]
@@ -141,6 +151,16 @@ def estimate_camera(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or only one of `l` and `L` is given.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(200, generator=g), torchsfm.random_poses(1, generator=g)
+        >>> K = torch.eye(3, dtype=X.dtype)
+        >>> seen = torchsfm.simulate_images(X, pose, torchsfm.Camera(K), outliers=0.3, generator=g)
+        >>> found = torchsfm.estimate_camera(seen.x[0], X, K, threshold=1e-3, generator=g)
+        >>> bool(found.model.allclose(pose.matrix()[0], atol=1e-6)), bool(found.inliers[~seen.outlier[0]].all())
+        (True, True)
     """
     data: dict[str, tuple[Tensor | None, str]] = {"x": (x, "n 2"), "X": (X, "n 3"), "K": (K, "3 3")}
     if l is None and L is None:

@@ -21,6 +21,8 @@ class FocalCameraEstimator:
     """The camera `diag(f, f, 1) [R | t]` in images whose origin is the principal point.
 
     Distances are reprojection errors in the unit of the image points.
+
+    See the example of `estimate_camera_focal`, which uses it.
     """
 
     model_name: ClassVar[str] = "focal_camera"
@@ -141,6 +143,16 @@ def estimate_camera_focal(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(200, generator=g), torchsfm.random_poses(1, generator=g)
+        >>> K = torchsfm.random_intrinsics(generator=g)
+        >>> seen = torchsfm.simulate_images(X, pose, torchsfm.Camera(K), outliers=0.3, generator=g)
+        >>> found = torchsfm.estimate_camera_focal(seen.x[0], X, K[:2, 2], threshold=2.0, generator=g)
+        >>> bool(torchsfm.geometry.krt_from_camera(found.model)[0].allclose(K, rtol=1e-4))
+        True
     """
     check_door({"x": (x, "n 2"), "X": (X, "n 3"), "c": (c, "2")}, threshold, options)
     dtype = x.dtype

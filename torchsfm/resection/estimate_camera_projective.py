@@ -25,6 +25,8 @@ class ProjectiveCameraEstimator:
 
     A sample is six points, of which the last gives one equation. Distances are reprojection errors in the unit of the image
     points.
+
+    See the example of `estimate_camera_projective`, which uses it.
     """
 
     model_name: ClassVar[str] = "projective_camera"
@@ -174,6 +176,16 @@ def estimate_camera_projective(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(200, generator=g), torchsfm.random_poses(1, generator=g)
+        >>> K = torchsfm.random_intrinsics(generator=g)
+        >>> seen = torchsfm.simulate_images(X, pose, torchsfm.Camera(K), outliers=0.3, generator=g)
+        >>> found = torchsfm.estimate_camera_projective(seen.x[0], X, threshold=2.0, generator=g)
+        >>> bool(torchsfm.geometry.krt_from_camera(found.model)[0].allclose(K, rtol=1e-4))
+        True
     """
     check_door({"x": (x, "n 2"), "X": (X, "n 3")}, threshold, options)
     usable = present(options.get("mask"), x, X)

@@ -43,6 +43,8 @@ class PointLineCameraEstimator:
 
     Attributes:
         K: Intrinsics of the camera of each problem; its last row is (0, 0, 1).
+
+    See the example of `estimate_camera`, which uses it where there are lines.
     """
 
     K: Float[Tensor, "*batch 3 3"]

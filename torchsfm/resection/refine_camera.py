@@ -26,7 +26,10 @@ PIECE = 16384
 
 @dataclass(frozen=True)
 class CameraRefinement:
-    """Refined cameras and how well they are determined."""
+    """Refined cameras and how well they are determined.
+
+    See the example of `refine_camera`.
+    """
 
     pose: Pose
     """`cam_from_world`."""
@@ -44,6 +47,7 @@ class CameraRefinement:
     cost: Float[Tensor, "*batch"]
     """Half the weighted sum of losses, which is what was minimised."""
     iterations: Int[Tensor, "*batch"]
+    """Steps tried."""
     status: Int[Tensor, "*batch"]
     """OK, NOT_CONVERGED, TOO_FEW, NOT_FINITE; DEGENERATE: the parameters are not determined (points in a line, all far away,
     ...); BEHIND: half of the weight or more is behind the camera."""
@@ -97,6 +101,16 @@ def refine_camera(
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, only one of `l` and `L` is given, or `free` names what the camera
             does not have.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(50, generator=g), torchsfm.random_poses(generator=g)
+        >>> camera = torchsfm.Camera(torchsfm.random_intrinsics(generator=g))
+        >>> x, start = torchsfm.project_points(pose, X, camera), pose.retract(torch.full((6,), 0.05, dtype=X.dtype))
+        >>> found = torchsfm.refine_camera(x, X, start, camera)
+        >>> bool(found.model.allclose(pose.matrix())), bool(found.error < 1e-6)
+        (True, True)
     """
     check_options(
         pose=(pose, Pose), camera=(camera, Camera), free=(free, Sequence), loss=(loss, Callable | None),

@@ -22,7 +22,10 @@ _STEPS = 8
 
 @dataclass(frozen=True)
 class ResectedCameras:
-    """Cameras, what they agree with and what became of each."""
+    """Cameras, what they agree with and what became of each.
+
+    See the example of `resect_cameras`.
+    """
 
     model: Float[Tensor, "*batch v 3 4"]
     """`[R | t]` where K was given, otherwise P with `|P[2, :3]| = 1`; finite always."""
@@ -72,6 +75,15 @@ def resect_cameras(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, only one of `l` and `L` is given, or lines without K.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(20, generator=g), torchsfm.random_poses(5, generator=g)
+        >>> K = torchsfm.random_intrinsics(5, generator=g)
+        >>> found = torchsfm.resect_cameras(torchsfm.project_points(K @ poses.matrix(), X), X, K)
+        >>> bool(found.model.allclose(poses.matrix())), found.inliers.sum(-1)
+        (True, tensor([20, 20, 20, 20, 20]))
     """
     limit = threshold if isinstance(threshold, Tensor) else None
     if limit is None:

@@ -24,6 +24,15 @@ class Degeneracy(IntEnum):
     """What the inliers of a model lack; results hold it as an int8 tensor over the batch.
 
     Which of these are found, and what they mean for the model, is said where the model is estimated.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(50, 2, generator=g, dtype=torch.float64)
+        >>> x2 = x1 + 0.1 + 1e-4 * torch.randn(50, 2, generator=g, dtype=torch.float64)  # a plane: any epipole fits
+        >>> found = torchsfm.estimate_fundamental(x1, x2, threshold=1e-3, generator=g)
+        >>> torchsfm.Degeneracy(int(found.degeneracy)).name
+        'PLANAR'
     """
 
     NONE = 0

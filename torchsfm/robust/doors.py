@@ -32,6 +32,8 @@ class SearchOptions(TypedDict, total=False):
         generator: Source of randomness; PyTorch's global one if not given.
         confidence: Wanted probability of having drawn a sample without outliers; 0.9999 if not given.
         max_iterations: Most samples to draw for a problem; 10,000 if nothing else is said where the model is estimated.
+
+    See the example of `RansacOptions`, which have two options more.
     """
 
     quality: Float[Tensor, "*#batch n"] | None
@@ -50,6 +52,14 @@ class RansacOptions(SearchOptions, total=False):
         mask: Which data exist, `(*batch, n)`; all of them if not given. Problems of different size share a batch this way. Rows
             that are not finite are left out too.
         covariance: Compute the covariance of the model, from the scatter of the data around it; not if not given.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> options: torchsfm.RansacOptions = {"scoring": torchsfm.Magsac(), "max_iterations": 1000}
+        >>> x = torch.rand(50, 2, generator=torch.Generator().manual_seed(0))
+        >>> found = torchsfm.estimate_homography(x, x + 0.1, threshold=1e-3, **options)
+        >>> found.inliers.sum()
+        tensor(50)
     """
 
     mask: Bool[Tensor, "*#batch n"] | None
@@ -83,6 +93,12 @@ def check_door(
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
         TypeError: There is no such option.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x1, x2 = torch.rand(8, 50, 2), torch.rand(50, 2)
+        >>> torchsfm.robust.check_door({"x1": (x1, "n 2"), "x2": (x2, "n 2")}, 1.0, {"confidence": 0.99})
+        torch.Size([8])
     """
     known = sorted(kind.__optional_keys__)  # type: ignore[attr-defined]
     for name in options.keys() - set(known):
@@ -107,6 +123,13 @@ def check_counts(count: int, **given: Tensor | None) -> None:
 
     Raises:
         ValueError: It names the argument, and the numbers wanted and given.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.robust.check_counts(3, weights=torch.ones(2))
+        Traceback (most recent call last):
+            ...
+        ValueError: weights: wanted 3 in the last dimension, for all data, got shape (2,)
     """
     for name, t in given.items():
         if t is not None and t.shape[-1] != count:
@@ -149,6 +172,16 @@ def estimate_robustly(
         step_unit: The units of the numbers of a step along the manifold in the caller's world. If given, the covariance is
             that of the step; else that of the entries of the caller's model, row by row.
         **options: The options of the door.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x = torch.rand(50, 2, generator=g, dtype=torch.float64)
+        >>> estimator = torchsfm.motion.HomographyEstimator()
+        >>> options = {"threshold": 1e-3, "dtype": torch.float32, "generator": g}
+        >>> found = torchsfm.robust.estimate_robustly(estimator, x, x + 0.1, **options)
+        >>> found.model.dtype, found.inliers.sum()
+        (torch.float32, tensor(50))
     """
     if isinstance(threshold, Tensor):
         threshold = threshold.double()

@@ -24,7 +24,14 @@ the gradient takes the one, the Hessian the other. A step that takes the weights
 
 
 def constant_weights(weights: Float[Tensor, "*#batch n"]) -> Weigh:
-    """The weights of a step of least squares: they do not depend on the distances; 0 for data to leave out."""
+    """The weights of a step of least squares: they do not depend on the distances; 0 for data to leave out.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> weigh = torchsfm.robust.constant_weights(torch.tensor([1.0, 0.0, 2.0]))
+        >>> weigh(torch.tensor([0.1, 0.2, 0.3]))[0]  # whatever the distances
+        tensor([1., 0., 2.])
+    """
     return lambda _: (weights, weights)
 
 
@@ -40,6 +47,12 @@ class Estimator(Protocol[M]):
     its own. Nothing here may raise on bad values. Data and models come in float64, and in the type of scoring.
 
     The signatures below are as wide as they are so that implementations can name their data.
+
+    Example:
+        >>> import torchsfm
+        >>> estimator = torchsfm.motion.HomographyEstimator()
+        >>> isinstance(estimator, torchsfm.Estimator), estimator.sample_size, estimator.max_solutions
+        (True, 4, 1)
     """
 
     sample_size: ClassVar[int]
@@ -75,6 +88,11 @@ class NeverZero(Protocol):
     """An estimator of which a model of zeros alone is none, as of what is homogeneous or holds a rotation.
 
     Such models, as those that are not finite, agree with no data, whatever the residual makes of them.
+
+    Example:
+        >>> import torchsfm
+        >>> torchsfm.motion.FundamentalEstimator().never_zero
+        True
     """
 
     never_zero: ClassVar[bool]
@@ -97,6 +115,11 @@ class Differentiable(Protocol):
     """An estimator that says how its models move: refined models then carry derivatives, and a covariance if asked for.
 
     The squared residual must be differentiable with respect to the model and the data.
+
+    Example:
+        >>> import torchsfm
+        >>> isinstance(torchsfm.motion.FundamentalEstimator(), torchsfm.robust.Differentiable)
+        True
     """
 
     dimension: ClassVar[int]
@@ -109,7 +132,13 @@ class Differentiable(Protocol):
 
 @runtime_checkable
 class Diagnosed(Protocol):
-    """An estimator that can tell when data agree on a model and yet leave it open."""
+    """An estimator that can tell when data agree on a model and yet leave it open.
+
+    Example:
+        >>> import torchsfm
+        >>> isinstance(torchsfm.motion.FundamentalEstimator(), torchsfm.robust.Diagnosed)
+        True
+    """
 
     def may_be_degenerate(self, model: Any, *data: Any, **options: Any) -> Bool[Tensor, "*batch"]:
         """Whether a closer look could find anything, judging by a part of the data that is spread over all.
@@ -131,7 +160,13 @@ class Diagnosed(Protocol):
 
 @runtime_checkable
 class WithAlternatives(Diagnosed, Protocol):
-    """An estimator that knows better models where samples are unlikely to lead, as those of data mostly in a plane."""
+    """An estimator that knows better models where samples are unlikely to lead, as those of data mostly in a plane.
+
+    Example:
+        >>> import torchsfm
+        >>> isinstance(torchsfm.motion.FundamentalEstimator(), torchsfm.robust.WithAlternatives)
+        True
+    """
 
     def alternative_models(self, model: Any, *data: Any, **options: Any) -> Solutions[Any]:
         """Such models, `(*batch, k)`, given the best one so far, `(*batch, ...)`.

@@ -50,6 +50,8 @@ class Structures(Generic[M]):
         found: How many structures there were; more than slots means that the smallest are left out.
         status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample had a
             solution; `NO_CONSENSUS`: no group is large enough.
+
+    See the example of `find_structures`.
     """
 
     model: M
@@ -93,6 +95,16 @@ def find_structures(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(60, 2, generator=g, dtype=torch.float64)
+        >>> x2 = torch.cat((x1[:30] + 0.1, x1[30:] * 0.8))  # two motions
+        >>> estimator = torchsfm.motion.HomographyEstimator()
+        >>> found = torchsfm.find_structures(estimator, x1, x2, threshold=1e-3, hypotheses=200, kept=50, generator=g)
+        >>> int(found.found), found.label.bincount()
+        (2, tensor([30, 30]))
     """
     flat = Flat.of(estimator, data, threshold, mask)
     m = estimator.sample_size

@@ -47,6 +47,8 @@ class RobustResult(Generic[M]):
             looked for is said where the model is estimated.
         covariance: If asked for, that of the model by the scatter of the data around it: of its entries, row by row, unless
             said otherwise where the model is estimated. Zero where the model is no optimum or not determined.
+
+    See the example of `ransac`.
     """
 
     model: M
@@ -112,6 +114,16 @@ def ransac(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the estimator lacks what it must have.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(8, 100, 2, generator=g, dtype=torch.float64)  # eight problems
+        >>> x2 = x1 + 0.1
+        >>> x2[:, :40] = torch.rand(8, 40, 2, generator=g, dtype=torch.float64)  # in each 40 % are wrong
+        >>> found = torchsfm.ransac(torchsfm.motion.HomographyEstimator(), x1, x2, threshold=1e-3, generator=g)
+        >>> found.model.shape, bool(found.inliers[:, 40:].all()), bool((found.status == torchsfm.Status.OK).all())
+        (torch.Size([8, 3, 3]), True, True)
     """
     flat = Flat.of(estimator, data, threshold, mask, unknown_threshold=1.0, quality=quality, weights=weights)
     check_options(

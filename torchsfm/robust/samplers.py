@@ -21,6 +21,8 @@ class Sampler(Protocol):
 
     What a sampler draws for a problem must be a function of the problem, the seed and the number of the sample alone: then the
     result for a problem does not depend on the batch it is in.
+
+    See the example of `Prosac`.
     """
 
     def draw(
@@ -44,7 +46,16 @@ class Sampler(Protocol):
 
 @dataclass(frozen=True)
 class Uniform:
-    """Every sample is as likely as every other; with weights, a datum as likely as it counts."""
+    """Every sample is as likely as every other; with weights, a datum as likely as it counts.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x = torch.rand(50, 2, generator=g)
+        >>> found = torchsfm.estimate_homography(x, x + 0.1, threshold=1e-3, sampler=torchsfm.Uniform(), generator=g)
+        >>> found.inliers.sum()
+        tensor(50)
+    """
 
     def draw(self, problems: Problems, part: Tensor, drawn: Tensor, number: int, seed: int) -> Int[Tensor, "g m number"]:
         """Independent samples."""
@@ -69,6 +80,17 @@ class Prosac:
     """Every other sample favours the data of the best quality, more and more of them (PROSAC, Chum & Matas 2005).
 
     A misleading order of the data costs a factor of two at most. Ends as soon as the samples of the best data suffice.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(200, 2, generator=g, dtype=torch.float64)
+        >>> x2 = torch.cat((x1[:60] + 0.1, torch.rand(140, 2, generator=g, dtype=torch.float64)))  # 70 % are wrong
+        >>> quality = torch.linspace(1, 0, 200, dtype=torch.float64)  # and known to be doubtful
+        >>> options = {"quality": quality, "sampler": torchsfm.Prosac(), "generator": g}
+        >>> found = torchsfm.estimate_homography(x1, x2, threshold=1e-3, **options)
+        >>> bool(found.inliers[:60].all())
+        True
     """
 
     def draw(self, problems: Problems, part: Tensor, drawn: Tensor, number: int, seed: int) -> Int[Tensor, "g m number"]:
@@ -105,6 +127,16 @@ class Neighbours:
 
     Attributes:
         sizes: Numbers of neighbours to draw from.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x = torch.rand(100, 2, generator=g, dtype=torch.float64)
+        >>> shift = torch.where(x[:, :1] < 0.3, 0.1, torch.rand(100, 2, generator=g))  # what moved lies together
+        >>> sampler = torchsfm.Neighbours()
+        >>> found = torchsfm.estimate_homography(x, x + shift, threshold=1e-4, sampler=sampler, generator=g)
+        >>> bool(found.inliers[x[:, 0] < 0.3].all())
+        True
     """
 
     sizes: tuple[int, ...] = (10, 20, 40)

@@ -23,7 +23,10 @@ BLUNT = {2: 9.2103, 3: 11.3449, 4: 13.2767}
 
 @runtime_checkable
 class Scoring(Protocol):
-    """How models are compared. Small frozen objects; `Msac()`, `Magsac()`, `InlierCount()`, `LeastMedian()`."""
+    """How models are compared. Small frozen objects; `Msac()`, `Magsac()`, `InlierCount()`, `LeastMedian()`.
+
+    See the example of `Msac`.
+    """
 
     needs_threshold: ClassVar[bool]
     """Whether the largest distance of an inlier must be known; otherwise `limit` estimates it."""
@@ -48,7 +51,14 @@ def _total(loss: Tensor, weight: Tensor | None) -> Tensor:
 
 @dataclass(frozen=True)
 class Msac:
-    """The squared distance, at most the squared threshold (Torr & Zisserman 2000)."""
+    """The squared distance, at most the squared threshold (Torr & Zisserman 2000).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> squared = torch.tensor([[[0.0, 1.0, 9.0, 16.0]]])  # distances 0, 1, 3, 4 from one model, threshold 2
+        >>> torchsfm.Msac().cost(squared, torch.tensor([4.0]), None, 1)  # 0 + 1 / 4 + 1 + 1
+        tensor([[2.2500]])
+    """
 
     needs_threshold: ClassVar[bool] = True
 
@@ -63,7 +73,14 @@ class Msac:
 
 @dataclass(frozen=True)
 class InlierCount:
-    """The number of data beyond the threshold (Fischler & Bolles 1981)."""
+    """The number of data beyond the threshold (Fischler & Bolles 1981).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> squared = torch.tensor([[[0.0, 1.0, 9.0, 16.0]]])  # distances 0, 1, 3, 4 from one model, threshold 2
+        >>> torchsfm.InlierCount().cost(squared, torch.tensor([4.0]), None, 1)  # two outliers
+        tensor([[2.0000]])
+    """
 
     needs_threshold: ClassVar[bool] = True
 
@@ -87,6 +104,13 @@ class Magsac:
 
     Attributes:
         dof: Degrees of freedom of the squared distance, 2, 3 or 4; 4 as published, for the coordinates of two points.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> squared = torch.tensor([[[0.0, 1.0, 9.0, 16.0]]])  # distances 0, 1, 3, 4 from one model, threshold 2
+        >>> cost = torchsfm.Magsac().cost(squared, torch.tensor([4.0]), None, 1)
+        >>> bool((cost > 2) & (cost < 3))  # two outliers, and a little of an inlier
+        True
     """
 
     dof: int = 4
@@ -138,6 +162,12 @@ class LeastMedian:
     """The median of the squared distances: needs no threshold, but more good data than bad (Rousseeuw 1984).
 
     The threshold follows from the median as the distance that nearly all inliers of Gaussian noise are nearer than.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> squared = torch.tensor([[[0.0, 1.0, 4.0, 900.0, 1600.0]]])  # of one model
+        >>> torchsfm.LeastMedian().cost(squared, torch.tensor([4.0]), None, 1)
+        tensor([[4.]])
     """
 
     needs_threshold: ClassVar[bool] = False

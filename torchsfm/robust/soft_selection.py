@@ -42,6 +42,8 @@ class SoftSelection(Generic[M]):
         log_sampling: The logarithm of the probability of drawing each sample in its order. Differentiable in the logits.
         status: `OK`; `TOO_FEW` data for a sample; `DEGENERATE`: no sample has a solution; `NOT_FINITE`: too few of the data are
             finite.
+
+    See the example of `soft_ransac`.
     """
 
     model: M
@@ -142,6 +144,17 @@ def soft_ransac(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x = torch.rand(50, 2, generator=g, dtype=torch.float64)
+        >>> logits = torch.zeros(50, dtype=x.dtype, requires_grad=True)
+        >>> estimator = torchsfm.motion.HomographyEstimator()
+        >>> chosen = torchsfm.soft_ransac(estimator, x, x + 0.1, threshold=1e-2, logits=logits, generator=g)
+        >>> chosen.expectation(1 - chosen.support / 50).backward()  # trains what gave the logits
+        >>> chosen.probability.shape, round(float(chosen.probability.sum()), 6), logits.grad.shape
+        (torch.Size([64, 1]), 1.0, torch.Size([50]))
     """
     flat = Flat.of(estimator, data, threshold, mask, logits=logits)
     check_options(

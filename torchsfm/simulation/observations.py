@@ -161,7 +161,7 @@ def random_intrinsics(
     angles = (view_angle, "2 float > 0 < 3.1416 radians")
     check_options(image_size=(image_size, "2 int >= 1"), view_angle=angles, wobble=(wobble, "float >= 0"))
     low, high = view_angle
-    angle = low + (high - low) * torch.rand(*shape, **options)  # type: ignore[call-overload]
+    angle = low + (high - low) * torch.rand(shape, **options)  # type: ignore[call-overload]
     width, height = image_size
     middle = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=dtype, device=device)
     c = middle + wobble * width * torch.randn(*shape, 2, **options)  # type: ignore[call-overload]

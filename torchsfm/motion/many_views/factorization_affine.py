@@ -44,6 +44,8 @@ class AffineFactorization:
         status: `OK`; `NOT_CONVERGED`; `TOO_FEW` points, or views (three are needed); `DEGENERATE`: planar scene, no turning, or
             cameras that are not of the kind asked for (P and X are then some affine frame's, R and scale mean nothing);
             `NOT_FINITE`: numbers beyond what the dtype holds, all fields are zero.
+
+    See the example of `factorize_affine`.
     """
 
     P: Float[Tensor, "*batch v 3 4"]
@@ -83,6 +85,15 @@ def factorize_affine(
 
     Raises:
         ValueError: Wrong shape, dtype, device or option.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(30, generator=g), torchsfm.random_poses(5, generator=g)
+        >>> x = 100 * (X @ poses.R.mT)[..., :2]  # five views from far away
+        >>> found = torchsfm.factorize_affine(x)
+        >>> bool(found.status == torchsfm.Status.OK), bool(found.error.max() < 1e-6)
+        (True, True)
     """
     batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
     check_options(model=(model, get_args(AffineModel)), max_iterations=(max_iterations, "int >= 0"))

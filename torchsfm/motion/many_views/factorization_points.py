@@ -66,6 +66,8 @@ class Factorization:
         used_point: Points in at least two used views.
         status: `OK`; `NOT_CONVERGED`; `TOO_FEW` views or points; `DEGENERATE`: the data leave cameras undetermined (points in
             a plane, views without baseline, parts that hang together too loosely).
+
+    See the example of `factorize_points`.
     """
 
     P: Float[Tensor, "*batch v 3 4"]
@@ -112,6 +114,14 @@ def factorize_points(
 
     Raises:
         ValueError: Wrong shape, dtype, device or option.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(30, generator=g), torchsfm.random_poses(6, generator=g).matrix()
+        >>> found = torchsfm.factorize_points(torchsfm.project_points(P, X))
+        >>> found.P.shape, found.X.shape, bool(found.error.max() < 1e-6)
+        (torch.Size([6, 3, 4]), torch.Size([30, 4]), True)
     """
     batch = check_tensors(x=(x, "v>=2 n>=1 2"), visible=(visible, "?v n: bool"), weights=(weights, "?v n"))
     check_options(robust=(robust, bool), max_iterations=(max_iterations, "int >= 1"))

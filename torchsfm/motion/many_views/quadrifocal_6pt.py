@@ -34,6 +34,8 @@ class QuadrifocalFit:
         status: OK; TOO_FEW points with weight; DEGENERATE: they leave more than one tensor (points in a plane, centres that
             coincide), exactly or within their noise; NOT_CONVERGED; NOT_FINITE: numbers with weight that
             are not.
+
+    See the example of `quadrifocal_6pt`.
     """
 
     Q: Float[Tensor, "*batch 3 3 3 3"]
@@ -63,6 +65,14 @@ def quadrifocal_6pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 6.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(8, generator=g), torchsfm.random_poses(4, generator=g).matrix()
+        >>> found = torchsfm.motion.quadrifocal_6pt(torchsfm.project_points(P, X))
+        >>> bool(found.P.allclose(torchsfm.tensors.canonical_cameras(P), atol=1e-6))
+        True
     """
     batch = check_tensors(x=(x, "4 n>=6 2"), weights=(weights, "?n"))
     check_options(max_iterations=(max_iterations, "int >= 0"))

@@ -28,6 +28,16 @@ class TrifocalEstimator:
     The points should be of moderate size around 0. The distance of a triplet is the root of the sum of squared distances in
     the three images to those of one point in space, the best to first order from a linear start. It is infinite for points
     behind the second or third camera, which are signed so that the points they come from are in front.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(100, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> x = torchsfm.project_points(poses, X)
+        >>> estimator = torchsfm.motion.TrifocalEstimator()
+        >>> found = torchsfm.ransac(estimator, *x, threshold=1e-3, generator=g)
+        >>> found.model.shape, found.inliers.sum()  # the second and the third camera
+        (torch.Size([2, 3, 4]), tensor(100))
     """
 
     model_name: ClassVar[str] = "trifocal"
@@ -179,6 +189,14 @@ def estimate_trifocal(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(100, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> found = torchsfm.estimate_trifocal(torchsfm.project_points(P, X), threshold=1e-3, generator=g)
+        >>> bool(found.model.allclose(torchsfm.tensors.canonical_cameras(P), atol=1e-6))
+        True
     """
     check_door({"x": (x, "3 n 2")}, threshold, options)
     y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), options.get("mask"))

@@ -70,6 +70,15 @@ def trifocal_6pt(x: Float[Tensor, "*batch 3 6 2"]) -> Solutions[Float[Tensor, "*
 
     Raises:
         ValueError: Wrong shape or dtype.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(6, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> found = torchsfm.motion.trifocal_6pt(torchsfm.project_points(P, X))
+        >>> off = (found.model[found.valid] - torchsfm.tensors.canonical_cameras(P)).abs().amax((-3, -2, -1))
+        >>> found.model.shape, bool(off.min() < 1e-6)  # the true one is there
+        (torch.Size([3, 3, 3, 4]), True)
     """
     batch = check_tensors(x=(x, "3 6 2"))
     with torch.no_grad():

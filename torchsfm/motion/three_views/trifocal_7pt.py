@@ -33,6 +33,8 @@ class TrifocalFit:
         status: OK; TOO_FEW points and lines with weight; DEGENERATE: they leave more than one tensor (points in a plane,
             centres that coincide, lines that meet), exactly or within their noise; NOT_CONVERGED;
             NOT_FINITE: numbers with weight that are not.
+
+    See the example of `trifocal_7pt`.
     """
 
     T: Float[Tensor, "*batch 3 3 3"]
@@ -73,6 +75,14 @@ def trifocal_7pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or too few points and lines.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(10, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> found = torchsfm.motion.trifocal_7pt(torchsfm.project_points(P, X))
+        >>> bool(found.P.allclose(torchsfm.tensors.canonical_cameras(P), atol=1e-6))
+        True
     """
     batch = check_tensors(
         x=(x, "3 n 2"), l=(l, "?3 m 3"), ends=(ends, "?m 2 2"), weights=(weights, "?n"), line_weights=(line_weights, "?m")

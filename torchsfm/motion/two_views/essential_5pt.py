@@ -60,6 +60,16 @@ def essential_5pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(5, generator=g), torchsfm.random_poses(generator=g)
+        >>> E = torchsfm.motion.essential_5pt(X, pose.transform(X))  # the first camera is the world's origin
+        >>> truth = torchsfm.tensors.essential_from_pose(pose.R, pose.t / pose.t.norm())
+        >>> fit = (E.model * truth).sum((-2, -1)).abs() / 2  # 1: the same up to sign
+        >>> E.model.shape, bool((fit[E.valid] > 1 - 1e-6).any())
+        (torch.Size([10, 3, 3]), True)
     """
     batch = check_tensors(d1=(d1, "5 3"), d2=(d2, "5 3"))
     with torch.no_grad():

@@ -82,6 +82,15 @@ def essential_6pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 6.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(6, generator=g), torchsfm.random_poses(generator=g)
+        >>> E = torchsfm.motion.essential_6pt(X, pose.transform(X))  # the first camera is the world's origin
+        >>> truth = torchsfm.tensors.essential_from_pose(pose.R, pose.t / pose.t.norm())
+        >>> E.valid, round(float((E.model[0] * truth).sum().abs() / 2), 6)  # 1: the same up to sign
+        (tensor([True]), 1.0)
     """
     check_tensors(d1=(d1, "n>=6 3"), d2=(d2, "n 3"), weights=(weights, "?n"))
     shape = broadcast_shapes(d1.shape[:-1], d2.shape[:-1], d1.shape[:-1] if weights is None else weights.shape)

@@ -30,6 +30,16 @@ class RelativePoseEstimator:
 
     Attributes:
         slack: That angle in radians, for each problem.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(100, generator=g), torchsfm.random_poses(2, generator=g)
+        >>> d1, d2 = torch.nn.functional.normalize(poses[:, None].transform(X[:, None])[..., 0, :], dim=-1)
+        >>> estimator = torchsfm.motion.RelativePoseEstimator(slack=torch.tensor(1e-3, dtype=X.dtype))
+        >>> found = torchsfm.ransac(estimator, d1, d2, threshold=1e-3, generator=g)
+        >>> found.model.shape, found.inliers.sum()  # [R | t]
+        (torch.Size([3, 4]), tensor(100))
     """
 
     slack: Float[Tensor, "*batch"]
@@ -144,6 +154,16 @@ def estimate_essential(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, R = torchsfm.random_points(200, generator=g), torch.eye(3, dtype=torch.float64)
+        >>> X, t = X + torch.tensor([0, 0, 5]), torch.tensor([0.6, 0.0, 0.8], dtype=X.dtype)
+        >>> d1, d2 = X, torch.cat(((X @ R.mT + t)[:140], X[140:].roll(1, 0)))  # 30 % are wrong
+        >>> found = torchsfm.estimate_essential(d1, d2, threshold=1e-3, generator=g)
+        >>> torchsfm.tensors.pose_from_essential(found.model, d1, d2, found.inliers).pose.t
+        tensor([0.6000, 0.0000, 0.8000], dtype=torch.float64)
     """
     batch = check_door({"d1": (d1, "n 3"), "d2": (d2, "n 3")}, threshold, options, radians=True)
     estimator = RelativePoseEstimator(pose_slack(threshold, d1).expand(batch))

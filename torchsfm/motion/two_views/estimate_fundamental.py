@@ -27,6 +27,16 @@ class FundamentalEstimator:
     The points should be of moderate size around 0. Distances are Sampson's, in their unit, and infinite where e2 x h2 and F h1
     are opposite: such a point is behind one camera and in front of the other (Chum, Werner & Matas 2004; Hartley 1998). That
     rejects half of the wrong matches that happen to lie on their epipolar lines.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(100, generator=g), torchsfm.random_poses(2, generator=g)
+        >>> x1, x2 = torchsfm.project_points(poses, X)
+        >>> estimator = torchsfm.motion.FundamentalEstimator()
+        >>> found = torchsfm.ransac(estimator, x1, x2, threshold=1e-3, generator=g)
+        >>> found.model.shape, found.inliers.sum()  # [F | e2]
+        (torch.Size([3, 4]), tensor(100))
     """
 
     model_name: ClassVar[str] = "oriented_fundamental"
@@ -188,6 +198,17 @@ def estimate_fundamental(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(8, 200, generator=g), torchsfm.random_poses(8, 2, generator=g)  # eight pairs
+        >>> camera = torchsfm.Camera(torchsfm.random_intrinsics(8, 1, generator=g))
+        >>> seen = torchsfm.simulate_images(X, poses, camera, noise=0.5, outliers=0.1, generator=g)
+        >>> x1, x2 = seen.x.unbind(1)
+        >>> found = torchsfm.estimate_fundamental(x1, x2, threshold=2.0, generator=g)
+        >>> found.model.shape, bool((found.inliers.sum(-1) > 140).all())
+        (torch.Size([8, 3, 3]), True)
     """
     check_door({"x1": (x1, "n 2"), "x2": (x2, "n 2")}, threshold, options)
     y = common_scale(x1.double(), x2.double(), options.get("mask"))

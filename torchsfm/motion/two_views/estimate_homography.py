@@ -30,6 +30,15 @@ class HomographyEstimator:
     With the constraint c = y - w x2, where (y, w) = H x1, and its derivatives B = H_2x2 - x2 h3' over x1 and -w I over x2, the
     squared distance is c' S^-1 c with S = B B' + w^2 I (Chum, Pajdla & Sturm 2005): to first order, the squared distance in
     both images together to the nearest pair of points that corresponds exactly.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(100, 2, generator=g, dtype=torch.float64)
+        >>> estimator = torchsfm.motion.HomographyEstimator()
+        >>> found = torchsfm.ransac(estimator, x1, x1 + 0.1, threshold=1e-3, generator=g)
+        >>> found.model.shape, found.inliers.sum()
+        (torch.Size([3, 3]), tensor(100))
     """
 
     model_name: ClassVar[str] = "homography"
@@ -197,6 +206,17 @@ def estimate_homography(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> H = torch.tensor([[1.0, 0.1, 0.0], [0.0, 1.2, 0.3], [0.0, 0.2, 1.0]], dtype=torch.float64)
+        >>> x1 = torch.rand(100, 2, generator=g, dtype=H.dtype)
+        >>> x2 = torchsfm.geometry.transform_points(H, x1)
+        >>> x2[:40] = torch.rand(40, 2, generator=g, dtype=H.dtype)  # 40 % are wrong
+        >>> found = torchsfm.estimate_homography(x1, x2, threshold=1e-3, generator=g)
+        >>> bool((found.model / found.model[2, 2]).allclose(H, atol=1e-3)), bool(found.inliers[40:].all())
+        (True, True)
     """
     check_door({"x1": (x1, "n 2"), "x2": (x2, "n 2")}, threshold, options)
     y = common_scale(x1.double(), x2.double(), options.get("mask"))

@@ -46,6 +46,15 @@ def estimate_fundamentals(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(2, 60, generator=g), torchsfm.random_poses(2, 2, generator=g)  # two bodies
+        >>> x = torch.cat(tuple(torchsfm.project_points(poses, X[:, None])), -2)
+        >>> found = torchsfm.estimate_fundamentals(x[0], x[1], threshold=0.005, generator=g)
+        >>> int(found.found), found.model.shape
+        (2, torch.Size([8, 3, 3]))
     """
     limit = threshold if isinstance(threshold, Tensor) else None
     if limit is None:
@@ -88,6 +97,15 @@ def estimate_homographies(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(60, 2, generator=g, dtype=torch.float64)
+        >>> x2 = torch.cat((x1[:30] + 0.1, x1[30:] * 0.8))  # two planes
+        >>> found = torchsfm.estimate_homographies(x1, x2, threshold=1e-3, generator=g)
+        >>> int(found.found), found.label.bincount()
+        (2, tensor([30, 30]))
     """
     limit = threshold if isinstance(threshold, Tensor) else None
     if limit is None:

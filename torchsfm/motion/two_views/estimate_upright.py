@@ -27,6 +27,8 @@ class UprightPoseEstimator:
         gravity1: The vertical in the first camera, of length 1, for each problem.
         gravity2: The vertical in the second camera, of length 1.
         slack: By which angle in radians rays must miss the front to count as behind.
+
+    See the example of `estimate_upright`, which uses it.
     """
 
     gravity1: Float[Tensor, "*batch 3"]
@@ -121,6 +123,17 @@ def estimate_upright(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, t = torchsfm.random_points(200, generator=g), torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+        >>> R = torchsfm.geometry.rotation_from_rotvec(torch.tensor([0.0, 0.5, 0.0], dtype=t.dtype))  # about the vertical
+        >>> down = torch.tensor([0.0, 1.0, 0.0], dtype=t.dtype)
+        >>> d1 = X + 5 * t
+        >>> found = torchsfm.estimate_upright(d1, d1 @ R.mT + t, down, down, threshold=1e-3, generator=g)
+        >>> bool(found.model.allclose(torchsfm.Pose(R, t).matrix(), atol=1e-6))
+        True
     """
     batch = check_door(
         {"d1": (d1, "n 3"), "d2": (d2, "n 3"), "gravity1": (gravity1, "3"), "gravity2": (gravity2, "3")},

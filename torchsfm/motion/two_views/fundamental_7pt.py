@@ -49,6 +49,16 @@ def fundamental_7pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(7, generator=g), torchsfm.random_poses(2, generator=g).matrix()
+        >>> x1, x2 = torchsfm.project_points(P, X)
+        >>> F = torchsfm.motion.fundamental_7pt(x1, x2)
+        >>> residual = torchsfm.geometry.sampson_distance(F.model[F.valid], x1, x2)
+        >>> F.model.shape, bool(residual.max() < 1e-6)
+        (torch.Size([3, 3, 3]), True)
     """
     batch = check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
     with torch.no_grad():

@@ -27,6 +27,15 @@ def fundamental_8pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 8.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(20, generator=g), torchsfm.random_poses(2, generator=g).matrix()
+        >>> x1, x2 = torchsfm.project_points(P, X)
+        >>> F = torchsfm.motion.fundamental_8pt(x1, x2)
+        >>> bool(torchsfm.geometry.sampson_distance(F, x1, x2).max() < 1e-6)
+        True
     """
     check_tensors(x1=(x1, "n>=8 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     y1, y2, w, T1, T2_inverse, finite = _normalised(x1, x2, weights)

@@ -49,6 +49,15 @@ def fundamental_affine_4pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 4.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(4, generator=g), torchsfm.random_poses(2, generator=g)
+        >>> x1, x2 = (X @ poses.R.mT)[..., :2]  # two views from far away
+        >>> F = torchsfm.motion.fundamental_affine_4pt(x1, x2)
+        >>> F.valid, bool(torchsfm.geometry.sampson_distance(F.model, x1, x2).max() < 1e-6)
+        (tensor([True]), True)
     """
     batch = check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     if x1.shape[-2] == 4 and weights is None:

@@ -49,7 +49,10 @@ _SIX, _THREE = _basis(3), _basis(2)
 
 @dataclass(frozen=True)
 class ConicEpipolarFit:
-    """Fundamental matrices and what is known about them."""
+    """Fundamental matrices and what is known about them.
+
+    See the example of `fundamental_from_conics`.
+    """
 
     model: Float[Tensor, "*batch 3 3"]
     """F with x2' F x1 = 0, of unit norm; finite always."""
@@ -132,6 +135,15 @@ def fundamental_from_conics(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or points are given in one image alone.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> scene = torchsfm.simulation.simulate_conics((), conics=5, views=2, generator=g)
+        >>> found = torchsfm.fundamental_from_conics(*scene.C, starts=8, generator=g)
+        >>> truth = torchsfm.tensors.fundamental_from_cameras(*scene.P)
+        >>> float((found.model * truth).sum().abs() / found.model.norm() / truth.norm())  # 1: the same up to scale
+        1.0
     """
     batch = check_tensors(
         C1=(C1, "m>=1 3 3"), C2=(C2, "m 3 3"), mask=(mask, "?m: bool"), covariance1=(covariance1, "?m 5 5"),

@@ -43,6 +43,14 @@ def homography_4pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x1 = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        >>> x2 = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.5, 1.0], [0.5, 1.0]])  # a square seen aslant
+        >>> H = torchsfm.motion.homography_4pt(x1, x2)
+        >>> H.valid, torchsfm.geometry.transform_points(H.model[0], torch.tensor([[0.5, 0.5]]))
+        (tensor([True]), tensor([[1.0000, 0.6667]]))
     """
     batch = check_tensors(x1=(x1, "4 2"), x2=(x2, "4 2"))
     with torch.no_grad():

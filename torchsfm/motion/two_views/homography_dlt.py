@@ -27,6 +27,14 @@ def homography_dlt(
 
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 4.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x1 = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        >>> x2 = torch.tensor([[0.0, 0.0], [2.0, 0.0], [1.5, 1.0], [0.5, 1.0]])  # a square seen aslant
+        >>> H = torchsfm.motion.homography_dlt(x1, x2)
+        >>> torchsfm.geometry.transform_points(H, torch.tensor([[0.5, 0.5]]))
+        tensor([[1.0000, 0.6667]])
     """
     check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     y1, y2, w, T1, T2_inverse, finite = _normalised(x1, x2, weights)

@@ -28,6 +28,8 @@ class PlaneMotion:
 
     The plane is `normal' X = 1` in the frame of the first camera, with its distance from that camera as the unit of length;
     |normal| = 1. In that unit X2 = R X1 + t. H ~ R + t normal'.
+
+    See the example of `motions_from_homography`.
     """
 
     R: Float[Tensor, "*batch 3 3"]
@@ -39,10 +41,12 @@ class PlaneMotion:
 class SelectedMotion:
     """The motion chosen by the points, and what speaks for it.
 
-    `in_front` says which points lie on the plane in front of both cameras. `alternative` is the other motion, and
-    `alternative_fits` whether it has as many points in front: then the points do not decide. `status` is OK; DEGENERATE where
-    the camera only turned (R is right, t = 0, the normal means nothing) or H is singular; TOO_FEW (no finite point has weight);
-    BEHIND (half of the weight or less is in front); NOT_FINITE (H).
+    `model` is the motion. `in_front` says which points lie on the plane in front of both cameras. `alternative` is the other
+    motion, and `alternative_fits` whether it has as many points in front: then the points do not decide. `status` is OK;
+    DEGENERATE where the camera only turned (R is right, t = 0, the normal means nothing) or H is singular; TOO_FEW (no finite
+    point has weight); BEHIND (half of the weight or less is in front); NOT_FINITE (H).
+
+    See the example of `motion_from_homography`.
     """
 
     model: PlaneMotion
@@ -85,6 +89,13 @@ def motions_from_homography(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> normal, t = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.5, 0.0, 0.0])
+        >>> motions = torchsfm.motion.motions_from_homography(torch.eye(3) + torch.outer(t, normal))
+        >>> motions.valid, bool((motions.model.t - t).norm(dim=-1).min() < 1e-3)  # one is the true one
+        (tensor([True, True]), True)
     """
     batch = check_tensors(H=(H, "3 3"), K1=(K1, "?3 3"), K2=(K2, "?3 3"))
     G = H.double()
@@ -168,6 +179,16 @@ def motion_from_homography(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torchsfm.random_points(20, kind="plane", generator=torch.Generator().manual_seed(0))
+        >>> X[:, 2] += 2
+        >>> t = torch.tensor([0.5, 0.0, 0.0], dtype=X.dtype)  # sideways, before a wall two units away
+        >>> H = torch.eye(3, dtype=X.dtype) + torch.outer(t, torch.tensor([0.0, 0.0, 0.5], dtype=X.dtype))
+        >>> found = torchsfm.motion.motion_from_homography(H, X, X + t)
+        >>> bool(found.status == torchsfm.Status.OK), int(found.in_front.sum())
+        (True, 20)
     """
     kind = "?n: bool" if getattr(weights, "dtype", None) == torch.bool else "?n"
     batch = check_tensors(H=(H, "3 3"), d1=(d1, "n 3"), d2=(d2, "n 3"), weights=(weights, kind))

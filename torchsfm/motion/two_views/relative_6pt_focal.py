@@ -60,6 +60,8 @@ class FocalMotion:
     """An essential matrix and the focal length of both cameras, in the unit of the image points.
 
     `d2' E d1 = 0` for rays d = (x, f), |E|^2 = 2 (Frobenius). F = diag(1, 1, f) E diag(1, 1, f) up to scale.
+
+    See the example of `relative_6pt_focal`.
     """
 
     E: Float[Tensor, "*batch 3 3"]
@@ -114,6 +116,15 @@ def relative_6pt_focal(x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#ba
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(6, generator=g), torchsfm.random_poses(2, generator=g).matrix()
+        >>> x1, x2 = 800 * torchsfm.project_points(P, X)
+        >>> found = torchsfm.motion.relative_6pt_focal(x1, x2)
+        >>> found.valid.shape, bool((found.model.f[found.valid] - 800).abs().min() < 1e-3)  # the true one is there
+        (torch.Size([15]), True)
     """
     batch = check_tensors(x1=(x1, "6 2"), x2=(x2, "6 2"))
     with torch.no_grad():

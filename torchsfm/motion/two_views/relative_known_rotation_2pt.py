@@ -56,6 +56,14 @@ def relative_known_rotation_2pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> d1 = torch.tensor([[0.0, 0.0, 5.0], [1.0, 0.5, 4.0]])
+        >>> t = torch.tensor([0.6, 0.0, 0.8])
+        >>> found = torchsfm.motion.relative_known_rotation_2pt(d1, d1 + t, torch.eye(3))
+        >>> found.model[0, :, 3]
+        tensor([0.6000, 0.0000, 0.8000])
     """
     batch = check_tensors(d1=(d1, "2 3"), d2=(d2, "2 3"), R=(R, "3 3"))
     with torch.no_grad():

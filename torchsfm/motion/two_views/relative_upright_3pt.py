@@ -75,6 +75,14 @@ def relative_upright_3pt(
 
     Raises:
         ValueError: Wrong shape, dtype or device.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> d1 = torch.tensor([[0.0, 0.0, 5.0], [1.0, 0.5, 4.0], [-1.0, 0.7, 6.0]])
+        >>> t, down = torch.tensor([0.6, 0.0, 0.8]), torch.tensor([0.0, 1.0, 0.0])
+        >>> found = torchsfm.motion.relative_upright_3pt(d1, d1 + t, down, down)
+        >>> bool((found.model[found.valid][..., 3] - t).norm(dim=-1).min() < 1e-3)  # the true one is there
+        True
     """
     batch = check_tensors(d1=(d1, "3 3"), d2=(d2, "3 3"), gravity1=(gravity1, "3"), gravity2=(gravity2, "3"))
     with torch.no_grad():
