@@ -119,8 +119,10 @@ from torchsfm.images import (
 )
 from torchsfm.motion import (
     AffineFactorization as AffineFactorization,
+    AveragedRotations as AveragedRotations,
     ConicEpipolarFit as ConicEpipolarFit,
     Factorization as Factorization,
+    average_rotations as average_rotations,
     estimate_essential as estimate_essential,
     estimate_fundamental as estimate_fundamental,
     estimate_fundamentals as estimate_fundamentals,

@@ -27,6 +27,7 @@ from torchsfm.geometry import (
     pluecker_from_points,
     project_points,
     project_quadric,
+    rotation_from_rotvec,
 )
 from torchsfm.images import Features, detect_segments
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
@@ -229,6 +230,12 @@ def _fundamentals(P: Tensor) -> Tensor:
     return fundamental_from_cameras(P[..., first, :, :], P[..., second, :, :])
 
 
+def _relative_rotations(s: Scene) -> Tensor:
+    _, R, _ = s.parameters(4)
+    first, second = PAIRS.unbind(-1)
+    return rotation_from_rotvec(0.01 * s.randn(6, 3)) @ R[second] @ R[first].mT
+
+
 def _fit(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
     return torch.stack((x[..., 0, None] * a - b, x[..., 1, None] * a.exp() - 1), -1)
 
@@ -330,6 +337,11 @@ FUNCTIONS: dict[str, Function] = {
     "linalg.usable": Function({"x": lambda s: s.randn(5)}),
     "linalg.null_vector": Function({"A": lambda s: s.randn(6, 4)}),
     "linalg.orthonormal_nullspace": Function({"A": lambda s: s.randn(3, 5)}),
+    "motion.average_rotations": Function(
+        {"R": _relative_rotations, "edges": PAIRS, "views": 4, "deviation": None, "weights": lambda s: s.rand(6, low=0.5)},
+        {"e": 6},
+        batched=False,
+    ),
     "motion.estimate_essential": Function(RAYS, {"n": 30}),
     "motion.estimate_fundamental": Function(ROBUST, {"n": 30}),
     "motion.estimate_fundamentals": Function({"threshold": 2.0, "generator": _generator, "slots": 2}, {"n": 30}),

@@ -1,5 +1,6 @@
 """From images alone: how did the camera move?"""
 
+from torchsfm.motion.many_views.average_rotations import AveragedRotations, average_rotations
 from torchsfm.motion.many_views.factorization_affine import AffineFactorization, factorize_affine
 from torchsfm.motion.many_views.factorization_points import Factorization, factorize_points
 from torchsfm.motion.many_views.quadrifocal_6pt import QuadrifocalFit, quadrifocal_6pt
@@ -35,6 +36,7 @@ ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, 
 __all__ = [
     "ESTIMATORS",
     "AffineFactorization",
+    "AveragedRotations",
     "ConicEpipolarFit",
     "Factorization",
     "FocalMotion",
@@ -47,6 +49,7 @@ __all__ = [
     "TrifocalEstimator",
     "TrifocalFit",
     "UprightPoseEstimator",
+    "average_rotations",
     "essential_5pt",
     "essential_6pt",
     "estimate_essential",

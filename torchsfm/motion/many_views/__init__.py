@@ -1,1 +1,1 @@
-"""Four and many views: the quadrifocal tensor, affine and projective factorisation."""
+"""Four and many views: the quadrifocal tensor, affine and projective factorisation, averaging over view graphs."""

@@ -1,0 +1,292 @@
+"""Rotations of all cameras of a view graph from relative rotations of which many may be wrong.
+
+The residual of an edge is the rotation vector of `R_j R_i' R_ij'`, in units of its standard deviation. The start is a spanning
+tree of the edges that close best around triangles; from there a minimum of the sum of lengths, which outliers bend little
+(Hartley, Aftab & Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011), whose scatter then sets the scale
+of a loss under which they have no pull at all (Chatterjee & Govindu, "Robust relative rotation averaging", PAMI 2018). Each is
+a sparse problem of three unknowns a camera.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int, Int8
+from torch import Tensor
+
+from torchsfm._types import Status, check_index, check_one_problem, check_options
+from torchsfm.geometry import cross_matrix, rotvec_from_rotation
+from torchsfm.linalg import usable
+from torchsfm.motion.many_views.spanning_rotations import spanning_rotations
+from torchsfm.motion.many_views.triplets import find_triplets, pairs_within, turn_angle
+from torchsfm.optim import Block, GemanMcClure, Huber, Loss, Rotation, SparseResult, Term, marginal_covariance
+from torchsfm.optim import sparse_levenberg_marquardt as minimise
+
+QUARTILE = 1.2125
+"""Of a squared residual of three normal components."""
+ROUNDS = 2
+"""Sums of lengths minimised, each with the scale that the last has left."""
+ROUGH = 1e-3
+"""Part of the cost to which that is done."""
+REACH = 5.0
+"""Scale of the last loss: where edges lose their pull, in standard deviations."""
+AGREES = 4.0
+"""Standard deviations within which an edge agrees: 0.1 % of right ones do not."""
+EXACT = 1e-4
+"""Radians that all edges are taken to be off at least: sharper losses find no way, and gain nothing."""
+NOT_A_ROTATION = 1e-2
+"""By how much entries of `R R'` may differ from those of the identity."""
+
+
+@dataclass(frozen=True)
+class AveragedRotations:
+    """Rotations of v cameras that agree best with e edges.
+
+    Attributes:
+        model: Rotations from the world to the cameras. The world is the smallest camera of each component.
+        status: OK; TOO_FEW: no edge of this camera counts; NO_CONSENSUS: of several edges at most one
+            agrees with the rest; NOT_CONVERGED: the iteration
+            limit came first, the rotations are the best seen.
+        component: The smallest camera that each is connected with through edges that agree. Rotations of different components
+            have nothing to do with each other.
+        angle: By how much each edge disagrees with the model, in radians; pi for edges that do not count.
+        inliers: Edges that agree to within four standard deviations.
+        scale: Standard deviation of the right edges in each of three directions, as estimated from their scatter: in radians,
+            or in units of what `deviation` says.
+        covariance: If asked for, that of each rotation, for a turn `exp(w) R` in the frame of the camera, relative to the
+            smallest camera of its component; infinite for cameras that are not OK.
+    """
+
+    model: Float[Tensor, "v 3 3"]
+    status: Int8[Tensor, "v"]
+    component: Int[Tensor, "v"]
+    angle: Float[Tensor, "e"]
+    inliers: Bool[Tensor, "e"]
+    scale: Float[Tensor, ""]
+    covariance: Float[Tensor, "v 3 3"] | None = None
+
+
+def average_rotations(
+    R: Float[Tensor, "e 3 3"],
+    edges: Int[Tensor, "e 2"],
+    *,
+    views: int,
+    deviation: Float[Tensor, "e 3 3"] | None = None,
+    weights: Float[Tensor, "e"] | None = None,
+    covariance: bool = False,
+    max_iterations: int = 100,
+) -> AveragedRotations:
+    """Rotations of all cameras of a view graph, robustly.
+
+    One sparse problem of any size and density: graphs that have no edge in common may be given as one, and each comes out as a
+    component of its own. Edges between the same two cameras count each by itself.
+
+    A camera that hangs on the rest by a single edge is where that edge puts it, right or wrong, and so are two parts of a
+    graph: nothing tells. Where most edges of a camera are wrong in the same way (things that look alike) they win.
+
+    Args:
+        R: Relative rotations, `R_j = R R_i` for cameras i and j of an edge.
+        edges: The first and second camera of each.
+        views: Number of cameras.
+        deviation: Covariance of each relative rotation, for a turn `exp(w) R` in radians, as two-view estimation gives it; that
+            all are off by a common factor does no harm. All edges are alike if not given.
+        weights: What each edge counts; 0 leaves it out.
+        covariance: Compute the covariance of each rotation: dense, for up to some thousand cameras.
+        max_iterations: Most steps of each of the minimisations.
+
+    Returns:
+        Rotations, statuses, components, and what is thought of each edge. Edges that are not finite, whose R is no rotation,
+        whose covariance is not positive or that join a camera with itself do not count. `model` carries its derivatives with
+        respect to `R`, `deviation` and `weights` by the implicit function theorem, at the scale that was found.
+
+    Raises:
+        ValueError: A shape, dtype, device or option does not fit, or a camera's number is out of range.
+    """
+    check_one_problem(
+        R=(R, "e 3 3"), edges=(edges, "e 2: int"), deviation=(deviation, "?e 3 3"), weights=(weights, "?e")
+    )  # fmt: skip
+    check_options(views=(views, "int >= 0"), covariance=(covariance, bool), max_iterations=(max_iterations, "int >= 0"))
+    check_index(edges=(edges, views))
+    edges = edges.long()
+    with torch.no_grad():
+        counts = _countable(R, edges, deviation, weights)
+    kept = counts.nonzero()[:, 0]
+    graph = _Graph(
+        R[kept].double(),
+        edges[kept],
+        None if deviation is None else deviation[kept].double(),
+        None if weights is None else weights[kept].double(),
+        views,
+    )
+    with torch.no_grad():
+        start, _ = graph.start()
+        for _ in range(ROUNDS):
+            scale = graph.scale(start)
+            start = _rotations(graph.minimise(start, Huber(scale), max_iterations, ROUGH))
+            start = graph.reseat(start, AGREES * graph.scale(start))
+        scale = graph.scale(start)
+    loss = GemanMcClure(REACH * scale)
+    found = graph.minimise(start, loss, max_iterations, 1e-6)
+    model = _rotations(found)
+    with torch.no_grad():
+        plain = model.detach()
+        angle, inliers = R.new_full((len(R),), torch.pi), torch.zeros_like(counts)
+        angle[kept] = turn_angle(graph.disagreement(plain)).to(R.dtype)
+        inliers[kept] = graph.square(plain).sqrt() <= AGREES * scale
+        status = _status(edges, counts, inliers, views, found.status)
+        sure = inliers & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
+        component = spanning_rotations(R[sure], edges[sure], angle[sure], views)[1]
+        spread = None
+        if covariance:
+            spread = graph.covariance(plain, component, status, loss, scale).to(R.dtype)
+    model = (model @ model[component].mT).to(R.dtype)
+    return AveragedRotations(model, status, component, angle, inliers, R.new_tensor(scale), spread)
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """The edges that count, in double precision."""
+
+    R: Float[Tensor, "e 3 3"]
+    edges: Int[Tensor, "e 2"]
+    deviation: Float[Tensor, "e 3 3"] | None
+    weights: Float[Tensor, "e"] | None
+    views: int
+
+    def start(self) -> tuple[Tensor, Tensor]:
+        """Rotations along the tree of the edges that most triangles speak for; among equals the more precise ones."""
+        R = self.R.detach()
+        quality = find_triplets(R, self.edges, self.views).votes(len(R))
+        weight = R.new_ones(len(R)) if self.weights is None else self.weights.detach()
+        if self.deviation is not None:
+            weight = weight / self.deviation.detach().diagonal(dim1=-2, dim2=-1).sum(-1)
+        if len(R):
+            quality = quality + weight / weight.amax()
+        return spanning_rotations(R, self.edges, quality, self.views)
+
+    def disagreement(self, model: Float[Tensor, "v 3 3"]) -> Float[Tensor, "e 3 3"]:
+        """`R_j R_i' R_ij'` of each edge."""
+        i, j = self.edges.unbind(-1)
+        return model[j] @ model[i].mT @ self.R.mT
+
+    def square(self, model: Float[Tensor, "v 3 3"]) -> Float[Tensor, "e"]:
+        """The squared residual of each edge."""
+        e = rotvec_from_rotation(self.disagreement(model))[..., None]
+        return (self._whitening() @ e)[..., 0].square().sum(-1)
+
+    def reseat(self, model: Float[Tensor, "v 3 3"], reach: float) -> Float[Tensor, "v 3 3"]:
+        """Put cameras with which most of their edges disagree where one of these wants them, if more then agree.
+
+        A sum of lengths has minima in which a few edges hold a camera far from where more of them would put it.
+        """
+        W = self._whitening()
+        camera = self.edges.mT.flatten()
+        agree = (self.square(model) <= reach**2).repeat(2)
+        total, support = (torch.bincount(c, minlength=self.views) for c in (camera, camera[agree]))
+        i, j = self.edges.unbind(-1)
+        wish = torch.cat((self.R.mT @ model[j], self.R @ model[i]))
+        doubtful = (2 * support < total)[camera].nonzero()[:, 0]
+        doubtful = doubtful[torch.argsort(camera[doubtful], stable=True)]
+        backers = torch.zeros_like(camera)
+        for a, b in pairs_within(camera[doubtful]):
+            a, b = doubtful[a], doubtful[b]
+            e = rotvec_from_rotation(wish[a] @ wish[b].mT)[..., None]
+            near = [((W[k % len(W)] @ e)[..., 0].square().sum(-1) <= 2 * reach**2).long() for k in (a, b)]
+            backers.index_add_(0, a, near[0]).index_add_(0, b, near[1])
+        most = torch.zeros_like(support).scatter_reduce_(0, camera, backers + 1, "amax")
+        # The first of the edges that most agree with.
+        chosen = (backers + 1 == most[camera]).nonzero()[:, 0]
+        seat = torch.full_like(support, len(wish)).scatter_reduce_(0, camera[chosen], chosen, "amin")
+        move = (most > support) & (most > 1)
+        return model.index_copy(0, move.nonzero()[:, 0], wish[seat[move]])
+
+    def scale(self, model: Float[Tensor, "v 3 3"]) -> float:
+        """The standard deviation of the right edges, if a quarter of those that do not merely fix the model are right."""
+        if not len(self.R):
+            return EXACT
+        least = EXACT * float(torch.linalg.matrix_norm(self._whitening()).median()) / 3**0.5
+        fixing = min(self.views - 1, len(self.R) - 1)
+        rank = fixing + (len(self.R) - fixing - 1) // 4
+        return max(float((self.square(model).kthvalue(rank + 1).values / QUARTILE).sqrt()), least)
+
+    def terms(self, loss: Loss) -> list[Term]:
+        """All edges."""
+        i, j = self.edges.unbind(-1)
+        return [Term(_residual, ("R", "R"), (i, j), (self.R, self._whitening()), loss, self.weights, _linearize)]
+
+    def minimise(self, start: Float[Tensor, "v 3 3"], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
+        """The minimum nearest to a start."""
+        blocks = {"R": Block(start.flatten(1), Rotation())}
+        return minimise(blocks, self.terms(loss), max_iterations=max_iterations, function_tolerance=tolerance)
+
+    def covariance(self, model: Tensor, component: Tensor, status: Tensor, loss: Loss, scale: float) -> Float[Tensor, "v 3 3"]:
+        """That of each rotation, with the first cameras of all components held."""
+        held = (component == torch.arange(self.views, device=component.device)) | (status != int(Status.OK))
+        within = (component[self.edges[:, 0]] == component[self.edges[:, 1]]).nonzero()[:, 0]
+        terms = [term.select(within) for term in self.terms(loss)]
+        spread = scale**2 * marginal_covariance({"R": Block(model.flatten(1), Rotation(), held)}, terms, "R")
+        unknown = torch.diag(spread.new_full((3,), torch.inf))
+        known = (status == int(Status.OK))[:, None, None]
+        return torch.where(known, spread, unknown)
+
+    def _whitening(self) -> Float[Tensor, "e 3 3"]:
+        """W with `W' W` the inverse of the covariance of each edge."""
+        eye = torch.eye(3, dtype=self.R.dtype, device=self.R.device).expand(len(self.R), 3, 3)
+        if self.deviation is None:
+            return eye
+        lower, _ = torch.linalg.cholesky_ex(self.deviation)
+        whitening: Tensor = torch.linalg.solve_triangular(lower, eye, upper=False)
+        return whitening
+
+
+def _rotations(found: SparseResult) -> Float[Tensor, "v 3 3"]:
+    return found.x["R"].view(-1, 3, 3)
+
+
+def _residual(a: Tensor, b: Tensor, R: Tensor, W: Tensor) -> Tensor:
+    """The whitened rotation vector of `b a' R'`."""
+    e = rotvec_from_rotation(b.reshape(-1, 3, 3) @ a.reshape(-1, 3, 3).mT @ R.mT)
+    return (W @ e[..., None])[..., 0]
+
+
+def _linearize(a: Tensor, b: Tensor, R: Tensor, W: Tensor, *, out: list[Tensor | None]) -> Tensor:
+    """The same, and its derivatives by turns of both cameras: `log(exp(w) exp(e)) = e + J w`, on the other side `J' w`."""
+    e = rotvec_from_rotation(b.reshape(-1, 3, 3) @ a.reshape(-1, 3, 3).mT @ R.mT)
+    square = (e * e).sum(-1)
+    half = 0.5 * square.clamp(min=1e-6).sqrt()
+    factor = torch.where(square < 1e-6, 1 / 12 + square / 720, (1 - half * half.cos() / half.sin()) / square.clamp(min=1e-6))
+    cross = cross_matrix(e)
+    J = torch.eye(3, dtype=e.dtype, device=e.device) - 0.5 * cross + factor[:, None, None] * (cross @ cross)
+    if out[0] is not None:
+        out[0].copy_(-W @ J.mT @ R)
+    if out[1] is not None:
+        out[1].copy_(W @ J)
+    return (W @ e[..., None])[..., 0]
+
+
+def _countable(R: Tensor, edges: Tensor, deviation: Tensor | None, weights: Tensor | None) -> Bool[Tensor, "e"]:
+    """Edges that say something."""
+    good = usable(R).all(-1).all(-1) & (edges[:, 0] != edges[:, 1])
+    safe = torch.where(good[:, None, None], R, 0)
+    off = (safe @ safe.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-2, -1))
+    good = good & (off < NOT_A_ROTATION) & (torch.linalg.det(safe) > 0)
+    if weights is not None:
+        good = good & usable(weights) & (weights > 0)
+    if deviation is not None:
+        good = good & usable(deviation).all(-1).all(-1)
+        eye = torch.eye(3, dtype=torch.float64, device=R.device)
+        _, info = torch.linalg.cholesky_ex(torch.where(good[:, None, None], deviation.double(), eye))
+        good = good & (info == 0)
+    counts: Tensor = good
+    return counts
+
+
+def _status(edges: Tensor, counts: Tensor, inliers: Tensor, views: int, course: Status) -> Int8[Tensor, "v"]:
+    """What became of each camera."""
+    of_camera = torch.zeros(2, views, dtype=torch.long, device=edges.device)
+    for row, chosen in zip(of_camera, (counts, inliers), strict=True):
+        row.index_add_(0, edges[chosen].flatten(), torch.ones_like(edges[chosen].flatten()))
+    code = torch.full((views,), int(course), dtype=torch.int8, device=edges.device)
+    # One edge of several supports nothing but itself.
+    code = torch.where((of_camera[1] < 2) & (of_camera[1] < of_camera[0]), int(Status.NO_CONSENSUS), code)
+    status: Tensor = torch.where(of_camera[0] == 0, int(Status.TOO_FEW), code).to(torch.int8)
+    return status
