@@ -33,6 +33,7 @@ from torchsfm.autocalibration import (
 from torchsfm.bundle import (
     AdjustedModel as AdjustedModel,
     BundleCovariance as BundleCovariance,
+    BundleConics as BundleConics,
     BundleLines as BundleLines,
     BundleModel as BundleModel,
     BundleResult as BundleResult,

@@ -5,6 +5,7 @@ from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
 from torchsfm.bundle.bundle_adjust_model import AdjustedModel, BundleModel, bundle_adjust_model
 from torchsfm.bundle.bundle_adjust_projective import ProjectiveBundleResult, bundle_adjust_projective
 from torchsfm.bundle.bundle_covariance import BundleCovariance, bundle_covariance
+from torchsfm.bundle.conics import BundleConics
 from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.intrinsics_covariance import intrinsics_covariance
 from torchsfm.bundle.lines import BundleLines
@@ -14,6 +15,7 @@ from torchsfm.bundle.structure import Structure
 
 __all__ = [
     "AdjustedModel",
+    "BundleConics",
     "BundleCovariance",
     "BundleLines",
     "BundleModel",

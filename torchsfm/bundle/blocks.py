@@ -42,7 +42,7 @@ class BundleTerms(TypedDict, total=False):
             the mean for "focal" and absolute otherwise, for all cameras or (g,) for each. An observation's distance counts in
             units of 1 pixel.
         intrinsics_mean: Where these are centred; the cameras given if not given.
-        structure: What the views see besides points: `BundleLines`. One of a kind.
+        structure: What the views see besides points: `BundleLines`, `BundleConics`. One of a kind.
     """
 
     free: Sequence[str]

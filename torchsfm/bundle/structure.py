@@ -57,7 +57,7 @@ class Structure(Protocol):
         """The variables where they start."""
 
     def term(self, sight: Sight, start: Block) -> Term:
-        """The residuals, pixels, one row an observation."""
+        """The residuals, in units in which those of points are pixels, one row an observation."""
 
     def covariance(self, x: Tensor, C: Tensor) -> Tensor:
         """Covariances of the variables in coordinates that mean something outside, from those of their steps."""

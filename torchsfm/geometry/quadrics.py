@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_options, check_tensors
+from torchsfm.geometry.similarity import Similarity
 from torchsfm.linalg import adjugate_3x3, adjugate_4x4, cross, eigh, eigvalsh, null_vector, unit_scale, usable
 
 _ROUNDING = 1e-12
@@ -39,6 +40,11 @@ class Ellipsoid:
         normal = cross(self.axes[..., 0, :], self.axes[..., 1, :])
         normal = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
         return torch.cat((normal, -(normal * self.centre).sum(-1, keepdim=True)), -1)
+
+    def transform(self, similarity: Similarity) -> "Ellipsoid":
+        """The same in another world."""
+        axes = similarity.scale[..., None, None] * (self.axes @ similarity.R.mT)
+        return Ellipsoid(similarity.transform(self.centre[..., None, :])[..., 0, :], axes)
 
 
 @dataclass(frozen=True)
