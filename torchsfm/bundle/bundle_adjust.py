@@ -71,11 +71,11 @@ def bundle_adjust(
     """Minimise the reprojection error over poses, cameras and structure together (Triggs et al. 2000; HZ 18.1).
 
     Points, and lines and conics where `structure` has some, are eliminated by the Schur complement (poses, where there are many
-    more poses than structure). Seven dimensions of gauge (place, orientation, size of the world) are free unless something holds
-    them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does no harm: the damping
-    takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Fixed and unobserved
-    poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a pinhole
-    shows them mirrored): leave them out, or use a loss. Computed in float64.
+    more poses than structure). Seven dimensions of gauge (place, orientation, size of the world) are free unless something
+    holds them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does no harm: the
+    damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Fixed and unobserved
+    poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a pinhole shows them
+    mirrored): leave them out, or use a loss. Computed in float64.
 
     Args:
         problem: Views of points, with estimates of everything.
