@@ -224,10 +224,17 @@ from torchsfm.triangulation import (
     triangulate_quadrics as triangulate_quadrics,
 )
 
+__version__: str
+"""That of the installed package, looked up when asked for."""
+
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        """What once stood here too and is a room's: found there, without being listed."""
+        """The version; and what once stood here too and is a room's: found there, without being listed."""
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("torchsfm")
         for room in (
             geometry, robust, motion, resection, triangulation, autocalibration, bundle, optim, images, tensors, reconstruction,
             formats, simulation, plot,
