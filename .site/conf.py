@@ -41,7 +41,7 @@ suppress_warnings = ["config.cache"]
 # Docstrings write names and formulas between single backticks, as Markdown does.
 default_role = "code"
 autodoc_member_order = "bysource"
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True}
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 96
 autosummary_generate = False
@@ -60,6 +60,7 @@ sphinx_gallery_conf = {
     "filename_pattern": r"\.py$",
     "within_subsection_order": FileNameSortKey,
     "reset_modules": ("matplotlib", "building.examples.forget"),
+    "default_thumb_file": str(ROOT / "examples" / "fountain.png"),
     "download_all_examples": False,
     "remove_config_comments": True,
     "min_reported_time": 1e9,

@@ -3,9 +3,10 @@
 import ast
 import importlib
 import inspect
-from enum import EnumMeta
+from enum import Enum, EnumMeta
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from sphinx.pycode import ModuleAnalyzer
 
@@ -77,9 +78,16 @@ def name_page(name: Name) -> str:
         lines += [f".. py:data:: {name.full}", "", *(f"   {line}" for line in plain(_comment(name)).splitlines())]
     else:
         lines += [f".. auto{name.kind}:: {name.full}"]
-        lines += ["   :undoc-members:"] * (isinstance(name.value, EnumMeta))
+        lines += ["   :undoc-members:"] * isinstance(name.value, EnumMeta)
+        lines += ["   :show-inheritance:"] * _tells_of_bases(name.value)
     lines += ["", f".. minigallery:: torchsfm.{name.name} {name.full}", "   :add-heading: Examples that use it", ""]
     return "\n".join(lines)
+
+
+def _tells_of_bases(value: Any) -> bool:
+    """Whether a class derives from something that a user knows."""
+    known = {id(n.value) for n in listed().values()}
+    return inspect.isclass(value) and (any(id(b) in known for b in value.__bases__) or issubclass(value, (Exception, Enum)))
 
 
 def _title(text: str, line: str = "=") -> list[str]:
