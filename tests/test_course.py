@@ -30,6 +30,22 @@ TRUTHS: dict[str, list[tuple[str, float, float]]] = {
         (r"estimated as E .* rotation off by ([\d.]+) degrees", 0, 0.2),
         (r"band of 2000 trials: ([\d.]+)", 0.9, 1.1),
     ],
+    "06_triangulation_and_covariance.py": [
+        (r"before the correction, ([\d.e+-]+) px after", 0, 1e-9),
+        (r"cameras unlike, optimal : reprojection error ([\d.]+)", 0.93, 1.07),
+        (r"baseline 2.0: .* ([\d.]+)% of the trials", 92, 98),
+        (r"two ways to the covariance: ([\d.e+-]+)", 0, 1e-6),
+        (r"those that agree: median point off by ([\d.]+)", 0, 0.02),
+        (r"in the end: second camera off by ([\d.]+) degrees", 0, 0.5),
+    ],
+    "08_bundle_adjustment.py": [
+        (r"the steps differ by ([\d.e+-]+)", 0, 1e-6),
+        (r"after \d+ steps: ([\d.]+) px", 0.38, 0.45),
+        (r"scale: .* = ([\d.e+-]+)", 0, 1e-9),
+        (r"free +: (\d+) directions free", 7, 7),
+        (r"Cauchy +: points +([\d.]+)", 0, 10),
+        (r"standard deviation of the angle: predicted [\d.]+ degrees, observed ([\d.]+)", 0.13, 0.27),
+    ],
 }
 """For a notebook, what it prints and between which numbers that must lie."""
 
