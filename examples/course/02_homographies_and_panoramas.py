@@ -250,7 +250,7 @@ for seed in range(3):
 # level decides. Leave it out, or add one of a thirtieth.
 #
 # **Exercise 3.** Let the focal length be unknown too: four unknowns. *Hint:* *k* becomes a function of ``w[3]``. This is
-# how a camera calibrates itself by turning (:mod:`torchsfm.autocalibration` has it in closed form).
+# how a camera calibrates itself by turning (``torchsfm.autocalibration`` has it in closed form).
 #
 # **Exercise 4.** A homography has eight degrees of freedom, a turn three. Estimate the panorama's homographies as turns:
 # :math:`K^{-1} H K` divided by the cube root of its determinant should be a rotation. How far from one is it?

@@ -75,16 +75,16 @@ match_of_pixel = camera.project(poses[1].transform(apex[None]))[0]
 print(f"depth {depth:.2f} m, seen by the second camera at {match_of_pixel.numpy().round(1)}: on the line, and on the ball")
 
 # %% [markdown]
-#
 # The matrix behind it
 # --------------------
-# Write the second camera relative to the first, :math:`d_2 \sim R d_1 + t` for a point at unit depth on the ray
-# :math:`d_1`. The three vectors :math:`d_2`, :math:`R d_1` and :math:`t` are in one plane, so their triple product is zero:
+# With the depths :math:`\lambda_1, \lambda_2` of a point in both cameras, and the second camera relative to the first,
+# :math:`\lambda_2 d_2 = \lambda_1 R d_1 + t`. So the three vectors :math:`d_2`, :math:`R d_1` and :math:`t` are in one
+# plane, their triple product is zero, and the unknown depths are gone:
 #
 # .. math:: d_2^T [t]_\times R \, d_1 = 0, \qquad E = [t]_\times R.
 #
 # With :math:`d = K^{-1} x` the same holds for pixels, :math:`x_2^T F x_1 = 0` with :math:`F = K_2^{-T} E K_1^{-1}`. The
-# line is :math:`l_2 = F x_1`: three lines of code.
+# line is :math:`l_2 = F x_1`.
 
 # %%
 second_from_first = poses[1] @ poses[0].inverse()
@@ -95,10 +95,11 @@ F = F / F.norm()
 print(f"determinant of F: {F.det():.0e}; singular values: {torch.linalg.svdvals(F).numpy().round(6)}")
 
 # %% [markdown]
-# *F* has nine entries. Its scale is free and its determinant is zero: seven degrees of freedom. It is singular because all
-# epipolar lines of an image meet in one point, the *epipole*: the image of the other camera's centre. The next figure shows
-# the plane in which it all happens. It contains both centres and the point, and cuts each image in an epipolar line. Other
-# points have other planes, but all planes contain the *baseline* between the centres.
+# *F* has nine entries. Its scale is free and its determinant is zero: seven degrees of freedom. (Its second singular value
+# is small only because a pixel is a small unit.) It is singular because all epipolar lines of an image meet in one point,
+# the *epipole*: the image of the other camera's centre. The next figure shows the plane in which it all happens. It
+# contains both centres and the point, and cuts each image in an epipolar line. Other points have other planes, but all
+# planes contain the *baseline* between the centres.
 
 # %%
 fig = plt.figure(figsize=(8, 6.5), layout="constrained")
@@ -164,7 +165,7 @@ some = good.nonzero()[:, 0][:: int(good.sum()) // 12][:12]
 plot_epipolar_lines(found.model, x1[some], x2[some], *seen.images)[0].set_title("the estimated epipolar lines")
 
 # %% [markdown]
-# Look at the red matches: many look plausible, as bricks and mosaics do. Only the geometry tells them apart.
+# Red matches join bricks and tiles that look alike. No descriptor can tell; the geometry can.
 #
 # Essential: the motion of the camera
 # -----------------------------------
@@ -187,7 +188,8 @@ for name, E in (("K' F K", E_from_F), ("estimated as E", essential.model)):
     )
 
 # %% [markdown]
-# Knowing *K* helps: five numbers are estimated instead of seven, from the same matches.
+# :math:`K^T F K` is nearly an essential matrix, its singular values tell how nearly. The direct estimate is one exactly:
+# five numbers from the same matches instead of seven.
 #
 # Four motions, one of them possible
 # ----------------------------------
