@@ -62,6 +62,7 @@ from torchsfm.formats import (
     read_nvm as read_nvm,
     read_openmvg as read_openmvg,
     read_opensfm as read_opensfm,
+    read_conics as read_conics,
     read_lines as read_lines,
     read_ply as read_ply,
     write_bal as write_bal,
@@ -75,6 +76,7 @@ from torchsfm.formats import (
     write_nvm as write_nvm,
     write_openmvg as write_openmvg,
     write_opensfm as write_opensfm,
+    write_conics as write_conics,
     write_lines as write_lines,
     write_ply as write_ply,
     write_tum as write_tum,
@@ -155,6 +157,7 @@ from torchsfm.plot import (
 )
 from torchsfm.reconstruction import (
     MatchedImages as MatchedImages,
+    Conics as Conics,
     Lines as Lines,
     Reconstruction as Reconstruction,
     ReconstructionError as ReconstructionError,

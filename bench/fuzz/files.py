@@ -234,6 +234,8 @@ def _formats() -> list[Format]:
         formats.append(Format("arrays", _files(folder, "stage.npz"), _load, _in_zip))
         formats.append(Format("intrinsics", {"K.txt": b"500 0 320\n0 500 240\n0 0 1\n"}, read_intrinsics))
         formats.append(Format("lines", {"lines.txt": b"0 0 1 1 0 1 .5 .5 .5 2 0 10 10 50 12 4 3 11 9 52 13 4\n"}, read_lines))
+        ellipse = b"0 0 1 1 0 0 0 .5 0 .5 .5 .5 1 0 10 10 8 5 .3 1 0 0 0 0 1 0 0 0 1 0 0 1 0 .1\n"
+        formats.append(Format("conics", {"conics.txt": ellipse}, read_conics))
         for suffix in (".png", ".jpg", ".bmp", ".tif", ".webp", ".ppm", ".pgm"):
             save_image(folder / f"a{suffix}", torch.rand(1 if suffix == ".pgm" else 3, 20, 24, generator=g))
             fix = (lambda data, damage: mend_png(damage(data))) if suffix == ".png" else None

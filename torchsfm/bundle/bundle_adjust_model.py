@@ -8,8 +8,10 @@ from torch import Tensor
 
 from torchsfm.bundle.blocks import BundleTerms
 from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
+from torchsfm.bundle.conics import BundleConics
 from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.lines import BundleLines
+from torchsfm.bundle.structure import Structure
 from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.optim import Loss
 from torchsfm.optim.ranks import Group
@@ -51,14 +53,14 @@ class BundleModel(Protocol):
 
 
 @runtime_checkable
-class ModelLines(Protocol):
-    """Lines of a model, in its member `lines`."""
+class ModelStructure(Protocol):
+    """What a model has besides points, in its members `lines` and `conics`."""
 
-    def bundle(self, *, unit: float = 1.0, loss: Loss | None = None) -> BundleLines:
+    def bundle(self, *, unit: float = 1.0, loss: Loss | None = None) -> Structure:
         """As a part of a bundle in which image points have the standard deviation `unit`, pixels."""
 
-    def moved_to(self, L: Tensor) -> "ModelLines":
-        """The same where they were adjusted to."""
+    def adjusted(self, structure: Any) -> "ModelStructure":
+        """The same where that part was moved to."""
 
 
 M = TypeVar("M", bound=BundleModel)
@@ -91,8 +93,8 @@ class AdjustedModel(Generic[M]):
 def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedModel[M]:
     """Minimise the reprojection error over all poses, cameras and points of a model; `bundle_adjust` for what holds a bundle.
 
-    Lines, where the model has some in a member `lines`, are adjusted with the points, unless `structure` has others. Everything
-    else in the model (names, colours, observations) stays. Views without observations keep their poses.
+    Lines and conics, where the model has some in members `lines` and `conics`, are adjusted with the points, unless `structure`
+    has others. Everything else in the model (names, colours, observations) stays. Views without observations keep their poses.
 
     Args:
         model: A `Reconstruction`, a `BundleProblem`, or a frozen dataclass with their members.
@@ -105,17 +107,22 @@ def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedM
         ValueError: Shapes, dtypes, indices or names do not fit.
     """
     problem = BundleProblem(model.poses, model.cameras, model.camera_index, model.X, model.x, model.view, model.point)
-    lines, others = getattr(model, "lines", None), options.get("structure", ())
-    own = lines if isinstance(lines, ModelLines) and all(some.block != BundleLines.block for some in others) else None
-    if own is not None:
+    others = options.get("structure", ())
+    members = {"lines": BundleLines.block, "conics": BundleConics.block}
+    own = {
+        name: some
+        for name, block in members.items()
+        if isinstance(some := getattr(model, name, None), ModelStructure) and all(other.block != block for other in others)
+    }
+    if own:
         apart = problem.residuals().detach()
         known = apart[apart.isfinite()]
         noise = min(MOST_NOISE, float(known.median()) / RAYLEIGH) if len(known) else MOST_NOISE
-        options = {**options, "structure": (*others, own.bundle(unit=noise, loss=options.get("loss")))}
+        mine = [some.bundle(unit=noise, loss=options.get("loss")) for some in own.values()]
+        options = {**options, "structure": (*others, *mine)}
     result = bundle_adjust(problem, **options)
     poses = result.poses if result.rig is None else result.rig.view_poses(result.poses)
     whole: Any = replace(cast(Any, model), poses=poses, cameras=result.cameras, X=result.X)
-    if own is not None:
-        (moved,) = (some for some in result.structure if isinstance(some, BundleLines))
-        whole = replace(whole, lines=own.moved_to(moved.L))
+    moved = dict(zip(own, result.structure[len(others) :], strict=True))
+    whole = replace(whole, **{name: some.adjusted(moved[name]) for name, some in own.items()})
     return AdjustedModel(whole, result)

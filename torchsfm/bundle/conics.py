@@ -18,9 +18,10 @@ from torch import Tensor
 from torchsfm._types import check_index, check_options, check_tensors
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.structure import Sight
-from torchsfm.geometry import Ellipse, Ellipsoid, Similarity
+from torchsfm.geometry import Camera, Ellipse, Ellipsoid, Pose, Similarity
 from torchsfm.geometry.conic_distance import root_slopes
 from torchsfm.geometry.ellipse_manifold import Ellipse3D, ellipse_from_row, ellipse_row, spanning
+from torchsfm.geometry.intrinsic_parameters import row_from_camera
 from torchsfm.linalg import inverse
 from torchsfm.optim import Block, Loss, Term
 
@@ -116,6 +117,25 @@ class BundleConics:
         centre = torch.where(moved[:, None], found.centre.to(self.model.centre.dtype), self.model.centre)
         axes = torch.where(moved[:, None, None], found.axes.to(self.model.axes.dtype), self.model.axes)
         return replace(self, model=Ellipsoid(centre, axes))
+
+
+def ellipse_distances(poses: Pose, cameras: Camera, conics: BundleConics) -> Float[Tensor, "k s"]:
+    """Distances of the images of ellipses in space from points all around the measured ones, along normals, pixels.
+
+    By the pose and camera of each view.
+    """
+    pose, camera = poses[conics.view], cameras[conics.view]
+    row = ellipse_row(Ellipsoid(conics.model.centre.double(), conics.model.axes.double()))[conics.conic]
+    e, n, _ = _sampled(conics.ellipse, None)
+    rays, valid = camera.unproject(e.to(conics.ellipse.centre.dtype))
+    rays = torch.where(valid[..., None], rays, torch.nan).double()
+    R = pose.R.double()
+    centre = (R @ row[:, :3, None])[..., 0] + pose.t.double()
+    columns = R @ spanning(row.mT).permute(2, 0, 1)
+    e, n, rays = (v.permute(2, 1, 0) for v in (e, n, rays))
+    through = Projection(type(cameras.distortion), ())
+    d = _along_normals(through, row_from_camera(camera).double().mT, centre.mT, columns.permute(1, 2, 0), e, n, rays)
+    return d.mT.to(conics.model.centre.dtype)
 
 
 def _sampled(ellipse: Ellipse, covariance: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:

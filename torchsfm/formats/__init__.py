@@ -4,6 +4,7 @@ from torchsfm.formats.bal import read_bal, write_bal
 from torchsfm.formats.bundler import read_bundler, write_bundler
 from torchsfm.formats.colmap import read_colmap, write_colmap
 from torchsfm.formats.colmap_database import read_database, write_database
+from torchsfm.formats.conics import read_conics, write_conics
 from torchsfm.formats.curves import write_curves_json, write_curves_ply
 from torchsfm.formats.export import TARGETS, export_model
 from torchsfm.formats.gltf import write_gltf
@@ -29,6 +30,7 @@ __all__ = [
     "read_bal",
     "read_bundler",
     "read_colmap",
+    "read_conics",
     "read_database",
     "read_hloc",
     "read_libmv",
@@ -44,6 +46,7 @@ __all__ = [
     "write_bal",
     "write_bundler",
     "write_colmap",
+    "write_conics",
     "write_curves_json",
     "write_curves_ply",
     "write_database",

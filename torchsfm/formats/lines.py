@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.reconstruction.files import whole_file
@@ -88,18 +89,23 @@ def read_lines(path: str | Path) -> Lines:
 
 
 def _ply(lines: Lines) -> bytes:
-    real = "<f8" if lines.ends.dtype == torch.float64 else "<f4"
-    vertices = np.empty(2 * len(lines), [(a, real) for a in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
+    return pieces_as_ply(lines.ends, lines.color)
+
+
+def pieces_as_ply(ends: Float[Tensor, "l 2 3"], color: Float[Tensor, "l 3"]) -> bytes:
+    """A PLY file of pieces of straight lines."""
+    real = "<f8" if ends.dtype == torch.float64 else "<f4"
+    vertices = np.empty(2 * len(ends), [(a, real) for a in "xyz"] + [(c, "u1") for c in ("red", "green", "blue")])
     edges = np.empty(
-        len(lines),
+        len(ends),
         [(name, t) for t, names in (("<i4", ("vertex1", "vertex2")), ("u1", ("red", "green", "blue"))) for name in names],
     )
-    levels = _levels(lines.color)
+    levels = _levels(color)
     for i, axis in enumerate("xyz"):
-        vertices[axis] = lines.ends[..., i].reshape(-1).numpy()
+        vertices[axis] = ends[..., i].reshape(-1).numpy()
     for i, channel in enumerate(("red", "green", "blue")):
         vertices[channel], edges[channel] = levels[:, i].repeat(2), levels[:, i]
-    edges["vertex1"], edges["vertex2"] = np.arange(0, 2 * len(lines), 2), np.arange(1, 2 * len(lines), 2)
+    edges["vertex1"], edges["vertex2"] = np.arange(0, 2 * len(ends), 2), np.arange(1, 2 * len(ends), 2)
     words = {"<f8": "double", "<f4": "float", "|u1": "uchar", "<i4": "int"}
     header = ["ply", "format binary_little_endian 1.0"]
     for name, records in (("vertex", vertices), ("edge", edges)):
@@ -109,10 +115,15 @@ def _ply(lines: Lines) -> bytes:
 
 
 def _obj(lines: Lines) -> bytes:
+    return pieces_as_obj(lines.ends, lines.color)
+
+
+def pieces_as_obj(ends: Float[Tensor, "l 2 3"], color: Float[Tensor, "l 3"]) -> bytes:
+    """An OBJ file of pieces of straight lines."""
     rows = ["# lines of a model: vertices with colours, and line elements"]
-    for (a, b), color in zip(lines.ends.tolist(), lines.color.clamp(0, 1).tolist(), strict=True):
-        rows += ["v " + " ".join(map(repr, [*end, *(round(c, 4) for c in color)])) for end in (a, b)]
-    rows += [f"l {2 * k + 1} {2 * k + 2}" for k in range(len(lines))]
+    for (a, b), shade in zip(ends.tolist(), color.clamp(0, 1).tolist(), strict=True):
+        rows += ["v " + " ".join(map(repr, [*end, *(round(c, 4) for c in shade)])) for end in (a, b)]
+    rows += [f"l {2 * k + 1} {2 * k + 2}" for k in range(len(ends))]
     return ("\n".join(rows) + "\n").encode("ascii")
 
 

@@ -29,6 +29,7 @@ def registered_only(model: Reconstruction) -> Reconstruction:
     number = keep.cumsum(0) - 1
     seen = keep[model.view]
     lines = None if model.lines is None else segments_where(model.lines, keep[model.lines.view])
+    conics = None if model.conics is None else model.conics.seen_where(keep[model.conics.view])
     return replace(
         model,
         names=tuple(name for name, kept in zip(model.names, keep.tolist(), strict=True) if kept),
@@ -40,6 +41,7 @@ def registered_only(model: Reconstruction) -> Reconstruction:
         view=number[model.view[seen]],
         point=model.point[seen],
         lines=None if lines is None else replace(lines, view=number[lines.view]),
+        conics=None if conics is None else replace(conics, view=number[conics.view]),
     )
 
 
@@ -58,7 +60,8 @@ def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: boo
 
     Returns:
         The same points, lines and poses, a camera for each camera and size of image, and the observations where they come to
-        lie; image points outside of the new pictures are left out. Images without a pose are left out, too.
+        lie; image points outside of the new pictures are left out. Images without a pose are left out, too, and measured
+        ellipses, which are other ones in the new pictures.
     """
     model = registered_only(model)
     keys = torch.cat([model.camera_index[:, None], model.image_size.to(model.camera_index.dtype)], -1)
@@ -73,9 +76,10 @@ def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: boo
     if lines is not None:
         ends, there = _moved(lines.x, lenses[index[lines.view]], pinholes[index[lines.view]])
         lines = segments_where(replace(lines, x=ends), there)
+    conics = None if model.conics is None else model.conics.seen_where(torch.zeros_like(model.conics.view, dtype=torch.bool))
     return replace(
         model, cameras=pinholes, camera_index=index, image_size=size[index], x=x[shown], view=model.view[shown],
-        point=model.point[shown], lines=lines,
+        point=model.point[shown], lines=lines, conics=conics,
     )  # fmt: skip
 
 

@@ -172,6 +172,16 @@ def _model(
                 else ""
             )
         )
+    if model.conics is not None:
+        conics = model.conics.select(model.conics.axes.isfinite().flatten(1).all(-1) & model.conics.centre.isfinite().all(-1))
+        chords = conics.chords()
+        shades = conics.color.repeat_interleave(len(chords) // max(len(conics), 1), 0)
+        line_ends, line_color = torch.cat((line_ends, chords)), torch.cat((line_color, shades))
+        summary.append(
+            f"{len(conics):,} ellipses"
+            + (f", in {float(conics.support().double().mean()):.1f} images" if len(conics) else "")
+            + (f", mean error {float(model.conic_residuals().nan_to_num().mean()):.3g} px" if len(model.conics.x) else "")
+        )
     if curves is not None:
         segments = _segments(curves).to(line_ends)
         line_ends, line_color = (

@@ -1,5 +1,6 @@
 """How do images become a model? The `Reconstruction`, and the doors from photographs and from tracks."""
 
+from torchsfm.reconstruction.conics import Conics
 from torchsfm.reconstruction.curves import CurveReconstruction, reconstruct_curves
 from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
@@ -11,6 +12,7 @@ from torchsfm.reconstruction.report import ImageReport, PairReport, Reconstructi
 from torchsfm.reconstruction.view_graph import Verdict
 
 __all__ = [
+    "Conics",
     "CurveReconstruction",
     "ImageReport",
     "Lines",

@@ -82,6 +82,10 @@ class Lines:
         x = self.x if ends else self.fit_points()
         return BundleLines(self.L, x, self.view, self.line, weights=self.weight * unit**2, loss=loss)
 
+    def adjusted(self, structure: BundleLines) -> "Lines":
+        """The same where that part of a bundle was moved to."""
+        return self.moved_to(structure.L)
+
     def moved_to(self, L: Float[Tensor, "l 6"]) -> "Lines":
         """The parts of other lines that are nearest to these."""
         d = L[:, None, :3]

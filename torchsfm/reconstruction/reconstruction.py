@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsfm._types import tensor_map
+from torchsfm.bundle.conics import ellipse_distances
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, Similarity
+from torchsfm.reconstruction.conics import Conics
 from torchsfm.reconstruction.files import load_arrays, whole_file
 from torchsfm.reconstruction.lines import Lines
 
@@ -37,6 +39,7 @@ class Reconstruction:
         view: Image of each observation.
         point: Point of each observation.
         lines: Lines and the segments that show them, where lines were looked for.
+        conics: Ellipses in space and the measured ones that show them, where there are some.
     """
 
     names: tuple[str, ...]
@@ -51,6 +54,7 @@ class Reconstruction:
     view: Int[Tensor, "m"]
     point: Int[Tensor, "m"]
     lines: Lines | None = None
+    conics: Conics | None = None
 
     @property
     def num_registered(self) -> int:
@@ -106,6 +110,13 @@ class Reconstruction:
             return self.X.new_zeros(0, 2)
         return segment_distances(self.poses, self.cameras[self.camera_index], self.lines.bundle(ends=True)).abs()
 
+    def conic_residuals(self) -> Float[Tensor, "k"]:
+        """Root-mean-square distance of each measured ellipse from the image of its ellipse in space, in pixels."""
+        if self.conics is None:
+            return self.X.new_zeros(0)
+        apart = ellipse_distances(self.poses, self.cameras[self.camera_index], self.conics.bundle())
+        return apart.square().mean(-1).sqrt()
+
     def transform(self, similarity: Similarity) -> "Reconstruction":
         """The same model in another world frame, `X' = s R X + t`; reprojections do not change."""
         poses = similarity.transform_pose(self.poses)
@@ -114,7 +125,8 @@ class Reconstruction:
             R=torch.where(keep[:, None, None], poses.R, self.poses.R), t=torch.where(keep[:, None], poses.t, self.poses.t)
         )
         lines = None if self.lines is None else self.lines.transform(similarity)
-        return replace(self, X=similarity.transform(self.X), poses=poses, lines=lines)
+        conics = None if self.conics is None else self.conics.transform(similarity)
+        return replace(self, X=similarity.transform(self.X), poses=poses, lines=lines, conics=conics)
 
     def summary(self) -> str:
         """A few lines for people: what was registered, how many points, how well they fit, the cameras found."""
@@ -130,6 +142,9 @@ class Reconstruction:
             lines.append(
                 f"{len(self.lines)} lines, {len(self.lines.x)} segments, in {views:.2f} images each, {error:.3f} px off"
             )
+        if self.conics is not None and len(self.conics):
+            views, error = self.conics.support().double().mean(), self.conic_residuals().mean()
+            lines.append(f"{len(self.conics)} ellipses, in {views:.2f} images each, {error:.3f} px off")
         used = torch.unique(self.camera_index[self.registered]).tolist()
         for index in used:
             camera = self.cameras[index]
@@ -149,8 +164,9 @@ class Reconstruction:
             for f in fields(self)
             if isinstance(getattr(self, f.name), Tensor)
         }
-        if self.lines is not None:
-            arrays |= {f"line_{f.name}": getattr(self.lines, f.name).detach().cpu().numpy() for f in fields(self.lines)}
+        for prefix, some in (("line", self.lines), ("conic", self.conics)):
+            if some is not None:
+                arrays |= {f"{prefix}_{f.name}": getattr(some, f.name).detach().cpu().numpy() for f in fields(some)}
         distortion = self.cameras.distortion
         model = next(name for name, cls in DISTORTION_MODELS.items() if type(distortion) is cls)
         count = len(self.cameras.K)
@@ -181,12 +197,14 @@ class Reconstruction:
             raise ValueError(f"{path} is not a saved reconstruction ({error})") from None
         tensors = {name: torch.from_numpy(arrays[name]) for name in LAYOUT if name not in ("names", "camera_model")}
         lines = {name.removeprefix("line_"): torch.from_numpy(arrays[name]) for name in LINES if "line_ends" in arrays}
+        conics = {name.removeprefix("conic_"): torch.from_numpy(arrays[name]) for name in CONICS if "conic_centre" in arrays}
         distortion = DISTORTION_MODELS[str(arrays["camera_model"])].from_parameters(tensors.pop("camera_distortion"))
         return cls(
             names=tuple(arrays["names"].tolist()),
             cameras=Camera(tensors.pop("camera_K"), distortion),
             poses=Pose(tensors.pop("pose_R"), tensors.pop("pose_t")),
             lines=Lines(**lines) if lines else None,
+            conics=Conics(**conics) if conics else None,
             **tensors,
         )
 
@@ -217,6 +235,16 @@ LINES = {
     "line_line": ("k", "integers"),
 }
 """Those of a model with lines."""
+CONICS = {
+    "conic_centre": ("e 3", "numbers"),
+    "conic_axes": ("e 2 3", "numbers"),
+    "conic_color": ("e 3", "numbers"),
+    "conic_x": ("q 5", "numbers"),
+    "conic_covariance": ("q 5 5", "numbers"),
+    "conic_view": ("q", "integers"),
+    "conic_conic": ("q", "integers"),
+}
+"""Those of a model with ellipses."""
 KINDS = {"text": "U", "integers": "i", "numbers": "f", "yes or no": "b"}
 
 
@@ -227,7 +255,7 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
         ValueError: One is missing, has the wrong shape or type, is not finite where it must be, or points at what is not there.
     """
     sizes: dict[str, int] = {}
-    layout = LAYOUT | (LINES if "line_ends" in arrays else {})
+    layout = LAYOUT | (LINES if "line_ends" in arrays else {}) | (CONICS if "conic_centre" in arrays else {})
     for name, (shape, kind) in layout.items():
         if name not in arrays:
             raise ValueError(f"it has no array '{name}'")
@@ -245,6 +273,7 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
     if model is None or model.num_parameters != sizes["p"]:
         raise ValueError(f"camera_model: there is no {str(arrays['camera_model'])[:40]!r} with {sizes['p']} parameters")
     limits = {"camera_index": "c", "view": "v", "point": "n", "line_view": "v", "line_line": "l"}
+    limits |= {"conic_view": "v", "conic_conic": "e"}
     for name, limit in ((name, sizes[letter]) for name, letter in limits.items() if name in layout):
         bad = (arrays[name] < 0) | (arrays[name] >= limit)
         if bad.any():
