@@ -23,7 +23,7 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?!\w)")
 # The program, which is run and not called.
 NOT_CALLED = {"cli"}
 UNFINISHED = {
-    "_types", "autocalibration", "bundle", "formats", "images", "linalg", "optim", "plot", "reconstruction", "simulation",
+    "_types", "formats", "images", "plot", "reconstruction", "simulation",
 }  # fmt: skip
 
 

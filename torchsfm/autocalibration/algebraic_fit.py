@@ -23,9 +23,13 @@ do."""
 
 @dataclass(frozen=True)
 class IntrinsicsEstimate:
-    """Intrinsics that all views share, from algebraic constraints."""
+    """Intrinsics that all views share, from algebraic constraints.
+
+    See the example of `constant_intrinsics`.
+    """
 
     K: Float[Tensor, "*batch 3 3"]
+    """The intrinsics, in pixels."""
     deviation: Float[Tensor, "*batch"]
     """Standard deviation of the logarithm of the focal length, as the residuals tell it; 1 where nothing is known."""
     cost: Float[Tensor, "*batch"]

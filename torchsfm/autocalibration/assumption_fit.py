@@ -26,7 +26,12 @@ _CLEAR = 9.0
 
 @dataclass(frozen=True)
 class AssumptionFit:
-    """What one assumption leads to; fields as in `Autocalibration`, and what the data say of its unknowns."""
+    """What one assumption leads to, and what the data say of its unknowns.
+
+    `status`, `chi2` and `redundancy` are as in `Autocalibration`.
+
+    See the example of `autocalibrate_points`.
+    """
 
     assumption: Assumption
     status: Int8[Tensor, "*batch"]

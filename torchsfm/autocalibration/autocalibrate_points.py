@@ -25,9 +25,13 @@ _FAR = 3.0
 
 @dataclass(frozen=True)
 class Autocalibration:
-    """Metric cameras and points, and how far the data determine them."""
+    """Metric cameras and points, and how far the data determine them.
+
+    See the example of `autocalibrate_points`.
+    """
 
     K: Float[Tensor, "*batch v 3 3"]
+    """Intrinsics of each view, in pixels."""
     P: Float[Tensor, "*batch v 3 4"]
     """Metric cameras `K [R | t]`. The world is the frame of the view with most points, the unit the mean distance of the others
     from it."""
@@ -45,10 +49,12 @@ class Autocalibration:
     probability: Float[Tensor, "*batch"]
     """Of that assumption among those tried; what the others would have had is in the deviations."""
     fits: tuple[AssumptionFit, ...]
+    """What each of the assumptions tried leads to."""
     deviation: Float[Tensor, "*batch v 5"]
     """Standard deviations of focal length (relative), aspect (relative), skew over focal length, and principal point in
     pixels."""
     covariance: Float[Tensor, "*batch v 5 5"]
+    """Of the same five numbers."""
     determined: Bool[Tensor, "*batch v 5"]
     """Which of those the data determine by themselves: better than `max_deviation` of the focal length. Others are what was
     assumed."""
@@ -57,15 +63,18 @@ class Autocalibration:
     chi2: Float[Tensor, "*batch"]
     """Weighted squared departure from metric cameras; about `redundancy` where the assumption holds."""
     redundancy: Float[Tensor, "*batch"]
+    """Constraints less unknowns."""
     distortion: Float[Tensor, "*batch"]
     """First coefficient of radial distortion, of which the cameras were freed before they were judged; see
     `distortion_sigma`."""
     distortion_deviation: Float[Tensor, "*batch"]
+    """Its standard deviation."""
     noise: Float[Tensor, "*batch"]
     """Standard deviation of the observations that was estimated or given, pixels."""
     in_front: Float[Tensor, "*batch"]
     """Share of the observations in front of their cameras."""
     motion: Motion
+    """How near the motion of the metric cameras is to a critical one."""
 
     @property
     def valid(self) -> Bool[Tensor, "*batch"]:
@@ -126,6 +135,17 @@ def autocalibrate_points(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or nothing is assumed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(30, generator=g), torchsfm.random_poses(5, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X)
+        >>> projective = torchsfm.factorize_points(x)  # in an unknown projective frame
+        >>> found = torchsfm.autocalibrate_points(projective.P, projective.X, x, image_size=(1000, 750))
+        >>> bool(found.valid), bool((found.K - K).abs().max() < 0.1)
+        (True, True)
     """
     options = (assume,) if isinstance(assume, Assumption) else assume
     check_options(

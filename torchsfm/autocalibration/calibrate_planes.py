@@ -38,23 +38,30 @@ MAX_DEVIATION = 0.3
 
 @dataclass(frozen=True)
 class PlaneCalibration:
-    """A calibrated camera and its poses before the plane z = 0."""
+    """A calibrated camera and its poses before the plane z = 0.
+
+    See the example of `calibrate_planes`.
+    """
 
     camera: Camera
+    """Intrinsics and distortion that all views share."""
     poses: Pose
     """Camera from plane, batch (*batch, v)."""
     rms: Float[Tensor, "*batch"]
     """Root mean square distance between observation and projection, pixels."""
     view_rms: Float[Tensor, "*batch v"]
+    """The same of each view."""
     used: Bool[Tensor, "*batch v"]
     """Views with at least four points that are not on a line."""
     parameter_names: tuple[str, ...]
+    """What was estimated."""
     covariance: Float[Tensor, "*batch q q"]
     """Of the free parameters in the order of `parameter_names`: "fx", "fy" (one of them stands for both without "aspect"),
     "skew", "cx", "cy" in pixels, and the distortion, from the residuals' own noise."""
     pose_covariance: Float[Tensor, "*batch v 6 6"]
     """Of each pose, rotation vector and translation from the left."""
     iterations: Int[Tensor, "*batch"]
+    """Steps tried."""
     status: Int8[Tensor, "*batch"]
     """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance), or a pose so badly
     that the dtype cannot hold its covariance; TOO_FEW: no view, or fewer measurements than unknowns; NOT_CONVERGED."""
@@ -105,6 +112,16 @@ def calibrate_planes(
 
     Raises:
         ValueError: Shapes, dtypes, devices or names do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(40, kind="plane", generator=g), torchsfm.random_poses(6, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X)  # six views of a plane, z = 0
+        >>> found = torchsfm.calibrate_planes(x, X[:, :2], image_size=(1000, 750))
+        >>> bool(found.status == torchsfm.Status.OK), bool((found.camera.K - K).abs().max() < 0.01)
+        (True, True)
     """
     batch = check_tensors(x=(x, "v>=1 n>=4 2"), X=(X, "n 2"), visible=(visible, "?v n : bool"))
     check_options(

@@ -40,6 +40,8 @@ class ViewGraphFocals:
             differ from what was expected.
         asymmetry: `(s1 - s2) / (s1 + s2)` of each pair's essential matrix at the focal lengths found; 1 for pairs that do not
             count.
+
+    See the example of `calibrate_view_graph`.
     """
 
     model: Float[Tensor, "*batch v"]
@@ -73,6 +75,17 @@ def calibrate_view_graph(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or a camera's number is out of range.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> f, c = torch.tensor([800.0, 900.0, 1000.0]).double(), torch.zeros(3, 2).double()
+        >>> P = torchsfm.intrinsics(f, c) @ torchsfm.random_poses(3, wobble=1.0, generator=g).matrix()
+        >>> pairs = torch.tensor([[0, 1], [0, 2], [1, 2]])
+        >>> F = torchsfm.tensors.bifocal_tensors(P, pairs)
+        >>> found = torchsfm.calibrate_view_graph(F, pairs, c, torch.full_like(f, 850), torch.full_like(f, 0.3))
+        >>> bool((found.model / f - 1).abs().max() < 0.05)
+        True
     """
     batch = check_tensors(F=(F, "p 3 3"), cameras=(cameras, "p 2: int"), c=(c, "v 2"), focal=(focal, "v"), sigma=(sigma, "v"))
     v, p = focal.shape[-1], F.shape[-3]

@@ -59,6 +59,16 @@ def constant_intrinsics(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the assumption lets intrinsics vary.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(8, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> projective = torchsfm.factorize_points(torchsfm.project_points(K @ poses.matrix(), X))
+        >>> found = torchsfm.autocalibration.constant_intrinsics(projective.P, projective.X, image_size=(1000, 750))
+        >>> bool((found.K - K).abs().max() < 1)
+        True
     """
     batch, ready = _ready(P, X, image_size, visible, assume)
     q = len(assume.columns(1))
@@ -99,6 +109,17 @@ def intrinsics_from_modulus(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the assumption lets intrinsics vary.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X = torchsfm.random_points(60, generator=g)
+        >>> poses = torchsfm.random_poses(8, spread=3.0, wobble=1.0, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> projective = torchsfm.factorize_points(torchsfm.project_points(K @ poses.matrix(), X))
+        >>> found = torchsfm.autocalibration.intrinsics_from_modulus(projective.P, projective.X, image_size=(1000, 750))
+        >>> bool((found.K - K).abs().max() < 1)
+        True
     """
     batch, ready = _ready(P, X, image_size, visible, assume)
     v = P.shape[-3]

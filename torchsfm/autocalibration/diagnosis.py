@@ -26,7 +26,10 @@ SMALL_SPREAD = 0.05
 
 @dataclass(frozen=True)
 class Motion:
-    """How the cameras moved. Angles in radians, lengths as ratios; flags say where a measure is small."""
+    """How the cameras moved. Angles in radians, lengths as ratios; flags say where a measure is small.
+
+    See the example of `diagnose_motion`.
+    """
 
     rotation: Float[Tensor, "*batch"]
     """Root mean square angle of the views' rotations about their mean."""
@@ -86,6 +89,13 @@ def diagnose_motion(
 
     Returns:
         The measures; 0 where no view takes part.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> poses = torchsfm.simulation.orbit_poses(8, height=(1.0, 1.0))  # around a point on a circle
+        >>> motion = torchsfm.autocalibration.diagnose_motion(poses.R, poses.centre, torch.ones(8, dtype=torch.bool))
+        >>> bool(motion.orbital), bool(motion.translation)
+        (True, False)
     """
     check_tensors(R=(R, "v>=1 3 3"), centre=(centre, "v 3"), present=(present, "v: bool"))
     w = present.to(R.dtype)[..., None]

@@ -27,11 +27,15 @@ SIGMA = {"aspect": 0.1, "skew": 0.01, "principal_point": 0.05, "focal": 3.0}
 
 @dataclass(frozen=True)
 class DualQuadric:
-    """An absolute dual quadric and the intrinsics that it gives each view."""
+    """An absolute dual quadric and the intrinsics that it gives each view.
+
+    See the example of `dual_quadric_linear`.
+    """
 
     model: Float[Tensor, "*batch 4 4"]
     """Symmetric, rank 3, positive semidefinite, |Q| = 1."""
     K: Float[Tensor, "*batch v 3 3"]
+    """Intrinsics of each view, in pixels."""
     valid: Bool[Tensor, "*batch v"]
     """Views whose conic is that of a real camera; others have K = I."""
     plane: Float[Tensor, "*batch 4"]
@@ -81,6 +85,16 @@ def dual_quadric_linear(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor([700.0, 800.0, 900.0, 1000.0]), torch.tensor([499.5, 374.5])).double()
+        >>> P = K @ torchsfm.random_poses(4, spread=3.0, generator=g).matrix()
+        >>> P = P @ (torch.eye(4) + 0.1).double()  # in a projective frame
+        >>> found = torchsfm.autocalibration.dual_quadric_linear(P, image_size=(1000, 750))
+        >>> found.valid, bool((found.K / K - 1)[:, 0, 0].abs().max() < 0.1)
+        (tensor([True, True, True, True]), True)
     """
     batch = check_tensors(P=(P, "v>=2 3 4"), weights=(weights, "?v"))
     check_options(

@@ -31,7 +31,10 @@ APART = 0.35
 
 @dataclass(frozen=True)
 class FocalEstimate:
-    """A focal length, and how well the pairs determine it."""
+    """A focal length, and how well the pairs determine it.
+
+    See the example of `focal_from_fundamentals`.
+    """
 
     model: Float[Tensor, "*batch"]
     """In pixels; where `status` is not OK only the least bad of the candidates."""
@@ -84,6 +87,17 @@ def focal_from_fundamentals(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the search range is empty.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> c = torch.tensor([[499.5, 374.5]]).double().expand(3, 2)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0).double(), c[0])
+        >>> P = K @ torchsfm.random_poses(3, wobble=1.0, generator=g).matrix()
+        >>> F = torchsfm.tensors.bifocal_tensors(P, torch.tensor([[0, 1], [0, 2], [1, 2]]))
+        >>> found = torchsfm.autocalibration.focal_from_fundamentals(F, c, c)
+        >>> bool(found.status == torchsfm.Status.OK), found.model
+        (True, tensor(900.0000, dtype=torch.float64))
     """
     batch = check_tensors(
         F=(F, "p 3 3"), c1=(c1, "p 2"), c2=(c2, "p 2"), weights=(weights, "?p"), image_size=(image_size, "?2")

@@ -17,8 +17,14 @@ class Assumption:
     """Which intrinsics are estimated, and which of those differ from view to view.
 
     What is not `free` is known: aspect 1, skew 0 and the principal point in the middle of the image, unless `K` is given to the
-    function that takes the assumption. A free principal point is expected within `principal_point_sigma` (a standard deviation,
-    over the longer side of the image) of that place; None expects nothing.
+    function that takes the assumption. What is free but not `varying` is the same in all views. A free principal point is
+    expected within `principal_point_sigma` (a standard deviation, over the longer side of the image) of that place; None
+    expects nothing.
+
+    Example:
+        >>> from torchsfm.autocalibration import Assumption
+        >>> print(Assumption(free=("focal",), varying=("focal",)))
+        focal length different in each view; aspect, skew, principal point known
     """
 
     free: tuple[str, ...] = ("focal", "principal_point")

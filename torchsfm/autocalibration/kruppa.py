@@ -42,6 +42,16 @@ def intrinsics_from_kruppa(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the assumption lets intrinsics vary.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> P = K @ torchsfm.random_poses(6, spread=3.0, wobble=1.0, generator=g).matrix()
+        >>> F = torchsfm.tensors.bifocal_tensors(P, torch.combinations(torch.arange(6)))
+        >>> found = torchsfm.autocalibration.intrinsics_from_kruppa(F, image_size=(1000, 750))
+        >>> bool((found.K - K).abs().max() < 1)
+        True
     """
     batch = check_tensors(F=(F, "m>=1 3 3"), weights=(weights, "?m"))
     check_shared(assume, image_size)

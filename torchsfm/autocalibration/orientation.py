@@ -22,6 +22,8 @@ class Orientation:
 
     `P` and `X` differ from what was given by signs alone. `consistent` is the share of the observations that are in front of
     their cameras then: 1 for a reconstruction of a real scene; 1 as well where nothing is visible.
+
+    See the example of `orient_projective`.
     """
 
     P: Float[Tensor, "*batch v 3 4"]
@@ -47,6 +49,15 @@ def orient_projective(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(20, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> P[1] *= -1  # a sign is lost
+        >>> found = torchsfm.autocalibration.orient_projective(P, torchsfm.geometry.to_homogeneous(X))
+        >>> float(found.consistent), bool(((found.P @ found.X.mT)[:, 2] > 0).all())
+        (1.0, True)
     """
     batch = check_tensors(P=(P, "v 3 4"), X=(X, "n 4"), visible=(visible, "?v n : bool"))
     v, n = P.shape[-3], X.shape[-2]

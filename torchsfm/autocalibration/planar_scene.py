@@ -44,6 +44,16 @@ def intrinsics_from_plane(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the assumption lets intrinsics vary.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> P = K @ torchsfm.random_poses(6, generator=g).matrix()
+        >>> H = P[:, :, [0, 1, 3]]  # from the plane z = 0 to each image
+        >>> found = torchsfm.autocalibration.intrinsics_from_plane(H[1:] @ torch.linalg.inv(H[0]), image_size=(1000, 750))
+        >>> found.K[0, 0]
+        tensor(900.0000, dtype=torch.float64)
     """
     batch = check_tensors(H=(H, "m>=1 3 3"), weights=(weights, "?m"))
     kind = Assumption(free=("focal",)) if assume is None else assume

@@ -26,6 +26,14 @@ def plane_at_infinity_from_intrinsics(
     Returns:
         p. With intrinsics that are wrong it is the plane for which the two views come nearest in that sense. Finite always;
         without meaning where a is zero (no baseline).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K, pose = torch.eye(3).double(), torchsfm.random_poses(generator=torch.Generator().manual_seed(0))
+        >>> p = torch.tensor([0.1, 0.2, 0.3]).double()  # the plane at infinity of a projective frame
+        >>> P = pose.matrix() @ torch.linalg.inv(torchsfm.autocalibration.metric_upgrade(K, p))
+        >>> torchsfm.autocalibration.plane_at_infinity_from_intrinsics(P, K, K)
+        tensor([0.1000, 0.2000, 0.3000], dtype=torch.float64)
     """
     check_tensors(P=(P, "3 4"), K1=(K1, "3 3"), K2=(K2, "3 3"))
     inverse = inverse_intrinsics(K2)
@@ -58,6 +66,15 @@ def metric_upgrade(K: Float[Tensor, "*#batch 3 3"], p: Float[Tensor, "*#batch 3"
 
     Returns:
         H.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K, p = torch.diag(torch.tensor([2.0, 2.0, 1.0])), torch.tensor([0.1, 0.2, 0.3])
+        >>> H = torchsfm.autocalibration.metric_upgrade(K, p)
+        >>> torch.eye(3, 4) @ H  # the first camera: K [I | 0]
+        tensor([[2., 0., 0., 0.],
+                [0., 2., 0., 0.],
+                [0., 0., 1., 0.]])
     """
     batch = check_tensors(K=(K, "3 3"), p=(p, "3"))
     bottom = torch.cat(

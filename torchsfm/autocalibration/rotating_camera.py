@@ -38,6 +38,15 @@ def intrinsics_from_rotations(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit, or the assumption lets intrinsics vary.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> R = torchsfm.geometry.rotation_from_rotvec(0.3 * torch.randn(5, 3, generator=g, dtype=torch.float64))
+        >>> found = torchsfm.autocalibration.intrinsics_from_rotations(K @ R @ torch.linalg.inv(K), image_size=(1000, 750))
+        >>> bool((found.K - K).abs().max() < 0.1)
+        True
     """
     batch = check_tensors(H=(H, "m>=1 3 3"), weights=(weights, "?m"))
     check_shared(assume, image_size)

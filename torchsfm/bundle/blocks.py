@@ -43,6 +43,8 @@ class BundleTerms(TypedDict, total=False):
             units of 1 pixel.
         intrinsics_mean: Where these are centred; the cameras given if not given.
         structure: What the views see besides points: `BundleLines`, `BundleConics`. One of a kind.
+
+    See the example of `bundle_adjust`.
     """
 
     free: Sequence[str]

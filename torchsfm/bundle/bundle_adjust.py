@@ -35,17 +35,22 @@ class BundleResult:
     coordinate, a camera or point that is not finite). `cost` and `initial_cost` are `sum w rho(residual^2) / 2` (and priors).
     `status`: `OK` where a tolerance was met, `NOT_CONVERGED` where the iteration limit came first, `INTERRUPTED` where it was
     stopped, `TOO_FEW` where nothing was free and observed, `NOT_FINITE` where no observation could be used.
+
+    See the example of `bundle_adjust`.
     """
 
     poses: Pose
     """Of the views, or where a rig was given, of its frames."""
     cameras: Camera
+    """The distinct cameras, batch (g,)."""
     X: Float[Tensor, "n 3"]
+    """The points, in the world."""
     cost: float
     initial_cost: float
     residuals: Float[Tensor, "m"]
     used: Bool[Tensor, "m"]
     iterations: int
+    """Steps tried."""
     status: Status
     rig: Rig | None = None
     """The rig adjusted, where one was given."""
@@ -98,6 +103,14 @@ def bundle_adjust(
 
     Raises:
         ValueError: Shapes, dtypes, indices or names do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 150, noise=0.0, generator=g).problem
+        >>> found = torchsfm.bundle_adjust(problem, free=("focal", "k1", "k2"), loss=torchsfm.Huber(2.0))
+        >>> found.status.name, bool(problem.residuals().max() > 10), bool(found.residuals.max() < 0.1)  # pixels
+        ('OK', True, True)
     """
     bundle = Bundle(problem, **terms)
     check_options(gauge=(gauge, ("free", "first")))

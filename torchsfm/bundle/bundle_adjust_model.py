@@ -21,7 +21,13 @@ from torchsfm.optim.sparse_derivative import Hessian
 
 @runtime_checkable
 class BundleModel(Protocol):
-    """What a model must have: a frozen dataclass with these members, and any others."""
+    """What a model must have: a frozen dataclass with these members, and any others.
+
+    Example:
+        >>> import torchsfm
+        >>> isinstance(torchsfm.random_bundle_problem(4, 50, 150).problem, torchsfm.BundleModel)
+        True
+    """
 
     @property
     def poses(self) -> Pose:
@@ -84,10 +90,15 @@ class BundleOptions(BundleTerms, total=False):
 
 @dataclass(frozen=True)
 class AdjustedModel(Generic[M]):
-    """A model with adjusted poses, cameras and points, and how the adjustment went."""
+    """A model with adjusted poses, cameras and points, and how the adjustment went.
+
+    See the example of `bundle_adjust_model`.
+    """
 
     model: M
+    """Of the kind that was given."""
     result: BundleResult
+    """Costs, residuals, status."""
 
 
 def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedModel[M]:
@@ -105,6 +116,14 @@ def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedM
 
     Raises:
         ValueError: Shapes, dtypes, indices or names do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 150, noise=0.0, generator=g).problem
+        >>> better = torchsfm.bundle_adjust_model(problem, free=("focal", "k1", "k2"))
+        >>> type(better.model).__name__, bool(better.model.residuals().max() < 0.1)  # pixels
+        ('BundleProblem', True)
     """
     problem = BundleProblem(model.poses, model.cameras, model.camera_index, model.X, model.x, model.view, model.point)
     others = options.get("structure", ())

@@ -23,6 +23,8 @@ class ProjectiveBundleResult:
     `P` and `X` keep the norm each of them came with, and their signs follow from the start without a jump. `residuals` are
     distances in the image, pixels, inf where `used` is False: weight 0, or not finite at the start. `cost` and `initial_cost`
     are `sum w rho(residual^2) / 2`. `status` is as in `BundleResult`.
+
+    See the example of `bundle_adjust_projective`.
     """
 
     P: Float[Tensor, "v 3 4"]
@@ -32,6 +34,7 @@ class ProjectiveBundleResult:
     residuals: Float[Tensor, "m"]
     used: Bool[Tensor, "m"]
     iterations: int
+    """Steps tried."""
     status: Status
 
 
@@ -82,6 +85,19 @@ def bundle_adjust_projective(
 
     Raises:
         ValueError: Shapes, dtypes or indices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(20, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> P = torchsfm.random_intrinsics(3, generator=g) @ P
+        >>> x, view, point = torchsfm.project_points(P, X), torch.arange(3), torch.arange(20)
+        >>> observations = (x.flatten(0, 1), view.repeat_interleave(20), point.repeat(3))
+        >>> start = P + 1e-3 * P.abs() * torch.randn(3, 3, 4, generator=g)
+        >>> X = torchsfm.geometry.to_homogeneous(X)
+        >>> found = torchsfm.bundle_adjust_projective(start, X, *observations)
+        >>> found.status.name, bool(found.residuals.max() < 0.1)  # pixels
+        ('OK', True)
     """
     check_one_problem(
         P=(P, "v 3 4"),

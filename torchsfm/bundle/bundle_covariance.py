@@ -19,9 +19,11 @@ class BundleCovariance:
 
     `poses` is in the coordinates of `Pose.retract`, (w, v): radians and the unit of the world, in the camera's frame; `cameras`
     in the free intrinsics in the order focal (pixels along x), aspect, skew, principal point, distortion; `X` in the world.
-    Fixed ones are zero; those that are not determined have an infinite diagonal. `sigma` is the standard deviation of an image
-    coordinate, given or estimated. `nullity` is the dimension of the free gauge: 7 without anything fixed. More means that
+    Fixed ones are zero; those that are not determined have an infinite diagonal; `determined_points` says of which points that
+    is not so. `sigma` is the standard deviation of an image coordinate, given or estimated. `nullity` is the dimension of the free gauge: 7 without anything fixed. More means that
     something else is not determined either. `everything` is the engine's own result, with cross-covariances, for sigma = 1.
+
+    See the example of `bundle_covariance`.
     """
 
     poses: Float[Tensor, "f 6 6"]
@@ -55,6 +57,15 @@ def bundle_covariance(problem: BundleProblem, *, sigma: float | None = None, **t
 
     Raises:
         ValueError: Shapes, dtypes, indices or names do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 150, noise=0.5, generator=g).problem
+        >>> better = torchsfm.bundle_adjust_model(problem, free=("focal", "k1", "k2")).model
+        >>> found = torchsfm.bundle_covariance(better, free=("focal", "k1", "k2"))
+        >>> found.poses.shape, found.X.shape, bool(0.2 < found.sigma < 1)  # pixels
+        (torch.Size([4, 6, 6]), torch.Size([50, 3, 3]), True)
     """
     check_options(sigma=(sigma, "?float > 0"))
     bundle = Bundle(problem, **terms)

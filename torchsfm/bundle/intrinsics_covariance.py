@@ -31,6 +31,12 @@ def intrinsics_covariance(
 
     Raises:
         ValueError: Shapes, dtypes, indices or names do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> truth = torchsfm.random_bundle_problem(4, 50, 150, generator=torch.Generator().manual_seed(0)).truth
+        >>> torchsfm.bundle.intrinsics_covariance(truth, free=("focal", "k1")).shape  # of four cameras
+        torch.Size([4, 2, 2])
     """
     bundle = Bundle(
         problem, free=free, fixed_intrinsics=fixed_intrinsics, loss=loss, intrinsics_sigma=intrinsics_sigma,

@@ -25,6 +25,17 @@ class BundleLines:
     """Lines of space and segments that views show of them.
 
     Ends need not correspond between views. Lines without observations, or that are fixed, come back bit for bit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> truth = torchsfm.random_bundle_problem(4, 50, 100, layout="dome", noise=0.0, generator=g).truth
+        >>> L = torchsfm.geometry.pluecker_from_points(truth.X[:1], truth.X[1:2])  # a line through two points
+        >>> x = torchsfm.project_points(truth.poses, truth.X[:2], truth.cameras)  # the ends of a segment in every view
+        >>> lines = torchsfm.BundleLines(L, x, torch.arange(4), torch.zeros(4, dtype=torch.int64))
+        >>> found = torchsfm.bundle_adjust(truth, structure=(lines,), max_iterations=1)
+        >>> found.structure[0].L.shape, bool(found.structure_residuals[0].max() < 1e-3)  # pixels
+        (torch.Size([1, 6]), True)
     """
 
     L: Float[Tensor, "l 6"]

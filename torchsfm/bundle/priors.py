@@ -20,7 +20,10 @@ Sigma = float | Tensor
 
 @runtime_checkable
 class Prior(Protocol):
-    """A residual over one block of a bundle, written in units of its standard deviation."""
+    """A residual over one block of a bundle, written in units of its standard deviation.
+
+    See the example of `CentrePrior`.
+    """
 
     @property
     def index(self) -> Tensor:
@@ -36,7 +39,16 @@ class Prior(Protocol):
 
 @dataclass(frozen=True)
 class CentrePrior:
-    """Known camera centres: GPS, or a surveyed track. With rigs, those of the rig's own origin."""
+    """Known camera centres: GPS, or a surveyed track. With rigs, those of the rig's own origin.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> simulated = torchsfm.random_bundle_problem(4, 50, 150, generator=torch.Generator().manual_seed(0))
+        >>> gps = torchsfm.CentrePrior(torch.arange(4), simulated.truth.poses.centre, sigma=1e-6)
+        >>> found = torchsfm.bundle_adjust(simulated.problem, priors=(gps,))
+        >>> bool((found.poses.centre - gps.centre).norm(dim=-1).max() < 1e-3)
+        True
+    """
 
     index: Int[Tensor, "k"]
     """Which poses."""
@@ -66,7 +78,16 @@ class CentrePrior:
 
 @dataclass(frozen=True)
 class PosePrior:
-    """Known poses: an inertial unit, an earlier adjustment."""
+    """Known poses: an inertial unit, an earlier adjustment.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> simulated = torchsfm.random_bundle_problem(4, 50, 150, generator=torch.Generator().manual_seed(0))
+        >>> known = torchsfm.PosePrior(torch.tensor([0]), simulated.truth.poses[:1], sigma=1e-6)
+        >>> found = torchsfm.bundle_adjust(simulated.problem, priors=(known,))
+        >>> bool((found.poses.t[0] - known.poses.t[0]).norm() < 1e-3)
+        True
+    """
 
     index: Int[Tensor, "k"]
     """Which poses."""
@@ -99,7 +120,16 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class PointPrior:
-    """Known points: ground control, markers that were measured."""
+    """Known points: ground control, markers that were measured.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> simulated = torchsfm.random_bundle_problem(4, 50, 150, generator=torch.Generator().manual_seed(0))
+        >>> surveyed = torchsfm.PointPrior(torch.arange(5), simulated.truth.X[:5], sigma=1e-6)
+        >>> found = torchsfm.bundle_adjust(simulated.problem, priors=(surveyed,))
+        >>> bool((found.X[:5] - surveyed.X).norm(dim=-1).max() < 1e-3)
+        True
+    """
 
     index: Int[Tensor, "k"]
     """Which points."""

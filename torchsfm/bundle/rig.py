@@ -18,6 +18,14 @@ class Rig:
 
     Views of one frame share the pose of the rig; views of one sensor share the place on the rig. Several rigs are one `Rig`
     with sensors of their own.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> right = torchsfm.Pose(torch.eye(3), torch.tensor([-0.1, 0.0, 0.0]))  # 10 cm beside the left one
+        >>> sensors = torchsfm.Pose.stack([torchsfm.Pose.identity(), right])
+        >>> rig = torchsfm.Rig(sensors, sensor=torch.tensor([0, 1, 0, 1]), frame=torch.tensor([0, 0, 1, 1]))
+        >>> rig.view_poses(torchsfm.Pose.identity(2)).centre[:, 0]
+        tensor([0.0000, 0.1000, 0.0000, 0.1000])
     """
 
     cam_from_rig: Pose

@@ -40,6 +40,8 @@ class Structure(Protocol):
     """Variables of one kind and what the views show of them.
 
     They are eliminated as points are, each by itself, so that no residual may depend on two of them.
+
+    See the example of `BundleLines`.
     """
 
     @property

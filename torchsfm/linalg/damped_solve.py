@@ -10,6 +10,12 @@ def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"])
 
     The damping is relative to the diagonal, so that the unknowns may be of different units. An unknown that nothing depends on
     is 0.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> A, b = torch.diag(torch.tensor([4.0, 0.0])).double(), torch.tensor([[8.0], [0.0]]).double()  # nothing says y
+        >>> torchsfm.linalg.damped_solve(A, b)[:, 0]
+        tensor([2., 0.], dtype=torch.float64)
     """
     A = A.clone()
     diagonal = A.diagonal(dim1=-2, dim2=-1)

@@ -20,7 +20,14 @@ _ROOM = 2.0**20
 def eigh(
     A: Float[Tensor, "*batch n n"],
 ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
-    """Eigenvalues, ascending, and eigenvectors, as columns, of symmetric matrices; the lower triangle counts."""
+    """Eigenvalues, ascending, and eigenvectors, as columns, of symmetric matrices; the lower triangle counts.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> values, vectors, ok = torchsfm.linalg.eigh(torch.tensor([[2.0, 1.0], [1.0, 2.0]]))
+        >>> values, bool(ok)
+        (tensor([1.0000, 3.0000]), True)
+    """
     safe, sound = _sound(A)
     values, vectors = _attempt(torch.linalg.eigh, safe)
     ok = sound & torch.isfinite(values).all(-1)
@@ -28,7 +35,15 @@ def eigh(
 
 
 def eigvalsh(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
-    """Eigenvalues, ascending, of symmetric matrices; the lower triangle counts."""
+    """Eigenvalues, ascending, of symmetric matrices; the lower triangle counts.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> A = torch.stack((torch.eye(2), torch.full((2, 2), torch.nan)))  # the second one spoils nothing
+        >>> values, ok = torchsfm.linalg.eigvalsh(A)
+        >>> values[0], ok
+        (tensor([1., 1.]), tensor([ True, False]))
+    """
     safe, sound = _sound(A)
     (values,) = _attempt(lambda a: (torch.linalg.eigvalsh(a),), safe)
     ok = sound & torch.isfinite(values).all(-1)
@@ -36,7 +51,14 @@ def eigvalsh(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"],
 
 
 def eigvals(A: Float[Tensor, "*batch n n"]) -> tuple[Complex[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
-    """Eigenvalues, in no order, of square matrices."""
+    """Eigenvalues, in no order, of square matrices.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> values, ok = torchsfm.linalg.eigvals(torch.tensor([[0.0, -1.0], [1.0, 0.0]]))  # a quarter of a turn: +-i
+        >>> values.imag.sort().values, bool(ok)
+        (tensor([-1.,  1.]), True)
+    """
     safe, sound = _sound(A)
     (values,) = _attempt(lambda a: (torch.linalg.eigvals(a),), safe)
     ok = sound & torch.isfinite(values).all(-1)
@@ -46,7 +68,14 @@ def eigvals(A: Float[Tensor, "*batch n n"]) -> tuple[Complex[Tensor, "*batch n"]
 def svd(
     A: Float[Tensor, "*batch m n"], *, full_matrices: bool = True
 ) -> tuple[Float[Tensor, "*batch m p"], Float[Tensor, "*batch k"], Float[Tensor, "*batch q n"], Bool[Tensor, "*batch"]]:
-    """`U`, the k = min(m, n) singular values, descending, and `V'`; all of the axes or the first k of them."""
+    """`U`, the k = min(m, n) singular values, descending, and `V'`; all of the axes or the first k of them.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> U, S, Vh, ok = torchsfm.linalg.svd(torch.diag(torch.tensor([1.0, 3.0, 2.0])))
+        >>> S, bool(ok)
+        (tensor([3., 2., 1.]), True)
+    """
     safe, sound = _sound(A)
     U, s, Vh = _attempt(lambda a: torch.linalg.svd(a, full_matrices=full_matrices), safe)
     ok = sound & torch.isfinite(s).all(-1)
@@ -54,7 +83,13 @@ def svd(
 
 
 def svdvals(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch k"], Bool[Tensor, "*batch"]]:
-    """The k = min(m, n) singular values, descending."""
+    """The k = min(m, n) singular values, descending.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.svdvals(torch.tensor([[0.0, 4.0], [3.0, 0.0]]))
+        (tensor([4.0000, 3.0000]), tensor(True))
+    """
     safe, sound = _sound(A)
     (s,) = _attempt(lambda a: (torch.linalg.svdvals(a),), safe)
     ok = sound & torch.isfinite(s).all(-1)
@@ -64,14 +99,29 @@ def svdvals(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch k"], 
 def qr(
     A: Float[Tensor, "*batch m n"], *, complete: bool = False
 ) -> tuple[Float[Tensor, "*batch m p"], Float[Tensor, "*batch p n"], Bool[Tensor, "*batch"]]:
-    """`Q`, all m columns or the first min(m, n), and the upper triangle `R`; `ok` says nothing of the rank."""
+    """`Q`, all m columns or the first min(m, n), and the upper triangle `R`; `ok` says nothing of the rank.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> A = torch.tensor([[3.0, 0.0], [4.0, 5.0]])
+        >>> Q, R, ok = torchsfm.linalg.qr(A)
+        >>> bool(ok), bool((Q @ R).allclose(A, atol=1e-5)), R.diagonal().abs()
+        (True, True, tensor([5., 3.]))
+    """
     safe, sound = _sound(A)
     Q, R = torch.linalg.qr(safe, mode="complete" if complete else "reduced")
     return _or_axes(Q, sound), torch.where(sound[..., None, None], R, 0.0), sound
 
 
 def triangular_factor(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch k n"], Bool[Tensor, "*batch"]]:
-    """The upper triangle `R` of the QR decomposition alone, k = min(m, n)."""
+    """The upper triangle `R` of the QR decomposition alone, k = min(m, n).
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> R, ok = torchsfm.linalg.triangular_factor(torch.tensor([[3.0, 0.0], [4.0, 5.0]]))
+        >>> R.diagonal().abs(), bool(ok)
+        (tensor([5., 3.]), True)
+    """
     safe, sound = _sound(A)
     R = torch.linalg.qr(safe, mode="r")[1]
     return torch.where(sound[..., None, None], R, 0.0), sound
@@ -85,6 +135,13 @@ def solve(
     Args:
         A: Square matrices.
         b: Right-hand sides as columns.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> A = torch.stack((2 * torch.eye(2), torch.zeros(2, 2)))  # the second one is singular
+        >>> x, ok = torchsfm.linalg.solve(A, torch.ones(2, 1))
+        >>> x[0, :, 0], ok
+        (tensor([0.5000, 0.5000]), tensor([ True, False]))
     """
     if b.ndim < A.ndim:
         # One dimension less, and torch may take columns for a batch of vectors: a 4x4 matrix for four systems of four, say.
@@ -95,7 +152,15 @@ def solve(
 
 
 def inverse(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
-    """The inverse; `ok` is False where LU finds the matrix singular, or it or its inverse is not finite."""
+    """The inverse; `ok` is False where LU finds the matrix singular, or it or its inverse is not finite.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> A = torch.stack((2 * torch.eye(2), torch.zeros(2, 2)))
+        >>> A_inv, ok = torchsfm.linalg.inverse(A)
+        >>> A_inv[0].diagonal(), ok
+        (tensor([0.5000, 0.5000]), tensor([ True, False]))
+    """
     B, info = torch.linalg.inv_ex(A)
     ok = _is_sound(A) & (info == 0) & torch.isfinite(B).all(-1).all(-1)
     return torch.where(ok[..., None, None], B, 0.0), ok

@@ -8,7 +8,13 @@ from torchsfm.linalg.rows import combine_rows
 
 
 def cross(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """The cross product along the last dimension, with broadcasting."""
+    """The cross product along the last dimension, with broadcasting.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.cross(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+        tensor([0., 0., 1.])
+    """
     a, b = torch.broadcast_tensors(a, b)  # type: ignore[no-untyped-call]
     a0, a1, a2 = a.unbind(-1)
     b0, b1, b2 = b.unbind(-1)
@@ -16,18 +22,36 @@ def cross(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float
 
 
 def determinant_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
-    """The determinant as a triple product, whose derivatives of every order exist where it is zero."""
+    """The determinant as a triple product, whose derivatives of every order exist where it is zero.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.determinant_3x3(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
+        tensor(6.)
+    """
     return (A[..., 0, :] * cross(A[..., 1, :], A[..., 2, :])).sum(-1)
 
 
 def adjugate_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not."""
+    """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.adjugate_3x3(torch.diag(torch.tensor([2.0, 3.0, 0.0]))).diagonal()
+        tensor([0., 0., 6.])
+    """
     r0, r1, r2 = A.unbind(-2)
     return torch.stack((cross(r1, r2), cross(r2, r0), cross(r0, r1)), -1)
 
 
 def adjugate_4x4(A: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not."""
+    """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.adjugate_4x4(torch.diag(torch.tensor([1.0, 2.0, 3.0, 0.0]))).diagonal()
+        tensor([0., 0., 0., 6.])
+    """
     rest = [[k for k in range(4) if k != i] for i in range(4)]
     rows = []
     for i in range(4):

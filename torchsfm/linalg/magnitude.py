@@ -9,12 +9,24 @@ LARGEST = 1e60
 
 
 def usable(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
-    """Which numbers are finite and of a size that products of several can be computed with."""
+    """Which numbers are finite and of a size that products of several can be computed with.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.usable(torch.tensor([1.0, torch.inf, torch.nan]))
+        tensor([ True, False, False])
+    """
     return x.detach().abs() < LARGEST
 
 
 def unit_scale(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch 1 1"]:
-    """A power of two by which the largest number of a finite matrix, unless it is 0, comes to between 1/2 and 1."""
+    """A power of two by which the largest number of a finite matrix, unless it is 0, comes to between 1/2 and 1.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.unit_scale(torch.tensor([[3.0, -12.0]]))  # 12 / 16 is 3 / 4
+        tensor([[0.0625]])
+    """
     if 0 in A.shape[-2:]:
         return A.new_ones(*A.shape[:-2], 1, 1)
     largest = A.detach().abs().amax((-2, -1), keepdim=True).clamp_min(torch.finfo(A.dtype).tiny)

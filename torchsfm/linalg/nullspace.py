@@ -10,7 +10,15 @@ from torchsfm.linalg.rows import combine_rows
 
 
 def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
-    """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose."""
+    """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.orthonormal_nullspace(torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])).abs()
+        tensor([[0.],
+                [0.],
+                [1.]])
+    """
     m = A.shape[-2]
     Q, _, _ = qr(A.mT, complete=True)
     return Q[..., m:]
@@ -25,6 +33,13 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
     Returns:
         An orthonormal basis as k = n - m rows, and the smallest pivot: the distance of a row from the span of those before it,
         which is 0 where the rows are dependent (the basis is then still orthonormal, or not finite).
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> a = torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])[..., None].double()  # one matrix, the batch comes last
+        >>> basis, pivot = torchsfm.linalg.nullspace_rows(a)
+        >>> basis[..., 0].abs()
+        tensor([[0., 0., 1.]], dtype=torch.float64)
     """
     basis, smallest = nullspace_columns(a.transpose(0, 1).contiguous())
     return basis.transpose(0, 1), smallest
@@ -77,6 +92,12 @@ def null_vector(
 
     Returns:
         Unit vectors, and the mask of elements with finite input; the others get the first basis vector.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> v, ok = torchsfm.linalg.null_vector(torch.tensor([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]]))
+        >>> v / v[0], bool(ok)
+        (tensor([1.0000, 1.0000, 1.0000]), True)
     """
     finite = torch.isfinite(A).all(-1).all(-1)
     safe = torch.where(finite[..., None, None], A, 0).double()

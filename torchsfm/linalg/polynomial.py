@@ -15,7 +15,13 @@ Roots = tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]
 
 
 def evaluate(c: Float[Tensor, "*#batch m"], x: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
-    """The values of polynomials at k points each, by Horner's rule."""
+    """The values of polynomials at k points each, by Horner's rule.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.evaluate(torch.tensor([1.0, 0.0, 2.0]), torch.tensor([0.0, 1.0, 3.0]))  # 1 + 2 x^2
+        tensor([ 1.,  3., 19.])
+    """
     value = c[..., -1:] + torch.zeros_like(x)
     for i in range(c.shape[-1] - 2, -1, -1):
         value = value * x + c[..., i : i + 1]
@@ -107,6 +113,13 @@ def solve_quadratic(c: Float[Tensor, "*batch 3"]) -> Roots:
 
     Returns:
         Roots in two slots and the mask of real ones. A double root stands in both slots. Differentiable.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> roots, real = torchsfm.linalg.solve_quadratic(torch.tensor([[-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]]))
+        >>> roots[0].sort().values, real  # x^2 = 1 and x^2 = -1
+        (tensor([-1.,  1.]), tensor([[ True,  True],
+                [False, False]]))
     """
     pair, reals = quadratic_rows(*c.detach().unbind(-1))
     real = torch.stack(reals, -1)
@@ -121,6 +134,12 @@ def solve_cubic(c: Float[Tensor, "*batch 4"]) -> Roots:
 
     Returns:
         Roots in three slots and the mask of real ones. Differentiable.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> roots, real = torchsfm.linalg.solve_cubic(torch.tensor([-8.0, 0.0, 0.0, 1.0], dtype=torch.float64))  # x^3 = 8
+        >>> roots[real]
+        tensor([2.0000], dtype=torch.float64)
     """
     kept = c.detach().float() if c.dtype.itemsize < 4 else c.detach()
     roots, real = (x.movedim(0, -1) for x in cubic_rows(*kept.unbind(-1)))
@@ -135,6 +154,13 @@ def companion_roots(c: Float[Tensor, "*batch m"]) -> Roots:
 
     Returns:
         Roots in `degree` slots and the mask of real ones.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> c = torch.tensor([-6.0, 11.0, -6.0, 1.0], dtype=torch.float64)  # (x - 1) (x - 2) (x - 3)
+        >>> roots, real = torchsfm.linalg.companion_roots(c)
+        >>> roots[real].sort().values
+        tensor([1.0000, 2.0000, 3.0000], dtype=torch.float64)
     """
     degree = c.shape[-1] - 1
     monic = -c[..., :-1] / c[..., -1:]

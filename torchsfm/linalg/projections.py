@@ -23,6 +23,12 @@ def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n 
 
     Returns:
         Rotations.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> R = torchsfm.linalg.nearest_rotation(torch.tensor([[0.0, -2.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 3.0]]))
+        >>> R @ torch.tensor([1.0, 0.0, 0.0])  # a quarter of a turn about z
+        tensor([0., 1., 0.])
     """
     check_tensors(A=(A, "n n"))
     with torch.no_grad():
@@ -54,6 +60,11 @@ def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*b
 
     Raises:
         ValueError: `rank` is out of range.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.nearest_rank(torch.diag(torch.tensor([3.0, 2.0, 0.1])), 2).diagonal()
+        tensor([3., 2., 0.])
     """
     check_tensors(A=(A, "m n"))
     if not 1 <= rank <= min(A.shape[-2:]):
@@ -100,6 +111,11 @@ def nearest_psd(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
 
     Returns:
         Symmetric matrices without negative eigenvalues (Higham 1988).
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> torchsfm.linalg.nearest_psd(torch.diag(torch.tensor([2.0, -1.0]))).diagonal()
+        tensor([2., 0.])
     """
     check_tensors(A=(A, "n n"))
     with torch.no_grad():

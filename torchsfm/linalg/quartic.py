@@ -81,6 +81,13 @@ def solve_quartic(c: Float[Tensor, "*batch 5"]) -> tuple[Float[Tensor, "*batch 4
     Returns:
         Roots in four slots and the mask of real ones; a double root, to rounding, stands in one slot. Computed in float64.
         Differentiable.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> c = torch.tensor([4.0, 0.0, -5.0, 0.0, 1.0], dtype=torch.float64)  # (x^2 - 1) (x^2 - 4)
+        >>> roots, real = torchsfm.linalg.solve_quartic(c)
+        >>> roots[real].sort().values
+        tensor([-2.0000, -1.0000,  1.0000,  2.0000], dtype=torch.float64)
     """
     with torch.no_grad():
         roots, real = (rows.movedim(0, -1) for rows in quartic_rows(c.detach().double().movedim(-1, 0)))

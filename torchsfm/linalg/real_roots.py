@@ -64,6 +64,13 @@ def real_roots(c: Float[Tensor, "*batch m"]) -> tuple[Float[Tensor, "*batch slot
     Returns:
         Roots in m - 1 slots and the mask of slots that hold one; infinite roots are left out, other slots are zero. Polynomials
         that are zero or not finite have none. Differentiable.
+
+    Example:
+        >>> import torch, torchsfm.linalg
+        >>> c = torch.tensor([4.0, 0.0, -5.0, 0.0, 1.0, 0.0], dtype=torch.float64)  # (x^2 - 1) (x^2 - 4)
+        >>> roots, valid = torchsfm.linalg.real_roots(c)
+        >>> roots[valid].sort().values
+        tensor([-2.0000, -1.0000,  1.0000,  2.0000], dtype=torch.float64)
     """
     with torch.no_grad():
         rows = c.detach().reshape(-1, c.shape[-1]).mT

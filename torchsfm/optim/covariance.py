@@ -29,6 +29,8 @@ class SparseCovariance:
     dimensions of the gauge (7 for a bundle without anything fixed; more means that something is not determined).
     `redundancy` is the number of residual components minus the number of unknowns determined: at a good fit `square_sum`, the
     weighted sum of squared residuals, is about that.
+
+    See the example of `sparse_covariance`.
     """
 
     blocks: dict[str, Tensor]
@@ -52,6 +54,15 @@ def sparse_covariance(
 
     Returns:
         The covariances, float64.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.optim import Block, Term
+        >>> x = Block(torch.zeros(1, 2))
+        >>> measured = Term(lambda x: x, ("x",), (torch.zeros(4, dtype=torch.int64),))  # four times, sigma 1
+        >>> found = torchsfm.optim.sparse_covariance({"x": x}, [measured])
+        >>> found.blocks["x"][0].diagonal(), found.nullity, found.redundancy
+        (tensor([0.2500, 0.2500], dtype=torch.float64), 0, 6)
     """
     _check(blocks, terms, eliminate)
     with torch.no_grad():
@@ -97,6 +108,14 @@ def marginal_covariance(
     The block must not be the one eliminated, and nothing in it may be part of the gauge. Zero where a variable is fixed, or
     held in a coordinate; infinite where the terms do not determine the block; residuals in units of their standard deviation,
     as in `sparse_covariance`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.optim import Block, Term
+        >>> x = Block(torch.zeros(1, 2))
+        >>> measured = Term(lambda x: x, ("x",), (torch.zeros(4, dtype=torch.int64),))  # four times, sigma 1
+        >>> torchsfm.optim.marginal_covariance({"x": x}, [measured], "x")[0].diagonal()
+        tensor([0.2500, 0.2500], dtype=torch.float64)
     """
     _check(blocks, terms, eliminate)
     check_options(name=(name, tuple(blocks)))

@@ -17,7 +17,14 @@ from torchsfm.linalg import qr
 
 
 def wants_derivative(*inputs: Tensor) -> bool:
-    """Whether any of the tensors is followed by reverse- or forward-mode differentiation right now."""
+    """Whether any of the tensors is followed by reverse- or forward-mode differentiation right now.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x, y = torch.zeros(2), torch.zeros(2, requires_grad=True)
+        >>> torchsfm.optim.wants_derivative(x), torchsfm.optim.wants_derivative(x, y)
+        (False, True)
+    """
     if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
         return True
     # Inside a level of forward mode only; unpacking outside one is an error in some versions.
@@ -53,6 +60,15 @@ def attach_implicit(
 
     Returns:
         `y`, unchanged in value, with derivatives attached.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> a = torch.tensor([4.0, 9.0], requires_grad=True)
+        >>> y = a.detach().sqrt()[:, None]  # found somehow: solves y^2 = a
+        >>> y = torchsfm.optim.attach_implicit(lambda y, a: y**2 - a[:, None], y, a)
+        >>> y.sum().backward()
+        >>> a.grad  # 1 / (2 y)
+        tensor([0.2500, 0.1667])
     """
     check_options(y=(y, Tensor), **{f"inputs[{i}]": (x, Tensor) for i, x in enumerate(inputs)})
     y = y.detach()
@@ -95,6 +111,15 @@ def attach_optimum(
 
     Returns:
         `y`, unchanged in value, with derivatives attached.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> a = torch.tensor([1.0, 2.0], requires_grad=True)
+        >>> y = 3 * a.detach()[:, None]  # found somehow: makes (y - 3 a)^2 smallest
+        >>> y = torchsfm.optim.attach_optimum(lambda y, a: (y[:, 0] - 3 * a) ** 2, y, a)
+        >>> y.sum().backward()
+        >>> a.grad
+        tensor([3., 3.])
     """
 
     def gradient(z: Tensor, *arguments: Tensor) -> Tensor:

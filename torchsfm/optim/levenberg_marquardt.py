@@ -33,6 +33,8 @@ class LeastSquaresResult(Generic[M]):
     `status` is `Status.OK` where a tolerance was met, `NOT_CONVERGED` where the iteration limit came first or no step lowers
     the cost though more is promised. It is `TOO_FEW` where there are fewer residuals than parameters and `NOT_FINITE` where the
     cost or its slope at the start is not finite: there `x` is the start, and a cost that is not a number is inf.
+
+    See the example of `levenberg_marquardt`.
     """
 
     x: M
@@ -89,6 +91,17 @@ def levenberg_marquardt(
 
     Raises:
         ValueError: `residual` does not return `(*batch, n, d)`, or `size` is missing for parameters that are not one tensor.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, 1, 20, dtype=torch.float64)
+        >>> rate = torch.tensor([[1.0], [2.0]], dtype=t.dtype)  # two problems: y = exp(-rate t)
+        >>> def residual(x, y):
+        ...     return (torch.exp(-x * t) - y)[..., None]
+        >>> found = torchsfm.optim.levenberg_marquardt(residual, torch.zeros_like(rate), torch.exp(-rate * t))
+        >>> found.x, bool((found.status == torchsfm.Status.OK).all())
+        (tensor([[1.0000],
+                [2.0000]], dtype=torch.float64), True)
     """
     check_options(
         max_iterations=(max_iterations, "int >= 0"), function_tolerance=(function_tolerance, "float >= 0"),

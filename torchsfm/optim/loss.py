@@ -18,7 +18,13 @@ Loss = Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Huber:
-    """`s` inside, `2 scale sqrt(s) - scale^2` outside (Huber 1964): convex, outliers pull with constant force."""
+    """`s` inside, `2 scale sqrt(s) - scale^2` outside (Huber 1964): convex, outliers pull with constant force.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.Huber(2.0)(torch.tensor([1.0, 4.0, 100.0]))  # of squared residuals
+        tensor([ 1.,  4., 36.])
+    """
 
     scale: float = 1.0
 
@@ -34,7 +40,13 @@ class Huber:
 
 @dataclass(frozen=True)
 class SoftL1:
-    """`2 scale^2 (sqrt(1 + s / scale^2) - 1)`: a smooth Huber (Charbonnier)."""
+    """`2 scale^2 (sqrt(1 + s / scale^2) - 1)`: a smooth Huber (Charbonnier).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.SoftL1(2.0)(torch.tensor([0.0, 12.0, 60.0]))  # of squared residuals
+        tensor([ 0.,  8., 24.])
+    """
 
     scale: float = 1.0
 
@@ -50,7 +62,13 @@ class SoftL1:
 
 @dataclass(frozen=True)
 class Cauchy:
-    """`scale^2 log(1 + s / scale^2)`: outliers lose their pull as 1 / residual."""
+    """`scale^2 log(1 + s / scale^2)`: outliers lose their pull as 1 / residual.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.Cauchy(2.0)(torch.tensor([0.0, 4.0, 1e4]))  # of squared residuals
+        tensor([ 0.0000,  2.7726, 31.2976])
+    """
 
     scale: float = 1.0
 
@@ -65,7 +83,13 @@ class Cauchy:
 
 @dataclass(frozen=True)
 class GemanMcClure:
-    """`s / (1 + s / scale^2)`, bounded by `scale^2` (Geman & McClure 1987)."""
+    """`s / (1 + s / scale^2)`, bounded by `scale^2` (Geman & McClure 1987).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.GemanMcClure(2.0)(torch.tensor([0.0, 4.0, 1e4]))  # of squared residuals: never more than 4
+        tensor([0.0000, 2.0000, 3.9984])
+    """
 
     scale: float = 1.0
 
@@ -80,7 +104,13 @@ class GemanMcClure:
 
 @dataclass(frozen=True)
 class Tukey:
-    """The biweight (Beaton & Tukey 1974): constant `scale^2 / 3` beyond `scale`, where residuals have no pull at all."""
+    """The biweight (Beaton & Tukey 1974): constant `scale^2 / 3` beyond `scale`, where residuals have no pull at all.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.Tukey(3.0)(torch.tensor([0.0, 9.0, 100.0]))  # of squared residuals: never more than 3
+        tensor([0., 3., 3.])
+    """
 
     scale: float = 1.0
 
@@ -96,7 +126,13 @@ class Tukey:
 
 @dataclass(frozen=True)
 class Truncated:
-    """`min(s, scale^2)`: least squares over the inliers of the moment (MSAC's score)."""
+    """`min(s, scale^2)`: least squares over the inliers of the moment (MSAC's score).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.Truncated(2.0)(torch.tensor([1.0, 4.0, 100.0]))  # of squared residuals
+        tensor([1., 4., 4.])
+    """
 
     scale: float = 1.0
 
@@ -110,7 +146,13 @@ class Truncated:
 
 
 def loss_slope(loss: Loss, s: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """`rho'(s)`, by the loss's own `slope` or by automatic differentiation; negative and non-finite slopes become 0."""
+    """`rho'(s)`, by the loss's own `slope` or by automatic differentiation; negative and non-finite slopes become 0.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.optim.loss_slope(torch.sqrt, torch.tensor([1.0, 4.0]))  # any function of squared residuals
+        tensor([0.5000, 0.2500])
+    """
     own = getattr(loss, "slope", None)
     if own is not None:
         slope: Tensor = own(s)

@@ -17,7 +17,14 @@ from torchsfm._types import broadcast_shapes
 
 @runtime_checkable
 class Manifold(Protocol):
-    """What an optimiser needs to know of a parameter block."""
+    """What an optimiser needs to know of a parameter block.
+
+    Example:
+        >>> import torchsfm
+        >>> sphere = torchsfm.optim.UnitSphere(3)
+        >>> isinstance(sphere, torchsfm.optim.Manifold), sphere.ambient, sphere.tangent
+        (True, 3, 2)
+    """
 
     @property
     def ambient(self) -> int:
@@ -33,9 +40,16 @@ class Manifold(Protocol):
 
 @dataclass(frozen=True)
 class Euclidean:
-    """Plain numbers: `x + delta`."""
+    """Plain numbers: `x + delta`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.optim.Euclidean(2).retract(torch.tensor([1.0, 2.0]), torch.tensor([0.5, 0.0]))
+        tensor([1.5000, 2.0000])
+    """
 
     size: int
+    """How many numbers a block holds."""
 
     @property
     def ambient(self) -> int:
@@ -54,10 +68,19 @@ class Euclidean:
 
 @dataclass(frozen=True)
 class Subset:
-    """Some coordinates of a block free, the others held: `x[free] + delta`."""
+    """Some coordinates of a block free, the others held: `x[free] + delta`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> held = torchsfm.optim.Subset(3, (0, 2))  # the second of three numbers does not move
+        >>> held.retract(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.5, 0.5]))
+        tensor([1.5000, 2.0000, 3.5000])
+    """
 
     size: int
+    """How many numbers a block holds."""
     free: tuple[int, ...]
+    """The places of those that move, in the order of the step."""
 
     @property
     def ambient(self) -> int:
@@ -79,10 +102,19 @@ class Subset:
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """`(R row by row, t)` in 12 numbers, moved from the left: `R <- exp(w) R`, `t <- exp(w) t + v`, `delta = (w, v)`."""
+    """`(R row by row, t)` in 12 numbers, moved from the left: `R <- exp(w) R`, `t <- exp(w) t + v`, `delta = (w, v)`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.cat((torch.eye(3).flatten(), torch.zeros(3)))
+        >>> torchsfm.optim.RigidMotion().retract(x, torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0]))[9:]  # no turn, a shift
+        tensor([1., 2., 3.])
+    """
 
     ambient: int = 12
+    """Numbers stored."""
     tangent: int = 6
+    """Degrees of freedom."""
 
     def retract(self, x: Float[Tensor, "*#b 12"], delta: Float[Tensor, "*#b 6"]) -> Float[Tensor, "*b 12"]:
         """The motion after the step."""
@@ -94,10 +126,19 @@ class RigidMotion:
 
 @dataclass(frozen=True)
 class Rotation:
-    """A rotation matrix row by row in 9 numbers, moved from the left: `R <- exp(w) R`."""
+    """A rotation matrix row by row in 9 numbers, moved from the left: `R <- exp(w) R`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> R = torchsfm.optim.Rotation().retract(torch.eye(3).flatten(), torch.tensor([0.0, 0.0, torch.pi / 2]))
+        >>> (R.reshape(3, 3) @ torch.tensor([1.0, 0.0, 0.0])).round(decimals=3).abs()
+        tensor([0., 1., 0.])
+    """
 
     ambient: int = 9
+    """Numbers stored."""
     tangent: int = 3
+    """Degrees of freedom."""
 
     def retract(self, x: Float[Tensor, "*#b 9"], delta: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*b 9"]:
         """The rotation after the step."""
@@ -106,9 +147,17 @@ class Rotation:
 
 @dataclass(frozen=True)
 class UnitSphere:
-    """Vectors of a fixed length (directions, homogeneous points): the length of `x` is kept whatever it is."""
+    """Vectors of a fixed length (directions, homogeneous points): the length of `x` is kept whatever it is.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torchsfm.optim.UnitSphere(3).retract(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([torch.pi / 2, 0.0]))
+        >>> x.norm(), bool(x[2].abs() < 1e-6)  # a quarter of the way round, on the sphere of radius 2
+        (tensor(2.), True)
+    """
 
     size: int
+    """How many numbers a block holds."""
 
     @property
     def ambient(self) -> int:
@@ -137,9 +186,16 @@ class UnitSphere:
 
 @dataclass(frozen=True)
 class Positive:
-    """Positive numbers (focal lengths, scales, depths), moved by their logarithm: `x exp(delta)`. Signs are kept."""
+    """Positive numbers (focal lengths, scales, depths), moved by their logarithm: `x exp(delta)`. Signs are kept.
+
+    Example:
+        >>> import math, torch, torchsfm
+        >>> torchsfm.optim.Positive().retract(torch.tensor([800.0]), torch.tensor([math.log(2.0)]))  # a focal length
+        tensor([1600.])
+    """
 
     size: int = 1
+    """How many numbers a block holds."""
 
     @property
     def ambient(self) -> int:
@@ -158,9 +214,18 @@ class Positive:
 
 @dataclass(frozen=True)
 class Product:
-    """Several parameters side by side in one block, each on its own manifold."""
+    """Several parameters side by side in one block, each on its own manifold.
+
+    Example:
+        >>> import torchsfm
+        >>> pose, focal = torchsfm.optim.RigidMotion(), torchsfm.optim.Positive()
+        >>> manifold = torchsfm.optim.Product((pose, focal))
+        >>> manifold.ambient, manifold.tangent
+        (13, 7)
+    """
 
     parts: tuple[Manifold, ...]
+    """In the order in which their numbers stand in the block."""
 
     @property
     def ambient(self) -> int:
@@ -180,7 +245,13 @@ class Product:
 
 
 def rotation_exponential(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """The rotation `exp([w]x)`, smooth at zero (Rodrigues)."""
+    """The rotation `exp([w]x)`, smooth at zero (Rodrigues).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.optim.rotation_exponential(torch.tensor([0.0, 0.0, torch.pi])).diagonal()  # half a turn about z
+        tensor([-1., -1.,  1.])
+    """
     square = (w * w).sum(-1)[..., None, None]
     a, b = _sinc_sqrt(square), _cosc_sqrt(square)
     x, y, z = w.unbind(-1)

@@ -30,10 +30,13 @@ class SparseResult:
     """The minimum of a sparse least-squares problem.
 
     `x` holds every block, `residuals` every term's residuals (m, d) there, `used` (m) which of them count: a residual that is
-    not finite at the start, or whose square is not, is left out. `status` is `Status.OK` where a tolerance was met or no step
+    not finite at the start, or whose square is not, is left out. `cost` and `initial_cost` are `sum w rho / 2`, and
+    `iterations` counts the steps tried. `status` is `Status.OK` where a tolerance was met or no step
     lowers the cost any more, `NOT_CONVERGED` where the iteration limit came first, `INTERRUPTED` where it was stopped from
     outside, `TOO_FEW` where nothing is free or observed, `NOT_FINITE` where no residual is finite, or where their sum or its
     derivatives are not: then `x` is the best seen.
+
+    See the example of `sparse_levenberg_marquardt`.
     """
 
     x: dict[str, Tensor]
@@ -102,6 +105,19 @@ def sparse_levenberg_marquardt(
     Raises:
         ValueError: A term names an unknown block, its tensors disagree in length, an index is out of range, or it depends on
             two eliminated variables.
+
+    Example:
+        >>> import torch
+        >>> from torchsfm.optim import Block, Term, sparse_levenberg_marquardt
+        >>> place = Block(torch.zeros(3, 2), fixed=torch.tensor([True, False, False]))  # three places on a map
+        >>> start, end = torch.tensor([0, 1, 2]), torch.tensor([1, 2, 0])
+        >>> way = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]])  # measured from each to the next
+        >>> term = Term(lambda a, b, way: b - a - way, ("place", "place"), (start, end), (way,))
+        >>> found = sparse_levenberg_marquardt({"place": place}, [term])
+        >>> found.x["place"], found.status.name
+        (tensor([[0., 0.],
+                [1., 0.],
+                [1., 1.]]), 'OK')
     """
     _check(blocks, terms, eliminate)
     check_options(linear_solver=(linear_solver, get_args(Solver)), max_iterations=(max_iterations, "int >= 0"))

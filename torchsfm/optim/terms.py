@@ -18,12 +18,17 @@ from torchsfm.optim.manifold import Manifold
 
 @dataclass(frozen=True)
 class Block:
-    """Variables of one kind: `x (N, k)`, how they move, and which of them do not."""
+    """Variables of one kind: `x (N, k)`, how they move, and which of them do not.
+
+    See the example of `sparse_levenberg_marquardt`.
+    """
 
     x: Float[Tensor, "n k"]
+    """Where the variables are, one in a row."""
     manifold: Manifold | None = None
     """Plain addition in all k coordinates if not given."""
     fixed: Bool[Tensor, "n"] | None = None
+    """Which variables do not move; none if not given."""
 
     @property
     def tangent(self) -> int:
@@ -46,16 +51,24 @@ class Term:
     Derivatives come from `d` reverse sweeps. Where hand-written ones pay, `linearize(*variables, *data, out=...)` returns the
     residuals and fills `out`: for each block a tensor `(m, d, tangent)` for the derivatives with respect to its tangent step
     (stored with m last), or None where they are not needed.
+
+    See the example of `sparse_levenberg_marquardt`.
     """
 
     residual: Callable[..., Tensor]
+    """The function of the variables and the data, `(m, d)`, in the unit in which the losses are meant."""
     blocks: tuple[str, ...]
+    """The names of the blocks it depends on; one may stand twice."""
     index: tuple[Int[Tensor, "m"], ...]
+    """For each of these, the variable of each residual."""
     data: tuple[Tensor, ...] = ()
+    """What else it depends on, a row for each residual."""
     loss: Loss | None = None
+    """Of the residuals' squared norms; `s` itself if not given."""
     weights: Float[Tensor, "m"] | None = None
     """Weight of each residual's squared norm; 0 leaves it out, whatever number it has."""
     linearize: Callable[..., Tensor] | None = None
+    """Residuals and hand-written derivatives; automatic ones if not given."""
 
     def select(self, rows: Tensor) -> "Term":
         """The term with some of its residuals."""
