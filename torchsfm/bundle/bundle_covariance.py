@@ -20,8 +20,9 @@ class BundleCovariance:
     `poses` is in the coordinates of `Pose.retract`, (w, v): radians and the unit of the world, in the camera's frame; `cameras`
     in the free intrinsics in the order focal (pixels along x), aspect, skew, principal point, distortion; `X` in the world.
     Fixed ones are zero; those that are not determined have an infinite diagonal; `determined_points` says of which points that
-    is not so. `sigma` is the standard deviation of an image coordinate, given or estimated. `nullity` is the dimension of the free gauge: 7 without anything fixed. More means that
-    something else is not determined either. `everything` is the engine's own result, with cross-covariances, for sigma = 1.
+    is not so. `sigma` is the standard deviation of an image coordinate, given or estimated. `nullity` is the dimension of the
+    free gauge: 7 without anything fixed. More means that something else is not determined either. `everything` is the engine's
+    own result, with cross-covariances, for sigma = 1.
 
     See the example of `bundle_covariance`.
     """
