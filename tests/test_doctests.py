@@ -22,9 +22,7 @@ import torchsfm
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?!\w)")
 # The program, which is run and not called.
 NOT_CALLED = {"cli"}
-UNFINISHED = {
-    "_types", "formats", "images", "plot", "reconstruction", "simulation",
-}  # fmt: skip
+UNFINISHED = {"_types", "images", "reconstruction"}
 
 
 def _public() -> Iterator[tuple[str, Any]]:

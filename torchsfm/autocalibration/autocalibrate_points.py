@@ -143,7 +143,7 @@ def autocalibrate_points(
         >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
         >>> x = torchsfm.project_points(K @ poses.matrix(), X)
         >>> projective = torchsfm.factorize_points(x)  # in an unknown projective frame
-        >>> found = torchsfm.autocalibrate_points(projective.P, projective.X, x, image_size=(1000, 750))
+        >>> found = torchsfm.autocalibrate_points(projective.P, projective.X, x, image_size=(1000.0, 750.0))
         >>> bool(found.valid), bool((found.K - K).abs().max() < 0.1)
         (True, True)
     """

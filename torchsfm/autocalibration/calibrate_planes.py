@@ -119,7 +119,7 @@ def calibrate_planes(
         >>> X, poses = torchsfm.random_points(40, kind="plane", generator=g), torchsfm.random_poses(6, generator=g)
         >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
         >>> x = torchsfm.project_points(K @ poses.matrix(), X)  # six views of a plane, z = 0
-        >>> found = torchsfm.calibrate_planes(x, X[:, :2], image_size=(1000, 750))
+        >>> found = torchsfm.calibrate_planes(x, X[:, :2], image_size=(1000.0, 750.0))
         >>> bool(found.status == torchsfm.Status.OK), bool((found.camera.K - K).abs().max() < 0.01)
         (True, True)
     """

@@ -66,7 +66,7 @@ def constant_intrinsics(
         >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(8, generator=g)
         >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
         >>> projective = torchsfm.factorize_points(torchsfm.project_points(K @ poses.matrix(), X))
-        >>> found = torchsfm.autocalibration.constant_intrinsics(projective.P, projective.X, image_size=(1000, 750))
+        >>> found = torchsfm.autocalibration.constant_intrinsics(projective.P, projective.X, image_size=(1000.0, 750.0))
         >>> bool((found.K - K).abs().max() < 1)
         True
     """
@@ -117,7 +117,7 @@ def intrinsics_from_modulus(
         >>> poses = torchsfm.random_poses(8, spread=3.0, wobble=1.0, generator=g)
         >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
         >>> projective = torchsfm.factorize_points(torchsfm.project_points(K @ poses.matrix(), X))
-        >>> found = torchsfm.autocalibration.intrinsics_from_modulus(projective.P, projective.X, image_size=(1000, 750))
+        >>> found = torchsfm.autocalibration.intrinsics_from_modulus(projective.P, projective.X, image_size=(1000.0, 750.0))
         >>> bool((found.K - K).abs().max() < 1)
         True
     """

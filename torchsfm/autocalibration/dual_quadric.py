@@ -92,7 +92,7 @@ def dual_quadric_linear(
         >>> K = torchsfm.intrinsics(torch.tensor([700.0, 800.0, 900.0, 1000.0]), torch.tensor([499.5, 374.5])).double()
         >>> P = K @ torchsfm.random_poses(4, spread=3.0, generator=g).matrix()
         >>> P = P @ (torch.eye(4) + 0.1).double()  # in a projective frame
-        >>> found = torchsfm.autocalibration.dual_quadric_linear(P, image_size=(1000, 750))
+        >>> found = torchsfm.autocalibration.dual_quadric_linear(P, image_size=(1000.0, 750.0))
         >>> found.valid, bool((found.K / K - 1)[:, 0, 0].abs().max() < 0.1)
         (tensor([True, True, True, True]), True)
     """

@@ -49,7 +49,7 @@ def intrinsics_from_kruppa(
         >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
         >>> P = K @ torchsfm.random_poses(6, spread=3.0, wobble=1.0, generator=g).matrix()
         >>> F = torchsfm.tensors.bifocal_tensors(P, torch.combinations(torch.arange(6)))
-        >>> found = torchsfm.autocalibration.intrinsics_from_kruppa(F, image_size=(1000, 750))
+        >>> found = torchsfm.autocalibration.intrinsics_from_kruppa(F, image_size=(1000.0, 750.0))
         >>> bool((found.K - K).abs().max() < 1)
         True
     """

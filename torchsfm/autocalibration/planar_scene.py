@@ -51,7 +51,7 @@ def intrinsics_from_plane(
         >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
         >>> P = K @ torchsfm.random_poses(6, generator=g).matrix()
         >>> H = P[:, :, [0, 1, 3]]  # from the plane z = 0 to each image
-        >>> found = torchsfm.autocalibration.intrinsics_from_plane(H[1:] @ torch.linalg.inv(H[0]), image_size=(1000, 750))
+        >>> found = torchsfm.autocalibration.intrinsics_from_plane(H[1:] @ torch.linalg.inv(H[0]), image_size=(1000.0, 750.0))
         >>> found.K[0, 0]
         tensor(900.0000, dtype=torch.float64)
     """

@@ -44,7 +44,7 @@ def intrinsics_from_rotations(
         >>> g = torch.Generator().manual_seed(0)
         >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
         >>> R = torchsfm.geometry.rotation_from_rotvec(0.3 * torch.randn(5, 3, generator=g, dtype=torch.float64))
-        >>> found = torchsfm.autocalibration.intrinsics_from_rotations(K @ R @ torch.linalg.inv(K), image_size=(1000, 750))
+        >>> found = torchsfm.autocalibration.intrinsics_from_rotations(K @ R @ torch.linalg.inv(K), image_size=(1000.0, 750.0))
         >>> bool((found.K - K).abs().max() < 0.1)
         True
     """

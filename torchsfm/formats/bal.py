@@ -47,6 +47,14 @@ def read_bal(path: str | Path) -> BundleProblem:
         ValueError: The file is not a BAL problem, ends too early, has a camera or a point that is not finite, or was packed to
             fill the memory; one line that says where. Image points that are not finite are kept: adjustment leaves them out.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_bal(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "problem.txt")
+        >>> problem = torchsfm.read_bal("problem.txt")
+        >>> problem.poses.shape, problem.X.shape, problem.x.shape
+        (torch.Size([3]), torch.Size([20, 3]), torch.Size([50, 2]))
     """
     path = Path(path)
     words = _unpack(path).split()
@@ -106,6 +114,8 @@ def write_bal(problem: BundleProblem, path: str | Path) -> None:
     Raises:
         ValueError: BAL cannot hold these cameras: skew, pixels that are not square, or other distortion.
         OSError: The file cannot be written.
+
+    See the example of `read_bal`.
     """
     path = Path(path)
     cameras = problem.cameras

@@ -33,6 +33,8 @@ def write_bundler(reconstruction: Reconstruction, path: str | Path) -> None:
         ValueError: Bundler cannot hold these cameras: a principal point that is not the centre of the image, skew, pixels that
             are not square, or other distortion; or a name with a line break.
         OSError: A file cannot be written.
+
+    See the example of `read_bundler`.
     """
     path = Path(path)
     model, f, centre = centred_cameras(reconstruction, "Bundler", Radial)
@@ -67,6 +69,15 @@ def read_bundler(path: str | Path) -> Reconstruction:
     Raises:
         ValueError: The file is none such, or a damaged one; one line that says why.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.formats.undistorted_model(torchsfm.read_model("model.npz"), centred=True)
+        >>> torchsfm.write_bundler(model, "bundle.out")
+        >>> torchsfm.read_bundler("bundle.out").X.shape
+        torch.Size([20, 3])
     """
     path = Path(path)
     with reading(path, "a Bundler file"):

@@ -63,6 +63,8 @@ def write_colmap(
     Raises:
         ValueError: A camera has skew, or a distortion, which none of the models has, or text files cannot hold a name.
         OSError: The folder cannot be made or written.
+
+    See the example of `read_colmap`.
     """
     folder = Path(folder)
     if unknown := set(models) - set(PARAMETERS):
@@ -143,6 +145,14 @@ def read_colmap(folder: str | Path) -> Reconstruction:
         FileNotFoundError: There is no such folder.
         ValueError: The folder holds no COLMAP model, a damaged one, or one with cameras that have no equal here.
         OSError: A file cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_colmap(torchsfm.read_model("model.npz"), "sparse")
+        >>> torchsfm.read_colmap("sparse").X.shape
+        torch.Size([20, 3])
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -55,6 +55,17 @@ def read_database(path: str | Path) -> MatchedImages:
     Raises:
         ValueError: The file is no such database, or a damaged one; one line that says why.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> x, match = torch.rand(10, 2, generator=torch.Generator().manual_seed(0)), torch.arange(10)
+        >>> pairs, matches = torch.tensor([[0, 1]]), (torch.stack((match, match), 1),)
+        >>> size = torch.tensor([[640, 480], [640, 480]])
+        >>> matched = torchsfm.MatchedImages(("a.jpg", "b.jpg"), size, (x, x), pairs, matches)
+        >>> torchsfm.write_database(matched, "database.db")
+        >>> found = torchsfm.read_database("database.db")
+        >>> found.names, found.matches[0].shape
+        (('a.jpg', 'b.jpg'), torch.Size([10, 2]))
     """
     path = Path(path)
     with path.open("rb"):
@@ -113,6 +124,8 @@ def write_database(matched: MatchedImages, path: str | Path) -> None:
     Raises:
         ValueError: Two images have one name, or one camera has two sizes of images.
         OSError: The file cannot be written.
+
+    See the example of `read_database`.
     """
     if len(set(matched.names)) < len(matched.names):
         raise ValueError("matched: wanted a name for each image, got one twice")

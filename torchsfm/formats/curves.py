@@ -25,6 +25,12 @@ def write_curves_ply(curves: Curve, path: str | Path) -> None:
     Raises:
         ValueError: Wrong shape.
         OSError: The file cannot be written.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, 6, 100)
+        >>> helix = torch.stack((t.cos(), t.sin(), t), -1)
+        >>> torchsfm.formats.write_curves_ply(torchsfm.geometry.curve_from_samples(helix[None]), "curves.ply")
     """
     check_tensors(x=(curves.x, "c n 3"), valid=(curves.valid, "c n: bool"), closed=(curves.closed, "c: bool"))
     valid = curves.valid.cpu()
@@ -64,6 +70,11 @@ def write_curves_json(splines: Sequence[Spline], path: str | Path) -> None:
     Raises:
         ValueError: Wrong shape.
         OSError: The file cannot be written.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> control = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0], [3.0, 2.0, 0.0], [4.0, 0.0, 0.0]])
+        >>> torchsfm.formats.write_curves_json([torchsfm.geometry.Spline(control, closed=False)], "curves.json")
     """
     records = []
     for spline in splines:

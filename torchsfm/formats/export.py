@@ -116,6 +116,15 @@ def export_model(
         ValueError: There is no such program, its format cannot hold the model (undistorted it might), photographs are wanted
             and not given or are not the model's, or the folder holds other files.
         OSError: A file cannot be read or written.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> folder = torchsfm.export_model(model, "colmap", "for_colmap", undistort=False)  # without pictures
+        >>> folder.is_dir()
+        True
     """
     if target not in TARGETS:
         raise ValueError(f"target: there is no {target!r} among {', '.join(TARGETS)}")

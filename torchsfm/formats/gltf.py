@@ -30,6 +30,13 @@ def write_gltf(reconstruction: Reconstruction, path: str | Path) -> None:
     Raises:
         ValueError: The format cannot hold these cameras: distortion, skew, or a principal point that is not the centre.
         OSError: The file cannot be written.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.formats.undistorted_model(torchsfm.read_model("model.npz"), centred=True)
+        >>> torchsfm.write_gltf(model, "model.glb")
     """
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)
     if not NoDistortion.includes(type(model.cameras.distortion)):

@@ -30,6 +30,12 @@ def read_hloc(features: str | Path, matches: str | Path, *, images: str | Path |
         ImportError: The package h5py is not installed.
         ValueError: A file is none such, or a damaged one, or does not tell the size of an image; one line that says which.
         OSError: A file cannot be read.
+
+    Example:
+        >>> import torchsfm
+        >>> matched = torchsfm.read_hloc("features.h5", "matches.h5")  # doctest: +SKIP
+        >>> data = (matched.keypoints, matched.pairs, matched.matches, matched.image_size)  # doctest: +SKIP
+        >>> result = torchsfm.reconstruct_matches(*data, names=matched.names)  # doctest: +SKIP
     """
     try:
         import h5py

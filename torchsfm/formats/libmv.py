@@ -32,6 +32,11 @@ def read_libmv(path: str | Path) -> BundleProblem:
         ValueError: The file is not a libmv problem, ends too early, or has a camera or point that is none; one line that says
             where. Markers that are not finite are kept: adjustment leaves them out.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torchsfm
+        >>> problem = torchsfm.formats.read_libmv("problem.bin")  # doctest: +SKIP
+        >>> result = torchsfm.bundle_adjust(problem)  # doctest: +SKIP
     """
     path = Path(path)
     data = path.read_bytes()

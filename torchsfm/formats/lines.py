@@ -32,6 +32,18 @@ def write_lines(model: Reconstruction, path: str | Path) -> None:
     Raises:
         ValueError: The model has no lines, or the name ends otherwise.
         OSError: The file cannot be written.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> from dataclasses import replace
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model, index = torchsfm.read_model("model.npz"), torch.zeros(0, dtype=torch.int64)
+        >>> ends, empty = model.X[:10].reshape(5, 2, 3), torch.zeros(0, dtype=torch.float64)
+        >>> lines = torchsfm.Lines(ends, torch.ones_like(ends[:, 0]), empty.reshape(0, 2, 2), empty, index, index)
+        >>> torchsfm.write_lines(replace(model, lines=lines), "lines.txt")
+        >>> torchsfm.read_lines("lines.txt").ends.shape
+        torch.Size([5, 2, 3])
     """
     path = Path(path)
     if model.lines is None:
@@ -56,6 +68,8 @@ def read_lines(path: str | Path) -> Lines:
     Raises:
         ValueError: The file is no such text; one line that says where.
         OSError: It cannot be read.
+
+    See the example of `write_lines`.
     """
     ends, color, segments, line = [], [], [], []
     for number, text in enumerate(Path(path).read_bytes().decode("ascii", "replace").splitlines(), 1):

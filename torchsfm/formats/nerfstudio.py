@@ -40,6 +40,8 @@ def write_nerfstudio(reconstruction: Reconstruction, path: str | Path) -> None:
     Raises:
         ValueError: A camera has skew, which the format has not.
         OSError: A file cannot be written.
+
+    See the example of `read_nerfstudio`.
     """
     path = Path(path)
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)
@@ -84,6 +86,14 @@ def read_nerfstudio(path: str | Path) -> Reconstruction:
     Raises:
         ValueError: The file is none such, or a damaged one, or has cameras that have no equal here; one line that says why.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_nerfstudio(torchsfm.read_model("model.npz"), "transforms.json")
+        >>> torchsfm.read_nerfstudio("transforms.json").num_registered
+        3
     """
     path = Path(path)
     data = path.read_bytes()

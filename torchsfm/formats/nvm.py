@@ -41,6 +41,8 @@ def write_nvm(reconstruction: Reconstruction, path: str | Path) -> None:
         ValueError: The format cannot hold these cameras: distortion, a principal point that is not the centre of the image,
             skew, or pixels that are not square; or a name with a tab, a quotation mark or a line break.
         OSError: The file cannot be written.
+
+    See the example of `read_nvm`.
     """
     model, f, centre = centred_cameras(registered_only(reconstruction), "NVM", NoDistortion)
     if odd := [name for name in model.names if any(c in name for c in '\n\r\t"') or not name]:
@@ -69,6 +71,15 @@ def read_nvm(path: str | Path) -> Reconstruction:
     Raises:
         ValueError: The file is none such, a damaged one, or has radial distortion or the calibration `FixedK`; one line.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.formats.undistorted_model(torchsfm.read_model("model.npz"), centred=True)
+        >>> torchsfm.write_nvm(model, "model.nvm")
+        >>> torchsfm.read_nvm("model.nvm").X.shape
+        torch.Size([20, 3])
     """
     path = Path(path)
     text = path.read_bytes().decode("utf-8", "surrogateescape")

@@ -37,6 +37,8 @@ def write_openmvg(reconstruction: Reconstruction, path: str | Path) -> None:
     Raises:
         ValueError: A camera has skew, or pixels that are not square, for which the format has no place.
         OSError: The file cannot be written.
+
+    See the example of `read_openmvg`.
     """
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)
     ids: dict[tuple[int, int, int], int] = {}
@@ -107,6 +109,14 @@ def read_openmvg(path: str | Path) -> Reconstruction:
     Raises:
         ValueError: The file is none such, or a damaged one, or has cameras that have no equal here; one line that says why.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_openmvg(torchsfm.read_model("model.npz"), "sfm_data.json")
+        >>> torchsfm.read_openmvg("sfm_data.json").X.shape
+        torch.Size([20, 3])
     """
     path = Path(path)
     data = path.read_bytes()

@@ -48,6 +48,8 @@ def write_opensfm(reconstruction: Reconstruction, path: str | Path) -> None:
     Raises:
         ValueError: A camera has skew, or a name a tab or line break, for which the format has no place.
         OSError: A file cannot be written.
+
+    See the example of `read_opensfm`.
     """
     path = Path(path)
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)
@@ -101,6 +103,14 @@ def read_opensfm(path: str | Path) -> Reconstruction:
     Raises:
         ValueError: A file is none such, or a damaged one, or has cameras that have no equal here; one line that says why.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_opensfm(torchsfm.read_model("model.npz"), "reconstruction.json")
+        >>> torchsfm.read_opensfm("reconstruction.json").X.shape
+        torch.Size([20, 3])
     """
     path = Path(path)
     data = path.read_bytes()

@@ -62,6 +62,14 @@ def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: boo
         The same points, lines and poses, a camera for each camera and size of image, and the observations where they come to
         lie; image points outside of the new pictures are left out. Images without a pose are left out, too, and measured
         ellipses, which are other ones in the new pictures.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.formats.undistorted_model(torchsfm.read_model("model.npz"))
+        >>> type(model.cameras.distortion).__name__
+        'NoDistortion'
     """
     model = registered_only(model)
     keys = torch.cat([model.camera_index[:, None], model.image_size.to(model.camera_index.dtype)], -1)

@@ -24,9 +24,13 @@ ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points and, where the file has them, colours."""
+    """Points and, where the file has them, colours.
+
+    See the example of `read_ply`.
+    """
 
     X: Float[Tensor, "n 3"]
+    """The points, in the file's unit."""
     color: Float[Tensor, "n 3"] | None
     """Red, green, blue in [0, 1]."""
 
@@ -48,6 +52,8 @@ def write_ply(
     Raises:
         ValueError: `color` does not fit, or is given together with a reconstruction.
         OSError: The file cannot be written.
+
+    See the example of `read_ply`.
     """
     cameras: npt.NDArray[Any] | None = None
     if isinstance(points, Reconstruction):
@@ -97,6 +103,13 @@ def read_ply(path: str | Path) -> PointCloud:
     Raises:
         ValueError: The file is not a PLY file, is damaged, or has no points.
         OSError: The file cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.write_ply(torch.zeros(5, 3), "points.ply", color=torch.ones(5, 3))
+        >>> cloud = torchsfm.read_ply("points.ply")
+        >>> cloud.X.shape, cloud.color[0]
+        (torch.Size([5, 3]), tensor([1., 1., 1.]))
     """
     path = Path(path)
     with path.open("rb") as file:

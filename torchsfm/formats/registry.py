@@ -149,6 +149,14 @@ def read_model(path: str | Path) -> Reconstruction:
     Raises:
         ValueError: It is no model of a known kind, or a damaged one; one line that says why.
         OSError: It cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> model.num_registered, model.num_points, model.num_observations
+        (3, 20, 50)
     """
     return as_reconstruction(read_model_or_problem(path))
 
@@ -183,6 +191,8 @@ def write_model(model: Model, path: str | Path, format: str | None = None) -> No
     Raises:
         ValueError: There is no such format, or it cannot hold the model.
         OSError: It cannot be written.
+
+    See the example of `read_model`.
     """
     kind = format_for(path, format)
     assert kind.write is not None

@@ -18,6 +18,15 @@ def write_tum(reconstruction: Reconstruction, path: str | Path) -> None:
 
     Raises:
         OSError: The file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_tum(torchsfm.read_model("model.npz"), "poses.txt")
+        >>> len(Path("poses.txt").read_text().splitlines()[0].split())  # time, centre, quaternion x y z w
+        8
     """
     poses, registered = reconstruction.poses, reconstruction.registered
     quaternion = quaternion_wxyz_from_rotation(poses.R.mT.double())
@@ -31,6 +40,15 @@ def write_kitti(reconstruction: Reconstruction, path: str | Path) -> None:
 
     Raises:
         OSError: The file cannot be written.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_kitti(torchsfm.read_model("model.npz"), "poses.txt")
+        >>> len(Path("poses.txt").read_text().splitlines()[0].split())  # a row for each image: [R | t] of world from camera
+        12
     """
     poses = reconstruction.poses
     rows = torch.cat([poses.R.mT, poses.centre[..., None]], -1).double()[reconstruction.registered]

@@ -22,6 +22,8 @@ class VggScene:
             correspond between views.
         segments_visible: Which lines were matched in which view.
         L: Line segments in space, their end points.
+
+    See the example of `read_vgg`.
     """
 
     x: Float[Tensor, "v n 2"]
@@ -44,6 +46,11 @@ def read_vgg(folder: str | Path) -> VggScene:
 
     Raises:
         ValueError: A file is missing or damaged, or holds a number that is not finite; one line that says which.
+
+    Example:
+        >>> import torchsfm
+        >>> scene = torchsfm.formats.read_vgg("model_house")  # doctest: +SKIP
+        >>> result = torchsfm.triangulate_points(scene.x, scene.P, visible=scene.visible)  # doctest: +SKIP
     """
     folder = Path(folder)
     corners = sorted((folder / "2D").glob("*.corners"))

@@ -27,6 +27,10 @@ def show_image(image: Photograph | Float[Tensor, "*channels h w"], *, title: str
     Raises:
         ValueError: The shape is none of these.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ax = torchsfm.show_image(torch.rand(3, 48, 64), title="noise")
     """
     image = pixels_of(image)
     check_tensors(image=(image, "h w"))
@@ -65,6 +69,10 @@ def show_scaled(
     Raises:
         ValueError: The shape is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ax = torchsfm.plot.show_scaled(torch.randn(48, 64))
     """
     check_tensors(image=(image, "h>=1 w>=1"))
     if image.ndim != 2:
@@ -94,6 +102,11 @@ def plot_points_2d(
     Raises:
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ax = torchsfm.show_image(torch.rand(3, 48, 64))
+        >>> ax = torchsfm.plot.plot_points_2d(torch.tensor([[10.0, 20.0], [30.0, 40.0]]), ax=ax)
     """
     check_tensors(x=(x, "n 2"), visible=(visible, "?n: bool"))
     fresh = ax is None
@@ -138,6 +151,11 @@ def plot_matches(
     Raises:
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> image, x1 = torch.rand(48, 64), torch.tensor([[10.0, 20.0], [30.0, 40.0]])
+        >>> ax = torchsfm.plot_matches(image, image, x1, x1 + 1.0, inliers=torch.tensor([True, False]))
     """
     check_tensors(x1=(x1, "n 2"), x2=(x2, "n 2"), inliers=(inliers, "?n: bool"))
     image1, image2 = pixels_of(image1), pixels_of(image2)
@@ -189,6 +207,12 @@ def plot_epipolar_lines(
     Raises:
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> F = torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0]))  # moved sideways
+        >>> image, x1 = torch.rand(48, 64), torch.tensor([[10.0, 20.0], [30.0, 40.0]])
+        >>> left, right = torchsfm.plot_epipolar_lines(F, x1, x1 - torch.tensor([5.0, 0.0]), image, image)
     """
     check_tensors(F=(F, "3 3"), x1=(x1, "n 2"), x2=(x2, "n 2"))
     plt = pyplot()

@@ -31,6 +31,13 @@ def up_direction(reconstruction: Reconstruction) -> Float[Tensor, "3"]:
     does not matter how far the cameras look down). Where the up directions cancel but all cameras look the same way, as from
     an aeroplane, up is against the view. Where the horizontal axes are all parallel and the up directions are not, the images
     lie on their side, and up is the end of that axis from which the cameras look down.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.plot.up_direction(torchsfm.read_model("model.npz")).norm()
+        tensor(1.0000, dtype=torch.float64)
     """
     rows = reconstruction.poses.R[reconstruction.registered].to(torch.float64)
     z_axis = rows.new_tensor([0.0, 0.0, 1.0])

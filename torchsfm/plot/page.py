@@ -65,6 +65,13 @@ def write_page(
     Raises:
         ValueError: No model was given.
         OSError: The file cannot be written.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_page(torchsfm.read_model("model.npz"), "model.html").name
+        'model.html'
     """
     models = [reconstruction] if isinstance(reconstruction, Reconstruction) else list(reconstruction)
     if not models:

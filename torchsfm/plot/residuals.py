@@ -35,6 +35,12 @@ def plot_residuals(
     Raises:
         ValueError: There is no such image, or it has no pose.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).problem, "model.npz")
+        >>> figure = torchsfm.plot.plot_residuals(torchsfm.read_model("model.npz"), 0)
     """
     if isinstance(image, str):
         if image not in reconstruction.names:

@@ -37,6 +37,11 @@ def plot_points_3d(
     Raises:
         ValueError: A shape or option is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torchsfm.random_points(200, generator=torch.Generator().manual_seed(0))
+        >>> ax = torchsfm.plot_points_3d(X, color=(X + 1) / 2)
     """
     check_tensors(X=(X, "n 3"), color=(color if isinstance(color, Tensor) else None, "?n 3"))
     if not 0 < share <= 1:
@@ -75,6 +80,10 @@ def plot_lines_3d(
     Raises:
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> ax = torchsfm.plot_lines_3d(torch.rand(5, 2, 3), color="black")
     """
     check_tensors(ends=(ends, "l 2 3"), color=(color if isinstance(color, Tensor) else None, "?l 3"))
     ax = spatial_axes(ax)
@@ -120,6 +129,10 @@ def plot_cameras(
     Raises:
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torchsfm
+        >>> ax = torchsfm.plot_cameras(torchsfm.simulation.orbit_poses(8))
     """
     if len(poses.shape) > 1:
         raise ValueError(f"poses: wanted batch shape (views,) or (), got {tuple(poses.shape)}")
@@ -195,6 +208,11 @@ def plot_tracks(
     Raises:
         ValueError: A shape is wrong.
         ImportError: matplotlib is not installed.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> frame, x = torch.arange(5), torch.rand(5, 2)  # a point in five frames
+        >>> ax = torchsfm.plot.plot_tracks(x, frame, torch.zeros_like(frame))
     """
     check_tensors(x=(x, "m 2"), view=(view, "m: int"), track=(track, "m: int"))
     ax = spatial_axes(ax)

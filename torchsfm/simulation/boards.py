@@ -44,6 +44,14 @@ def render_board(
 
     Returns:
         The photographs.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> centre = torch.tensor([2.0, 1.5, -6.0], dtype=torch.float64)  # before the middle of the board
+        >>> poses = torchsfm.Pose(torch.eye(3, dtype=centre.dtype)[None], -centre[None])
+        >>> K = torchsfm.intrinsics(torch.tensor(100.0), torch.tensor([49.5, 37.0])).double()
+        >>> torchsfm.simulation.render_board(poses, torchsfm.Camera(K), 5, 4, width=100, height=75).shape
+        torch.Size([1, 1, 75, 100])
     """
     check_options(
         poses=(poses, Pose), camera=(camera, Camera), columns=(columns, "int >= 2"), rows=(rows, "int >= 2"),

@@ -24,7 +24,10 @@ from torchsfm.simulation.viewpoints import look_at
 
 @dataclass(frozen=True)
 class SimulatedConics:
-    """Conics in space or ellipsoids, and their images; n of them in v views."""
+    """Conics in space or ellipsoids, and their images; n of them in v views.
+
+    See the example of `simulate_conics`.
+    """
 
     model: Ellipsoid
     """The truth, of batch (*batch, n)."""
@@ -63,6 +66,12 @@ def simulate_conics(
 
     Returns:
         The scenes, on the CPU.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.simulate_conics((), conics=2, views=3, generator=torch.Generator().manual_seed(0))
+        >>> scene.model.centre.shape, scene.C.shape
+        (torch.Size([2, 3]), torch.Size([3, 2, 3, 3]))
     """
     check_options(
         conics=(conics, "int >= 1"), views=(views, "int >= 1"), points=(points, "int >= 1"), noise=(noise, "float >= 0"),

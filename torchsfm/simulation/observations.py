@@ -14,7 +14,10 @@ from torchsfm.geometry.poses import Pose
 
 @dataclass(frozen=True)
 class SimulatedImages:
-    """What the cameras measured, and what they would have measured without errors."""
+    """What the cameras measured, and what they would have measured without errors.
+
+    See the example of `simulate_images`.
+    """
 
     x: Float[Tensor, "*batch v n 2"]
     """Measured image points in pixels; zero where not visible."""
@@ -60,6 +63,15 @@ def simulate_images(
 
     Returns:
         Observations and truth, with batch shape that of all arguments together.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(100, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> camera = torchsfm.Camera(torchsfm.random_intrinsics(generator=g))
+        >>> seen = torchsfm.simulate_images(X, poses, camera, image_size=(1000, 750), noise=0.5, outliers=0.1, generator=g)
+        >>> seen.x.shape, bool(0 < seen.outlier.sum() < 60)
+        (torch.Size([3, 100, 2]), True)
     """
     check_tensors(X=(X, "n 3"))
     check_options(
@@ -122,6 +134,12 @@ def random_points(
         generator: Source of randomness; torch's own where none is given.
         dtype: Of the points.
         device: Of the points.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torchsfm.random_points(8, 100, generator=torch.Generator().manual_seed(0))  # eight scenes
+        >>> X.shape, bool(X.norm(dim=-1).max() <= 1)
+        (torch.Size([8, 100, 3]), True)
     """
     check_options(kind=(kind, ("ball", "cube", "plane", "line", "gauss")), size=(size, "float"))
     options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
@@ -156,6 +174,12 @@ def random_intrinsics(
         generator: Source of randomness; torch's own where none is given.
         dtype: Of the matrices.
         device: Of the matrices.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.random_intrinsics(5, image_size=(640, 480), generator=torch.Generator().manual_seed(0))
+        >>> K.shape, bool((K[:, 0, 0] > 460).all())
+        (torch.Size([5, 3, 3]), True)
     """
     options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
     angles = (view_angle, "2 float > 0 < 3.1416 radians")

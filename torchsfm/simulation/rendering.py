@@ -17,7 +17,10 @@ from torchsfm.simulation.viewpoints import orbit_poses
 
 @dataclass(frozen=True)
 class RenderedSequence:
-    """Images and everything that is true about them. Images and colours are float32, the rest has the poses' dtype."""
+    """Images and everything that is true about them. Images and colours are float32, the rest has the poses' dtype.
+
+    See the example of `render_sequence`.
+    """
 
     images: Float[Tensor, "v 3 h w"]
     """Red, green, blue in [0, 1]."""
@@ -80,6 +83,13 @@ def render_sequence(
 
     Returns:
         Images and truth. Pixels outside the valid radius of the distortion are black, without depth.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> scene = torchsfm.render_sequence(views=2, width=64, height=48, points=50, generator=g)
+        >>> scene.images.shape, scene.depth.shape, scene.X.shape
+        (torch.Size([2, 3, 48, 64]), torch.Size([2, 48, 64]), torch.Size([50, 3]))
     """
     for name, value in (("views", views), ("width", width), ("height", height), ("supersample", supersample)):
         if value < 1:

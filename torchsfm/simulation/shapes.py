@@ -20,9 +20,13 @@ _MARGIN = 4.0
 
 @dataclass(frozen=True)
 class RenderedShapes:
-    """Images of shapes; what comes later hides what comes before, ellipses and polygons in turn."""
+    """Images of shapes; what comes later hides what comes before, ellipses and polygons in turn.
+
+    See the example of `render_shapes`.
+    """
 
     images: Float[Tensor, "*batch 1 h w"]
+    """Grey, with blur and noise."""
     ellipses: Ellipse
     """Of batch (*batch, n)."""
     ellipses_seen: Float[Tensor, "*batch n"]
@@ -70,6 +74,13 @@ def render_shapes(
 
     Returns:
         Images and truth, on the CPU.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> drawn = torchsfm.render_shapes((2,), ellipses=3, radius=(5.0, 20.0), width=80, height=60, generator=g)
+        >>> drawn.images.shape, drawn.ellipses.centre.shape
+        (torch.Size([2, 1, 60, 80]), torch.Size([2, 3, 2]))
     """
     check_options(
         ellipses=(ellipses, "int >= 0"), rings=(rings, "int >= 0"), polygons=(polygons, "int >= 0"),
@@ -158,6 +169,13 @@ def paint_shapes(
 
     Raises:
         ValueError: Wrong kind, shape, number or dtype.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> disc = torchsfm.Ellipse(torch.tensor([16.0, 12.0]), torch.tensor([8.0, 5.0]), torch.tensor(0.3))
+        >>> image = torchsfm.simulation.paint_shapes([disc], torch.tensor([0.2, 0.9]), width=32, height=24)
+        >>> image.shape, image[0, 12, 16], image[0, 0, 0]
+        (torch.Size([1, 24, 32]), tensor(0.9000), tensor(0.2000))
     """
     check_options(
         shapes=(shapes, Sequence), width=(width, "int >= 1"), height=(height, "int >= 1"), blur=(blur, "float > 0"),

@@ -22,9 +22,13 @@ class Textured:
 
 @dataclass(frozen=True)
 class TexturedScene:
-    """What `render_sequence` renders: textured surfaces under a sun and an even sky, the z axis up."""
+    """What `render_sequence` renders: textured surfaces under a sun and an even sky, the z axis up.
+
+    See the example of `courtyard_scene`.
+    """
 
     objects: tuple[Textured, ...]
+    """The surfaces with their textures."""
     sun: Float[Tensor, "3"]
     """Direction to the sun; any length."""
     ambient: float = 0.5
@@ -61,6 +65,13 @@ def courtyard_scene(*, texel: float = 0.006, generator: torch.Generator | None =
     Args:
         texel: Size of a texel in metres; smaller textures look sharper from near and take longer to paint.
         generator: Source of randomness for the textures and small changes of the layout; torch's own where none is given.
+
+    Example:
+        >>> import torch
+        >>> from torchsfm.simulation import courtyard_scene, render_sequence
+        >>> scene = courtyard_scene(texel=0.1, generator=torch.Generator().manual_seed(0))
+        >>> render_sequence(scene, views=1, width=32, height=24, points=10).images.shape
+        torch.Size([1, 3, 24, 32])
     """
     device = generator.device if generator is not None else None
     wobble = torch.rand(16, generator=generator, dtype=torch.float32, device=device).tolist()

@@ -26,6 +26,12 @@ def look_at(
 
     Returns:
         World to camera. Where centre and target coincide the camera looks along the world's z axis.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> pose = torchsfm.simulation.look_at(torch.tensor([0.0, -5.0, 0.0]), torch.zeros(3))
+        >>> pose.transform(torch.tensor([[0.0, 0.0, 1.0]]))  # above the target: 5 ahead, y points down
+        tensor([[ 0., -1.,  5.]])
     """
     check_tensors(centre=(centre, "3"), target=(target, "3"), up=(up, "?3"))
     if up is None:
@@ -70,6 +76,12 @@ def orbit_poses(
 
     Returns:
         World to camera, batch (views,).
+
+    Example:
+        >>> import torch, torchsfm
+        >>> poses = torchsfm.simulation.orbit_poses(8, radius=3.0)
+        >>> poses.centre[:, :2].norm(dim=-1)[:4]
+        tensor([3.0000, 3.0000, 3.0000, 3.0000], dtype=torch.float64)
     """
     check_options(
         views=(views, "int >= 1"), radius=(radius, "float"), height=(height, "2 float"), sweep=(sweep, "float"),
@@ -111,6 +123,12 @@ def random_poses(
 
     Returns:
         World to camera, with the given batch shape.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> poses = torchsfm.random_poses(8, 2, generator=torch.Generator().manual_seed(0))  # eight pairs
+        >>> poses.shape, bool(poses.centre.norm(dim=-1).min() >= 4)
+        (torch.Size([8, 2]), True)
     """
     check_options(distance=(distance, "2 float"), spread=(spread, "float"), wobble=(wobble, "float"), roll=(roll, "float"))
     options: dict[str, object] = {"dtype": dtype, "device": device}

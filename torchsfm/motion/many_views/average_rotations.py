@@ -54,6 +54,8 @@ class AveragedRotations:
             or in units of what `deviation` says.
         covariance: If asked for, that of each rotation, for a turn `exp(w) R` in the frame of the camera, relative to the
             smallest camera of its component; infinite for cameras that are not OK.
+
+    See the example of `average_rotations`.
     """
 
     model: Float[Tensor, "v 3 3"]
@@ -100,6 +102,16 @@ def average_rotations(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or a camera's number is out of range.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> R = torchsfm.random_poses(6, spread=3.0, generator=torch.Generator().manual_seed(0)).R
+        >>> edges = torch.combinations(torch.arange(6))  # every pair of six cameras
+        >>> relative = R[edges[:, 1]] @ R[edges[:, 0]].mT
+        >>> relative[0] = torch.eye(3)  # one of them is wrong
+        >>> found = torchsfm.motion.average_rotations(relative, edges, views=6)
+        >>> bool(found.model.allclose(R @ R[0].mT)), found.inliers[:3]
+        (True, tensor([False,  True,  True]))
     """
     check_one_problem(
         R=(R, "e 3 3"), edges=(edges, "e 2: int"), deviation=(deviation, "?e 3 3"), weights=(weights, "?e")
