@@ -38,6 +38,19 @@ class BundleConics:
     """Ellipses of space and what views measured of them.
 
     Ellipses without observations, or that are fixed, come back bit for bit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.simulate_conics((), conics=20, generator=torch.Generator().manual_seed(0))
+        >>> K, R, t = torchsfm.geometry.krt_from_camera(scene.P)
+        >>> seen = torchsfm.geometry.ellipse_from_conic(scene.C.flatten(0, 1))[0]  # 20 discs in three views
+        >>> view, disc = torch.arange(3).repeat_interleave(20), torch.arange(20).repeat(3)
+        >>> conics = torchsfm.bundle.BundleConics(scene.model, seen, view, disc)
+        >>> x, X = torchsfm.project_points(scene.P, scene.model.centre).flatten(0, 1), scene.model.centre
+        >>> problem = torchsfm.BundleProblem.of(torchsfm.Pose(R, t), torchsfm.Camera(K), X, x, view, disc)
+        >>> found = torchsfm.bundle_adjust(problem, structure=(conics,))
+        >>> bool(found.structure_residuals[0].abs().max() < 1e-3)
+        True
     """
 
     model: Ellipsoid
