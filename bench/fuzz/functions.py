@@ -475,7 +475,7 @@ EXCEPTIONS: dict[str, str] = {
     **{f"formats.write_{name}": FILES for name in (
         "bal", "bundler", "colmap", "curves_json", "curves_ply", "database", "gltf", "kitti", "model", "nerfstudio", "nvm",
         "openmvg", "opensfm", "ply", "tum")},
-    **{f"formats.{name}_lines": FILES for name in ("read", "write")},
+    **{f"formats.{name}_{what}": FILES for name in ("read", "write") for what in ("lines", "conics")},
     "formats.export_model": FILES,
     "formats.undistorted_model": "hands a model to undistorted_cameras",
     **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},
