@@ -31,6 +31,7 @@ from torchsfm.cli.results import VERSION
 from torchsfm.formats import read_lines, read_ply
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
+from torchsfm.reconstruction.stages import saved_stages
 from torchsfm.simulation import look_at
 
 
@@ -393,7 +394,9 @@ def test_a_wrong_option_is_wrong_usage(courtyard: Path, tmp_path: Path) -> None:
 # ---- interruption --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("stage", "saved"), [("features", []), ("match", ["features"]), ("verify", ["features", "match"])])
+@pytest.mark.parametrize(
+    ("stage", "saved"), [("features", []), ("match", ["features", "pairs"]), ("verify", ["features", "match", "pairs"])]
+)
 def test_an_interrupted_run_goes_on_where_it_was(
     stage: str, saved: list[str], finished: tuple[Path, str], courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -410,7 +413,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
         status, _, stderr = torchsfm(*words)
     assert status == 130
     assert "interrupted while" in stderr
-    assert sorted(path.stem for path in tmp_path.glob("stages/*.npz")) == saved
+    assert saved_stages(tmp_path) == saved
     assert ("--resume" in stderr) == bool(saved)
 
     seen: list[str] = []

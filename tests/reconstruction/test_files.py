@@ -69,8 +69,8 @@ def test_a_full_disk_leaves_the_old_files_and_nothing_else(tmp_path: Path) -> No
 def test_a_model_or_stage_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> None:
     model = make()
     model.save(tmp_path / "model.npz")
-    stages = Stages(tmp_path, False, "x")
-    stages.run("a", lambda: {"values": torch.zeros(3)})
+
+    Stages(tmp_path, False, "x").run("a", lambda: {"values": torch.zeros(3)})
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.npz")}
     larger = replace(model, X=torch.rand(30, 3, dtype=torch.float64))
     with full_disk(1000):
@@ -78,7 +78,7 @@ def test_a_model_or_stage_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> N
             larger.save(tmp_path / "model.npz")
         assert caught.value.filename == str(tmp_path / "model.npz")
         with pytest.raises(OSError, match="File too large"):
-            stages.run("a", lambda: {"values": torch.rand(3000)})
+            Stages(tmp_path, False, "x").run("a", lambda: {"values": torch.rand(3000)})
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()} == before
 
 

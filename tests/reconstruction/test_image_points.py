@@ -8,7 +8,8 @@ from chance import seeded
 
 from torchsfm.images import detect_features, read_image, save_image
 from torchsfm.reconstruction import image_points
-from torchsfm.reconstruction.image_points import detect_all, unpack
+from torchsfm.reconstruction.image_points import detect_all
+from torchsfm.reconstruction.stages import Stages
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
@@ -20,7 +21,7 @@ def test_positions_are_those_of_the_whole_image(suffix: str, tmp_path: Path, mon
     files = [tmp_path / f"{i}{suffix}" for i in range(2)]
     for file in files:
         save_image(file, image, quality=98)
-    points = unpack(detect_all(files, 500, 10**6, lambda *_: None), files, ["a", "b"])
+    points = detect_all(files, ["a", "b"], Stages(None, False, ""), 500, 10**6, lambda *_: None)
     assert points.image_size.tolist() == [[800, 600]] * 2
     expected = detect_features(read_image(files[0]), 500, max_size=400).x
     found = points.features[0].x

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from chance import seeded
 from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, photograph, torchsfm
 
 from torchsfm.images import ImageError, save_image
@@ -62,7 +61,7 @@ def matched(folder: Path, masks: Path | None, *, out: Path | None = None, sequen
     """Features and matches alone."""
     return match_photographs(
         folder, sequence=sequence, max_features=1000, max_pixels=10**7, neighbours=20, out=out, resume=True,
-        generator=seeded(), progress=lambda stage, done, total: None, masks=masks,
+        seed=0, progress=lambda stage, done, total: None, masks=masks,
     )  # fmt: skip
 
 

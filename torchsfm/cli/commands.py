@@ -18,6 +18,7 @@ from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.known_poses import Masks, register, triangulate
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
+from torchsfm.cli.ranks import Started
 from torchsfm.cli.results import VERSION, compare, finish
 from torchsfm.formats import TARGETS
 from torchsfm.formats.registry import model_files
@@ -144,6 +145,15 @@ def reconstruct(
     threads: Threads = None,
 ) -> None:
     """Turn photographs into calibrated cameras and coloured 3D points."""
+    started = Started.by()
+    source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
+    shown = {"masks": masks, "sequence": sequence, "max_features": max_features, "max_pixels": max_pixels}
+    if started.rank > 0:
+        with told(Job(out)) as job:
+            if read_matched(images) is None:
+                started.begin(out, resume)
+                job.help(source, threads, started, seed=seed, **shown)
+        return
     with told(Job(out)) as job, output_folder(out):
         matched = read_matched(images)
         folder = photograph_folder(images) if matched is None else None
@@ -160,11 +170,7 @@ def reconstruct(
         if matched is not None:
             result = job.run_matched(matched, threads, **options)
         else:
-            source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
-            result = job.run(
-                source, threads, masks=masks, sequence=sequence, lines=lines, max_features=max_features, max_pixels=max_pixels,
-                resume=resume, **options,
-            )  # fmt: skip
+            result = job.run(source, threads, lines=lines, resume=started.begin(out, resume), **shown, **options)
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
         finish(job, result, folder, {}, max_pixels)

@@ -14,7 +14,10 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 
+from torchsfm.cli.ranks import Started
 from torchsfm.reconstruction import MatchedImages, ReconstructionError, SfmResult, reconstruct, reconstruct_matches
+from torchsfm.reconstruction.photographs import NEIGHBOURS, match_photographs
+from torchsfm.reconstruction.stages import saved_stages
 
 NOTHING, WRONG, INTERRUPTED = 1, 2, 130
 
@@ -124,6 +127,22 @@ class Job:
         except ReconstructionError as error:
             raise UserError(" ".join(str(error).split())) from None
 
+    def help(self, images: Path | list[Path], threads: int | None, started: Started, **arguments: Any) -> None:
+        """Work on the stages of a run that another process leads; that one tells what there is to tell of the input."""
+        self.set_threads(threads)
+        try:
+            match_photographs(
+                images,
+                out=self.out,
+                resume=True,
+                neighbours=NEIGHBOURS,
+                first=started.rank / started.count,
+                progress=lambda stage, done, total: None,
+                **arguments,
+            )
+        except ReconstructionError:
+            raise typer.Exit(WRONG) from None
+
 
 @contextmanager
 def told(job: Job) -> Iterator[Job]:
@@ -134,7 +153,7 @@ def told(job: Job) -> Iterator[Job]:
         job.close()
         # Without --resume, what an earlier run left there is of no use.
         since = 0 if "--resume" in sys.argv else job.started
-        saved = sorted(path.stem for path in job.out.glob("stages/*.npz") if path.stat().st_mtime >= since)
+        saved = saved_stages(job.out, since)
         typer.echo(f"interrupted while {LABELS.get(job.stage, 'starting')}", err=True)
         if saved and sys.argv[1:2] == ["reconstruct"]:
             words = [word for word in sys.argv[1:] if word != "--resume"]

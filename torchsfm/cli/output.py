@@ -8,14 +8,13 @@ run between two of these steps, the next command goes on from there: new results
 import os
 import re
 import shutil
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from torchsfm.cli.job import UserError
-from torchsfm.reconstruction.files import PARTIAL
+from torchsfm.reconstruction.files import HELD, PARTIAL, lock_file
 
 LOCK, WRITING, WRITTEN, ARRIVING = ".lock", ".writing", ".written", ".arriving"
 RESULTS = re.compile(
@@ -42,8 +41,9 @@ def output_folder(folder: Path) -> Iterator[None]:
         finish_replacing(folder)
         shutil.rmtree(folder / WRITING, ignore_errors=True)
         # Left by a run that was killed.
-        for partial in [*folder.glob(f".*{PARTIAL}"), *(folder / "stages").glob(f".*{PARTIAL}")]:
-            partial.unlink(missing_ok=True)
+        stages = folder / "stages"
+        for left in [*folder.glob(f".*{PARTIAL}"), *stages.rglob(f".*{PARTIAL}"), *stages.rglob(f".*{HELD}")]:
+            left.unlink(missing_ok=True)
         yield
 
 
@@ -101,7 +101,7 @@ def _locked(folder: Path) -> Iterator[None]:
     lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         try:
-            _lock(lock)
+            lock_file(lock)
         except (BlockingIOError, PermissionError):
             owner = os.read(lock, 20).decode("ascii", "replace").strip()
             raise UserError(f"{folder}: another run is writing to it (process {owner}); give another --out, or wait") from None
@@ -113,20 +113,3 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(lock)
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _lock(descriptor: int) -> None:
-        # Beyond what is written there: a locked byte cannot be read.
-        os.lseek(descriptor, 1024, os.SEEK_SET)
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        finally:
-            os.lseek(descriptor, 0, os.SEEK_SET)
-else:
-    import fcntl
-
-    def _lock(descriptor: int) -> None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

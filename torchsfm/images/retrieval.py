@@ -10,6 +10,11 @@ from torchsfm._types import check_options
 from torchsfm.images.features import Features, check_features
 from torchsfm.images.matching import unit_descriptors
 
+SIMILARITIES = 2**22
+"""Similarities of images computed at once."""
+SAMPLED, LEAST_SAMPLED = 256, 16
+"""Descriptors among which a visual word is found, and the least number taken from an image that gives any."""
+
 
 def retrieve_pairs(
     features: Sequence[Features],
@@ -21,10 +26,11 @@ def retrieve_pairs(
     """Pairs of images that are likely to show the same things.
 
     Every image is paired with the `neighbours` images most like it by `describe_images`. Where that would be all of them, all
-    pairs are returned and nothing is computed.
+    pairs are returned and nothing is computed. Similarities are computed for some images at a time, so that the memory grows
+    with the number of images and not with its square.
 
     Args:
-        features: The features of every image.
+        features: The features of every image, asked for one after the other: they need not all be in the memory.
         neighbours: How many partners to find for each image; an image may have more, as it may be the partner of others.
         words: Number of visual words.
         generator: Randomness for the choice of words; a fixed seed where not given.
@@ -41,13 +47,25 @@ def retrieve_pairs(
     n = len(usable)
     if n - 1 <= neighbours:
         return usable[torch.combinations(torch.arange(n)).reshape(-1, 2)]
-    described = describe_images([features[i] for i in usable.tolist()], words=words, generator=generator)
-    similarity = (described @ described.mT).fill_diagonal_(-torch.inf)
-    # Sorted stably, so that images equally alike are taken in order.
-    partners = similarity.argsort(dim=1, descending=True, stable=True)[:, :neighbours].cpu()
+    described = describe_images(features, words=words, generator=generator)[usable]
+    partners = _most_alike(described, neighbours).cpu()
     pairs = torch.stack([torch.arange(n)[:, None].expand_as(partners), partners], -1).reshape(-1, 2)
     pairs = torch.unique(pairs.sort(dim=1).values, dim=0)
     return usable[pairs]
+
+
+def _most_alike(rows: Float[Tensor, "n k"], count: int) -> Int[Tensor, "n count"]:
+    """The other rows with the largest products with each, the first ones among equals, in order."""
+    n = len(rows)
+    found = []
+    for some in torch.split(torch.arange(n, device=rows.device), max(1, SIMILARITIES // n)):
+        similarity = rows[some] @ rows.mT
+        similarity[torch.arange(len(some)), some] = -torch.inf
+        least = similarity.topk(count).values[:, -1:]
+        above, ties = similarity > least, similarity == least
+        room = count - above.sum(1, keepdim=True)
+        found.append((above | (ties & (ties.cumsum(1) <= room))).nonzero()[:, 1].view(-1, count))
+    return torch.cat(found)
 
 
 def describe_images(
@@ -70,23 +88,27 @@ def describe_images(
     check_options(words=(words, "int >= 1"))
     if not features:
         return torch.zeros(0, 0)
-    if not any(len(f) for f in features):
+    filled = [i for i, f in enumerate(features) if len(f)]
+    if not filled:
         return torch.zeros(len(features), words * features[0].descriptors.shape[1])
     device = features[0].descriptors.device
     generator = generator or torch.Generator().manual_seed(0)
-    share = max(1, 256 * words // len(features))
+    wanted = SAMPLED * words
+    share = max(LEAST_SAMPLED, wanted // len(filled))
     sample = []
-    for f in features:
+    # Of very many images, some are enough.
+    for i in filled[:: max(1, len(filled) * LEAST_SAMPLED // wanted)]:
+        f = features[i]
         chosen = torch.randperm(len(f), generator=generator)[:share].to(device)
         sample.append(unit_descriptors(f.descriptors[chosen]))
     centres = _cluster(torch.cat(sample), words, generator)
-    rows = []
-    for f in features:
+    described = centres.new_empty((len(features), centres.numel()))
+    for row, f in zip(described, features, strict=True):
         unit = unit_descriptors(f.descriptors)
         word = _nearest(unit, centres)
         total = torch.zeros_like(centres).index_add_(0, word, unit - centres[word])
-        rows.append(torch.nn.functional.normalize(total, dim=1).flatten())
-    return torch.nn.functional.normalize(torch.stack(rows), dim=1)
+        row.copy_(torch.nn.functional.normalize(total, dim=1).flatten())
+    return torch.nn.functional.normalize(described, dim=1)
 
 
 def _nearest(x: Tensor, centres: Tensor) -> Tensor:

@@ -5,10 +5,11 @@ import os
 import re
 import secrets
 import struct
+import sys
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 PARTIAL = ".partial"
 """Ending of files that are being written; what a killed process left under it is of no use."""
+HELD = ".lock"
+"""Ending of files by which processes agree who works on what."""
 MAX_RATIO = 200
 FREE_BYTES = 2**24
 """An archive may unpack to so many times its size, or to so many bytes: beyond, it was made to fill the memory."""
@@ -81,8 +84,30 @@ def write_whole_files(contents: Mapping[Path, bytes]) -> None:
             partial.unlink(missing_ok=True)
 
 
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` file, none of them pickled.
+@contextmanager
+def held_file(path: Path) -> Iterator[bool]:
+    """Whether this process, and this block of it alone, holds a file as long as the block lasts; it is made and removed here.
+
+    The system takes it away from a process that ends in whatever way. On a file system without locks everybody holds it.
+    """
+    descriptor, mine = os.open(path, os.O_RDWR | os.O_CREAT, 0o666), True
+    try:
+        try:
+            lock_file(descriptor)
+        except (BlockingIOError, PermissionError):
+            mine = False
+        except OSError:
+            pass
+        yield mine
+    finally:
+        if mine:
+            with suppress(OSError):
+                path.unlink()
+        os.close(descriptor)
+
+
+def load_arrays(path: Path, wanted: Callable[[str], bool] | None = None) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz` file, none of them pickled; where it is given, those whose names pass a test.
 
     Nothing is taken on trust: an array is read after its announced size was found in the file.
 
@@ -101,7 +126,9 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
                     raise ValueError(
                         f"damaged, or made to fill the memory: {size} bytes unpack to more than {MAX_RATIO} times that"
                     )
-                return {member.filename.removesuffix(".npy"): _read_array(archive, member) for member in members}
+                names = {member.filename.removesuffix(".npy"): member for member in members}
+                chosen = names if wanted is None else filter(wanted, names)
+                return {name: _read_array(archive, names[name]) for name in chosen}
         except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, RuntimeError) as error:
             raise ValueError(f"a damaged archive ({' '.join(str(error).split()) or type(error).__name__})") from None
         except OSError:
@@ -124,3 +151,22 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
             order: Literal["F", "C"] = "F" if header["columns"] == b"True" else "C"
             return values.astype(dtype.newbyteorder("="), copy=False).reshape(shape, order=order)
     raise ValueError(f"a damaged archive ({member.filename!r} is not an array of numbers or text)")
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def lock_file(descriptor: int) -> None:
+        """Lock an open file for as long as it is open; BlockingIOError or PermissionError where another has done so."""
+        # Beyond what is written there: a locked byte cannot be read.
+        os.lseek(descriptor, 1024, os.SEEK_SET)
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        finally:
+            os.lseek(descriptor, 0, os.SEEK_SET)
+else:
+    import fcntl
+
+    def lock_file(descriptor: int) -> None:
+        """Lock an open file for as long as it is open; BlockingIOError or PermissionError where another has done so."""
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,10 +1,12 @@
 """The image points of all photographs: read each file, detect features, keep what the later stages need."""
 
+import math
 import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
+from typing import overload
 
 import torch
 from jaxtyping import Float, Int
@@ -14,9 +16,11 @@ from torchsfm._types import tensor_map
 from torchsfm.images import Features, ImageError, Photograph, detect_features, read_image
 from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.report import Progress, ReconstructionError
-from torchsfm.reconstruction.stages import Arrays
+from torchsfm.reconstruction.stages import Arrays, Shards, Stages
 
 Found = tuple[Photograph, Features, Tensor]
+SHARDS, MOST_IMAGES = 64, 64
+"""The photographs are divided into about so many shards, but none of more images than this."""
 DETECTION_SIZE = 2400
 """Larger photographs are read and searched at this longer side; positions are those of the whole image."""
 
@@ -32,8 +36,35 @@ class ImagePoints:
     focal: tuple[float | None, ...]
     failures: dict[str, str]
     """Why the other files could not be read, by name."""
-    features: tuple[Features, ...]
-    color: tuple[Tensor, ...]
+    x: tuple[Float[Tensor, "_ 2"], ...]
+    """Where the features of each are, pixels."""
+    color: tuple[Float[Tensor, "_ 3"], ...]
+    features: "SavedFeatures"
+    """Their descriptors, read when they are asked for."""
+
+
+@dataclass(frozen=True)
+class SavedFeatures(Sequence[Features]):
+    """The features of readable images; scale, angle and response are not kept."""
+
+    shards: Shards
+    place: tuple[tuple[int, int], ...]
+    """The shard of each image, and its number there."""
+    x: tuple[Tensor, ...]
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    @overload
+    def __getitem__(self, number: int) -> Features: ...
+    @overload
+    def __getitem__(self, number: slice) -> list[Features]: ...
+    def __getitem__(self, number: int | slice) -> Features | list[Features]:
+        if isinstance(number, slice):
+            return [self[k] for k in range(len(self))[number]]
+        shard, k = self.place[number]
+        name, x = f"descriptors-{k}", self.x[number]
+        return Features(x=x, scale=x[:, 0], angle=x[:, 0], response=x[:, 0], descriptors=self.shards.only(shard, name)[name])
 
 
 def image_names(files: Sequence[Path]) -> list[str]:
@@ -53,9 +84,31 @@ def image_names(files: Sequence[Path]) -> list[str]:
 
 
 def detect_all(
-    files: Sequence[Path], max_features: int, max_pixels: int, progress: Progress, masks: Masks | None = None
-) -> Arrays:
-    """Features of all files, those that masks admit, as tensors to save; `unpack` reads them."""
+    files: Sequence[Path],
+    names: Sequence[str],
+    stages: Stages,
+    max_features: int,
+    max_pixels: int,
+    progress: Progress,
+    masks: Masks | None = None,
+) -> ImagePoints:
+    """Features of all files, those that masks admit.
+
+    Args:
+        files: The photographs.
+        names: By what to know them.
+        stages: Where to save.
+        max_features: Most features of an image.
+        max_pixels: Larger images are left out.
+        progress: Called as the work goes on.
+        masks: Where nothing is to be found.
+
+    Raises:
+        ReconstructionError: Fewer than two files could be read.
+    """
+    size = min(max(math.ceil(len(files) / SHARDS), 1), MOST_IMAGES)
+    done = [0]
+    counting = Lock()
 
     def work(path: Path) -> Found | str:
         try:
@@ -76,12 +129,17 @@ def detect_all(
         whole = replace(photo, pixels=torch.zeros(1, 1, 1), focal=focal)
         return whole, replace(features, x=(features.x + 0.5) * zoom - 0.5), color
 
-    found: list[Found | str] = []
-    with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
-        for result in pool.map(work, files):
-            found.append(result)
-            progress("features", len(found), len(files))
-    return _pack(found)
+    def shard(number: int) -> Arrays:
+        found = []
+        for path in files[size * number : size * (number + 1)]:
+            found.append(work(path))
+            with counting:
+                done[0] += 1
+                progress("features", done[0], len(files))
+        return _pack(found)
+
+    count = math.ceil(len(files) / size)
+    return _unpack(stages.shards("features", count, shard, threads=max(1, torch.get_num_threads())), files, names)
 
 
 def nearest_colors(pixels: Float[Tensor, "c h w"], x: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
@@ -93,7 +151,7 @@ def nearest_colors(pixels: Float[Tensor, "c h w"], x: Float[Tensor, "n 2"]) -> F
 
 
 def _pack(found: list[Found | str]) -> Arrays:
-    """One table of features of all readable images, and a record per file."""
+    """The features of the readable images of a shard, one after the other, and a record per file."""
     good = [entry for entry in found if not isinstance(entry, str)]
     records = [entry if isinstance(entry, str) else _label(entry[0]) for entry in found]
     text = "\0".join(records).encode("utf-8", "surrogateescape")
@@ -104,8 +162,9 @@ def _pack(found: list[Found | str]) -> Arrays:
         "size": torch.tensor([photo.size for photo, _, _ in good], dtype=torch.long).reshape(-1, 2),
         "count": torch.tensor([len(features) for _, features, _ in good], dtype=torch.long),
         "x": torch.cat([features.x for _, features, _ in good]) if good else torch.zeros(0, 2),
-        "descriptors": torch.cat([f.descriptors for _, f, _ in good]) if good else torch.zeros(0, 128, dtype=torch.uint8),
         "color": torch.cat([color for _, _, color in good]) if good else torch.zeros(0, 3),
+        # Each by itself, so that one can be read without the others.
+        **{f"descriptors-{k}": features.descriptors for k, (_, features, _) in enumerate(good)},
     }
 
 
@@ -115,31 +174,31 @@ def _label(photo: Photograph) -> str:
     return "|".join([photo.make, photo.model, focal]).replace("\0", "")
 
 
-def unpack(saved: Arrays, files: Sequence[Path], names: Sequence[str]) -> ImagePoints:
-    """What `detect_all` found in files to be known under these names.
+def _unpack(shards: Shards, files: Sequence[Path], names: Sequence[str]) -> ImagePoints:
+    """What shards say of files to be known under these names.
 
     Raises:
         ReconstructionError: Fewer than two files could be read.
     """
-    records = bytes(saved["records"].numpy()).decode("utf-8", "surrogateescape").split("\0")
-    readable = saved["readable"].tolist()
+    parts = [shards.only(k, "readable", "records", "focal", "size", "count", "x", "color") for k in range(len(shards))]
+    records = [r for part in parts for r in bytes(part["records"].numpy()).decode("utf-8", "surrogateescape").split("\0")]
+    readable = [bool(ok) for part in parts for ok in part["readable"]]
     failures = {name: record for name, record, ok in zip(names, records, readable, strict=True) if not ok}
     if sum(readable) < 2:
         worst = next(iter(failures.values()))
         raise ReconstructionError(f"{sum(readable)} of {len(files)} files can be read as images; first failure: {worst}")
-    counts = saved["count"].tolist()
-    x, descriptors, color = (torch.split(saved[key], counts) for key in ("x", "descriptors", "color"))
+    x, color = (
+        tuple(rows for part in parts for rows in torch.split(part[key], part["count"].tolist())) for key in ("x", "color")
+    )
+    place = tuple((k, i) for k, part in enumerate(parts) for i in range(len(part["count"])))
     return ImagePoints(
         files=tuple(path for path, ok in zip(files, readable, strict=True) if ok),
         names=tuple(name for name, ok in zip(names, readable, strict=True) if ok),
-        image_size=saved["size"],
+        image_size=torch.cat([part["size"] for part in parts]),
         labels=tuple(record for record, ok in zip(records, readable, strict=True) if ok),
-        focal=tuple(f or None for f in saved["focal"].tolist()),
+        focal=tuple(f or None for part in parts for f in part["focal"].tolist()),
         failures=failures,
-        # Scale, angle and response are not needed any more.
-        features=tuple(
-            Features(x=a, scale=a[:, 0], angle=a[:, 0], response=a[:, 0], descriptors=b)
-            for a, b in zip(x, descriptors, strict=True)
-        ),
-        color=tuple(color),
+        x=x,
+        color=color,
+        features=SavedFeatures(shards, place, x),
     )

@@ -19,7 +19,7 @@ from torchsfm.reconstruction.doubt import examine
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE, UNKNOWN_FOCAL, MappingOptions, next_images
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.models import image_reports
-from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
+from torchsfm.reconstruction.photographs import NEIGHBOURS, MatchedPhotographs, match_photographs
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.register import register_images
 from torchsfm.reconstruction.report import Progress, ReconstructionError, Report, SfmResult, pair_report
@@ -40,7 +40,7 @@ def triangulate_photographs(
     masks: str | Path | None = None,
     max_features: int = 8192,
     max_pixels: int = MAX_PIXELS,
-    neighbours: int = 20,
+    neighbours: int = NEIGHBOURS,
     seed: int = 0,
     out: str | Path | None = None,
     resume: bool = False,
@@ -80,7 +80,7 @@ def triangulate_photographs(
     generator = torch.Generator().manual_seed(seed)
     seen = match_photographs(
         images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
-        resume=resume, generator=generator, progress=report, masks=masks,
+        resume=resume, seed=seed, progress=report, masks=masks,
     )  # fmt: skip
     place = _places(seen, poses)
     reasons = dict.fromkeys((place < 0).nonzero()[:, 0].tolist(), "has no pose in the given model")

@@ -126,19 +126,10 @@ def reconstruct_matches(
     report = progress or (lambda stage, done, total: None)
     with stages.timed("verify"), one_thread():
         report("verify", 0, len(kept))
-        graph = verify_pairs(
-            named,
-            image_size,
-            [torch.where(good[:, None], x, 0.0).double() for x, good in zip(keypoints, finite, strict=True)],
-            [torch.full((len(x), 3), 0.5, dtype=torch.float64) for x in keypoints]
-            if color is None
-            else [values.double() for values in color],
-            kept,
-            rows,
-            quality=trust,
-            threshold=threshold,
-            generator=generator,
-        )
+        points = [torch.where(good[:, None], x, 0.0).double() for x, good in zip(keypoints, finite, strict=True)]
+        colors = [torch.full((len(x), 3), 0.5) for x in keypoints] if color is None else color
+        verified = verify_pairs(image_size, points, kept, rows, quality=trust, threshold=threshold, generator=generator)
+        graph = verified.graph(named, image_size, points, [values.double() for values in colors], kept)
         report("verify", len(kept), len(kept))
     return build_models(
         graph,

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +11,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
-from torchsfm.images import MAX_PIXELS, ImageError, list_images, list_skipped, match_features, retrieve_pairs
+from torchsfm.images import MAX_PIXELS, ImageError, list_images, list_skipped
 from torchsfm.reconstruction.find_lines import FoundSegments
-from torchsfm.reconstruction.image_points import ImagePoints, detect_all, image_names, unpack
+from torchsfm.reconstruction.image_points import ImagePoints, detect_all, image_names
 from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.match_all import match_all
 from torchsfm.reconstruction.models import METHODS, build_models
 from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult, describe_skipped
 from torchsfm.reconstruction.segments import detect_all_segments
-from torchsfm.reconstruction.sequence import add_corners, sequence_pairs, track_corners
-from torchsfm.reconstruction.stages import Arrays, Stages, fingerprint, one_thread
-from torchsfm.reconstruction.view_graph import ViewGraph, verify_pairs
+from torchsfm.reconstruction.stages import Stages, fingerprint
+from torchsfm.reconstruction.view_graph import ViewGraph
 
-MAX_IMAGES_ALL_PAIRS = 80
-"""Up to this many images every pair is matched; beyond it, each image with those that look most alike."""
+NEIGHBOURS = 20
+"""Images each one is matched with when there are many."""
 
 
 def reconstruct(
@@ -40,7 +39,7 @@ def reconstruct(
     masks: str | Path | None = None,
     max_features: int = 8192,
     max_pixels: int = MAX_PIXELS,
-    neighbours: int = 20,
+    neighbours: int = NEIGHBOURS,
     seed: int = 0,
     out: str | Path | None = None,
     resume: bool = False,
@@ -94,10 +93,9 @@ def reconstruct(
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
     report = progress or (lambda stage, done, total: None)
-    generator = torch.Generator().manual_seed(seed)
     seen = match_photographs(
         images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
-        resume=resume, generator=generator, progress=report, masks=masks,
+        resume=resume, seed=seed, progress=report, masks=masks,
     )  # fmt: skip
 
     def segments() -> FoundSegments:
@@ -116,7 +114,7 @@ def reconstruct(
         K=K,
         free_principal_point=free_principal_point,
         method=method,
-        generator=generator,
+        generator=torch.Generator().manual_seed(seed),
         stages=seen.stages,
         progress=report,
         segments=cache(segments) if lines else None,
@@ -154,11 +152,15 @@ def match_photographs(
     neighbours: int,
     out: str | Path | None,
     resume: bool,
-    generator: torch.Generator,
+    seed: int,
     progress: Progress,
     masks: str | Path | None,
+    first: float = 0.0,
 ) -> MatchedPhotographs:
     """Read photographs, find their features and match them; the arguments are those of `reconstruct`.
+
+    Several processes may do so together into one folder, all with `resume`, each with another `first` (see `Stages`): each does
+    a part of the work, and all return the same.
 
     Raises:
         ReconstructionError: No such folder, or fewer than two readable images.
@@ -170,10 +172,10 @@ def match_photographs(
     found = None if masks is None else Masks.of(masks, files)
     if found is not None:
         options["masks"] = fingerprint([path for file in files if (path := found.path(file))], {})
-    stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options))
-    points = unpack(stages.run("features", lambda: detect_all(files, max_features, max_pixels, progress, found)), files, names)
-    graph = _view_graph(
-        points, stages, progress, generator, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels, masks=found
+    stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options), first)
+    points = detect_all(files, names, stages, max_features, max_pixels, progress, found)
+    graph = match_all(
+        points, stages, progress, seed, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels, masks=found
     )
     return MatchedPhotographs(tuple(names), tuple(skipped), points, graph, stages, found)
 
@@ -197,52 +199,3 @@ def _files(images: str | Path | Sequence[str | Path]) -> tuple[list[Path], list[
     if missing := [path for path in files if not path.is_file()]:
         raise ReconstructionError(f"{missing[0]}: no such file")
     return files, skipped
-
-
-def _view_graph(
-    points: ImagePoints,
-    stages: Stages,
-    progress: Progress,
-    generator: torch.Generator,
-    *,
-    sequence: bool,
-    neighbours: int,
-    max_pixels: int,
-    masks: Masks | None,
-) -> ViewGraph:
-    """Matches of all pairs worth comparing, verified."""
-    features = points.features
-
-    def match() -> Arrays:
-        if sequence:
-            pairs = sequence_pairs(features)
-        elif len(features) <= MAX_IMAGES_ALL_PAIRS:
-            pairs = torch.tensor(list(combinations(range(len(features)), 2)), dtype=torch.long).reshape(-1, 2)
-        else:
-            pairs = retrieve_pairs(features, neighbours=neighbours)
-        progress("match", 0, len(pairs))
-        rows = match_features(features, pairs, progress=lambda done: progress("match", done, len(pairs)))
-        return {
-            "pairs": pairs,
-            "count": torch.tensor([len(m) for m in rows], dtype=torch.long),
-            "match": torch.cat(rows) if rows else torch.zeros(0, 2, dtype=torch.long),
-        }
-
-    matched = stages.run("match", match)
-    pairs, matches = matched["pairs"], list(torch.split(matched["match"], matched["count"].tolist()))
-    x, color = [f.x for f in features], list(points.color)
-    if sequence:
-        add_corners(x, color, pairs, matches, stages.run("track", lambda: track_corners(points, max_pixels, progress, masks)))
-    with stages.timed("verify"), one_thread():
-        progress("verify", 0, len(matches))
-        graph = verify_pairs(
-            points.names,
-            points.image_size,
-            [a.double() for a in x],
-            [c.double() for c in color],
-            pairs,
-            matches,
-            generator=generator,
-        )
-        progress("verify", len(matches), len(matches))
-    return graph

@@ -1,6 +1,7 @@
 """Videos and other ordered images: which frames to compare, and corners followed from frame to frame."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -61,25 +62,26 @@ def _pixels(files: Sequence[Path], max_pixels: int) -> Iterator[Float[Tensor, "c
         yield read_image(path, max_pixels=max_pixels).pixels
 
 
-def add_corners(
-    x: list[Float[Tensor, "_ 2"]],
-    color: list[Float[Tensor, "_ 3"]],
-    pairs: Int[Tensor, "p 2"],
-    matches: list[Int[Tensor, "_ 2"]],
-    corners: Arrays,
-) -> None:
-    """Append tracked corners to the image points, and to the matches of every pair of frames they link, in place."""
-    frame, track = corners["frame"], corners["track"]
-    counts = torch.bincount(frame, minlength=len(x))
-    # Row of each track in each frame's table; a follower sees a track at most once per frame.
-    local = torch.arange(len(frame)) - (counts.cumsum(0) - counts)[frame] + torch.tensor([len(p) for p in x])[frame]
-    tables = list(zip(torch.split(track, counts.tolist()), torch.split(local, counts.tolist()), strict=True))
-    for q, (i, j) in enumerate(pairs.tolist()):
-        (track1, row1), (track2, row2) = tables[i], tables[j]
-        position = torch.full((int(track.max()) + 1 if len(track) else 0,), -1, dtype=torch.long)
-        position[track2] = row2
-        both = position[track1] >= 0
-        matches[q] = torch.cat([matches[q], torch.stack([row1[both], position[track1[both]]], 1)])
-    parts = zip(torch.split(corners["x"], counts.tolist()), torch.split(corners["color"], counts.tolist()), strict=True)
-    for i, (own_x, own_color) in enumerate(parts):
-        x[i], color[i] = torch.cat([x[i], own_x]), torch.cat([color[i], own_color])
+@dataclass(frozen=True)
+class Corners:
+    """Tracked corners, frame by frame."""
+
+    x: tuple[Float[Tensor, "_ 2"], ...]
+    color: tuple[Float[Tensor, "_ 3"], ...]
+    track: tuple[Int[Tensor, "_"], ...]
+    """No track is twice in a frame."""
+    tracks: int
+
+    @classmethod
+    def of(cls, saved: Arrays, frames: int) -> "Corners":
+        """From the tensors of `track_corners`."""
+        counts = torch.bincount(saved["frame"], minlength=frames).tolist()
+        x, color, track = (tuple(torch.split(saved[key], counts)) for key in ("x", "color", "track"))
+        return cls(x, color, track, int(saved["track"].max()) + 1 if len(saved["track"]) else 0)
+
+    def matches(self, i: int, j: int) -> Int[Tensor, "_ 2"]:
+        """The corners that two frames share, as their numbers in each."""
+        position = torch.full((self.tracks,), -1, dtype=torch.long)
+        position[self.track[j]] = torch.arange(len(self.track[j]))
+        found = position[self.track[i]]
+        return torch.stack([torch.arange(len(found)), found], 1)[found >= 0]

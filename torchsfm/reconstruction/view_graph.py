@@ -105,25 +105,68 @@ class ViewGraph:
         return torch.where(related, verdict, int(Verdict.UNRELATED))
 
 
+@dataclass(frozen=True)
+class VerifiedPairs:
+    """What was found of pairs: members of `ViewGraph`, but with matches as indices into the points of their two images."""
+
+    num_matches: Int[Tensor, "q"]
+    F: Float[Tensor, "q 3 3"]
+    H: Float[Tensor, "q 3 3"]
+    fundamental_inliers: Int[Tensor, "q"]
+    homography_inliers: Int[Tensor, "q"]
+    match: Int[Tensor, "k 2"]
+    match_pair: Int[Tensor, "k"]
+
+    @classmethod
+    def join(cls, parts: Sequence["VerifiedPairs"]) -> "VerifiedPairs":
+        """Several lists of pairs as one."""
+        whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__}
+        sizes = torch.tensor([len(part.match) for part in parts])
+        pairs = torch.tensor([0, *(len(part.F) for part in parts[:-1])]).cumsum(0)
+        return cls(**whole | {"match_pair": whole["match_pair"] + pairs.repeat_interleave(sizes)})
+
+    def graph(
+        self,
+        names: Sequence[str],
+        image_size: Int[Tensor, "v 2"],
+        x: Sequence[Float[Tensor, "_ 2"]],
+        color: Sequence[Float[Tensor, "_ 3"]],
+        pairs: Int[Tensor, "q 2"],
+    ) -> ViewGraph:
+        """The view graph of the images that the pairs are of; the arguments are those of `verify_pairs`."""
+        offset = torch.tensor([0, *(len(p) for p in x)], dtype=torch.long).cumsum(0)
+        return ViewGraph(
+            names=tuple(names),
+            image_size=image_size,
+            x=torch.cat(list(x)) if x else self.F.new_zeros(0, 2),
+            view=torch.arange(len(x)).repeat_interleave(offset.diff()),
+            color=torch.cat(list(color)) if color else self.F.new_zeros(0, 3),
+            pairs=pairs,
+            num_matches=self.num_matches,
+            F=self.F,
+            H=self.H,
+            fundamental_inliers=self.fundamental_inliers,
+            homography_inliers=self.homography_inliers,
+            match=self.match + offset[pairs[self.match_pair]],
+            match_pair=self.match_pair,
+        )
+
+
 def verify_pairs(
-    names: Sequence[str],
     image_size: Int[Tensor, "v 2"],
     x: Sequence[Float[Tensor, "_ 2"]],
-    color: Sequence[Float[Tensor, "_ 3"]],
     pairs: Int[Tensor, "q 2"],
     matches: Sequence[Int[Tensor, "_ 2"]],
     *,
     quality: Sequence[Float[Tensor, "_"]] | None = None,
     threshold: float = 3.0,
     generator: torch.Generator | None = None,
-) -> ViewGraph:
+) -> VerifiedPairs:
     """Keep the matches that agree with the epipolar geometry of their pair; all pairs are estimated together.
 
     Args:
-        names: File names of the images.
         image_size: Width and height in pixels.
         x: Image points per image, in pixels.
-        color: Colours of the image points.
         pairs: Pairs of images that were matched.
         matches: Per pair, indices of matching points in its first and second image.
         quality: Per pair, how much each match can be trusted, the larger the more, in any unit: samples favour the best.
@@ -132,10 +175,9 @@ def verify_pairs(
         generator: Source of randomness.
 
     Returns:
-        The view graph; a pair with fewer than `MIN_INLIERS` inliers keeps its counts but none of its matches.
+        What was found; a pair with fewer than `MIN_INLIERS` inliers keeps its counts but none of its matches.
     """
     counts = torch.tensor([len(m) for m in matches], dtype=torch.long)
-    offset = torch.tensor([0, *(len(p) for p in x)], dtype=torch.long).cumsum(0)
     q = len(pairs)
     dtype = x[0].dtype if x else torch.float64
     F, H = (torch.eye(3, dtype=dtype).repeat(q, 1, 1) for _ in range(2))
@@ -152,8 +194,8 @@ def verify_pairs(
         limit = threshold * scale[pairs[block]].amax(dim=-1)
         options: dict[str, Any] = {"generator": generator, "confidence": CONFIDENCE, "max_iterations": _trials(slots)}
         if quality is not None:
-            rows = [quality[index].to(dtype) for index in block.tolist()]
-            options["quality"] = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+            trusted = [quality[index].to(dtype) for index in block.tolist()]
+            options["quality"] = torch.nn.utils.rnn.pad_sequence(trusted, batch_first=True)
         epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, **options)
         F[block] = epipolar.model
         num_F[block] = epipolar.inliers.sum(-1) * (epipolar.status == Status.OK)
@@ -172,22 +214,15 @@ def verify_pairs(
             elif num_H[index] >= MIN_INLIERS:
                 kept[index] = matches[index][planar_inliers[row, : len(matches[index])]]
     verified = sorted(kept)
-    edges = [kept[index] + offset[pairs[index]] for index in verified]
-    sizes = torch.tensor([len(e) for e in edges], dtype=torch.long)
-    return ViewGraph(
-        names=tuple(names),
-        image_size=image_size,
-        x=torch.cat(list(x)) if x else torch.zeros(0, 2, dtype=dtype),
-        view=torch.arange(len(x)).repeat_interleave(offset.diff()),
-        color=torch.cat(list(color)) if color else torch.zeros(0, 3, dtype=dtype),
-        pairs=pairs,
+    rows = [kept[index] for index in verified]
+    return VerifiedPairs(
         num_matches=counts,
         F=F,
         H=H,
         fundamental_inliers=num_F,
         homography_inliers=num_H,
-        match=torch.cat(edges) if edges else torch.zeros(0, 2, dtype=torch.long),
-        match_pair=torch.tensor(verified, dtype=torch.long).repeat_interleave(sizes),
+        match=torch.cat(rows) if rows else torch.zeros(0, 2, dtype=torch.long),
+        match_pair=torch.tensor(verified, dtype=torch.long).repeat_interleave(torch.tensor([len(m) for m in rows]).long()),
     )
 
 
@@ -250,13 +285,6 @@ def graph_from_tracks(
     for i, j in pairs.tolist():
         both = (node[i] >= 0) & (node[j] >= 0)
         matches.append(torch.stack([node[i][both] - start[i], node[j][both] - start[j]], 1))
-    graph = verify_pairs(
-        names,
-        image_size,
-        list(torch.split(x, counts.tolist())),
-        list(torch.split(color, counts.tolist())),
-        pairs,
-        matches,
-        generator=generator,
-    )
-    return graph, track
+    points, colors = torch.split(x, counts.tolist()), torch.split(color, counts.tolist())
+    verified = verify_pairs(image_size, points, pairs, matches, generator=generator)
+    return verified.graph(names, image_size, points, colors, pairs), track

@@ -1,0 +1,158 @@
+"""Which photographs to compare, their matches, and what epipolar geometry says of these: shard by shard."""
+
+import hashlib
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from torchsfm.images import match_features, retrieve_pairs
+from torchsfm.reconstruction.image_points import SHARDS, ImagePoints
+from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.report import Progress
+from torchsfm.reconstruction.sequence import Corners, sequence_pairs, track_corners
+from torchsfm.reconstruction.stages import Arrays, Stages, one_thread
+from torchsfm.reconstruction.view_graph import VerifiedPairs, ViewGraph, verify_pairs
+
+MAX_IMAGES_ALL_PAIRS = 80
+"""Up to this many images every pair is matched; beyond it, each image with those that look most alike."""
+NEAR_IMAGES = 16
+"""Pairs of one block of so many by so many images are matched one after the other, and so need few images at a time."""
+MATCHED_AT_ONCE = 128
+"""Pairs whose images are in the memory together."""
+VERIFIED_AT_ONCE = 4096
+"""Pairs of a shard of verification, which gains from large batches."""
+
+
+@dataclass(frozen=True)
+class PairShards:
+    """How pairs of images are divided into shards: runs of them for verification, and parts of these for matching.
+
+    Where they are divided depends on the pairs alone, never on how many processes there are. Pairs of the same images are
+    matched together.
+    """
+
+    order: Int[Tensor, "q"]
+    """The pairs in the order in which they are matched; the same as theirs from run to run."""
+    size: int
+    """Pairs of a shard of matching, which divides that of verification."""
+    digest: str
+
+    @classmethod
+    def of(cls, pairs: Int[Tensor, "q 2"]) -> "PairShards":
+        """Divide pairs."""
+        block = torch.div(pairs, NEAR_IMAGES, rounding_mode="floor")
+        key = torch.arange(len(pairs)) // VERIFIED_AT_ONCE
+        for column in (block[:, 0], block[:, 1]):
+            key = key * (int(block.max()) + 1 if len(block) else 1) + column
+        size = 64
+        while size < VERIFIED_AT_ONCE // 8 and size * SHARDS < len(pairs):
+            size *= 2
+        digest = hashlib.sha256(pairs.numpy().tobytes()).hexdigest()[:32]
+        return cls(torch.argsort(key, stable=True), size, digest)
+
+    @property
+    def match_shards(self) -> int:
+        """How many there are for matching."""
+        return math.ceil(len(self.order) / self.size)
+
+    @property
+    def verify_shards(self) -> int:
+        """How many there are for verification."""
+        return max(1, math.ceil(len(self.order) / VERIFIED_AT_ONCE))
+
+    def matched(self, shard: int) -> Int[Tensor, "_"]:
+        """The pairs of a shard of matching."""
+        return self.order[self.size * shard : self.size * (shard + 1)]
+
+    def verified(self, shard: int) -> slice:
+        """The pairs of a shard of verification."""
+        return slice(VERIFIED_AT_ONCE * shard, VERIFIED_AT_ONCE * (shard + 1))
+
+    def match_shards_of(self, shard: int) -> range:
+        """The shards of matching that have the pairs of a shard of verification, and no others."""
+        each = VERIFIED_AT_ONCE // self.size
+        return range(each * shard, min(each * (shard + 1), self.match_shards))
+
+
+def match_all(
+    points: ImagePoints,
+    stages: Stages,
+    progress: Progress,
+    seed: int,
+    *,
+    sequence: bool,
+    neighbours: int,
+    max_pixels: int,
+    masks: Masks | None,
+) -> ViewGraph:
+    """Matches of all pairs worth comparing, verified.
+
+    Args:
+        points: The photographs and their features.
+        stages: Where finished shards are saved.
+        progress: Called as the work goes on.
+        seed: Of the choice of samples.
+        sequence: Whether the photographs are frames of a video.
+        neighbours: Images each one is matched with where there are many.
+        max_pixels: Larger frames cannot be read.
+        masks: Where frames show nothing to track.
+    """
+    features = points.features
+
+    def choose() -> Arrays:
+        if sequence:
+            return {"pairs": sequence_pairs(features)}
+        if len(features) <= MAX_IMAGES_ALL_PAIRS:
+            return {"pairs": torch.combinations(torch.arange(len(features)))}
+        return {"pairs": retrieve_pairs(features, neighbours=neighbours)}
+
+    pairs = stages.run("pairs", choose)["pairs"]
+    work = PairShards.of(pairs)
+    told = 0
+
+    def match(shard: int) -> Arrays:
+        nonlocal told
+        chosen, rows = pairs[work.matched(shard)], list[Tensor]()
+        for some in torch.split(chosen, MATCHED_AT_ONCE):
+            progress("match", told, len(pairs))
+            # Only what these pairs need is read.
+            images, local = torch.unique(some, return_inverse=True)
+            rows += match_features([features[i] for i in images.tolist()], local)
+            told += len(some)
+        progress("match", told, len(pairs))
+        return {"count": torch.tensor([len(m) for m in rows]).long(), "match": torch.cat(rows)}
+
+    matched = stages.shards("match", work.match_shards, match, after=work.digest)
+    x, color, corners = points.x, points.color, None
+    if sequence:
+        found = stages.run("track", lambda: track_corners(points, max_pixels, progress, masks))
+        corners = Corners.of(found, len(points.names))
+        x = tuple(torch.cat(both) for both in zip(points.x, corners.x, strict=True))
+        color = tuple(torch.cat(both) for both in zip(points.color, corners.color, strict=True))
+    x = tuple(a.double() for a in x)
+
+    def verify(shard: int) -> Arrays:
+        progress("verify", work.verified(shard).start, len(pairs))
+        matches: dict[int, Tensor] = {}
+        for number in work.match_shards_of(shard):
+            saved = matched[number]
+            matches |= zip(work.matched(number).tolist(), torch.split(saved["match"], saved["count"].tolist()), strict=True)
+        if corners is not None:
+            for q in matches:
+                i, j = pairs[q].tolist()
+                before = torch.tensor([len(points.x[i]), len(points.x[j])])
+                matches[q] = torch.cat([matches[q], before + corners.matches(i, j)])
+        chosen = work.verified(shard)
+        some = [matches[q] for q in range(len(pairs))[chosen]]
+        # What a pair gets depends on the seed and the pair alone.
+        found = verify_pairs(points.image_size, x, pairs[chosen], some, generator=torch.Generator().manual_seed(seed))
+        progress("verify", min(chosen.stop, len(pairs)), len(pairs))
+        return {field.name: getattr(found, field.name) for field in fields(found)}
+
+    with one_thread():
+        shards = stages.shards("verify", work.verify_shards, verify, after=f"{work.digest} {seed}")
+    verified = VerifiedPairs.join([VerifiedPairs(**shard) for shard in shards])
+    return verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
