@@ -1,3 +1,5 @@
+import weakref
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -5,7 +7,7 @@ import torch
 from chance import seeded
 from torch import Tensor
 
-from torchsfm.images import Features, describe_images, detect_features, list_images, read_image, retrieve_pairs
+from torchsfm.images import Features, describe_images, detect_features, list_images, read_image, retrieval, retrieve_pairs
 
 
 def scene_features(scenes: int, views: int, generator: torch.Generator, points: int = 200) -> list[Features]:
@@ -85,3 +87,55 @@ def test_two_places_are_told_apart(data: Path) -> None:
     features = [detect_features(read_image(path, gray=True, max_size=640), 1500) for path in paths]
     place = retrieve_pairs(features, 3) // 7
     assert float((place[:, 0] == place[:, 1]).float().mean()) > 0.95
+
+
+@pytest.mark.parametrize("entries", [1, 700, 2**22])
+def test_partners_are_those_of_the_whole_table(
+    entries: int, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many similarities are computed at once; among images equally alike the first ones are taken."""
+    monkeypatch.setattr(retrieval, "SIMILARITIES", entries)
+    features = scene_features(5, 6, generator)
+    # Integers, so that many products are equal.
+    rows = torch.randint(-3, 4, (40, 6), generator=generator).float()
+    for count in (1, 5, 39):
+        similarity = (rows @ rows.mT).fill_diagonal_(-torch.inf)
+        expected = similarity.argsort(dim=1, descending=True, stable=True)[:, :count].sort(1).values
+        assert torch.equal(retrieval._most_alike(rows, count), expected)
+    described = describe_images(features, words=8)
+    similarity = (described @ described.mT).fill_diagonal_(-torch.inf)
+    partners = similarity.argsort(dim=1, descending=True, stable=True)[:, :4]
+    wanted = {(min(i, j), max(i, j)) for i, row in enumerate(partners.tolist()) for j in row}
+    assert {tuple(pair) for pair in retrieve_pairs(features, 4, words=8).tolist()} == wanted
+
+
+class OneAtATime(Sequence[Features]):
+    """Features that are made when they are asked for and counted while anybody has them."""
+
+    def __init__(self, count: int, scenes: int) -> None:
+        self.count, self.scenes, self.there, self.most = count, scenes, 0, 0
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, number: int) -> Features:  # type: ignore[override]
+        if number >= self.count:
+            raise IndexError(number)
+        scene = seeded(number % self.scenes + 1)
+        world = torch.rand(40, 16, generator=scene).pow(4)
+        made = features_of(world + 0.02 * torch.rand(40, 16, generator=seeded(number + 1000)))
+        self.there += 1
+        self.most = max(self.most, self.there)
+        weakref.finalize(made, self.leave)
+        return made
+
+    def leave(self) -> None:
+        self.there -= 1
+
+
+def test_features_need_not_be_in_the_memory_together() -> None:
+    """Of more images than give descriptors for the words, too."""
+    features = OneAtATime(180, 36)
+    pairs = retrieve_pairs(features, 4, words=8)
+    assert features.most <= 3
+    assert float((pairs[:, 0] % 36 == pairs[:, 1] % 36).double().mean()) > 0.9

@@ -69,7 +69,6 @@ def test_a_full_disk_leaves_the_old_files_and_nothing_else(tmp_path: Path) -> No
 def test_a_model_or_stage_on_a_full_disk_leaves_the_old_one(tmp_path: Path) -> None:
     model = make()
     model.save(tmp_path / "model.npz")
-
     Stages(tmp_path, False, "x").run("a", lambda: {"values": torch.zeros(3)})
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.npz")}
     larger = replace(model, X=torch.rand(30, 3, dtype=torch.float64))

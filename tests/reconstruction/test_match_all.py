@@ -1,0 +1,89 @@
+"""Photographs compared shard by shard: how pairs are divided, and that division changes nothing."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from command_line import photograph
+
+from torchsfm.reconstruction import match_all
+from torchsfm.reconstruction.image_points import SavedFeatures
+from torchsfm.reconstruction.match_all import NEAR_IMAGES, VERIFIED_AT_ONCE, PairShards
+from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
+from torchsfm.reconstruction.view_graph import ViewGraph
+
+
+@pytest.fixture(scope="module")
+def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photograph(tmp_path_factory.mktemp("courtyard"))
+
+
+def matched(folder: Path, out: Path | None = None, **options: Any) -> MatchedPhotographs:
+    options = {"sequence": False, "seed": 3, "progress": lambda *_: None, "first": 0.0} | options
+    return match_photographs(
+        folder, max_features=600, max_pixels=10**7, neighbours=20, out=out, resume=True, masks=None, **options
+    )
+
+
+def same_graph(a: ViewGraph, b: ViewGraph) -> bool:
+    return a.names == b.names and all(
+        torch.equal(getattr(a, name), getattr(b, name)) for name in ViewGraph.__dataclass_fields__ if name != "names"
+    )
+
+
+@pytest.mark.parametrize("images", [2, 40, 90, 300])
+@pytest.mark.parametrize("share", [0.05, 1.0])
+def test_shards_divide_the_pairs(images: int, share: float, generator: torch.Generator) -> None:
+    pairs = torch.combinations(torch.arange(images))
+    pairs = pairs[torch.rand(len(pairs), generator=generator) < share]
+    work = PairShards.of(pairs)
+    assert sorted(work.order.tolist()) == list(range(len(pairs)))
+    seen, each = [], []
+    for shard in range(work.verify_shards):
+        own = [q for number in work.match_shards_of(shard) for q in work.matched(number).tolist()]
+        assert sorted(own) == list(range(len(pairs)))[work.verified(shard)]
+        seen += list(work.match_shards_of(shard))
+    assert seen == list(range(work.match_shards))
+    for number in seen:
+        own = work.matched(number)
+        assert 1 <= len(own) <= VERIFIED_AT_ONCE // 8
+        each.append(len(torch.unique(pairs[own])) / len(own))
+    if share == 1 and images > 4 * NEAR_IMAGES:
+        # All against all of two blocks of 16: 32 images for 256 pairs, where the order of the pairs themselves needs 65 for 64.
+        assert sum(each) / len(each) < 0.6
+
+
+def test_an_image_is_read_for_the_pairs_at_hand_alone(courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = matched(courtyard)
+    asked: list[int] = []
+    read = SavedFeatures.__getitem__
+    monkeypatch.setattr(SavedFeatures, "__getitem__", lambda features, i: (asked.append(i), read(features, i))[1])
+    monkeypatch.setattr(match_all, "MATCHED_AT_ONCE", 2)
+    few = matched(courtyard, tmp_path)
+    assert len(asked) <= 2 * len(few.graph.pairs)
+    assert same_graph(alone.graph, few.graph)
+    asked.clear()
+    again = matched(courtyard, tmp_path, first=0.5)
+    assert not asked, "what is saved is not matched again"
+    assert same_graph(alone.graph, again.graph)
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+def test_verification_in_parts_is_that_of_the_whole(
+    sequence: bool, courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the shards: a pair gets what the seed and its matches say, also with tracked corners."""
+    whole = matched(courtyard, sequence=sequence)
+    assert int(whole.graph.fundamental_inliers.sum()) > 500
+    monkeypatch.setattr(match_all, "VERIFIED_AT_ONCE", 4)
+    monkeypatch.setattr(PairShards, "of", classmethod(lambda cls, pairs: cls(torch.arange(len(pairs)), 2, "")))
+    parts = matched(courtyard, tmp_path, sequence=sequence)
+    assert len(list((tmp_path / "stages/verify").glob("*.npz"))) == 3
+    assert torch.equal(parts.graph.num_matches, whole.graph.num_matches)
+    # The least number of samples depends on the largest number of matches in a part.
+    inliers = parts.graph.fundamental_inliers.sum() / whole.graph.fundamental_inliers.sum()
+    assert 0.97 < float(inliers) < 1.03
+    assert torch.equal(parts.graph.x, whole.graph.x)
+    other = matched(courtyard, tmp_path, sequence=sequence, seed=4)
+    assert not torch.equal(other.graph.F, parts.graph.F)

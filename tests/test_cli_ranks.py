@@ -1,0 +1,135 @@
+"""The command started several times at once."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch.distributed
+from chance import stream_seed
+from command_line import copies, photograph, same_model, torchsfm
+
+from torchsfm.cli.ranks import Started
+from torchsfm.reconstruction.stages import saved_stages
+
+KILLS = 20
+LAUNCHED = {"RANK": "1", "WORLD_SIZE": "3", "MASTER_ADDR": "localhost", "MASTER_PORT": "29500"}
+
+
+@pytest.fixture(scope="module")
+def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photograph(tmp_path_factory.mktemp("courtyard"))
+
+
+def test_what_the_environment_says() -> None:
+    assert Started.by({}) == Started()
+    assert Started.by(LAUNCHED) == Started(1, 3, again=False)
+    assert Started.by(LAUNCHED | {"TORCHELASTIC_RESTART_COUNT": "2"}) == Started(1, 3, again=True)
+    assert Started.by({"RANK": "1", "WORLD_SIZE": "3"}) == Started(), "of a batch system, without a place to meet"
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_one_alone_meets_nobody(resume: bool, tmp_path: Path) -> None:
+    assert Started().begin(tmp_path, resume) is resume
+
+
+@pytest.mark.parametrize(
+    ("rank", "again", "resume", "kept"),
+    [(0, False, False, False), (0, True, False, True), (0, False, True, True), (1, False, False, True)],
+)
+def test_the_first_removes_what_is_of_no_use(
+    rank: int, again: bool, resume: bool, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("init_process_group", "barrier", "destroy_process_group"):
+        monkeypatch.setattr(torch.distributed, name, lambda *_: None)
+    (tmp_path / "stages/match").mkdir(parents=True)
+    (tmp_path / "stages/match/000000.npz").write_bytes(b"")
+    (tmp_path / "stages/features.npz").write_bytes(b"of an earlier version")
+    assert Started(rank, 2, again).begin(tmp_path, resume)
+    assert (saved_stages(tmp_path) == ["match"]) == kept
+    assert (tmp_path / "stages/features.npz").exists() == kept
+
+
+def test_a_helper_makes_the_stages_and_leaves_the_rest(
+    courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One process after the other: the second does everything but the model, the first has nothing else left to do."""
+    images = copies(courtyard, tmp_path / "images", "view0.png", "view1.png", "view2.png")
+    words = ("reconstruct", images, "--max-features", 600, "--seed", 2)
+    assert torchsfm(*words, "--out", tmp_path / "alone")[0] == 0
+    with monkeypatch.context() as patched:
+        patched.setattr(Started, "begin", lambda started, folder, resume: True)
+        patched.setattr(Started, "by", classmethod(lambda cls: cls(1, 2)))
+        assert torchsfm(*words, "--out", tmp_path / "out") == (0, "", "")
+    assert saved_stages(tmp_path / "out") == ["features", "match", "pairs", "verify"]
+    assert not (tmp_path / "out/model.npz").exists()
+    status, _, stderr = torchsfm(*words, "--out", tmp_path / "out", "--resume")
+    assert status == 0
+    assert [line for line in stderr.splitlines() if "..." in line] == ["building the model ...", "writing results ..."]
+    assert same_model(tmp_path / "alone/model.npz", tmp_path / "out/model.npz")
+
+
+# ---- torchrun ------------------------------------------------------------------------------------------------------------
+
+
+def launch(count: int, *words: object) -> "subprocess.Popen[bytes]":
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", count, "--max-restarts", 3, "-m", "torchsfm"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen([str(word) for word in (*command, *words)], stdout=quiet, stderr=quiet, env=environment)
+
+
+def workers(process: "subprocess.Popen[bytes]") -> list[int]:
+    """The processes that torchrun has started."""
+    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True)
+    return [int(line) for line in listed.stdout.split()]
+
+
+def shards(out: Path) -> dict[str, tuple[int, int]]:
+    """What is saved, and when it was made."""
+    found = {path: path.stat() for path in out.glob("stages/*/*.npz")}
+    return {path.relative_to(out).as_posix(): (stat.st_ino, stat.st_mtime_ns) for path, stat in found.items()}
+
+
+@pytest.mark.slow
+def test_ranks_killed_at_any_moment(courtyard: Path, tmp_path: Path) -> None:
+    """In whatever stage a rank is killed the run ends with the same model, and what was saved is not made again."""
+    words, chance = ("reconstruct", courtyard, "--max-features", 600), random.Random(stream_seed())
+    assert torchsfm(*words, "--out", tmp_path / "alone")[0] == 0
+    last = {"features": 1, "pairs": 5, "match": 6, "verify": 7, "map": 8}
+    for k in range(KILLS):
+        out = tmp_path / str(k)
+        with launch(2, *words, "--out", out) as process:
+            wanted = list(last.values())[k % len(last)]
+            while len(shards(out)) < wanted and process.poll() is None:
+                time.sleep(0.01)
+            time.sleep(chance.uniform(0, 0.3))
+            before = shards(out)
+            alive = workers(process)
+            if alive:
+                os.kill(chance.choice(alive), signal.SIGKILL)
+            assert process.wait() == 0
+        after = shards(out)
+        assert {name: after[name] for name in before} == before
+        assert same_model(tmp_path / "alone/model.npz", out / "model.npz")
+        assert not [path for path in out.rglob(".*") if path.name != ".lock"]
+
+
+@pytest.mark.slow
+def test_begun_with_two_and_finished_with_three(courtyard: Path, tmp_path: Path) -> None:
+    words = ("reconstruct", courtyard, "--max-features", 600, "--out", tmp_path / "out")
+    with launch(2, *words) as process:
+        while len(shards(tmp_path / "out")) < 3 and process.poll() is None:
+            time.sleep(0.01)
+        process.terminate()
+    before = shards(tmp_path / "out")
+    with launch(3, *words, "--resume") as process:
+        assert process.wait() == 0
+    after = shards(tmp_path / "out")
+    assert {name: after[name] for name in before} == before
+    assert torchsfm(*words[:-1], tmp_path / "alone")[0] == 0
+    assert same_model(tmp_path / "alone/model.npz", tmp_path / "out/model.npz")
