@@ -132,11 +132,13 @@ def recall(views: int) -> Row:
 
 def bundle(ranks: int) -> list[Row]:
     """A bundle of 200 cameras over processes: what each of them takes."""
+    from torchsfm._types import tensor_map
     from torchsfm.simulation import random_bundle_problem
 
     with tempfile.TemporaryDirectory() as folder:
         simulated = random_bundle_problem(200, 120_000, 600_000, generator=torch.Generator().manual_seed(0))
-        torch.save(simulated.problem, Path(folder) / "problem")
+        # Views of larger tensors would be saved with all of these.
+        torch.save(tensor_map(torch.clone, simulated.problem), Path(folder) / "problem")
         words = [sys.executable, "-m", "bench.scale", "bundle", "--worker", folder]
         group = [
             subprocess.Popen(words, env=os.environ | {"RANK": str(rank), "WORLD_SIZE": str(ranks)}, stdout=subprocess.PIPE)
