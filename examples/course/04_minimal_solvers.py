@@ -98,7 +98,7 @@ print(f"fifty problems: as many solutions as by hand, and the same but for {wors
 fig, axes = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
 angle = torch.linspace(0, math.pi, 400)
 for ax, number in zip(axes, (1, 3), strict=True):
-    i = int((library.valid.sum(-1) == number).nonzero()[2])
+    i = int((library.valid.sum(-1) == number).nonzero()[8])
     F1, F2 = null_by_svd(epipolar_rows(x1[i], x2[i])).unflatten(-1, (3, 3))
     value = torch.linalg.det(angle.cos()[:, None, None] * F1 + angle.sin()[:, None, None] * F2)
     ax.plot(angle, value / value.abs().max())
