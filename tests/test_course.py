@@ -53,6 +53,15 @@ TRUTHS: dict[str, list[tuple[str, float, float]]] = {
         (r"those that agree: median point off by ([\d.]+)", 0, 0.02),
         (r"in the end: second camera off by ([\d.]+) degrees", 0, 0.5),
     ],
+    "07_resection.py": [
+        (r"camera_pnp: rotation off by [\d.]+ degrees in relief, ([\d.]+)", 0, 1),
+        (r"derivative against finite differences: ([\d.e+-]+)", 0, 1e-5),
+        (r"80 px +camera_pnp .* ([\d.]+)%\n", 0, 0),
+        (r"80 px +DLT .* ([\d.]+)%\n", 30, 60),
+        (r"camera_pnp: pose error .* to ([\d.]+) at the end", 0, 0.2),
+        (r"camera_pnp: pose error .* at first, (\d+) at the end", 0, 70),
+        (r"DLT +: pose error .* at first, (\d+) at the end", 100, 1e4),
+    ],
     "08_bundle_adjustment.py": [
         (r"the steps differ by ([\d.e+-]+)", 0, 1e-6),
         (r"after \d+ steps: ([\d.]+) px", 0.38, 0.45),
