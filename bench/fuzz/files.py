@@ -29,6 +29,7 @@ from torchsfm.formats import (
     VggScene,
     read_bal,
     read_colmap,
+    read_conics,
     read_database,
     read_libmv,
     read_lines,
