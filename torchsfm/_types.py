@@ -18,7 +18,17 @@ T = TypeVar("T")
 
 
 class Status(IntEnum):
-    """What became of one element of a batch; result objects hold it as an int8 tensor over the batch."""
+    """What became of one element of a batch; result objects hold it as an int8 tensor over the batch.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(3, generator=g), torchsfm.random_poses(2, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, X)
+        >>> x[:, 1] = torch.nan  # spoils the second point, and no other
+        >>> [torchsfm.Status(status).name for status in torchsfm.triangulate_points(x, P).status.tolist()]
+        ['OK', 'NOT_FINITE', 'OK']
+    """
 
     OK = 0
     NOT_CONVERGED = 1
@@ -43,6 +53,13 @@ class Solutions(Generic[M]):
 
     `model` holds every slot of every problem, slots right after the batch dimensions; empty slots hold finite numbers without
     meaning. `valid` is the only truth about which slots are solutions.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> d = torch.rand(8, 5, 3, generator=torch.Generator().manual_seed(0))  # eight problems
+        >>> E = torchsfm.motion.essential_5pt(d, d.flip(-1))  # ten slots each
+        >>> E.model.shape, E.valid.shape, E.model[E.valid].shape[1:]
+        (torch.Size([8, 10, 3, 3]), torch.Size([8, 10]), torch.Size([3, 3]))
     """
 
     model: M

@@ -27,6 +27,8 @@ class BoardPoints:
 
     On the board x turns to y as it does in the image: none is seen from behind. A pattern that looks the same when it is turned
     may be numbered from another of its ends.
+
+    See the example of `detect_chessboard`.
     """
 
     x: Float[Tensor, "*batch n 2"]
@@ -47,6 +49,16 @@ def detect_chessboard(image: Float[Tensor, "*batch c h w"], columns: int, rows: 
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> centre = torch.tensor([2.0, 1.5, -6.0], dtype=torch.float64)  # before the middle of the board
+        >>> poses = torchsfm.Pose(torch.eye(3, dtype=centre.dtype)[None], -centre[None])
+        >>> camera = torchsfm.Camera(torchsfm.intrinsics(torch.tensor(300.0), torch.tensor([149.5, 112.0])).double())
+        >>> image = torchsfm.simulation.render_board(poses, camera, 5, 4, width=300, height=225)
+        >>> found = torchsfm.images.detect_chessboard(image, 5, 4)
+        >>> found.found, found.x.shape
+        (tensor([True]), torch.Size([1, 20, 2]))
     """
     import cv2
 
@@ -88,6 +100,16 @@ def detect_circles_grid(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> centre = torch.tensor([2.0, 1.5, -6.0], dtype=torch.float64)  # before the middle of the board
+        >>> poses = torchsfm.Pose(torch.eye(3, dtype=centre.dtype)[None], -centre[None])
+        >>> camera = torchsfm.Camera(torchsfm.intrinsics(torch.tensor(300.0), torch.tensor([149.5, 112.0])).double())
+        >>> image = torchsfm.simulation.render_board(poses, camera, 5, 4, radius=0.3, width=300, height=225)
+        >>> found = torchsfm.images.detect_circles_grid(image, 5, 4)
+        >>> found.found, found.x.shape
+        (tensor([True]), torch.Size([1, 20, 2]))
     """
     check_options(ratio=(ratio, "?0 < float < 1"), max_ellipses=(max_ellipses, "int >= 1"))
     batch, flat = _gray(image, columns, rows, 2)

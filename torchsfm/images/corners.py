@@ -14,7 +14,10 @@ _SOBEL = ((-0.125, 0.0, 0.125), (-0.25, 0.0, 0.25), (-0.125, 0.0, 0.125))
 
 @dataclass(frozen=True)
 class Corners:
-    """Corners of images, in slots of which `valid` ones hold a corner, strongest first."""
+    """Corners of images, in slots of which `valid` ones hold a corner, strongest first.
+
+    See the example of `detect_corners`.
+    """
 
     x: Float[Tensor, "*batch n 2"]
     """Pixel positions; (0, 0) is the centre of the top-left pixel, and what empty slots hold."""
@@ -54,6 +57,14 @@ def detect_corners(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, 20:40, 30:50] = 1.0  # a square
+        >>> found = torchsfm.images.detect_corners(image)
+        >>> found.valid.sum(), found.x[found.valid].mean(0)
+        (tensor(4), tensor([39.5000, 29.5000]))
     """
     batch = check_tensors(image=(image, "c h>=8 w>=8"), mask=(mask, "?h w: bool"))
     check_options(

@@ -26,6 +26,8 @@ class Edges:
 
     Edge points of a chain are in consecutive slots, in order: the brighter side is to the left as seen on the screen. What
     empty slots hold is 0, their chain is -1.
+
+    See the example of `detect_edges`.
     """
 
     x: Float[Tensor, "*batch n 2"]
@@ -87,6 +89,14 @@ def detect_edges(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, :, 40:] = 1.0  # a step between the columns 39 and 40
+        >>> found = torchsfm.detect_edges(image)
+        >>> found.x[found.valid][:, 0].mean(), found.chain.max()  # one chain
+        (tensor(39.5000), tensor(0))
     """
     batch = check_tensors(image=(image, "c h>=8 w>=8"), mask=(mask, "?h w: bool"))
     check_options(

@@ -46,7 +46,10 @@ _SHARED = 0.5
 
 @dataclass(frozen=True)
 class Ellipses:
-    """Ellipses of images, in slots of which the first ones are `valid`, the most edge points first; zero in empty slots."""
+    """Ellipses of images, in slots of which the first ones are `valid`, the most edge points first; zero in empty slots.
+
+    See the example of `detect_ellipses`.
+    """
 
     ellipse: Ellipse
     """In pixels, batch (*batch, n)."""
@@ -106,6 +109,14 @@ def detect_ellipses(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> disc = torchsfm.Ellipse(torch.tensor([60.0, 45.0]), torch.tensor([30.0, 20.0]), torch.tensor(0.3))
+        >>> image = torchsfm.simulation.paint_shapes([disc], torch.tensor([0.2, 0.9]), width=120, height=90)
+        >>> found = torchsfm.detect_ellipses(image)
+        >>> found.valid.sum(), found.ellipse.semi_axes[0].round()
+        (tensor(1), tensor([30., 20.]))
     """
     check_options(
         max_ellipses=(max_ellipses, "int >= 1"), min_coverage=(min_coverage, "0 <= float <= 1"),

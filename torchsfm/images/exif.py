@@ -33,21 +33,32 @@ _FILM_DIAGONAL = math.hypot(36.0, 24.0)
 
 @dataclass(frozen=True)
 class Exif:
-    """The tags of one photograph; `None` and the empty string stand for absent or senseless values."""
+    """The tags of one photograph; `None` and the empty string stand for absent or senseless values.
+
+    Example:
+        >>> from torchsfm.images import Exif
+        >>> Exif(focal_35mm=24.0).focal(4000, 3000)  # pixels
+        2773.5009811261452
+    """
 
     orientation: int = 1
     """1 to 8: how the stored pixels are to be turned, as Exif numbers it."""
     make: str = ""
+    """Who made the camera."""
     model: str = ""
+    """What the maker calls it."""
     focal_mm: float | None = None
+    """The focal length of the lens, in millimetres."""
     focal_35mm: float | None = None
     """The focal length that gives the same diagonal angle of view on 36 mm x 24 mm film."""
     width: int | None = None
+    """The width the camera wrote, before a program scaled or cropped the image."""
     height: int | None = None
-    """The size the camera wrote, before a program scaled or cropped the image."""
+    """The height."""
     plane_x_resolution: float | None = None
+    """Pixels per millimetre on the sensor along x, for the size the camera wrote."""
     plane_y_resolution: float | None = None
-    """Pixels per millimetre on the sensor, for the size the camera wrote."""
+    """The same along y."""
 
     def focal(self, width: int, height: int) -> float | None:
         """The focal length in pixels of an image of the given stored size, or None where the tags do not tell.
@@ -72,7 +83,13 @@ class Exif:
 
 
 def parse_exif(data: bytes) -> Exif:
-    """The Exif tags in the bytes of an image file (JPEG, PNG, TIFF, WebP); an empty `Exif` where there are none."""
+    """The Exif tags in the bytes of an image file (JPEG, PNG, TIFF, WebP); an empty `Exif` where there are none.
+
+    Example:
+        >>> import torchsfm
+        >>> torchsfm.images.parse_exif(b"no picture").focal_mm is None
+        True
+    """
     block = _find_block(data)
     tags = read_tags(block) if block is not None else {}
 

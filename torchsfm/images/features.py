@@ -21,7 +21,10 @@ _CELLS = 24
 
 @dataclass(frozen=True)
 class Features:
-    """Points of one image, each with a description of what is around it."""
+    """Points of one image, each with a description of what is around it.
+
+    See the example of `detect_features`.
+    """
 
     x: Float[Tensor, "n 2"]
     """Pixel positions; the centre of the top-left pixel is (0, 0)."""
@@ -75,6 +78,14 @@ def detect_features(
 
     Raises:
         ValueError: The shape of the image or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> found = torchsfm.detect_features(image)
+        >>> len(found.x) > 20, found.descriptors.shape[1]
+        (True, 128)
     """
     import cv2
 

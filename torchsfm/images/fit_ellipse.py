@@ -26,7 +26,10 @@ _RANK = 1e-12
 
 @dataclass(frozen=True)
 class EllipseFit:
-    """Ellipses and what is known about them."""
+    """Ellipses and what is known about them.
+
+    See the example of `fit_ellipse`.
+    """
 
     model: Ellipse
     """The ellipses, finite always; where `status` is not OK they may mean little."""
@@ -68,6 +71,13 @@ def fit_ellipse(
 
     Raises:
         ValueError: Shapes, dtypes or devices do not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> truth = torchsfm.Ellipse(torch.tensor([5.0, 1.0]), torch.tensor([3.0, 2.0]), torch.tensor(0.5))
+        >>> found = torchsfm.fit_ellipse(truth.points(torch.linspace(0, 6, 20)))
+        >>> found.model.centre, found.model.semi_axes
+        (tensor([5.0000, 1.0000]), tensor([3.0000, 2.0000]))
     """
     batch = check_tensors(x=(x, "n 2"), weights=(weights, "?n"), mask=(mask, "?n: bool"))
     check_options(max_iterations=(max_iterations, "int >= 0"))

@@ -25,7 +25,10 @@ _APART = (math.radians(0.5), 1.0)
 
 @dataclass(frozen=True)
 class HoughLines:
-    """Straight lines of images in slots, those with most edge points first; zero in empty slots."""
+    """Straight lines of images in slots, those with most edge points first; zero in empty slots.
+
+    See the example of `hough_lines`.
+    """
 
     line: Float[Tensor, "*batch n 3"]
     """Lines with a normal of length 1."""
@@ -36,6 +39,7 @@ class HoughLines:
     scatter: Float[Tensor, "*batch n"]
     """Their root-mean-square distance from it, in pixels."""
     valid: Bool[Tensor, "*batch n"]
+    """Which slots hold a line."""
 
 
 def hough_lines(
@@ -72,6 +76,14 @@ def hough_lines(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, 30:] = 1.0  # a step between the rows 29 and 30
+        >>> found = torchsfm.images.hough_lines(image)
+        >>> found.valid.sum(), found.line[0].abs()  # y = 29.5
+        (tensor(1), tensor([ 0.0000,  1.0000, 29.5000]))
     """
     check_options(max_lines=(max_lines, "int >= 1"), min_count=(min_count, "int >= 3"), max_gap=(max_gap, "float > 0"))
     edges = detect_edges(image, blur=blur, low=low, high=high, noise=noise, mask=mask)

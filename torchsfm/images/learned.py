@@ -25,10 +25,15 @@ MatcherName = Literal["disk", "dedode-b", "dedode-g", "sift"]
 
 @dataclass(frozen=True)
 class LearnedDetector:
-    """A network that finds and describes points; made by `load_detector`, called like `detect_features`."""
+    """A network that finds and describes points; made by `load_detector`, called like `detect_features`.
+
+    See the example of `load_detector`.
+    """
 
     name: str
+    """Of the network, as `load_detector` knows it."""
     network: torch.nn.Module
+    """The network with its weights."""
 
     def __call__(
         self, image: Photograph | Float[Tensor, "c h w"], max_features: int = 8192, *, max_size: int = 1600
@@ -73,10 +78,15 @@ class LearnedDetector:
 
 @dataclass(frozen=True)
 class LearnedMatcher:
-    """A network that matches the points of two images; made by `load_matcher`."""
+    """A network that matches the points of two images; made by `load_matcher`.
+
+    See the example of `load_matcher`.
+    """
 
     name: str
+    """Of the detector whose points it matches."""
     network: Any
+    """The network with its weights."""
 
     def __call__(
         self, features1: Features, features2: Features, size1: tuple[int, int], size2: tuple[int, int]
@@ -138,6 +148,11 @@ def load_detector(
 
     Raises:
         ValueError: An unknown name, or a file that is missing, unreadable or of another network.
+
+    Example:
+        >>> import torchsfm
+        >>> detector = torchsfm.images.load_detector("disk", "depth-save.pth")  # doctest: +SKIP
+        >>> features = detector(torchsfm.read_image("view.jpg"))  # doctest: +SKIP
     """
     from kornia import feature
 
@@ -179,6 +194,11 @@ def load_matcher(
 
     Raises:
         ValueError: An unknown name, or a file that is missing, unreadable or of another network.
+
+    Example:
+        >>> import torchsfm
+        >>> matcher = torchsfm.images.load_matcher("disk", "disk_lightglue.pth")  # doctest: +SKIP
+        >>> matches = matcher(features1, features2, (1600, 1200), (1600, 1200))  # doctest: +SKIP
     """
     from kornia.feature import LightGlue
 

@@ -31,6 +31,13 @@ def list_images(folder: str | os.PathLike[str]) -> list[Path]:
 
     Raises:
         ImageError: There is no such folder, or it cannot be read.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> for name in ("view10.png", "view2.png"):
+        ...     torchsfm.images.save_image(name, torch.rand(3, 4, 5))
+        >>> [path.name for path in torchsfm.list_images(".")]
+        ['view2.png', 'view10.png']
     """
     return [path for path in _entries(folder) if path.suffix.lower() in SUFFIXES and path.is_file()]
 
@@ -43,6 +50,13 @@ def list_skipped(folder: str | os.PathLike[str]) -> list[tuple[Path, str]]:
 
     Raises:
         ImageError: There is no such folder, or it cannot be read.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import torchsfm
+        >>> Path("film.mp4").touch()
+        >>> [path.name for path, reason in torchsfm.images.list_skipped(".")]
+        ['film.mp4']
     """
     reasons = ((path, _reason(path)) for path in _entries(folder))
     return [(path, reason) for path, reason in reasons if reason]

@@ -52,6 +52,16 @@ def match_features(
 
     Raises:
         ValueError: As `match_descriptors`; or a pair names an image that is not there.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> features = [torchsfm.detect_features(image), torchsfm.detect_features(image[..., 10:])]  # ten columns cut off
+        >>> (match,) = torchsfm.match_features(features, torch.tensor([[0, 1]]))
+        >>> shift = features[0].x[match[:, 0]] - features[1].x[match[:, 1]]
+        >>> len(match) > 10, shift.median(0).values.round()
+        (True, tensor([10.,  0.]))
     """
     _check(ratio, mutual, max_distance)
     check_features(features)
@@ -97,6 +107,14 @@ def match_descriptors(
 
     Raises:
         ValueError: Descriptors of two lengths or two precisions, or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> d1 = torch.eye(5)
+        >>> torchsfm.images.match_descriptors(d1, d1[[2, 0, 4]])
+        tensor([[0, 1],
+                [2, 0],
+                [4, 2]])
     """
     _check(ratio, mutual, max_distance)
     for name, descriptors in (("descriptors1", descriptors1), ("descriptors2", descriptors2)):

@@ -37,12 +37,23 @@ _TURNS: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
 
 
 class ImageError(ValueError):
-    """A file could not be read as an image; the message is one line that names the file and the reason."""
+    """A file could not be read as an image; the message is one line that names the file and the reason.
+
+    Example:
+        >>> import torchsfm
+        >>> torchsfm.read_image("nothing.jpg")
+        Traceback (most recent call last):
+            ...
+        torchsfm.images.reading.ImageError: nothing.jpg: no such file
+    """
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """An image with what its file says of the camera."""
+    """An image with what its file says of the camera.
+
+    See the example of `read_image`.
+    """
 
     pixels: Float[Tensor, "c h w"]
     """Values in [0, 1], upright; three channels red, green, blue, or one channel grey."""
@@ -95,6 +106,13 @@ def read_image(
     Raises:
         ImageError: The file is missing, unreadable, empty, cut short, too large, or no image.
         ValueError: `max_size` or `max_pixels` is not positive.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.images.save_image("view.png", torch.rand(3, 48, 64))
+        >>> photograph = torchsfm.read_image("view.png", max_size=32)
+        >>> photograph.pixels.shape, photograph.size, photograph.focal
+        (torch.Size([3, 24, 32]), (64, 48), None)
     """
     for name, value in (("max_size", max_size), ("max_pixels", max_pixels)):
         if value is not None and value < 1:
@@ -138,6 +156,12 @@ def save_image(
     Raises:
         ValueError: The shape or an option is wrong.
         ImageError: The file cannot be written.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.images.save_image("grey.png", torch.rand(48, 64), bits=16)
+        >>> torchsfm.read_image("grey.png", gray=True).pixels.shape
+        torch.Size([1, 48, 64])
     """
     import cv2
 
@@ -180,6 +204,12 @@ def scale_image(image: Float[Tensor, "*batch h w"], *, low: float | None = None,
 
     Returns:
         Images in [0, 1]. An image of one value, or of `low >= high`, becomes 0 everywhere.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.images.scale_image(torch.tensor([[2.0, 3.0], [4.0, 6.0]]))
+        tensor([[0.0000, 0.2500],
+                [0.5000, 1.0000]])
     """
     check_tensors(image=(image, "h>=1 w>=1"))
     check_options(low=(low, "?float"), high=(high, "?float"))

@@ -40,6 +40,13 @@ def retrieve_pairs(
 
     Raises:
         ValueError: `neighbours` or `words` is not positive.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> images = torch.rand(4, 1, 60, 80, generator=torch.Generator().manual_seed(0))
+        >>> features = [torchsfm.detect_features(image) for image in images]
+        >>> torchsfm.images.retrieve_pairs(features, neighbours=20).shape  # few images: all pairs
+        torch.Size([6, 2])
     """
     check_features(features)
     check_options(neighbours=(neighbours, "int >= 1"), words=(words, "int >= 1"))
@@ -83,6 +90,13 @@ def describe_images(
 
     Returns:
         One row for each image; zeros for an image without features.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> images = torch.rand(3, 1, 60, 80, generator=torch.Generator().manual_seed(0))
+        >>> d = torchsfm.images.describe_images([torchsfm.detect_features(image) for image in images], words=8)
+        >>> d.shape, (d @ d.mT).diagonal()
+        (torch.Size([3, 1024]), tensor([1.0000, 1.0000, 1.0000]))
     """
     check_features(features)
     check_options(words=(words, "int >= 1"))

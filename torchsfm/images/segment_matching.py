@@ -29,6 +29,14 @@ def describe_segments(image: Float[Tensor, "c h w"], ends: Float[Tensor, "n 2 2"
 
     Raises:
         ValueError: A shape is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, 20:40, 30:60] = 1.0  # a rectangle
+        >>> d = torchsfm.images.describe_segments(image, torchsfm.detect_segments(image, 4).ends)
+        >>> d.norm(dim=-1)
+        tensor([1.0000, 1.0000, 1.0000, 1.0000])
     """
     check_tensors(image=(image, "c h>=8 w>=8"), ends=(ends, "n 2 2"))
     gray = to_gray(image)
@@ -84,6 +92,16 @@ def match_segments(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, 20:40, 30:60] = torch.linspace(0.3, 1.0, 30)  # a rectangle, brighter to the right
+        >>> segments, moved = torchsfm.detect_segments(image, 4), torchsfm.detect_segments(image.roll(5, -1), 4)
+        >>> pairs, similarity = torchsfm.match_segments(segments, moved, image, image.roll(5, -1))
+        >>> shift = moved.ends[pairs[:, 1]] - segments.ends[pairs[:, 0]]
+        >>> len(pairs) >= 2, shift.mean((0, 1)).round()
+        (True, tensor([5., 0.]))
     """
     check_options(
         segments1=(segments1, Segments), segments2=(segments2, Segments), min_overlap=(min_overlap, "0 <= float <= 1"),

@@ -21,7 +21,10 @@ _BESIDE = 0.7
 
 @dataclass(frozen=True)
 class Segments:
-    """Line segments of images, in slots of which the first ones are `valid`, the longest first; zero in empty slots."""
+    """Line segments of images, in slots of which the first ones are `valid`, the longest first; zero in empty slots.
+
+    See the example of `detect_segments`.
+    """
 
     ends: Float[Tensor, "*batch n 2 2"]
     """End points in pixels; from the first to the second the brighter side is to the left, as seen on the screen."""
@@ -30,6 +33,7 @@ class Segments:
     support: Float[Tensor, "*batch n 2 2"]
     """The two points of the line that say where it is as all edge points do: their standard deviation from the middle away."""
     length: Float[Tensor, "*batch n"]
+    """Distance between the ends, in pixels."""
     count: Int[Tensor, "*batch n"]
     """Number of edge points."""
     scatter: Float[Tensor, "*batch n"]
@@ -87,6 +91,14 @@ def detect_segments(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, 20:40, 30:60] = 1.0  # a rectangle
+        >>> found = torchsfm.detect_segments(image)
+        >>> found.valid.sum(), found.length[0].round(decimals=-1)
+        (tensor(4), tensor(30.))
     """
     check_options(
         max_segments=(max_segments, "int >= 1"), min_length=(min_length, "float > 0"), tolerance=(tolerance, "float > 0")

@@ -17,23 +17,31 @@ from torchsfm.images.reading import Photograph, pixels_of
 
 @dataclass(frozen=True)
 class TrackedPoints:
-    """Where points of one image are in another."""
+    """Where points of one image are in another.
+
+    See the example of `track_points`.
+    """
 
     x: Float[Tensor, "*batch n 2"]
     """Pixel positions in the second image; where not valid, finite without meaning."""
     valid: Bool[Tensor, "*batch n"]
+    """Which points were found again."""
     error: Float[Tensor, "*batch n"]
     """Distance in pixels between the point and what tracking its image back gives; 0 where not valid."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points followed through frames: one row for each sighting, sorted by track, then frame."""
+    """Points followed through frames: one row for each sighting, sorted by track, then frame.
+
+    See the example of `track_sequence`.
+    """
 
     frame: Int[Tensor, " m"]
     track: Int[Tensor, " m"]
     """Numbers from 0 without gaps, in the order in which the tracks begin."""
     x: Float[Tensor, "m 2"]
+    """Pixel positions."""
 
     def __len__(self) -> int:
         """The number of tracks."""
@@ -69,6 +77,16 @@ def track_points(
 
     Raises:
         ValueError: A shape or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> x = torch.tensor([[80.0, 60.0], [40.0, 50.0]])
+        >>> found = torchsfm.track_points(image, image.roll(3, -1), x)  # all moved by three columns
+        >>> found.x[found.valid].round()
+        tensor([[83., 60.],
+                [43., 50.]])
     """
     places = check_tensors(x1=(x1, "n 2"), guess=(guess, "?n 2"))
     pictures = check_tensors(image1=(image1, "c h>=1 w>=1"), image2=(image2, "c h w"))
@@ -138,6 +156,14 @@ def track_sequence(
 
     Raises:
         ValueError: Frames of different sizes, or an option is wrong.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> tracks = torchsfm.track_sequence([image.roll(3 * i, -1) for i in range(4)], max_points=50)
+        >>> len(tracks) > 10, tracks.frame.max()
+        (True, tensor(3))
     """
     check_options(
         images=(images, Iterable), max_points=(max_points, "int >= 1"), min_distance=(min_distance, "int >= 1"),

@@ -15,9 +15,13 @@ BORDER = 257
 
 
 class Pinholes(NamedTuple):
-    """Cameras without distortion, and the sizes of their pictures."""
+    """Cameras without distortion, and the sizes of their pictures.
+
+    See the example of `undistorted_cameras`.
+    """
 
     cameras: Camera
+    """Of the new pictures."""
     size: Int[Tensor, "*batch 2"]
     """Width and height in pixels."""
 
@@ -41,6 +45,14 @@ def undistorted_cameras(
     Returns:
         The cameras, without skew too, and their sizes: at least one pixel, and no side farther from the optical axis than the
         old picture is wide and high, as no pinhole shows all that a very wide lens does.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(60.0), torch.tensor([39.5, 29.5]))
+        >>> camera = torchsfm.Camera(K, torchsfm.SimpleRadial(torch.tensor(-0.1)))
+        >>> pinholes = torchsfm.images.undistorted_cameras(camera, torch.tensor([80, 60]))
+        >>> type(pinholes.cameras.distortion).__name__, bool((pinholes.size > 0).all())
+        ('NoDistortion', True)
     """
     batch = check_tensors(size=(size, "2: int"))
     check_options(cameras=(cameras, Camera), alpha=(alpha, "0 <= float <= 1"), centred=(centred, bool))
@@ -92,6 +104,16 @@ def undistort_images(
 
     Returns:
         The new pictures; 0 where the old ones show nothing.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(60.0), torch.tensor([39.5, 29.5]))
+        >>> camera = torchsfm.Camera(K, torchsfm.SimpleRadial(torch.tensor(-0.1)))
+        >>> pinholes = torchsfm.images.undistorted_cameras(camera, torch.tensor([80, 60]))
+        >>> width, height = pinholes.size.tolist()
+        >>> image = torch.rand(3, 60, 80, generator=torch.Generator().manual_seed(0))
+        >>> torchsfm.images.undistort_images(image, camera, pinholes.cameras, (width, height)).shape == (3, height, width)
+        True
     """
     check_tensors(images=(images, "c h>=1 w>=1"))
     check_options(cameras=(cameras, Camera), pinholes=(pinholes, Camera), size=(size, "2 int >= 1"))

@@ -15,7 +15,10 @@ from torchsfm.optim import Loss
 
 @dataclass(frozen=True)
 class Conics:
-    """Ellipses in space and their tracks: what images show of them, as `detect_ellipses` and `fit_ellipse` measure it."""
+    """Ellipses in space and their tracks: what images show of them, as `detect_ellipses` and `fit_ellipse` measure it.
+
+    See the example of `write_conics`.
+    """
 
     centre: Float[Tensor, "n 3"]
     """In the world."""

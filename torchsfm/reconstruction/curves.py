@@ -27,7 +27,10 @@ _AGREE = 4
 
 @dataclass(frozen=True)
 class CurveReconstruction:
-    """Curves in space, sample by sample."""
+    """Curves in space, sample by sample.
+
+    See the example of `reconstruct_curves`.
+    """
 
     curve: Curve
     """The curves (c, n), the longest first."""
@@ -80,6 +83,14 @@ def reconstruct_curves(
 
     Raises:
         ValueError: Wrong shape, dtype, device or option; another number of images than of cameras.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.render_sequence(views=3, width=96, height=72, generator=torch.Generator().manual_seed(0))
+        >>> images, cameras, poses = scene.images, scene.cameras, scene.poses
+        >>> found = torchsfm.reconstruction.reconstruct_curves(images, cameras, poses, points=scene.X)
+        >>> found.curve.x.shape[-1], len(found.curve.x) > 0
+        (3, True)
     """
     check_tensors(K=(cameras.K, "3 3"), R=(poses.R, "3 3"), t=(poses.t, "3"))
     check_options(

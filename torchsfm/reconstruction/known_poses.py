@@ -75,6 +75,11 @@ def triangulate_photographs(
     Raises:
         ReconstructionError: Wrong input: no such folder, fewer than two photographs that the model has poses for, or
             photographs of other sizes than the model says.
+
+    Example:
+        >>> import torchsfm
+        >>> poses = torchsfm.read_colmap("sparse")  # doctest: +SKIP
+        >>> result = torchsfm.triangulate_photographs("photos/", poses)  # doctest: +SKIP
     """
     report = progress or (lambda stage, done, total: None)
     generator = torch.Generator().manual_seed(seed)

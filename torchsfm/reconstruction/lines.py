@@ -20,6 +20,8 @@ class Lines:
     """Lines of space, each as far as it was seen, and their tracks: the segments of images that show them, sorted by line.
 
     Several segments of one image may be parts of the same line.
+
+    See the example of `write_lines`.
     """
 
     ends: Float[Tensor, "l 2 3"]

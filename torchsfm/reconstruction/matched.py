@@ -28,6 +28,8 @@ class MatchedImages:
         weights: Per pair, how much each match can be trusted, the larger the more; None where nothing tells.
         camera_index: Which camera took each image; None where nothing tells.
         focal: Focal length in pixels that is known of each image, as far as it is.
+
+    See the example of `write_database`.
     """
 
     names: tuple[str, ...]
@@ -93,6 +95,17 @@ def reconstruct_matches(
 
     Raises:
         ValueError: Shapes or numbers of entries disagree, or an index is out of range.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X)
+        >>> pairs, same = torch.tensor([[0, 1], [0, 2], [1, 2]]), torch.arange(60)[:, None].expand(60, 2)
+        >>> found = torchsfm.reconstruct_matches(list(x), pairs, [same] * 3, torch.tensor([[1000, 750]] * 3), K=K)
+        >>> found.model.num_registered, found.report.pairs.count(torchsfm.reconstruction.Verdict.GENERAL)
+        (3, 3)
     """
     check_one_problem(pairs=(pairs, "q 2: int"), image_size=(image_size, "v>=1 2: int"), K=(K, "?3 3"))
     check_one_problem(camera_index=(camera_index, "?v: int"))

@@ -238,6 +238,17 @@ def reconstruct_tracks(
 
     Raises:
         ValueError: Shapes disagree or an index is out of range.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X).flatten(0, 1)
+        >>> view, track = torch.arange(3).repeat_interleave(60), torch.arange(60).repeat(3)
+        >>> found = torchsfm.reconstruct_tracks(x, view, track, torch.tensor([[1000, 750]] * 3), K=K)
+        >>> found.model.num_registered, found.model.num_points, found.report.images[0].model
+        (3, 60, 0)
     """
     check_one_problem(x=(x, "n 2"), view=(view, "n: int"), track=(track, "n: int"), image_size=(image_size, "v 2: int"))
     check_one_problem(color=(color, "?n 3"))

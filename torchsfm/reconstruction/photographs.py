@@ -85,6 +85,12 @@ def reconstruct(
     Raises:
         ReconstructionError: Wrong input: no such folder, fewer than two readable images, an unknown camera model.
         ValueError: An argument has the wrong shape.
+
+    Example:
+        >>> import torchsfm
+        >>> result = torchsfm.reconstruct("photos/")  # doctest: +SKIP
+        >>> print(result.report.summary())  # doctest: +SKIP
+        >>> result.model.save("model.npz")  # doctest: +SKIP
     """
     if camera is not None and camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")

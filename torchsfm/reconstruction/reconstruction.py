@@ -40,6 +40,16 @@ class Reconstruction:
         point: Point of each observation.
         lines: Lines and the segments that show them, where lines were looked for.
         conics: Ellipses in space and the measured ones that show them, where there are some.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "problem.npz")
+        >>> model = torchsfm.read_model("problem.npz")
+        >>> model.num_registered, model.num_points, model.num_observations
+        (3, 20, 50)
+        >>> model.poses.centre.shape, bool(model.residuals().max() < 10)  # pixels
+        (torch.Size([3, 3]), True)
     """
 
     names: tuple[str, ...]

@@ -17,7 +17,15 @@ Progress = Callable[[str, int, int], None]
 
 
 class ReconstructionError(ValueError):
-    """The input cannot be used; the message is one line for people."""
+    """The input cannot be used; the message is one line for people.
+
+    Example:
+        >>> import torchsfm
+        >>> torchsfm.reconstruct("no folder")
+        Traceback (most recent call last):
+            ...
+        torchsfm.reconstruction.report.ReconstructionError: no folder: no such folder
+    """
 
 
 def printable(text: str) -> str:
@@ -40,6 +48,8 @@ class ImageReport:
         doubt: Why its place in the model may be wrong; empty where nothing says so.
         rotation_sigma: Standard deviation of its rotation, degrees; infinite where it is not known.
         position_sigma: Standard deviation of its place over the median distance of the points that it sees.
+
+    See the example of `reconstruct_tracks`.
     """
 
     name: str
@@ -53,13 +63,21 @@ class ImageReport:
 
 @dataclass(frozen=True)
 class PairReport:
-    """All compared pairs: matches, how many agree with F and with H, and what that says of the pair."""
+    """All compared pairs: matches, how many agree with F and with H, and what that says of the pair.
+
+    See the example of `reconstruct_matches`.
+    """
 
     pairs: Int[Tensor, "q 2"]
+    """The numbers of both images."""
     num_matches: Int[Tensor, "q"]
+    """Matches that were given or found."""
     fundamental_inliers: Int[Tensor, "q"]
+    """Of these, how many agree with the fundamental matrix."""
     homography_inliers: Int[Tensor, "q"]
+    """How many agree with a homography."""
     verdict: Int[Tensor, "q"]
+    """A `Verdict` each."""
 
     def count(self, verdict: Verdict) -> int:
         """Number of pairs with this verdict."""
@@ -79,6 +97,8 @@ class Report:
         autocalibration: For each set of images that was autocalibrated what was assumed, found and determined, or why not.
         skipped: Files and folders in the input folder that may hold photographs but were passed over, each with the reason.
         calibrations: For each model how its cameras were found, and how well they are known.
+
+    See the example of `reconstruct_tracks`.
     """
 
     images: tuple[ImageReport, ...]
@@ -123,10 +143,15 @@ def describe_skipped(skipped: Sequence[tuple[str, str]]) -> list[str]:
 
 @dataclass(frozen=True)
 class SfmResult:
-    """Models, the largest first (none when nothing could be reconstructed), and the report."""
+    """Models, the largest first (none when nothing could be reconstructed), and the report.
+
+    See the example of `reconstruct_tracks`.
+    """
 
     models: tuple[Reconstruction, ...]
+    """The models, the largest first."""
     report: Report
+    """What became of every image and pair."""
 
     @property
     def model(self) -> Reconstruction:

@@ -26,7 +26,10 @@ _ROWS_PER_CALL = 4_000_000
 
 
 class Verdict(IntEnum):
-    """What two images have to do with each other."""
+    """What two images have to do with each other.
+
+    See the example of `reconstruct_matches`.
+    """
 
     UNRELATED = 0
     """Too few matches agree with any epipolar geometry."""
