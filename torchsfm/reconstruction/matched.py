@@ -29,7 +29,7 @@ class MatchedImages:
         camera_index: Which camera took each image; None where nothing tells.
         focal: Focal length in pixels that is known of each image, as far as it is.
 
-    See the example of `write_database`.
+    See the example of `read_database`.
     """
 
     names: tuple[str, ...]
