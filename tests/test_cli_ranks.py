@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ import torch.distributed
 from chance import stream_seed
 from command_line import copies, photograph, same_model, torchsfm
 
+from torchsfm.cli import ranks
 from torchsfm.cli.ranks import Started
 from torchsfm.reconstruction.stages import saved_stages
 
@@ -27,8 +29,8 @@ def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_what_the_environment_says() -> None:
     assert Started.by({}) == Started()
-    assert Started.by(LAUNCHED) == Started(1, 3, again=False)
-    assert Started.by(LAUNCHED | {"TORCHELASTIC_RESTART_COUNT": "2"}) == Started(1, 3, again=True)
+    assert Started.by(LAUNCHED) == Started(1, 3)
+    assert Started.by(LAUNCHED | {"TORCHELASTIC_RESTART_COUNT": "2"}) == Started(1, 3, attempt=2)
     assert Started.by({"RANK": "1", "WORLD_SIZE": "3"}) == Started(), "of a batch system, without a place to meet"
 
 
@@ -38,18 +40,24 @@ def test_one_alone_meets_nobody(resume: bool, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rank", "again", "resume", "kept"),
-    [(0, False, False, False), (0, True, False, True), (0, False, True, True), (1, False, False, True)],
+    ("rank", "attempt", "resume", "kept"),
+    [(0, 0, False, False), (0, 1, False, True), (0, 0, True, True), (1, 0, False, True)],
 )
 def test_the_first_removes_what_is_of_no_use(
-    rank: int, again: bool, resume: bool, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rank: int, attempt: int, resume: bool, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("init_process_group", "barrier", "destroy_process_group"):
-        monkeypatch.setattr(torch.distributed, name, lambda *_: None)
+    store = torch.distributed.HashStore()
+    monkeypatch.setattr(ranks, "rendezvous", lambda url: iter([(store, rank, 2)]))
+    if rank > 0:
+        monkeypatch.setattr(ranks, "LONGEST_START", timedelta(milliseconds=20))
+        with pytest.raises(torch.distributed.DistStoreError, match="timeout"):
+            Started(rank, 2, attempt).begin(tmp_path, resume)
+        store.set(f"torchsfm ready {attempt}", "")
     (tmp_path / "stages/match").mkdir(parents=True)
     (tmp_path / "stages/match/000000.npz").write_bytes(b"")
     (tmp_path / "stages/features.npz").write_bytes(b"of an earlier version")
-    assert Started(rank, 2, again).begin(tmp_path, resume)
+    assert Started(rank, 2, attempt).begin(tmp_path, resume)
+    assert store.check([f"torchsfm ready {attempt}"])
     assert (saved_stages(tmp_path) == ["match"]) == kept
     assert (tmp_path / "stages/features.npz").exists() == kept
 

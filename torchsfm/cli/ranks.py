@@ -7,11 +7,15 @@ more with it than the shard that it was working on.
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
-import torch.distributed
+from torch.distributed.rendezvous import rendezvous
 
 from torchsfm.reconstruction.stages import clear_stages
+
+LONGEST_START = timedelta(minutes=30)
+"""What the first process may take until it has the folder; if it fails before, the others are ended from outside."""
 
 
 @dataclass(frozen=True)
@@ -20,27 +24,30 @@ class Started:
 
     rank: int = 0
     count: int = 1
-    again: bool = False
-    """Whether they were started anew after one had failed."""
+    attempt: int = 0
+    """How often they were started anew after one had failed."""
 
     @classmethod
     def by(cls, environment: Mapping[str, str] = os.environ) -> "Started":
         """What the variables of `torchrun` say."""
         if not all(environment.get(name) for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")):
             return cls()
-        again = int(environment.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
-        return cls(int(environment["RANK"]), int(environment["WORLD_SIZE"]), again)
+        attempt = int(environment.get("TORCHELASTIC_RESTART_COUNT", "0"))
+        return cls(int(environment["RANK"]), int(environment["WORLD_SIZE"]), attempt)
 
     def begin(self, folder: Path, resume: bool) -> bool:
-        """Wait for all processes; return whether to use what is saved in the folder.
+        """Wait for the first process; return whether to use what is saved in the folder.
 
         Several do so always: what is of no use to them the first has removed before.
         """
         if self.count == 1:
             return resume
-        if self.rank == 0 and not (resume or self.again):
+        store, _, _ = next(rendezvous("env://"))
+        ready = f"torchsfm ready {self.attempt}"
+        if self.rank > 0:
+            store.wait([ready], LONGEST_START)
+            return True
+        if not resume and self.attempt == 0:
             clear_stages(folder)
-        torch.distributed.init_process_group("gloo")
-        torch.distributed.barrier()
-        torch.distributed.destroy_process_group()
+        store.set(ready, "")
         return True
