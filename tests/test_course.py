@@ -70,6 +70,22 @@ TRUTHS: dict[str, list[tuple[str, float, float]]] = {
         (r"Cauchy +: points +([\d.]+)", 0, 10),
         (r"standard deviation of the angle: predicted [\d.]+ degrees, observed ([\d.]+)", 0.13, 0.27),
     ],
+    "09_many_views.py": [
+        (r"trifocal tensor +: +([\d.]+) px", 0.4, 1.5),
+        (r"after projective bundle adjustment ([\d.]+) px", 0.5, 0.7),
+        (r"autocalibration: OK\nfocal length ([\d.]+)", 980, 1020),
+        (r"points off by ([\d.]+) of the cube", 0, 0.02),
+        (r"moving sideways .* DEGENERATE +f = +[\d.]+ \+- ([\d.]+)%", 5, 1e6),
+        (r"turns of 28.7 degrees: f \+- ([\d.]+)", 0, 2),
+    ],
+    "10_lines_conics_curves.py": [
+        (r"OK: direction off by ([\d.]+) degrees", 0, 2),
+        (r"because of EPIPOLAR_PLANE\nat ([\d.]+) degrees", 3, 3),
+        (r"OK: centre in space off by ([\d.]+)", 0, 0.01),
+        (r"after the last, metric bundle adjustment: f = ([\d.]+)", 820, 880),
+        (r"the scene being 2 wide\nOK: .* samples found, ([\d.]+) off", 0, 0.01),
+        (r"found (-[\d.]+) \+-", -0.185, -0.175),
+    ],
 }
 """For a notebook, what it prints and between which numbers that must lie."""
 
