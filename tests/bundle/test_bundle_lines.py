@@ -27,8 +27,8 @@ from torchsfm.geometry import (
     rotvec_from_rotation,
 )
 from torchsfm.geometry.line_manifold import line_tangents
-from torchsfm.optim import Block, Huber, RigidMotion, Term, sparse_levenberg_marquardt
-from torchsfm.optim.terms import Workspace, lift_of, linearize, prepare, term_residual
+from torchsfm.optim import Block, Cauchy, Huber, Loss, RigidMotion, Term, sparse_levenberg_marquardt
+from torchsfm.optim.terms import Workspace, curvature, lift_of, linearize, prepare, term_residual
 
 F64 = torch.float64
 LENSES = {
@@ -346,3 +346,31 @@ def test_the_written_derivatives_are_those_of_the_residuals(generator: torch.Gen
     only = [None] * (len(found) - 2) + [torch.empty_like(found[-2])]
     linearize(terms[0], x, {}, only, Workspace(lines.x))
     torch.testing.assert_close(only[-1], found[-2])
+
+
+@pytest.mark.parametrize("loss", [None, Cauchy(0.5)])
+@pytest.mark.parametrize("rigged", [False, True])
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_written_second_derivatives_are_those_of_the_cost(
+    generator: torch.Generator, lens: str, rigged: bool, loss: Loss | None
+) -> None:
+    scene = make_scene(generator, lens=lens, noise=1.0, views=4, lines=5)
+    problem, lines = disturbed(scene, generator, 0.002)
+    lines = dataclasses.replace(lines, loss=loss, weights=0.5 + torch.rand(len(lines.x), generator=generator, dtype=F64))
+    names = ("focal", "aspect", "skew", "principal_point", *problem.cameras.distortion.parameter_names)
+    views = len(problem.poses.t)
+    sensors = Pose.identity(2, dtype=F64).retract(0.1 * torch.randn(2, 6, generator=generator, dtype=F64))
+    rig = Rig(sensors, torch.arange(views) % 2, torch.arange(views)) if rigged else None
+    held = {"skew": torch.tensor([not rigged])}
+    blocks, terms = Bundle(problem, free=names, fixed_intrinsics=held, rig=rig, structure=(lines,)).problem()
+    blocks["camera"] = dataclasses.replace(blocks["camera"], x=blocks["camera"].x * 1.003)
+    blocks, (term,), _ = prepare(blocks, terms[1:2])
+    assert term.reduction is not None
+    x = {name: block.x for name, block in blocks.items()}
+    slots = torch.arange(len(term.index[0])), torch.arange(len(term.index[0]))
+    wanted = [True] * len(term.blocks)
+    found, other = (
+        curvature(some, x, blocks, wanted, "line", slots) for some in (term, dataclasses.replace(term, reduction=None))
+    )
+    for mine, exact in zip(found, other, strict=True):
+        torch.testing.assert_close(mine, exact, rtol=1e-6, atol=1e-7 * float(exact.abs().max()))

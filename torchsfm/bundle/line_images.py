@@ -70,6 +70,44 @@ def nearest_on_curve(
     return NearestOnCurve(normal[:, None], ray, by_ray, across, (across * away).sum(0))
 
 
+def expand_distances(
+    projection: Projection,
+    camera: Float[Tensor, "c k"],
+    normal: Float[Tensor, "3 k"],
+    x: Float[Tensor, "2 e k"],
+    rays: Float[Tensor, "3 e k"],
+) -> tuple[Float[Tensor, "e k"], Float[Tensor, "p e k"], Float[Tensor, "p p e k"]]:
+    """The distances of `nearest_on_curve`, and their first and second derivatives by (normal, free numbers of the camera).
+
+    A distance is the stationary value of `c'(x - p)` over the direction of the unit vector c and the place s of p along the
+    curve, so that its second derivatives are `L_yy - L_yu L_uu^-1 L_uy` of that Lagrangian with u = (angle of c, s). What it
+    takes of lenses are those of c'p with c held, by the ray and the camera's numbers.
+    """
+    found = nearest_on_curve(projection, camera, normal, x, rays)
+    q, n, r = found.ray, found.across, found.distance
+    size = normal.square().sum(0).clamp_min(_TINY).sqrt()
+    unit = (normal / size)[:, None]
+    along = torch.linalg.cross(unit.expand_as(q), q, dim=0)
+    first, second, sideways = _lens_slopes(projection, camera, q, n)
+    # A step d of the normal moves the ray by -unit (d'q) / size, to first order.
+    lean = q / size
+    on_unit, on_along = (second[:, :3] * unit).sum(1), (second[:, :3] * along).sum(1)
+    tilt = (first[:3] * unit).sum(0)
+    by = torch.cat((tilt * lean, -first[3:]))
+    speed, bend = (sideways[:3] * along).sum(0), (on_along[:3] * along).sum(0)
+    by_angle = torch.cat(((sideways[:3] * unit).sum(0) * lean, -sideways[3:]))
+    by_place = torch.cat(((on_along[:3] * unit).sum(0) * lean + tilt * (along / size), -on_along[3:]))
+    twice = torch.empty_like(second)
+    mixed = tilt * lean[:, None] * (unit / size)
+    twice[:3, :3] = -(on_unit[:3] * unit).sum(0) * lean[:, None] * lean - mixed - mixed.transpose(0, 1)
+    twice[:3, 3:] = lean[:, None] * on_unit[3:]
+    twice[3:, :3] = twice[:3, 3:].transpose(0, 1)
+    twice[3:, 3:] = -second[3:, 3:]
+    scale = 1 / (r * bend - speed.square())
+    through = by_angle[:, None] * (speed * by_place - bend * by_angle) + by_place[:, None] * (speed * by_angle - r * by_place)
+    return r, by, twice - scale * through
+
+
 def curve_distances(
     projection: Projection,
     camera: Float[Tensor, "c k"],
@@ -147,3 +185,21 @@ def _followed(
     ones = torch.ones_like(place[0])
     slopes = [torch.autograd.grad(row, ray, ones, create_graph=True, retain_graph=True)[0] for row in place]
     return place, torch.stack([(slope * along).sum(0) for slope in slopes])
+
+
+def _lens_slopes(
+    projection: Projection, camera: Float[Tensor, "c k"], ray: Float[Tensor, "3 e k"], c: Float[Tensor, "2 e k"]
+) -> tuple[Float[Tensor, "p e k"], Float[Tensor, "p p e k"], Float[Tensor, "p e k"]]:
+    """First and second derivatives of `c'p` by (ray, free numbers of the camera), and the first of p along the curve."""
+    free = projection.free
+    with torch.enable_grad():
+        moves = camera[list(free)][:, None].expand(-1, *ray.shape[1:])
+        leaf = torch.cat((ray, moves)).detach().requires_grad_()
+        rows = list(camera[:, None].expand(-1, *ray.shape[1:]).unbind(0))
+        for place, column in enumerate(free, 3):
+            rows[column] = leaf[place]
+        pixels = projection.inside.pixels(leaf[:3], torch.stack(rows))
+        (first,) = torch.autograd.grad((c * pixels).sum(), leaf, create_graph=True)
+        (sideways,) = torch.autograd.grad((c[1] * pixels[0] - c[0] * pixels[1]).sum(), leaf, retain_graph=True)
+        second = [torch.autograd.grad(row.sum(), leaf, retain_graph=True, materialize_grads=True)[0] for row in first]
+    return first.detach(), torch.stack(second), sideways

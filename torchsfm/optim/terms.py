@@ -41,6 +41,19 @@ class Block:
 
 
 @dataclass(frozen=True)
+class Reduction:
+    """Few numbers on which residuals depend, and their derivatives by these, first and second, written out.
+
+    Those by the variables follow by the chain rule.
+    """
+
+    numbers: Callable[..., Tensor]
+    """Of `(*variables)`: the numbers (m, p)."""
+    expand: Callable[..., tuple[Tensor, Tensor, Tensor]]
+    """Of `(*variables, *data)`: residuals (m, d), their first derivatives (m, d, p) by the numbers, and second (m, d, p, p)."""
+
+
+@dataclass(frozen=True)
 class Term:
     """Residuals of one kind.
 
@@ -69,6 +82,8 @@ class Term:
     """Weight of each residual's squared norm; 0 leaves it out, whatever number it has."""
     linearize: Callable[..., Tensor] | None = None
     """Residuals and hand-written derivatives; automatic ones if not given."""
+    reduction: Reduction | None = None
+    """For second derivatives, which are those of `residual` if it is not given."""
 
     def select(self, rows: Tensor) -> "Term":
         """The term with some of its residuals."""
@@ -250,7 +265,8 @@ def curvature(
     slot, some = slots
     kept, point, moved = [], [], []
     with torch.enable_grad():
-        for name, a, index, w in zip(term.blocks, _arguments(term, x, None), term.index, wanted, strict=True):
+        arguments = _arguments(term, x, None)
+        for name, a, index, w in zip(term.blocks, arguments, term.index, wanted, strict=True):
             if not w:
                 moved.append(a)
             elif name == eliminated:
@@ -262,7 +278,10 @@ def curvature(
                 # Fixed variables, whichever they are, share a slot: they stay.
                 same = index == index[some][slot]
                 moved.append(torch.where(same, each.mT.index_select(1, slot), a.mT).mT)
-        cost = term_cost(term, term.residual(*moved, *term.data))
+        if term.reduction is None:
+            cost = term_cost(term, term.residual(*moved, *term.data))
+        else:
+            cost = _expanded_cost(term, term.reduction, arguments, moved)
         by_kept, by_point = _rows(cost, kept, [*kept, *point]), _rows(cost, point, point)
     size = sum(len(k) for k in kept)
     empty = x[term.blocks[0]].new_zeros
@@ -271,6 +290,34 @@ def curvature(
         return U, empty((size, 0, len(slot))), empty((0, 0, len(slot)))
     W = torch.stack([row[-1] for row in by_kept]) if kept else empty((0, len(point[0]), len(slot)))
     return U, W, torch.stack([row[0] for row in by_point])
+
+
+def _expanded_cost(term: Term, reduction: Reduction, still: Sequence[Tensor], moved: Sequence[Tensor]) -> Tensor:
+    """The cost to second order about where the variables are, but for a constant."""
+    with torch.no_grad():
+        r, J, H = reduction.expand(*still, *term.data)
+        slope = (r[..., None] * J).sum(1)
+        A = J.mT @ J + (r[..., None, None] * H).sum(1)
+        if term.loss is not None:
+            first, second = _loss_slopes(term.loss, r.square().sum(-1))
+            A = first[:, None, None] * A + 2 * second[:, None, None] * (slope[:, :, None] * slope[:, None])
+            slope = first[:, None] * slope
+        if term.weights is not None:
+            slope, A = term.weights[:, None] * slope, term.weights[:, None, None] * A
+        start = reduction.numbers(*still)
+    step = reduction.numbers(*moved) - start
+    return (step * (slope + 0.5 * (A @ step[..., None])[..., 0])).sum()
+
+
+def _loss_slopes(loss: Loss, square: Float[Tensor, "m"]) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
+    """First and second derivatives of a loss."""
+    with torch.enable_grad():
+        leaf = square.detach().requires_grad_()
+        (first,) = torch.autograd.grad(loss(leaf).sum(), leaf, create_graph=True)
+        if not first.requires_grad:
+            return first, torch.zeros_like(first)
+        (second,) = torch.autograd.grad(first.sum(), leaf, materialize_grads=True)
+    return first.detach(), second
 
 
 def _rows(cost: Tensor, by: list[Tensor], then: list[Tensor]) -> list[tuple[Tensor, ...]]:
