@@ -125,6 +125,7 @@ from torchsfm.motion import (
     AveragedRotations as AveragedRotations,
     ConicEpipolarFit as ConicEpipolarFit,
     Factorization as Factorization,
+    GlobalPositions as GlobalPositions,
     average_rotations as average_rotations,
     estimate_essential as estimate_essential,
     estimate_fundamental as estimate_fundamental,
@@ -136,6 +137,7 @@ from torchsfm.motion import (
     factorize_affine as factorize_affine,
     factorize_points as factorize_points,
     fundamental_from_conics as fundamental_from_conics,
+    position_globally as position_globally,
 )
 from torchsfm.optim import (
     Cauchy as Cauchy,

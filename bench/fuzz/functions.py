@@ -359,6 +359,15 @@ FUNCTIONS: dict[str, Function] = {
     ),
     "motion.homography_4pt": Function(planar=True),
     "motion.homography_dlt": Function(planar=True),
+    "motion.position_globally": Function(
+        {
+            "d": lambda s: torch.cat([s.rays(k, 12) for k in range(4)]), "view": torch.arange(48) // 12,
+            "point": torch.arange(48) % 12, "R": lambda s: s.parameters(4)[1], "points": 12,
+            "weights": lambda s: s.rand(48, low=0.5),
+        },
+        {"m": 48, "v": 4},
+        batched=False,
+    ),
     "motion.relative_6pt_focal": Function(centred=True),
     "motion.trifocal_7pt": Function(together=(("l", "ends", "line_weights"),)),
     "optim.attach_implicit": Function(

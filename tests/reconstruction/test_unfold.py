@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
+from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.calibration import CameraPrior
 from torchsfm.reconstruction.distinctive import Backbone, distinctiveness
 from torchsfm.reconstruction.doubt import examine
@@ -17,7 +18,7 @@ from torchsfm.reconstruction.incremental import MappingOptions, grow_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
 from torchsfm.reconstruction.settle import settle
-from torchsfm.reconstruction.tracks import build_tracks, components
+from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import unfold
 from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at

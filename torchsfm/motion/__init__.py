@@ -3,6 +3,7 @@
 from torchsfm.motion.many_views.average_rotations import AveragedRotations, average_rotations
 from torchsfm.motion.many_views.factorization_affine import AffineFactorization, factorize_affine
 from torchsfm.motion.many_views.factorization_points import Factorization, factorize_points
+from torchsfm.motion.many_views.position_globally import GlobalPositions, position_globally
 from torchsfm.motion.many_views.quadrifocal_6pt import QuadrifocalFit, quadrifocal_6pt
 from torchsfm.motion.three_views.estimate_trifocal import TrifocalEstimator, estimate_trifocal
 from torchsfm.motion.three_views.trifocal_6pt import trifocal_6pt
@@ -41,6 +42,7 @@ __all__ = [
     "Factorization",
     "FocalMotion",
     "FundamentalEstimator",
+    "GlobalPositions",
     "HomographyEstimator",
     "PlaneMotion",
     "QuadrifocalFit",
@@ -69,6 +71,7 @@ __all__ = [
     "homography_dlt",
     "motion_from_homography",
     "motions_from_homography",
+    "position_globally",
     "quadrifocal_6pt",
     "relative_6pt_focal",
     "relative_known_rotation_2pt",

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.reconstruction.tracks import components
+from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.view_graph import ViewGraph
 
 

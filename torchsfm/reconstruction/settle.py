@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.consistency import PairAgreement, pair_agreement
 from torchsfm.reconstruction.incremental import MappingOptions, extend_model
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.tracks import components
 
 ROUNDS = 3
 """Times that cameras are taken out and tried again."""

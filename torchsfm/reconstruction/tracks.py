@@ -45,15 +45,3 @@ def build_tracks(
     unmatched = bool((size[root] == 1).any())
     numbered: Tensor = track - int(unmatched)
     return numbered
-
-
-def components(pairs: Int[Tensor, "q 2"], count: int) -> Int[Tensor, "v"]:
-    """The smallest index that each vertex of a graph is connected to."""
-    label = torch.arange(count)
-    while True:
-        least = label[pairs].amin(1)
-        new = label.scatter_reduce(0, pairs.T.flatten(), least.repeat(2), "amin")
-        new = new[new]
-        if torch.equal(new, label):
-            return label
-        label = new

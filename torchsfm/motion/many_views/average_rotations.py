@@ -16,6 +16,7 @@ from torch import Tensor
 from torchsfm._types import Status, check_index, check_one_problem, check_options
 from torchsfm.geometry import cross_matrix, rotvec_from_rotation
 from torchsfm.linalg import usable
+from torchsfm.motion.many_views.components import components
 from torchsfm.motion.many_views.spanning_rotations import spanning_rotations
 from torchsfm.motion.many_views.triplets import find_triplets, pairs_within, turn_angle
 from torchsfm.optim import Block, GemanMcClure, Huber, Loss, Rotation, SparseResult, Term, marginal_covariance
@@ -146,7 +147,7 @@ def average_rotations(
         inliers[kept] = graph.square(plain).sqrt() <= AGREES * scale
         status = _status(edges, counts, inliers, views, found.status)
         sure = inliers & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
-        component = spanning_rotations(R[sure], edges[sure], angle[sure], views)[1]
+        component = components(edges[sure], views)
         spread = None
         if covariance:
             spread = graph.covariance(plain, component, status, loss, scale).to(R.dtype)
