@@ -25,7 +25,6 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
-    "sphinx.ext.mathjax",
     "myst_parser",
     "building.extension",
     "sphinx_gallery.gen_gallery",
@@ -71,6 +70,7 @@ sphinx_gallery_conf = {
     "matplotlib_animations": False,
 }
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"torchsfm {release}"
 html_static_path = ["static"]

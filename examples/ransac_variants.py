@@ -81,7 +81,6 @@ def compare(
     fig.savefig(FOLDER / f"{name}.png", dpi=120)
     if "ipykernel" in sys.modules:
         plt.show()
-    plt.close(fig)
 
 
 # %% Uniform samples or guided ones (PROSAC): how many samples are needed when scores say a little

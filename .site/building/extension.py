@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from building import api, examples, figures, links, pages, plain, signatures
+from building import api, examples, figures, formulas, links, pages, plain, signatures
 
 GENERATED = Path(__file__).parent.parent / "generated"
 ROOT = GENERATED.parent.parent
@@ -15,6 +15,7 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-signature", signatures.shorten)
     app.connect("autodoc-process-docstring", plain.process, priority=100)
     app.connect("autodoc-process-docstring", plain.types_beside_names, priority=900)
+    app.add_html_math_renderer("mathml", (formulas.inline, None), (formulas.block, None))
     app.add_post_transform(links.LinkNames)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 

@@ -71,7 +71,7 @@ def frames() -> Figure:
     write("world", torch.zeros(3, dtype=F64), (0, -14))
     write("centre of the camera,\nC = −R't", pose.centre, (14, 24), ha="left")
     write("point X", X[0], (0, 12))
-    write("image x ~ K (R X + t)", corners[3], (14, -12), ha="left")
+    write("image x ~ K (R X + t)", corners[3], (4, -22), ha="left")
     ax.set(aspect="equal")
     ax.yaxis.set_inverted(True)
     ax.margins(0.12)
