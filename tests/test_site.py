@@ -1,6 +1,7 @@
 """What the site's hand-written pages say of the package is so, and its generated ones leave nothing out."""
 
 import inspect
+import io
 import re
 import sys
 from pathlib import Path
@@ -103,6 +104,21 @@ def test_examples_get_a_title_from_their_first_words() -> None:
     assert head == '"""How many?\n========='
     assert rest == 'As many as\nit takes: more.\n\n.. code-block:: sh\n\n    python examples/a.py\n"""\n\nx = 1\n'
     assert titled('"""A title\n=======\n\nText: so.\n"""\n') == '"""A title\n=======\n\nText: so.\n"""\n'
+
+
+@pytest.mark.parametrize("path", sorted((SITE.parent / "examples").rglob("*.py")), ids=lambda path: path.stem)
+def test_text_in_examples_is_markup_that_can_be_read(path: Path, tmp_path: Path) -> None:
+    """What an editor breaks, as a list whose lines were filled, would be seen only when the site is built."""
+    parser = pytest.importorskip("sphinx_gallery.py_source_parser")
+    from docutils.core import publish_doctree
+
+    script = tmp_path / "example.py"
+    script.write_text(titled(path.read_text()))
+    said = io.StringIO()
+    for kind, text, _ in parser.split_code_and_text_blocks(str(script))[1]:
+        if kind == "text":
+            publish_doctree(text, settings_overrides={"warning_stream": said, "default_role": "code"})
+    assert said.getvalue() == ""
 
 
 def test_the_residual_that_is_shown_finds_the_points() -> None:

@@ -18,7 +18,7 @@ def plain(text: str) -> str:
 def _is_code(paragraphs: list[str], i: int) -> bool:
     indented = paragraphs[i][:1] == " " or "\n " in paragraphs[i - 1]
     block = i >= 2 and paragraphs[i - 2].rstrip().endswith("::") and indented
-    return block or paragraphs[i].lstrip().startswith(">>>")
+    return block or re.search(r"^\s*>>> ", paragraphs[i], re.MULTILINE) is not None
 
 
 def _escaped(paragraph: str) -> str:
