@@ -72,12 +72,11 @@ print(f"the rays miss each other by {1000 * gap.median():.1f} thousandths of a u
 # %% [markdown]
 # Which point is best? Three answers:
 #
-# - the *midpoint* of the shortest segment between the rays: simple, and without a meaning in the images; - the *linear*
-# one: each image point gives two equations :math:`(x\, p_3 - p_1) X = 0`, and the smallest singular vector solves
-#   them. It minimises an algebraic error;
+# - the *midpoint* of the shortest segment between the rays: simple, and without a meaning in the images;
+# - the *linear* one: each image point gives two equations :math:`(x\, p_3 - p_1) X = 0`, and the smallest singular vector
+#   solves them. It minimises an algebraic error;
 # - the *optimal* one: the point whose projections are nearest to what was measured, in the sum of squares over the images.
-# For
-#   noise that is alike in all directions it is the most likely point.
+#   For noise that is alike in all directions it is the most likely point.
 #
 # In two views the optimal one has a closed form, nearly: move both image points as little as possible so that they satisfy
 # the epipolar constraint :math:`x_2^T F x_1 = 0`, then the rays meet. ``correct_matches`` does this.
