@@ -95,6 +95,8 @@ def test_stars_and_bars_in_docstrings_are_themselves() -> None:
     assert tree.astext().split("\n\n") == [
         "A pose [R | t] of shape (*batch, 3, 4), |t| = 1, with a*b or |R|.", "As here:", "f(*x) | y", ">>> g(*x)\n4"
     ]  # fmt: skip
+    example = "x\n\nExample:\n    >>> f(*x) | y\n    (4,)"
+    assert plain(example) == example
     assert plain("x\n\nArgs:\n    *data: Tensors (*batch, n).") == "x\n\nArgs:\n    *data: Tensors (\\*batch, n)."
 
 
