@@ -70,6 +70,8 @@ class GlobalPositions:
         angle: Between each ray and the direction to its point, in radians; pi for rays that do not count.
         inliers: Rays that agree to within four standard deviations.
         scale: Standard deviation of the right rays in each of two directions, in radians.
+
+    See the example of `position_globally`.
     """
 
     centres: Float[Tensor, "v 3"]
@@ -112,6 +114,17 @@ def position_globally(
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or a number of a camera or point is out of range.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(30, generator=g), torchsfm.random_poses(6, spread=3.0, generator=g)
+        >>> view, point = torch.arange(6).repeat_interleave(30), torch.arange(30).repeat(6)  # all see all
+        >>> d = poses[view].transform(X[point][:, None])[:, 0]
+        >>> found = torchsfm.motion.position_globally(d, view, point, poses.R, points=30)
+        >>> fit = torchsfm.geometry.similarity_from_points(found.centres, poses.centre)  # up to place and size
+        >>> bool(fit.transform(found.centres).allclose(poses.centre, atol=1e-3)), int(found.inliers.sum())
+        (True, 180)
     """
     check_one_problem(d=(d, "m 3"), view=(view, "m: int"), point=(point, "m: int"), R=(R, "v 3 3"), weights=(weights, "?m"))
     check_options(points=(points, "int >= 0"), max_iterations=(max_iterations, "int >= 0"))
