@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from torchsfm import Status
-from torchsfm.autocalibration import Autocalibration, autocalibrate_points
+from torchsfm.autocalibration import Assumption, Autocalibration, autocalibrate_points
 from torchsfm.bundle import bundle_adjust, bundle_adjust_projective, bundle_covariance
 from torchsfm.geometry import (
     BundleProblem,
@@ -162,7 +162,7 @@ print(f"reprojection error: {before:.3f} px, after projective bundle adjustment 
 # .. math:: P_i\, Q^* P_i^T \sim K K^T.
 
 # %%
-metric = autocalibrate_points(bundle.P, bundle.X, x, image_size=SIZE, visible=visible)
+metric = autocalibrate_points(bundle.P, bundle.X, x, image_size=SIZE, visible=visible, assume=Assumption())
 f, cx, cy = metric.K[0, 0, 0], metric.K[0, 0, 2], metric.K[0, 1, 2]
 relative, _, _, dx, dy = metric.deviation[0].tolist()
 print(f"autocalibration: {Status(int(metric.status)).name}")
@@ -203,7 +203,7 @@ def from_images(poses: Pose) -> tuple[float, Autocalibration]:
     view, point = torch.isfinite(found.error).nonzero().unbind(-1)
     bundle = bundle_adjust_projective(found.P, found.X, x[view, point], view, point)
     error = float(bundle.residuals.square().mean().sqrt())
-    return error, autocalibrate_points(bundle.P, bundle.X, x, image_size=SIZE, visible=visible)
+    return error, autocalibrate_points(bundle.P, bundle.X, x, image_size=SIZE, visible=visible, assume=Assumption())
 
 
 i = torch.linspace(-1, 1, 12)
@@ -252,7 +252,7 @@ for turn, deviation in ((turns[0], known[0]), (turns[-1], known[-1])):
 
 # %% [markdown]
 # **Exercise 4.** Known principal points: assume only the focal length unknown,
-# ``assume=torchsfm.autocalibration.Assumption(free=("focal",))``. Which of the three motions is determined now?
+# ``assume=Assumption(free=("focal",))``. Which of the three motions is determined now?
 #
 # **Exercise 5.** Add one single image to the sideways motion, turned by 90 degrees about the optical axis. What happens to
 # the deviation? Photographers who calibrate know this trick.

@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from torchsfm import Status
-from torchsfm.autocalibration import autocalibrate_points
+from torchsfm.autocalibration import Assumption, autocalibrate_points
 from torchsfm.bundle import bundle_adjust, bundle_adjust_projective
 from torchsfm.geometry import (
     BundleProblem,
@@ -181,7 +181,9 @@ seen_points = simulate_images(cloud, moving, hidden, image_size=SIZE, noise=NOIS
 shape = factorize_points(seen_points.x, visible=seen_points.visible)
 view, point = torch.isfinite(shape.error).nonzero().unbind(-1)
 bundle = bundle_adjust_projective(shape.P, shape.X, seen_points.x[view, point], view, point)
-metric = autocalibrate_points(bundle.P, bundle.X, seen_points.x, image_size=SIZE, visible=seen_points.visible)
+metric = autocalibrate_points(
+    bundle.P, bundle.X, seen_points.x, image_size=SIZE, visible=seen_points.visible, assume=Assumption()
+)
 f = metric.K[0, 0, 0]
 print(f"{Status(int(metric.status)).name}: f = {f:.1f} +- {f * metric.deviation[0, 0]:.1f} px, in truth 850")
 _, R, t = krt_from_camera(metric.P)
