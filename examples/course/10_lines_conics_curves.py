@@ -36,7 +36,7 @@ from torchsfm.geometry import (
 )
 from torchsfm.images import fit_ellipse
 from torchsfm.motion import factorize_points
-from torchsfm.plot import plot_cameras, plot_lines_3d, plot_tracks
+from torchsfm.plot import plot_lines_3d, plot_tracks
 from torchsfm.simulation import look_at, random_points, random_poses, simulate_images
 from torchsfm.triangulation import LineFault, triangulate_conics, triangulate_curves, triangulate_lines
 
@@ -157,9 +157,8 @@ rim = disc.centre + torch.stack((turn.cos(), turn.sin()), -1) @ disc.axes[0, :2]
 ax.plot(*torch.cat((rim, rim[:1])).T, color="tab:orange", label="the ellipse")
 ax.plot(*truth.x.T, color="grey", linewidth=1, label="the wire in truth")
 ax.plot(*X.T, ".", color="tab:blue", label="the wire from its images")
-plot_cameras(poses, Camera(K), size=1.0, ax=ax)
+ax.set_aspect("equal")
 ax.legend(loc="upper left")
-ax.view_init(elev=-50, azim=-70)
 ax.set_title("A line, an ellipse and a curve from four views")
 
 # %% [markdown]
