@@ -175,7 +175,7 @@ def test_errors_are_those_of_the_covariance(generator: torch.Generator, lens: st
         scene.problem, sigma=1.0, structure=[scene.measured(scene.edges, 0.2)], fixed_poses=held,
         weights=torch.full_like(scene.problem.x[:, 0], 25.0),
     )  # fmt: skip
-    for _ in range(10):
+    for _ in range(6):
         noise = [0.2 * torch.randn(x.shape, generator=generator, dtype=F64) for x in (scene.problem.x, scene.edges)]
         noisy = dataclasses.replace(scene.problem, x=scene.problem.x + noise[0])
         seen = scene.measured(scene.edges + noise[1], 0.2)
