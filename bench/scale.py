@@ -14,7 +14,6 @@ import argparse
 import json
 import math
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -48,8 +47,9 @@ def render(folder: Path, views: int) -> list[Path]:
 
 
 def memory() -> float:
-    """Peak memory of this process so far, MB (Linux)."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Peak memory of this process so far, MB (Linux); what `resource` says has the peak of its parent in it."""
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def photographs(views: int) -> Row:

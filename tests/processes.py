@@ -24,9 +24,13 @@ def run_ranks(count: int, folder: Path, work: Callable[..., Any], *arguments: An
     processes = [_CONTEXT.Process(target=_run, args=(rank, count, str(folder), work)) for rank in range(count)]
     for process in processes:
         process.start()
-    for process in processes:
-        process.join(120)
-        assert process.exitcode == 0
+    try:
+        for process in processes:
+            process.join(120)
+            assert process.exitcode == 0
+    finally:
+        for process in processes:
+            process.kill()  # of those that wait for one that has failed
     return [torch.load(folder / f"{rank}", weights_only=False) for rank in range(count)]
 
 
