@@ -65,7 +65,7 @@ def photographs(views: int) -> Row:
         spent = result.report.seconds
     names = ("features", "pairs", "match", "verify", "map")
     return {
-        "pairs compared": len(result.report.pairs),
+        "pairs compared": len(result.report.pairs.pairs),
         "registered": result.models[0].num_registered if result.models else 0,
         **{f"{name} s": spent.get(name, 0.0) for name in names},
         "MB before": before,
