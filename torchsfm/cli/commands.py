@@ -43,6 +43,7 @@ class Method(StrEnum):
 
     incremental = "incremental"
     projective = "projective"
+    all_at_once = "global"
 
 
 Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")]
@@ -123,7 +124,10 @@ def reconstruct(
     ] = True,
     method: Annotated[
         Method,
-        typer.Option(help="From two images on, or all together without calibration and then autocalibration."),
+        typer.Option(
+            help="From two images on; all together without calibration and then autocalibration; or rotations of all images, "
+            "then all places."
+        ),
     ] = Method.incremental,
     lines: Annotated[
         bool, typer.Option("--lines", help="Find straight lines too, and adjust cameras by points and lines together.")

@@ -16,6 +16,7 @@ from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
+from torchsfm.reconstruction.global_start import global_start
 from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.projective import projective_start
@@ -27,7 +28,7 @@ from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import unfold
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
 
-METHODS = ("incremental", "projective")
+METHODS = ("incremental", "projective", "global")
 MIN_IMAGES = 2
 """Smallest number of images of a model."""
 FEW_IMAGES = 60
@@ -67,7 +68,7 @@ def build_models(
         shared_camera: See `reconstruct`.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
-        method: "incremental" or "projective".
+        method: "incremental", "projective" or "global".
         generator: Source of randomness.
         stages: Timing and saving.
         progress: Called as images are registered.
@@ -112,6 +113,11 @@ def build_models(
                 source = tuple("autocalibration" for _ in start.focal_sigma)
                 metric = replace(options, expected=start.expected(), focal_sigma=start.focal_sigma)
                 mapped, known = extend_model(start.mapping, taken, metric, report), metric
+            elif method == "global":
+                placed = global_start(empty, ~taken, options)
+                if placed is None:
+                    break
+                mapped, known = extend_model(placed, taken, options, report), options
             else:
                 grown = grow_model(replace(empty, registered=taken), options, report)
                 if grown is None:
@@ -121,7 +127,7 @@ def build_models(
             model, parted = settle(model, taken, known, report)
             failed |= parted
             uncertain = None
-            if matched and method == "incremental":
+            if matched and method != "projective":
                 unfolded = unfold(empty, model, taken, known, report)
                 model, uncertain = unfolded.model, unfolded.uncertain
                 # What is left is mapped without the relations that were given up.
@@ -229,7 +235,7 @@ def reconstruct_tracks(
         K: Known intrinsics of all images.
         focal: First guess of the focal length in pixels, which is then adjusted.
         free_principal_point: Estimate the principal point too.
-        method: "incremental" or "projective", see `reconstruct`.
+        method: "incremental", "projective" or "global", see `reconstruct`.
         seed: The same seed gives the same model.
         progress: Called as images are registered.
 

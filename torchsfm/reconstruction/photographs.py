@@ -65,7 +65,9 @@ def reconstruct(
             image's size from its centre, instead of holding it there.
         method: "incremental" starts from two images and a first focal length; "projective" reconstructs all images together
             without calibration, by factorisation of the longest tracks, and finds the camera by autocalibration. It refuses
-            rather than guesses where the images do not determine the focal length (`report.autocalibration` says why).
+            rather than guesses where the images do not determine the focal length (`report.autocalibration` says why);
+            "global" finds the rotations of all images from those of pairs, then all centres and points at once, with a first
+            focal length.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
         masks: Folder of masks, in which nothing counts that is black: see `Masks` for their names. The mask of `view.jpg` is

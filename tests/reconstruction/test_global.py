@@ -1,0 +1,53 @@
+"""All images at once: rotations, centres, points, then the finish that all roads share."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from test_reconstruct_tracks import Scene, make_scene, run, turning
+
+from torchsfm.geometry import Pose
+from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.simulation import orbit_poses
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_poses_are_as_good_as_those_of_the_incremental_road(seed: int) -> None:
+    scene = make_scene(seed=seed, outliers=0.1)
+    found, other = run(scene, method="global").model, run(scene).model
+    assert bool(found.registered.all())
+    error, wanted = (pose_errors(m.poses, scene.poses, m.registered).pose for m in (found, other))
+    # Both end in the same minimum, of points that may differ at the threshold.
+    assert float(error.max()) < 1.2 * float(wanted.max()) + 0.05
+    assert abs(float(found.residuals().mean()) - float(other.residuals().mean())) < 0.05
+
+
+def test_two_unrelated_scenes_give_two_models() -> None:
+    one, two = make_scene(seed=1), make_scene(orbit_poses(6, radius=4.0, sweep=1.2), seed=2)
+    v, n = len(one.image_size), int(one.track.max()) + 1
+    both = Scene(
+        torch.cat((one.x, two.x)), torch.cat((one.view, two.view + v)), torch.cat((one.track, two.track + n)),
+        Pose(torch.cat((one.poses.R, two.poses.R)), torch.cat((one.poses.t, two.poses.t))),
+        torch.cat((one.image_size, two.image_size)),
+    )  # fmt: skip
+    result = run(both, method="global")
+    assert [model.registered.nonzero()[:, 0].tolist() for model in result.models] == [[*range(8)], [*range(8, 14)]]
+    for model, scene in zip(result.models, (one, two), strict=True):
+        own = model.registered
+        assert float(pose_errors(model.poses[own], scene.poses).pose.max()) < 1.5
+
+
+def test_known_intrinsics_are_kept_and_the_same_seed_gives_the_same_model() -> None:
+    scene = make_scene(distortion=0.0)
+    K = torch.tensor([[1100.0, 0, 499.5], [0, 1100, 374.5], [0, 0, 1]]).double()
+    first, second = (run(scene, method="global", K=K).model for _ in range(2))
+    assert torch.equal(first.cameras.K[0], K)
+    assert torch.equal(first.X, second.X)
+    assert float(pose_errors(first.poses, scene.poses).pose.max()) < 0.5
+
+
+def test_what_has_no_depth_is_refused() -> None:
+    assert not run(make_scene(turning(6)), method="global").models
+    scene = make_scene()
+    few = replace(scene, x=scene.x[:9], view=scene.view[:9], track=scene.track[:9])
+    assert not run(few, method="global").models

@@ -1,0 +1,164 @@
+"""All images of a component at once: rotations from pairs, then centres and points from rotations and rays.
+
+Relative poses of all pairs -> `average_rotations`, weighted by how well each pair determines its rotation -> tracks of the
+pairs that agree -> `position_globally` -> a model that is adjusted, completed and finished like any other (Pan et al., "Global
+structure-from-motion revisited", ECCV 2024).
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.bundle import bundle_adjust
+from torchsfm.geometry import BundleProblem, Pose
+from torchsfm.motion import RelativePoseEstimator, average_rotations, position_globally
+from torchsfm.optim import Cauchy
+from torchsfm.reconstruction.incremental import MappingOptions
+from torchsfm.reconstruction.initialize import MIN_POINTS
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.structure import complete_tracks, filter_points, triangulate_tracks
+from torchsfm.reconstruction.tracks import build_tracks
+from torchsfm.reconstruction.view_graph import MIN_INLIERS
+from torchsfm.robust import ransac
+
+MATCHES = 200
+"""Matches of a pair that its relative pose is estimated from: those in excess say little more of it."""
+ROWS = 200_000
+"""Padded matches worked on at once."""
+TRACKS_PER_VIEW = 150
+"""Longest tracks of each image that are positioned: enough for its centre."""
+ROUNDS = 3
+"""Adjustments with poses and points alone, each with a loss half as wide as the last."""
+WIDEST = 16.0
+"""Scale of the first of their losses in pixels, at most."""
+USABLE = (int(Status.OK), int(Status.NOT_CONVERGED))
+
+
+def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: MappingOptions) -> Mapping | None:
+    """Poses and points of the largest set of images that their pairs hold together.
+
+    Args:
+        mapping: An empty mapping; its cameras are taken as they are.
+        available: Images to consider.
+        options: How models are made.
+
+    Returns:
+        The mapping with poses, points and tracks of the pairs that agree; None where too little does.
+    """
+    graph, v = mapping.graph, len(mapping.registered)
+    related = (graph.fundamental_inliers >= MIN_INLIERS) & available[graph.pairs].all(-1)
+    chosen = related.nonzero()[:, 0]
+    if not len(chosen):
+        return None
+    motion, deviation, good = relative_poses(mapping, chosen, options)
+    chosen, motion, deviation = chosen[good], motion[good], deviation[good]
+    turned = average_rotations(motion[..., :3], graph.pairs[chosen], views=v, deviation=deviation)
+    rotated = _largest(turned.component, torch.isin(turned.status, torch.tensor(USABLE)))
+    if int(rotated.sum()) < 2:
+        return None
+    agreeing = chosen[turned.inliers & rotated[graph.pairs[chosen]].all(-1)]
+    kept = torch.zeros(len(graph.pairs), dtype=torch.bool).index_fill_(0, agreeing, True)
+    own = kept[graph.match_pair]
+    track = build_tracks(graph.view, graph.match[own], graph.fundamental_inliers[graph.match_pair[own]])
+    node = _longest_tracks(track, graph.view, v)
+    d, valid = mapping.rays(node)
+    node, d = node[valid], d[valid]
+    _, point = torch.unique(track[node], return_inverse=True)
+    count = int(point.max()) + 1 if len(point) else 0
+    placed = position_globally(d, graph.view[node], point, turned.model, points=count)
+    registered = _largest(placed.component, torch.isin(placed.status, torch.tensor(USABLE)) & rotated)
+    if int(registered.sum()) < 2:
+        return None
+    R = torch.where(registered[:, None, None], turned.model, mapping.poses.R)
+    t = torch.where(registered[:, None], -(turned.model @ placed.centres[..., None])[..., 0], mapping.poses.t)
+    sure = placed.inliers & registered[graph.view[node]] & placed.valid[point]
+    number = torch.full_like(graph.view, -1).index_copy_(0, node[sure], point[sure])
+    start = replace(mapping, poses=Pose(R, t), registered=registered, X=placed.X, point=number).compacted()
+    focal = mapping.cameras.K[mapping.camera_index[registered], 0, 0].median()
+    model = _tighten(start, track, min(float(placed.scale * focal), WIDEST), options)
+    return model if len(model.X) >= MIN_POINTS else None
+
+
+def relative_poses(
+    mapping: Mapping, chosen: Int[Tensor, "q"], options: MappingOptions
+) -> tuple[Float[Tensor, "q 3 4"], Float[Tensor, "q 3 3"], Bool[Tensor, "q"]]:
+    """The relative pose of pairs of images, the covariance of its rotation, and where there are both.
+
+    Args:
+        mapping: Cameras, and the view graph.
+        chosen: The pairs.
+        options: Largest distance of an inlier, and randomness.
+    """
+    graph = mapping.graph
+    order = torch.argsort(graph.match_pair, stable=True)
+    counts = torch.bincount(graph.match_pair, minlength=len(graph.pairs))
+    first = counts.cumsum(0) - counts
+    a, b = graph.match[order].unbind(1)
+    (d1, valid1), (d2, valid2) = mapping.rays(a), mapping.rays(b)
+    focal = mapping.cameras.K[mapping.camera_index, 0, 0][graph.pairs].mean(-1)
+    motions, deviations, good = [], [], []
+    for some in torch.split(chosen, max(1, ROWS // MATCHES)):
+        # Every so many-th of those in excess.
+        slots = torch.arange(MATCHES) * (counts[some, None] / MATCHES).clamp(min=1)
+        mask = slots.long() < counts[some, None]
+        place = torch.where(mask, first[some, None] + slots.long(), 0)
+        limit = (options.reprojection / focal[some]).clamp(max=0.1)
+        found = ransac(
+            RelativePoseEstimator(limit), d1[place], d2[place], threshold=limit, mask=mask & valid1[place] & valid2[place],
+            covariance=True, generator=options.generator,
+        )  # fmt: skip
+        assert found.covariance is not None, "asked for"
+        spread = found.covariance[..., :3, :3]
+        motions.append(found.model)
+        deviations.append(spread)
+        good.append((found.status == Status.OK) & (spread.diagonal(dim1=-2, dim2=-1) > 0).all(-1))
+    return torch.cat(motions), torch.cat(deviations), torch.cat(good)
+
+
+def _largest(component: Int[Tensor, "v"], usable: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
+    """The usable members of the component that has most of them."""
+    number = torch.bincount(component[usable], minlength=len(component))
+    return usable & (component == number.argmax())
+
+
+def _longest_tracks(track: Int[Tensor, "n"], view: Int[Tensor, "n"], views: int) -> Int[Tensor, "k"]:
+    """The image points of tracks that are among the longest of an image."""
+    node = (track >= 0).nonzero()[:, 0]
+    length = torch.bincount(track[node])
+    order = node[torch.argsort(length[track[node]], descending=True, stable=True)]
+    order = order[torch.argsort(view[order], stable=True)]
+    seen = torch.bincount(view[order], minlength=views)
+    place = torch.arange(len(order)) - (seen.cumsum(0) - seen)[view[order]]
+    wanted = torch.zeros_like(length, dtype=torch.bool)
+    wanted[track[order[place < TRACKS_PER_VIEW]]] = True
+    return node[wanted[track[node]]]
+
+
+def _tighten(model: Mapping, track: Int[Tensor, "n"], width: float, options: MappingOptions) -> Mapping:
+    """Adjust poses and points with losses that become narrower, and triangulate all tracks with what has come out."""
+    model = replace(model, track=track)
+    for k in range(ROUNDS):
+        model = _adjust(model, max(width / 2**k, 1.0))
+    reach = 2 * options.reprojection
+    model = replace(model, X=model.X[:0], point=torch.full_like(model.point, -1))
+    model = triangulate_tracks(model, threshold=reach, min_angle=options.min_angle)
+    model = options.adjust(model, max_iterations=20, tolerance=1e-3)
+    model = filter_points(model, threshold=reach, min_angle=options.min_angle)
+    model = complete_tracks(model, threshold=options.reprojection)
+    model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
+    return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+
+
+def _adjust(model: Mapping, width: float) -> Mapping:
+    """The minimum of reprojection errors, without what then lies behind a camera or far off."""
+    node = model.observations()
+    view, point = model.graph.view[node], model.point[node]
+    problem = BundleProblem(model.poses, model.cameras, model.camera_index, model.X, model.graph.x[node], view, point)
+    result = bundle_adjust(problem, loss=Cauchy(width), free=(), max_iterations=20, tolerance=1e-3)
+    if result.status == Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    moved = replace(model, poses=result.poses, X=result.X)
+    return moved.without(node[moved.errors(point, node) > 8 * width])
