@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Int
@@ -155,4 +155,6 @@ def match_all(
     with one_thread():
         shards = stages.shards("verify", work.verify_shards, verify, after=f"{work.digest} {seed}")
     verified = VerifiedPairs.join([VerifiedPairs(**shard) for shard in shards])
-    return verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
+    graph = verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
+    # Corners that were tracked through a sequence have no descriptors.
+    return graph if sequence else replace(graph, descriptors=torch.cat([f.descriptors for f in features]))

@@ -4,13 +4,18 @@ A thing that occurs twice makes photographs of the two match, and folds a model:
 the thing alone. What stands around it differs, and no match is wrong there: they are missing (Zach, Irschara & Bischof 2008,
 2010). In a folded model, two such cameras share many points in one part of the image, and in another part each has points of
 its own, seen by others, none of which the other camera sees though nothing stands before them.
+
+That nothing stands before a point is judged in two ways. Where each camera misses what the other sees in one and the same part
+of the image, no thing in front of it explains both. And where a camera sees something through the place itself, as far away or
+farther, one that it misses there is not hidden.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchsfm.reconstruction.mapping import Mapping
@@ -25,6 +30,12 @@ FINE = (24, 20)
 """Columns and rows in which the depth of what an image sees is known."""
 BEHIND = 0.95
 """A point is taken to be hidden by what lies at less than this fraction of its depth."""
+FINER = (48, 36)
+"""Columns and rows in which it is known how far an image sees."""
+FARTHER = 0.97
+"""A camera that sees this fraction of a point's depth beside its place sees the place itself."""
+ALIKE = 0.85
+"""Descriptors of one point, seen from like viewpoints, have at least this cosine; those of others rarely do."""
 WRONG = 0.02
 """Share of points at which a wrong match is found where there can be no right one."""
 SHIFT = 7
@@ -74,8 +85,9 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
 
     A point counts between two cameras if the one sees it, at least one camera besides these two does, and the model says that
     it lies in the other's view, from nearly the same direction and distance. The share that the other sees is the pair's own;
-    a part of the image where it is zero, both for the points of the one camera and for those of the other, speaks against the
-    pair with the likelihood of so many misses at that share.
+    a part of the image where it is zero speaks against the pair with the likelihood of so many misses at that share, if it is
+    zero both for the points of the one camera and for those of the other, or if both miss points, each anywhere, at places that
+    they see. A point is found again where its track says so, or where the other image has a point that looks like it.
     """
     v = len(mapping.registered)
     pairs = _like_viewpoints(mapping)
@@ -83,11 +95,12 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     directed = torch.cat([pairs, pairs.flip(1)])
     cells = CELLS[0] * CELLS[1]
     # In each part of the first, and of the second image: points, how many are found, how many chance would find.
-    own, other = (torch.zeros(3, len(directed), cells, dtype=torch.float64) for _ in range(2))
+    own, other, open_ = (torch.zeros(3, len(directed), cells, dtype=torch.float64) for _ in range(3))
     node = mapping.observations()
     point, view = mapping.point[node], mapping.graph.view[node]
     observed = Lookup(point * v + view)
-    occupied, nearest = _Occupied.of(mapping), _NearestDepth.of(mapping)
+    occupied = _Occupied.of(mapping)
+    nearest, farthest = _DepthMap.of(mapping, FINE, "amin"), _DepthMap.of(mapping, FINER, "amax")
     length = torch.bincount(point, minlength=len(mapping.X))
     for a in torch.unique(directed[:, 0]).tolist():
         rows = (directed[:, 0] == a).nonzero()[:, 0]
@@ -96,37 +109,52 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
         p = mapping.point[mine]
         x, depth, near = _predicted(mapping, p, a, b)
         seen = observed.has(p * v + b[:, None])
-        found = seen | occupied.at(b[:, None], x)
+        found = seen | occupied.at(b[:, None], x, mine)
         chance = torch.stack([
-            occupied.at(b[:, None], x + x.new_tensor(step)).double()
+            occupied.at(b[:, None], x + x.new_tensor(step), mine).double()
             for step in ((SHIFT, SHIFT), (-SHIFT, SHIFT), (SHIFT, -SHIFT), (-SHIFT, -SHIFT))
         ]).mean(0)  # fmt: skip
+        near &= length[p] - seen.long() >= 2
         hidden = nearest.at(b[:, None], x) < BEHIND * depth
-        counts = near & ~hidden & (length[p] - seen.long() >= 2)
+        through = farthest.at(b[:, None], x) > FARTHER * depth
         first = _cell(mapping.graph.x[mine], mapping.graph.image_size[a]).expand(len(b), -1)
         second = _cell(x, mapping.graph.image_size[b][:, None])
         offset = torch.arange(len(b))[:, None] * cells
-        for table, cell in ((own, first), (other, second)):
+        bare, through = near & ~hidden, near & through
+        for table, cell, counts in ((own, first, bare), (other, second, bare), (open_, first, through)):
             index = (cell + offset)[counts]
             for k, weights in enumerate((torch.ones_like(chance), found.double(), chance)):
                 flat = torch.zeros(len(b) * cells, dtype=torch.float64).index_add_(0, index, weights[counts].double())
                 table[k, rows] = flat.reshape(-1, cells)
-    total, hit, by_chance = own.sum(-1)
-    share = ((hit + 1) / (total + 2)).clamp(max=0.95)[:, None]
-    share_by_chance = ((by_chance + WRONG) / (total + 1)).clamp(min=WRONG)[:, None]
+    expected = _Shares.of(own)
+    swapped = torch.arange(len(directed)).roll(len(pairs))
+    both = 2 * torch.minimum(expected.against(own), expected.against(other)[swapped]).sum(-1)
+    each = _Shares.of(open_).against(open_).sum(-1)
+    score = torch.maximum(both, torch.minimum(each, each[swapped])).reshape(2, -1).amax(0)
+    limit = math.log(2 * max(len(pairs), 1) * cells / SIGNIFICANCE)
+    return Conflicts(pairs, score, limit)
 
-    def against(table: Tensor) -> Tensor:
+
+@dataclass(frozen=True)
+class _Shares:
+    """Which share of the points of one camera another finds again, and which it finds by chance."""
+
+    found: Float[Tensor, "q 1"]
+    by_chance: Float[Tensor, "q 1"]
+
+    @classmethod
+    def of(cls, table: Float[Tensor, "3 q cells"]) -> "_Shares":
+        """Of tables of points, points found, and points that chance would find."""
+        total, hit, by_chance = table.sum(-1)
+        found, chance = ((hit + 1) / (total + 2)).clamp(max=0.95), ((by_chance + WRONG) / (total + 1)).clamp(min=WRONG)
+        return cls(found[:, None], chance[:, None])
+
+    def against(self, table: Float[Tensor, "3 q cells"]) -> Float[Tensor, "q cells"]:
         """Log-likelihood that only chance finds points in a part, over that they are found as in the rest of the pair."""
         n, k, c = table
-        dead = ((c + 5 * share_by_chance) / (n + 5)).clamp(WRONG, 0.9)
-        ratio = k * (dead / share).log() + (n - k) * ((1 - dead) / (1 - share)).log()
-        return torch.where(dead < share, ratio, 0.0)
-
-    swapped = torch.arange(len(directed)).roll(len(pairs))
-    both = 2 * torch.minimum(against(own), against(other)[swapped]).clamp(min=0)
-    score = both.sum(-1).reshape(2, -1).amax(0)
-    limit = math.log(max(len(pairs), 1) * cells / SIGNIFICANCE)
-    return Conflicts(pairs, score, limit)
+        dead = ((c + 5 * self.by_chance) / (n + 5)).clamp(WRONG, 0.9)
+        ratio = k * (dead / self.found).log() + (n - k) * ((1 - dead) / (1 - self.found)).log()
+        return torch.where(dead < self.found, ratio, 0.0).clamp(min=0)
 
 
 class Lookup:
@@ -146,49 +174,67 @@ class Lookup:
 
 @dataclass(frozen=True)
 class _Occupied:
-    """The pixels at or beside which each image has an image point."""
+    """The image points at or beside each pixel of each image."""
 
-    cells: Lookup
+    pixel: Int[Tensor, "m"]
+    """Pixels that are occupied, in ascending order, one for each point there."""
+    point: Int[Tensor, "m"]
+    descriptors: UInt8[Tensor, "n d"] | None
     width: int
     height: int
 
     @classmethod
     def of(cls, mapping: Mapping) -> "_Occupied":
-        width, height = (int(n) + 2 for n in mapping.graph.image_size.amax(0))
-        x = mapping.graph.x.round().long() + 1
+        graph = mapping.graph
+        width, height = (int(n) + 2 for n in graph.image_size.amax(0))
+        x = graph.x.round().long() + 1
         step = torch.tensor([-1, 0, 1])
         column, row = x[:, 0, None, None] + step, x[:, 1, None, None] + step[:, None]
-        return cls(Lookup(((mapping.graph.view[:, None, None] * height + row) * width + column).flatten()), width, height)
+        pixel = ((graph.view[:, None, None] * height + row) * width + column).flatten()
+        order = pixel.argsort()
+        return cls(pixel[order], order // 9, graph.descriptors, width, height)
 
-    def at(self, view: Int[Tensor, "*#k"], x: Float[Tensor, "*k 2"]) -> Bool[Tensor, "*k"]:
-        """Whether an image has an image point at a place, within a pixel or so."""
+    def at(self, view: Int[Tensor, "k 1"], x: Float[Tensor, "k n 2"], like: Int[Tensor, "n"]) -> Bool[Tensor, "k n"]:
+        """Whether an image has a point at a place, within a pixel or so, that looks like a given one where that is known."""
         place = x.nan_to_num(-9.0).clamp(-9, max(self.width, self.height) + 9).round().long() + 1
         inside = (place >= 0).all(-1) & (place[..., 0] < self.width) & (place[..., 1] < self.height)
-        return inside & self.cells.has((view * self.height + place[..., 1]) * self.width + place[..., 0])
+        pixel = (view * self.height + place[..., 1]) * self.width + place[..., 0]
+        first, end = torch.searchsorted(self.pixel, pixel), torch.searchsorted(self.pixel, pixel, right=True)
+        end = torch.where(inside, end, first)
+        if self.descriptors is None:
+            return end > first
+        own = torch.nn.functional.normalize(self.descriptors[like].float(), dim=-1).expand(*pixel.shape, -1)
+        found = torch.zeros_like(inside)
+        for k in range(int((end - first).amax()) if end.numel() else 0):
+            rows = first + k < end
+            others = self.descriptors[self.point[(first + k)[rows]]].float()
+            found[rows] |= (torch.nn.functional.normalize(others, dim=-1) * own[rows]).sum(-1) > ALIKE
+        return found
 
 
 @dataclass(frozen=True)
-class _NearestDepth:
-    """How near the points are that each image sees in and around each small part of it."""
+class _DepthMap:
+    """How near, or how far, the points are that each image sees in and around each small part of it."""
 
-    table: Float[Tensor, "v r c"]
+    table: Float[Tensor, "v columns rows"]
     size: Int[Tensor, "v 2"]
 
     @classmethod
-    def of(cls, mapping: Mapping) -> "_NearestDepth":
+    def of(cls, mapping: Mapping, grid: tuple[int, int], extreme: Literal["amin", "amax"]) -> "_DepthMap":
         node = mapping.observations()
         view = mapping.graph.view[node]
         _, depth = mapping.project(mapping.point[node], view)
-        columns, rows = FINE
+        columns, rows = grid
+        sign = 1 if extreme == "amax" else -1
         size = mapping.graph.image_size
-        place = (view * rows * columns) + _cell(mapping.graph.x[node], size[view], FINE)
-        table = depth.new_full((len(size) * rows * columns,), torch.inf).scatter_reduce(0, place, depth, "amin")
-        around = -torch.nn.functional.max_pool2d(-table.reshape(-1, 1, columns, rows), 3, 1, 1)[:, 0]
-        return cls(around, size)
+        place = (view * rows * columns) + _cell(mapping.graph.x[node], size[view], grid)
+        table = depth.new_full((len(size) * rows * columns,), -torch.inf).scatter_reduce(0, place, sign * depth, "amax")
+        around = torch.nn.functional.max_pool2d(table.reshape(-1, 1, columns, rows), 3, 1, 1)[:, 0]
+        return cls(sign * around, size)
 
     def at(self, view: Int[Tensor, "k 1"], x: Float[Tensor, "k n 2"]) -> Float[Tensor, "k n"]:
-        """The depth of the nearest point seen at or beside a place; infinite where none is."""
-        return self.table.flatten(1)[view, _cell(x, self.size[view], FINE)]
+        """The depth at or beside a place; infinite with the other sign where nothing is seen."""
+        return self.table.flatten(1)[view, _cell(x, self.size[view], (self.table.shape[1], self.table.shape[2]))]
 
 
 def _like_viewpoints(mapping: Mapping) -> Int[Tensor, "q 2"]:

@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -59,6 +59,7 @@ class ViewGraph:
         homography_inliers: Matches that agree with H.
         match: Verified matches, as indices into `x`.
         match_pair: Pair of each verified match.
+        descriptors: What each image point looks like, if known: RootSIFT.
     """
 
     names: tuple[str, ...]
@@ -74,6 +75,7 @@ class ViewGraph:
     homography_inliers: Int[Tensor, "q"]
     match: Int[Tensor, "k 2"]
     match_pair: Int[Tensor, "k"]
+    descriptors: UInt8[Tensor, "n d"] | None = None
 
     def only(self, kept: Bool[Tensor, "q"]) -> "ViewGraph":
         """The graph in which the other pairs have nothing in common."""

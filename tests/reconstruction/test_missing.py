@@ -1,0 +1,111 @@
+"""Two places that pass for one, by what each of their photographs misses of the other's."""
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Pose, intrinsics
+from torchsfm.geometry.distortion import Radial
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.view_graph import ViewGraph
+
+SIZE = (640, 480)
+GROUP = 6
+WALL, CRATE, CLUTTER = 500, 120, 30000
+F64 = torch.float64
+
+
+def model(
+    generator: torch.Generator, *, folded: bool, clutter: bool = False, described: bool = False, veiled: bool = False
+) -> Mapping:
+    """Twelve cameras before one wall, with one crate on its left and one on its right.
+
+    Folded: six of them stand before another wall that looks the same, and each wall has one of the crates. Veiled: nothing is
+    found again where the other six saw the crate, nor behind it. Clutter is image points that match nothing.
+    """
+
+    def uniform(n: int, *bounds: tuple[float, float]) -> Tensor:
+        low, high = torch.tensor(bounds, dtype=F64).T
+        return low + (high - low) * torch.rand(n, 3, generator=generator, dtype=F64)
+
+    wall = uniform(WALL, (-3.5, 3.5), (-2.6, 2.6), (7.0, 7.4))
+    crates = [uniform(CRATE, (side - 0.5, side + 0.5), (0.2, 1.2), (4.4, 5.0)) for side in (-1.3, 1.3)]
+    X = torch.cat([wall, *crates])
+    kind = torch.tensor([0] * WALL + [1] * CRATE + [2] * CRATE)
+    v = 2 * GROUP
+    centre = 0.3 * torch.randn(v, 3, generator=generator, dtype=F64)
+    poses = Pose(torch.eye(3, dtype=F64).repeat(v, 1, 1), -centre)
+    zero = torch.zeros(1, dtype=F64)
+    middle = torch.tensor([[SIZE[0] / 2, SIZE[1] / 2]], dtype=F64)
+    camera = Camera(intrinsics(torch.full((1,), 500.0, dtype=F64), middle), Radial(zero, zero))
+    x = camera[torch.zeros(v, dtype=torch.long)].project(poses.transform(X.expand(v, -1, -1)))
+    second = torch.arange(v) >= GROUP
+    sees = ((x >= 1) & (x < torch.tensor(SIZE) - 2)).all(-1) & (torch.rand(x.shape[:-1], generator=generator) < 0.7)
+
+    def behind(crate: int) -> Bool[Tensor, "v n"]:
+        low, high = (torch.stack([edge(x[i, kind == crate], 0) for i in range(v)]) for edge in (torch.amin, torch.amax))
+        return ((x >= low[:, None]) & (x <= high[:, None])).all(-1) & (kind == 0)
+
+    here = [~second if folded else torch.ones_like(second), second if folded else torch.ones_like(second)]
+    for crate, group in enumerate(here, 1):
+        sees &= ~(behind(crate) & group[:, None]) & ((kind != crate) | group[:, None])
+    if veiled:
+        sees &= ~(second[:, None] & (behind(1) | (kind == 1)))
+    view, point = sees.nonzero(as_tuple=True)
+    looks = torch.randint(0, 256, (len(X), 32), generator=generator)
+    place, look = x[view, point], looks[point]
+    if clutter:
+        place = torch.cat([place, torch.rand(v * CLUTTER, 2, generator=generator, dtype=F64) * torch.tensor(SIZE)])
+        look = torch.cat([look, torch.randint(0, 256, (v * CLUTTER, 32), generator=generator)])
+        view = torch.cat([view, torch.arange(v).repeat_interleave(CLUTTER)])
+        point = torch.cat([point, torch.full((v * CLUTTER,), -1)])
+    none = torch.zeros(0, dtype=torch.long)
+    graph = ViewGraph(
+        names=tuple(f"{i}.png" for i in range(v)),
+        image_size=torch.tensor([SIZE] * v),
+        x=place,
+        view=view,
+        color=torch.zeros(len(view), 3, dtype=F64),
+        pairs=none.reshape(0, 2),
+        num_matches=none,
+        F=torch.zeros(0, 3, 3, dtype=F64),
+        H=torch.zeros(0, 3, 3, dtype=F64),
+        fundamental_inliers=none,
+        homography_inliers=none,
+        match=none.reshape(0, 2),
+        match_pair=none,
+        descriptors=look.to(torch.uint8) if described else None,
+    )
+    registered = torch.ones(v, dtype=torch.bool)
+    return Mapping(graph, point, camera, torch.zeros(v, dtype=torch.long), poses, registered, X, point)
+
+
+def across(pairs: Tensor) -> Tensor:
+    return (pairs < GROUP).sum(1) == 1
+
+
+def test_what_is_seen_through_is_not_there(generator: torch.Generator) -> None:
+    """Each camera misses a crate in another part of the image, before a wall that it sees."""
+    for _ in range(5):
+        conflicts = missing_correspondences(model(generator, folded=True))
+        assert conflicts.folded
+        assert across(conflicts.refuted).all()
+        assert len(conflicts.refuted) >= GROUP
+        right = missing_correspondences(model(generator, folded=False))
+        assert not len(right.refuted)
+
+
+def test_what_may_be_hidden_refutes_nothing(generator: torch.Generator) -> None:
+    for _ in range(5):
+        assert not len(missing_correspondences(model(generator, folded=False, veiled=True)).refuted)
+
+
+def test_points_beside_each_other_need_not_look_alike(generator: torch.Generator) -> None:
+    """Where image points are everywhere, only what they look like tells whether one is found again."""
+    blind = missing_correspondences(model(generator, folded=True, clutter=True))
+    assert not blind.folded
+    told = missing_correspondences(model(generator, folded=True, clutter=True, described=True))
+    assert told.folded
+    assert across(told.refuted).all()
+    assert not len(missing_correspondences(model(generator, folded=False, clutter=True, described=True)).refuted)
