@@ -9,12 +9,14 @@ from torch import Tensor
 
 from bench.cases import scenes
 from bench.cases.case import Case, Peer, Sample, pose_error
+from bench.cases.scenes import F64
 from torchsfm import (
     Solutions,
     Status,
     camera_1p2l,
     camera_2p1l,
     camera_3l,
+    camera_circle,
     camera_dlt,
     camera_gp3p,
     camera_p3p,
@@ -24,7 +26,7 @@ from torchsfm import (
     camera_pnp,
     camera_up2p,
 )
-from torchsfm.geometry import pluecker_from_points
+from torchsfm.geometry import pluecker_from_points, rotation_from_rotvec
 from torchsfm.resection.camera_gp3p import equations as gp3p_equations
 from torchsfm.resection.camera_p3p import equations as p3p_equations
 from torchsfm.resection.camera_p4pf import equations as p4pf_equations
@@ -207,6 +209,27 @@ def opencv_p3p() -> Callable[..., Any]:
     return solve
 
 
+def circle_rays(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+    """Samples of a circle's cone of rays and its radius; and [R | t] up to a turn about the axis."""
+    turn = 0.9 * (2 * scenes.uniform(generator, batch, 3) - 1)
+    R, t = (
+        rotation_from_rotvec(turn),
+        torch.cat((scenes.normal(generator, batch, 2), torch.full((batch, 1), 6.0, dtype=F64)), -1),
+    )
+    radius = 0.3 + scenes.uniform(generator, batch)
+    H = torch.linalg.inv(torch.cat((R[..., :2], t[..., None]), -1))
+    circle = torch.diag_embed(torch.stack((torch.ones_like(radius), torch.ones_like(radius), -radius.square()), -1))
+    return ((H.mT @ circle @ H).to(dtype), radius.to(dtype)), torch.cat((R, t[..., None]), -1)
+
+
+def circle_error(models: Tensor, truth: Tensor) -> Tensor:
+    """The larger of the differences of the circle's normal, of either side, and of its centre relative to its distance."""
+    n, centre = models[..., 2], models[..., 3]
+    normal, place = truth[:, None, :, 2], truth[:, None, :, 3]
+    turned = torch.minimum((n - normal).norm(dim=-1), (n + normal).norm(dim=-1))
+    return torch.maximum(turned, (centre - place).norm(dim=-1) / place.norm(dim=-1))
+
+
 CASES: tuple[Case, ...] = (
     Case(
         "camera_p3p",
@@ -238,6 +261,16 @@ CASES: tuple[Case, ...] = (
             ("camera_1p2l", camera_1p2l, 1, 4, "p1p2ll"),
             ("camera_3l", camera_3l, 0, 8, "p3ll"),
         )
+    ),
+    Case(
+        "camera_circle",
+        size=1,
+        slots=2,
+        solve=camera_circle,
+        scene=circle_rays,
+        error=circle_error,
+        families=(),
+        degenerate=(),
     ),
     Case(
         "camera_up2p",

@@ -489,6 +489,7 @@ EXCEPTIONS: dict[str, str] = {
     "formats.undistorted_model": "hands a model to undistorted_cameras",
     **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},
     **{f"images.{name}": FILES for name in ("parse_exif", "read_image", "save_image")},
+    "optim.for_slots": "a view of a tensor, not its values",
     "optim.wants_derivative": "a question about tensors, not their values",
     "reconstruction.reconstruct_curves": "photographs one after another, and seconds",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
@@ -507,6 +508,7 @@ EXCEPTIONS: dict[str, str] = {
 INNER = {
     "geometry.curve_crossings", "geometry.curve_from_samples", "geometry.foot_points", "geometry.least_number_off",
     "geometry.line_and_plane_distances", "images.describe_images", "images.describe_segments", "images.list_skipped",
+    "optim.for_slots",
     "images.parse_exif", "optim.loss_slope", "optim.marginal_covariance", "optim.rotation_exponential",
     "optim.wants_derivative", "robust.check_counts", "robust.check_door", "robust.constant_weights",
     "robust.estimate_robustly",

@@ -161,6 +161,29 @@ def test_a_camera_that_its_pairs_contradict_is_doubted(generator: torch.Generato
     assert "contradict" in doubt[3]
 
 
+def test_places_that_leave_many_matches_unexplained_are_doubted(generator: torch.Generator) -> None:
+    """Of things that repeat, a pair has matches of another relation, too; most may still agree with the model."""
+    mapping = scene(generator)
+    graph = mapping.graph
+    others = [torch.randint(0, int(n), (int(0.6 * q), 1), generator=generator) for q, n in _sizes(mapping)]
+    assert all(len(rows) > 50 for rows in others)
+    first, second = (graph.pairs[:, side] for side in range(2))
+    start = torch.searchsorted(graph.view, torch.arange(8))
+    wrong = [torch.cat((start[i] + rows, start[j] + rows.flip(0)), 1) for rows, i, j in zip(others, first, second, strict=True)]
+    pair = torch.arange(len(graph.pairs)).repeat_interleave(torch.tensor([len(rows) for rows in wrong]))
+    ambiguous = replace(graph, match=torch.cat([graph.match, *wrong]), match_pair=torch.cat([graph.match_pair, pair]))
+    assert pair_agreement(replace(mapping, graph=ambiguous), threshold=4.0).supports.all()
+    assert all("matches of its pairs agree" in reason for reason in judged(replace(mapping, graph=ambiguous)))
+
+
+def _sizes(mapping: Mapping) -> list[tuple[Tensor, Tensor]]:
+    """For each pair the number of its matches, and the smaller number of image points of its two views."""
+    graph = mapping.graph
+    points = torch.bincount(graph.view, minlength=len(graph.names))
+    matches = torch.bincount(graph.match_pair, minlength=len(graph.pairs))
+    return list(zip(matches, points[graph.pairs].amin(1), strict=True))
+
+
 def test_deviations_do_not_depend_on_the_frame(generator: torch.Generator) -> None:
     mapping = scene(generator)
     R = random_rotation(generator=generator, dtype=torch.float64)

@@ -33,9 +33,23 @@ from torchsfm.motion.two_views.relative_upright_3pt import relative_upright_3pt
 
 ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, TrifocalEstimator, UprightPoseEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
+SOLVERS = (
+    essential_5pt,
+    essential_6pt,
+    fundamental_7pt,
+    fundamental_affine_4pt,
+    homography_4pt,
+    motions_from_homography,
+    relative_6pt_focal,
+    relative_known_rotation_2pt,
+    relative_upright_3pt,
+    trifocal_6pt,
+)
+"""What returns `Solutions` of a sample here; the contract tests run over them, on the scenes of `bench/cases/`."""
 
 __all__ = [
     "ESTIMATORS",
+    "SOLVERS",
     "AffineFactorization",
     "AveragedRotations",
     "ConicEpipolarFit",

@@ -1,7 +1,7 @@
 """Which parameters make the residuals smallest, and how do they move when the data move? Engines that know no geometry."""
 
 from torchsfm.optim.covariance import SparseCovariance, marginal_covariance, sparse_covariance
-from torchsfm.optim.implicit import attach_implicit, attach_optimum, wants_derivative
+from torchsfm.optim.implicit import attach_implicit, attach_optimum, for_slots, wants_derivative
 from torchsfm.optim.levenberg_marquardt import LeastSquaresResult, levenberg_marquardt
 from torchsfm.optim.loss import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey, loss_slope
 from torchsfm.optim.manifold import (
@@ -41,6 +41,7 @@ __all__ = [
     "UnitSphere",
     "attach_implicit",
     "attach_optimum",
+    "for_slots",
     "levenberg_marquardt",
     "loss_slope",
     "marginal_covariance",

@@ -33,6 +33,22 @@ def wants_derivative(*inputs: Tensor) -> bool:
     return any(forward_ad.unpack_dual(x).tangent is not None for x in inputs)  # type: ignore[no-untyped-call]
 
 
+def for_slots(x: Float[Tensor, "..."], batch: tuple[int, ...], dims: int = 2) -> Float[Tensor, "..."]:
+    """What a solver was given, as each of its solutions sees it: `(*batch, 1, ...)`, whatever batch dimensions it came with.
+
+    Args:
+        x: An argument of the solver; its last `dims` dimensions belong to one problem.
+        batch: The batch dimensions of all arguments together.
+        dims: See `x`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.optim.for_slots(torch.zeros(7, 2), (5,)).shape  # seven points, the same for five problems
+        torch.Size([5, 1, 7, 2])
+    """
+    return x.expand(*batch, *x.shape[x.ndim - dims :]).unsqueeze(len(batch))
+
+
 def attach_implicit(
     equations: Callable[..., Tensor],
     y: Float[Tensor, "..."],
@@ -54,7 +70,7 @@ def attach_implicit(
         y: The solution, `(*batch, ...)` with `dims` trailing dimensions that make up one solution. Its graph, if any, is
             dropped.
         *inputs: What the solution depends on. Each carries the batch dimensions of `y` in front, of size 1 where shared
-            (`x[..., None, :, :]` for several solution slots).
+            (`for_slots` for several solution slots).
         dims: How many trailing dimensions of `y` belong to one solution.
         valid: Which elements of the batch are solutions at all.
 

@@ -6,8 +6,8 @@ the thing alone. What stands around it differs, and no match is wrong there: the
 its own, seen by others, none of which the other camera sees though nothing stands before them.
 
 That nothing stands before a point is judged in two ways. Where each camera misses what the other sees in one and the same part
-of the image, no thing in front of it explains both. And where a camera sees something through the place itself, as far away or
-farther, one that it misses there is not hidden.
+of the image, no thing in front of it explains both. And where a camera sees only what is as far away as a point, or
+farther, beside the place where it should see that point, nothing hides it.
 """
 
 import math
@@ -33,7 +33,7 @@ BEHIND = 0.95
 FINER = (48, 36)
 """Columns and rows in which it is known how far an image sees."""
 FARTHER = 0.97
-"""A camera that sees this fraction of a point's depth beside its place sees the place itself."""
+"""A camera that sees this fraction of a point's depth beside its place, and nothing nearer, sees the place itself."""
 ALIKE = 0.85
 """Descriptors of one point, seen from like viewpoints, have at least this cosine; those of others rarely do."""
 WRONG = 0.02
@@ -101,6 +101,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     observed = Lookup(point * v + view)
     occupied = _Occupied.of(mapping)
     nearest, farthest = _DepthMap.of(mapping, FINE, "amin"), _DepthMap.of(mapping, FINER, "amax")
+    beside = _DepthMap.of(mapping, FINER, "amin")
     length = torch.bincount(point, minlength=len(mapping.X))
     for a in torch.unique(directed[:, 0]).tolist():
         rows = (directed[:, 0] == a).nonzero()[:, 0]
@@ -116,7 +117,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
         ]).mean(0)  # fmt: skip
         near &= length[p] - seen.long() >= 2
         hidden = nearest.at(b[:, None], x) < BEHIND * depth
-        through = farthest.at(b[:, None], x) > FARTHER * depth
+        through = (farthest.at(b[:, None], x) > FARTHER * depth) & (beside.at(b[:, None], x) > BEHIND * depth)
         first = _cell(mapping.graph.x[mine], mapping.graph.image_size[a]).expand(len(b), -1)
         second = _cell(x, mapping.graph.image_size[b][:, None])
         offset = torch.arange(len(b))[:, None] * cells

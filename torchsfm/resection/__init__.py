@@ -21,9 +21,22 @@ from torchsfm.resection.resect_cameras import ResectedCameras, resect_cameras
 
 ESTIMATORS = (CameraEstimator, FocalCameraEstimator, PointLineCameraEstimator, ProjectiveCameraEstimator)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
+SOLVERS = (
+    camera_1p2l,
+    camera_2p1l,
+    camera_3l,
+    camera_circle,
+    camera_gp3p,
+    camera_p3p,
+    camera_p4pf,
+    camera_p35pf,
+    camera_up2p,
+)
+"""What returns `Solutions` of a sample here; the contract tests run over them, on the scenes of `bench/cases/`."""
 
 __all__ = [
     "ESTIMATORS",
+    "SOLVERS",
     "CameraEstimate",
     "CameraEstimator",
     "CameraRefinement",

@@ -15,7 +15,7 @@ from torchsfm.linalg import qr
 from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.quadric_intersection import intersect_quadrics, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.triangle import ASIDE, NEAREST
 
 _CHUNK = 4096
@@ -85,7 +85,7 @@ def camera_gp3p(
         held = torch.isfinite(model).flatten(-2).all(-1)
         valid, model = valid & held, torch.where(held[..., None, None], model, 0)
     if wants_derivative(p, d, X):
-        model = attach_implicit(equations, model, *(a[..., None, :, :] for a in (p, d, X)), dims=2, valid=valid)
+        model = attach_implicit(equations, model, *(for_slots(a, batch) for a in (p, d, X)), dims=2, valid=valid)
     return Solutions(model, valid)
 
 

@@ -16,7 +16,7 @@ from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.quadric_intersection import cubic_of_forms, intersect_quadrics, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.focal import camera_of, incidence_rows, scaled, world_camera
 
 _CHUNK = 4096
@@ -85,7 +85,7 @@ def camera_p35pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"
         held = torch.isfinite(model).flatten(-2).all(-1)
         valid, model = valid & held, torch.where(held[..., None, None], model, 0)
     if wants_derivative(x, X):
-        model = attach_implicit(equations, model, x[..., None, :, :], X[..., None, :, :], dims=2, valid=valid)
+        model = attach_implicit(equations, model, for_slots(x, batch), for_slots(X, batch), dims=2, valid=valid)
     return Solutions(model, valid)
 
 

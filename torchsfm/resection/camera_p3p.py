@@ -75,10 +75,11 @@ def _solve(rays: Tensor, points: Tensor, eps: float, differentiable: bool) -> tu
     if differentiable:
         depths = Triangle(u, X).follow(depths, valid)
     Y = u.unsqueeze(2) * depths.unsqueeze(1)
-    if differentiable:
-        # Empty slots have no derivative.
-        Y = torch.where(valid, Y, Y.detach())
-    return _pose(X, Y), valid
+    if not differentiable:
+        return _pose(X, Y), valid
+    # Empty slots have no derivative, neither by their points nor by their depths, which need not be finite.
+    pose = _pose(X, torch.where(valid, Y, Y.detach()))
+    return torch.where(valid, pose, pose.detach()), valid
 
 
 def equations(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.geometry.homogeneous import moderate_directions
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.triangle import NEAREST
 
 
@@ -81,7 +81,7 @@ def camera_up2p(
         valid, model = valid & held, torch.where(held[..., None, None], model, 0)
     if wants_derivative(d, X, g, G):
         d, g, G = (moderate_directions(v) for v in (d, g, G))
-        inputs = (d[..., None, :, :], X[..., None, :, :], g[..., None, :], G[..., None, :])
+        inputs = (for_slots(d, batch), for_slots(X, batch), for_slots(g, batch, 1), for_slots(G, batch, 1))
         model = attach_implicit(equations, model, *inputs, dims=2, valid=valid)
     return Solutions(model, valid)
 

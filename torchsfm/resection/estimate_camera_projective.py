@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import damped_solve, nullspace_rows
-from torchsfm.optim import UnitSphere, attach_implicit, wants_derivative
+from torchsfm.optim import UnitSphere, attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.flat_structure import flatness, flatness_suspected
 from torchsfm.resection.focal import incidence_rows
 from torchsfm.resection.reprojection_step import normal_equations, squared_reprojection
@@ -49,7 +49,7 @@ class ProjectiveCameraEstimator:
             P, valid = (torch.cat(part) for part in zip(*parts, strict=True))
             P, valid = P.reshape(*batch, 1, 3, 4).to(x.dtype), valid.reshape(*batch, 1)
         if wants_derivative(x, X):
-            P = attach_implicit(equations, P, x[..., None, :, :], X[..., None, :, :], dims=2, valid=valid)
+            P = attach_implicit(equations, P, for_slots(x, batch), for_slots(X, batch), dims=2, valid=valid)
         return Solutions(P, valid)
 
     def squared_residual(

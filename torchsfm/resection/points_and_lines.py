@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross, usable
-from torchsfm.optim import attach_implicit, rotation_exponential, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, rotation_exponential, wants_derivative
 
 _STEPS = 3
 _MET = 1e-9
@@ -105,7 +105,7 @@ def solve_poses(
         model = torch.where(valid[..., None, None], model, torch.eye(3, 4, dtype=dtype, device=L.device))
         model, valid = model.reshape(*batch, slots, 3, 4), valid.reshape(*batch, slots)
     if wants_derivative(*data):
-        model = attach_implicit(equations, model, *(t[..., None, :, :] for t in data), dims=2, valid=valid)
+        model = attach_implicit(equations, model, *(for_slots(t, batch) for t in data), dims=2, valid=valid)
     return Solutions(model, valid)
 
 

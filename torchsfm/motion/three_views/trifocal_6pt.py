@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.three_views.dual_sixth_point import null_3x3, sixth_point
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.tensors import trifocal_from_cameras
 from torchsfm.tensors.transfer import axis_lines
 
@@ -91,7 +91,7 @@ def trifocal_6pt(x: Float[Tensor, "*batch 3 6 2"]) -> Solutions[Float[Tensor, "*
         eye = torch.eye(3, 4, dtype=P.dtype, device=P.device).expand(*batch, 3, 1, 3, 4)
         P = torch.cat((eye, P), -3).to(x.dtype)
     if wants_derivative(x):
-        P = attach_implicit(equations, P, x[..., None, :, :, :], dims=3, valid=valid)
+        P = attach_implicit(equations, P, for_slots(x, batch, 3), dims=3, valid=valid)
     return Solutions(P, valid)
 
 

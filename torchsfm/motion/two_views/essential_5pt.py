@@ -17,7 +17,7 @@ from torchsfm.linalg.real_roots import number_among_equals
 from torchsfm.linalg.rows import take_columns
 from torchsfm.motion.two_views.essential_manifold import combine, from_roots, polish
 from torchsfm.motion.two_views.five_points import five_point_roots
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 4096
 """Problems at a time: their matrices fit the cache."""
@@ -78,7 +78,7 @@ def essential_5pt(
         E, valid = _solve(rows1, rows2)
         E, valid = E.to(d1.dtype).reshape(*batch, 10, 3, 3), valid.reshape(*batch, 10)
     if wants_derivative(d1, d2):
-        E = attach_implicit(equations, E, d1[..., None, :, :], d2[..., None, :, :], dims=2, valid=valid)
+        E = attach_implicit(equations, E, for_slots(d1, batch), for_slots(d2, batch), dims=2, valid=valid)
     return Solutions(E, valid)
 
 

@@ -18,7 +18,7 @@ from torchsfm.linalg import damped_solve, svd, triangular_factor
 from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.motion.two_views.epipolar_fit import cofactors
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 1024
 """Problems at a time: their matrices fit the cache."""
@@ -105,11 +105,11 @@ def essential_6pt(
         E, valid = E.to(d1.dtype).reshape(*batch, 1, 3, 3), valid.reshape(*batch, 1)
     given = [v for v in (d1, d2, weights) if v is not None]
     if wants_derivative(*given):
-        inputs = [d1[..., None, :, :], d2[..., None, :, :]]
+        inputs = [for_slots(d1, batch), for_slots(d2, batch)]
         if weights is not None:
             # Absent rays may hold anything: ones take their place.
             there = (weights > 0)[..., None, :, None]
-            inputs = [*(torch.where(there, d, 1) for d in inputs), weights[..., None, :]]
+            inputs = [*(torch.where(there, d, 1) for d in inputs), for_slots(weights, batch, 1)]
         E = attach_implicit(equations, E, *inputs, dims=2, valid=valid)
     return Solutions(E, valid)
 

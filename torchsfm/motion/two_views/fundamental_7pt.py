@@ -17,7 +17,7 @@ from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.polynomial import cubic_rows
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.linalg.vectors import fma, fms
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _INDEPENDENT = 1e-12
 """Smallest pivot of the normalised equations, and largest coefficient of the cubic, that are not taken for zero."""
@@ -66,7 +66,7 @@ def fundamental_7pt(
         F = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 3).to(x1.dtype)
         valid = good.mT.reshape(*batch, 3)
     if wants_derivative(x1, x2):
-        F = attach_implicit(equations, F, x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
+        F = attach_implicit(equations, F, for_slots(x1, batch), for_slots(x2, batch), dims=2, valid=valid)
     return Solutions(F, valid)
 
 

@@ -12,7 +12,7 @@ from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg import eigvalsh, null_vector, usable
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.two_views.sample_rows import in_chunks, rows_of
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 4096
 """Problems at a time: their numbers fit the cache."""
@@ -65,7 +65,7 @@ def fundamental_affine_4pt(
             rows, good = in_chunks(_solve, _CHUNK, *rows_of(batch, x1, x2))
             F, valid = rows.mT.to(x1.dtype).reshape(*batch, 1, 3, 3), good.reshape(*batch, 1)
         if wants_derivative(x1, x2):
-            F = attach_implicit(equations, F, x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
+            F = attach_implicit(equations, F, for_slots(x1, batch), for_slots(x2, batch), dims=2, valid=valid)
         return Solutions(F, valid)
     normal, offset, valid = _fit(x1, x2, weights)
     zero = torch.zeros_like(offset)

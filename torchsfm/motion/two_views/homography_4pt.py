@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.vectors import fma, fms
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 
 def equations(
@@ -59,7 +59,7 @@ def homography_4pt(
         H = rows.permute(2, 0, 1).reshape(*batch, 1, 3, 3).to(x1.dtype)
         valid = good.reshape(*batch, 1)
     if wants_derivative(x1, x2):
-        H = attach_implicit(equations, H, x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
+        H = attach_implicit(equations, H, for_slots(x1, batch), for_slots(x2, batch), dims=2, valid=valid)
     return Solutions(H, valid)
 
 

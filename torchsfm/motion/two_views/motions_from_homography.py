@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, Status, check_tensors
 from torchsfm.linalg import cross, determinant_3x3, solve, svd
 from torchsfm.motion.two_views.epipolar_fit import matrices
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _SINGULAR = 1e-10
 """Smallest singular value of a homography, relative to the middle one."""
@@ -113,7 +113,7 @@ def motions_from_homography(
         y, valid = _solve(G.detach())
         valid = valid & finite[..., None]
     if wants_derivative(G):
-        y = attach_implicit(equations, y, G[..., None, :, :], valid=valid)
+        y = attach_implicit(equations, y, for_slots(G, batch), valid=valid)
     # An empty slot holds I, 0, e3.
     eye = torch.eye(3, dtype=y.dtype, device=y.device)
     empty = torch.cat((eye.flatten(), eye.new_zeros(3), eye[2], eye.new_ones(1)))

@@ -13,7 +13,7 @@ from torchsfm.linalg.rows import combine_rows
 from torchsfm.linalg.vectors import cross, fma, fms
 from torchsfm.motion.two_views.epipolar_fit import MIXTURE, with_left_epipole
 from torchsfm.motion.two_views.fundamental_7pt import batch_last, equations, solve
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 
 def oriented_7pt(
@@ -36,7 +36,7 @@ def oriented_7pt(
         model = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 4).to(x1.dtype)
         valid = valid.mT.reshape(*batch, 3)
     if wants_derivative(x1, x2):
-        F = attach_implicit(equations, model[..., :3], x1[..., None, :, :], x2[..., None, :, :], dims=2, valid=valid)
+        F = attach_implicit(equations, model[..., :3], for_slots(x1, batch), for_slots(x2, batch), dims=2, valid=valid)
         model = with_left_epipole(F, model[..., 3])
     return Solutions(model, valid)
 

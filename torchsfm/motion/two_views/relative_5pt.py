@@ -22,7 +22,7 @@ from torchsfm.motion.two_views.five_points import (
     normalised,
     products_of_minors,
 )
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 4096
 """Samples at a time: their matrices fit the cache."""
@@ -81,7 +81,7 @@ def relative_5pt(
             valid.index_fill_(0, place, True)
         pose, valid = pose.to(d1.dtype).reshape(*batch, 10, 3, 4), valid.reshape(*batch, 10)
     if wants_derivative(d1, d2):
-        pose = attach_implicit(equations, pose, d1[..., None, :, :], d2[..., None, :, :], dims=2, valid=valid)
+        pose = attach_implicit(equations, pose, for_slots(d1, batch), for_slots(d2, batch), dims=2, valid=valid)
     return Solutions(pose, valid)
 
 

@@ -22,7 +22,7 @@ from torchsfm.linalg.nullspace import nullspace_rows
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.motion.two_views.epipolar_fit import matrices
 from torchsfm.motion.two_views.sample_rows import rows_of
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 1024
 """Problems at a time."""
@@ -135,7 +135,7 @@ def relative_6pt_focal(x1: Float[Tensor, "*#batch 6 2"], x2: Float[Tensor, "*#ba
         y, valid = (torch.cat(p) for p in zip(*parts, strict=True))
         y, valid = y.to(x1.dtype).reshape(*batch, _SLOTS, 10), valid.reshape(*batch, _SLOTS)
     if wants_derivative(x1, x2):
-        y = attach_implicit(equations, y, x1[..., None, :, :], x2[..., None, :, :], valid=valid)
+        y = attach_implicit(equations, y, for_slots(x1, batch), for_slots(x2, batch), valid=valid)
     return Solutions(FocalMotion(matrices(y[..., :9], 3), y[..., 9]), valid)
 
 

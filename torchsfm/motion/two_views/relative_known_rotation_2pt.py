@@ -18,7 +18,7 @@ from torchsfm.motion.two_views.sample_rows import (
     towards_the_front,
     unit_rays,
 )
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 4096
 """Problems at a time: their numbers fit the cache."""
@@ -70,7 +70,7 @@ def relative_known_rotation_2pt(
         t, valid = in_chunks(_solve, _CHUNK, *rows_of(batch, d1, d2, R))
         t, valid = t.mT.to(d1.dtype).reshape(*batch, 1, 3), valid.reshape(*batch, 1)
     if wants_derivative(d1, d2, R):
-        t = attach_implicit(equations, t, d1[..., None, :, :], d2[..., None, :, :], R[..., None, :, :], valid=valid)
+        t = attach_implicit(equations, t, for_slots(d1, batch), for_slots(d2, batch), for_slots(R, batch), valid=valid)
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     kept = torch.where(valid[..., None, None], R[..., None, :, :], eye)
     return Solutions(torch.cat((kept, t[..., None]), -1), valid)

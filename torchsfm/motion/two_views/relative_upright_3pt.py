@@ -18,7 +18,7 @@ from torchsfm.linalg import cross
 from torchsfm.linalg.quartic import quartic_rows
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.two_views.sample_rows import cross_columns, in_chunks, rows_of, unit_rays
-from torchsfm.optim import attach_implicit, wants_derivative
+from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 2048
 """Problems at a time: their numbers fit the cache."""
@@ -91,7 +91,7 @@ def relative_upright_3pt(
         pose, valid = pose.permute(2, 1, 0).to(d1.dtype).reshape(*batch, 4, 3, 4), valid.mT.reshape(*batch, 4)
     if wants_derivative(d1, d2, gravity1, gravity2):
         d1, d2, gravity1, gravity2 = (moderate_directions(v) for v in (d1, d2, gravity1, gravity2))
-        inputs = (d1[..., None, :, :], d2[..., None, :, :], gravity1[..., None, :], gravity2[..., None, :])
+        inputs = (for_slots(d1, batch), for_slots(d2, batch), for_slots(gravity1, batch, 1), for_slots(gravity2, batch, 1))
         pose = attach_implicit(equations, pose, *inputs, dims=2, valid=valid)
     return Solutions(pose, valid)
 
