@@ -176,7 +176,8 @@ def test_derivatives_are_those_of_the_solutions(case: Case, generator: torch.Gen
     size = model.detach().norm(dim=-1)
     compared = 0
     for k, x in enumerate(sample):
-        along = x.abs().reshape(len(x), -1).amax(-1).reshape(-1, *[1] * (x.ndim - 1)) * torch.randn(x.shape, generator=generator)
+        reach = x.abs().reshape(len(x), -1).amax(-1).reshape(-1, *[1] * (x.ndim - 1))
+        along = reach * torch.randn(x.shape, generator=generator)
         ends, near = [], found.valid.any(-1)
         for sign in (-1, 1):
             side = case.solve(*sample[:k], x + sign * step * along, *sample[k + 1 :])

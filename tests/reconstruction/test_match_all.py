@@ -27,8 +27,12 @@ def matched(folder: Path, out: Path | None = None, **options: Any) -> MatchedPho
 
 
 def same_graph(a: ViewGraph, b: ViewGraph) -> bool:
-    return a.names == b.names and all(
-        torch.equal(getattr(a, name), getattr(b, name)) for name in ViewGraph.__dataclass_fields__ if name != "names"
+    tensors = ViewGraph.__dataclass_fields__.keys() - {"names", "descriptors"}
+    looks = zip(a.descriptors or (), b.descriptors or (), strict=True)
+    return (
+        a.names == b.names
+        and all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
+        and all(torch.equal(x, y) for x, y in looks)
     )
 
 

@@ -59,7 +59,7 @@ class ViewGraph:
         homography_inliers: Matches that agree with H.
         match: Verified matches, as indices into `x`.
         match_pair: Pair of each verified match.
-        descriptors: What each image point looks like, if known: RootSIFT.
+        descriptors: What the points of each image look like, read when asked for; None where that is not known of all.
     """
 
     names: tuple[str, ...]
@@ -75,7 +75,7 @@ class ViewGraph:
     homography_inliers: Int[Tensor, "q"]
     match: Int[Tensor, "k 2"]
     match_pair: Int[Tensor, "k"]
-    descriptors: UInt8[Tensor, "n d"] | None = None
+    descriptors: Sequence[UInt8[Tensor, "_ d"]] | None = None
 
     def only(self, kept: Bool[Tensor, "q"]) -> "ViewGraph":
         """The graph in which the other pairs have nothing in common."""
