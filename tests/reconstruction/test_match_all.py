@@ -28,11 +28,11 @@ def matched(folder: Path, out: Path | None = None, **options: Any) -> MatchedPho
 
 def same_graph(a: ViewGraph, b: ViewGraph) -> bool:
     tensors = ViewGraph.__dataclass_fields__.keys() - {"names", "descriptors"}
-    looks = zip(a.descriptors or (), b.descriptors or (), strict=True)
     return (
         a.names == b.names
         and all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
-        and all(torch.equal(x, y) for x, y in looks)
+        and (a.descriptors is None) == (b.descriptors is None)
+        and (a.descriptors is None or b.descriptors is None or torch.equal(a.descriptors(), b.descriptors()))
     )
 
 

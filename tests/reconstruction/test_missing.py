@@ -60,8 +60,6 @@ def model(
         look = torch.cat([look, torch.randint(0, 256, (v * CLUTTER, 32), generator=generator)])
         view = torch.cat([view, torch.arange(v).repeat_interleave(CLUTTER)])
         point = torch.cat([point, torch.full((v * CLUTTER,), -1)])
-        order = view.argsort(stable=True)
-        place, look, view, point = (rows[order] for rows in (place, look, view, point))
     none = torch.zeros(0, dtype=torch.long)
     graph = ViewGraph(
         names=tuple(f"{i}.png" for i in range(v)),
@@ -77,7 +75,7 @@ def model(
         homography_inliers=none,
         match=none.reshape(0, 2),
         match_pair=none,
-        descriptors=torch.split(look.to(torch.uint8), torch.bincount(view).tolist()) if described else None,
+        descriptors=(lambda: look.to(torch.uint8)) if described else None,
     )
     registered = torch.ones(v, dtype=torch.bool)
     return Mapping(graph, point, camera, torch.zeros(v, dtype=torch.long), poses, registered, X, point)

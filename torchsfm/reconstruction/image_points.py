@@ -67,25 +67,6 @@ class SavedFeatures(Sequence[Features]):
         return Features(x=x, scale=x[:, 0], angle=x[:, 0], response=x[:, 0], descriptors=self.shards.only(shard, name)[name])
 
 
-@dataclass(frozen=True)
-class Descriptors(Sequence[Tensor]):
-    """What the features of each image look like."""
-
-    features: Sequence[Features]
-
-    def __len__(self) -> int:
-        return len(self.features)
-
-    @overload
-    def __getitem__(self, number: int) -> Tensor: ...
-    @overload
-    def __getitem__(self, number: slice) -> list[Tensor]: ...
-    def __getitem__(self, number: int | slice) -> Tensor | list[Tensor]:
-        if isinstance(number, slice):
-            return [found.descriptors for found in self.features[number]]
-        return self.features[number].descriptors
-
-
 def image_names(files: Sequence[Path]) -> list[str]:
     """A name for each file, no two the same: without its folder, or where that is not enough from the common folder on.
 

@@ -9,7 +9,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchsfm.images import match_features, retrieve_pairs
-from torchsfm.reconstruction.image_points import SHARDS, Descriptors, ImagePoints
+from torchsfm.reconstruction.image_points import SHARDS, ImagePoints
 from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.sequence import Corners, sequence_pairs, track_corners
@@ -157,4 +157,4 @@ def match_all(
     verified = VerifiedPairs.join([VerifiedPairs(**shard) for shard in shards])
     graph = verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
     # Corners that were tracked through a sequence have no descriptors.
-    return graph if sequence else replace(graph, descriptors=Descriptors(features))
+    return graph if sequence else replace(graph, descriptors=lambda: torch.cat([f.descriptors for f in features]))

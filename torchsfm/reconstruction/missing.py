@@ -193,7 +193,7 @@ class _Occupied:
         column, row = x[:, 0, None, None] + step, x[:, 1, None, None] + step[:, None]
         pixel = ((graph.view[:, None, None] * height + row) * width + column).flatten()
         order = pixel.argsort()
-        looks = None if graph.descriptors is None else torch.cat(list(graph.descriptors))
+        looks = None if graph.descriptors is None else graph.descriptors()
         return cls(pixel[order], order // 9, looks, width, height)
 
     def at(self, view: Int[Tensor, "k 1"], x: Float[Tensor, "k n 2"], like: Int[Tensor, "n"]) -> Bool[Tensor, "k n"]:

@@ -1,7 +1,7 @@
 """What the images say of each other: matches between all pairs, checked against epipolar geometry in one batched call."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -59,7 +59,7 @@ class ViewGraph:
         homography_inliers: Matches that agree with H.
         match: Verified matches, as indices into `x`.
         match_pair: Pair of each verified match.
-        descriptors: What the points of each image look like, read when asked for; None where that is not known of all.
+        descriptors: Reads what the image points look like; None where that is not known of all.
     """
 
     names: tuple[str, ...]
@@ -75,7 +75,7 @@ class ViewGraph:
     homography_inliers: Int[Tensor, "q"]
     match: Int[Tensor, "k 2"]
     match_pair: Int[Tensor, "k"]
-    descriptors: Sequence[UInt8[Tensor, "_ d"]] | None = None
+    descriptors: Callable[[], UInt8[Tensor, "n d"]] | None = None
 
     def only(self, kept: Bool[Tensor, "q"]) -> "ViewGraph":
         """The graph in which the other pairs have nothing in common."""
