@@ -123,6 +123,7 @@ from torchsfm.images import (
 from torchsfm.motion import (
     AffineFactorization as AffineFactorization,
     AveragedRotations as AveragedRotations,
+    CurveFactorization as CurveFactorization,
     ConicEpipolarFit as ConicEpipolarFit,
     Factorization as Factorization,
     GlobalPositions as GlobalPositions,
@@ -135,6 +136,7 @@ from torchsfm.motion import (
     estimate_trifocal as estimate_trifocal,
     estimate_upright as estimate_upright,
     factorize_affine as factorize_affine,
+    factorize_curves as factorize_curves,
     factorize_points as factorize_points,
     fundamental_from_conics as fundamental_from_conics,
     position_globally as position_globally,

@@ -151,6 +151,15 @@ def _image_curve(s: Scene) -> Curve:
     return tensor_map(lambda t: t[(*(slice(None),) * len(s.batch), 0)], _image_curves(s))
 
 
+def _images_of_curves(s: Scene) -> Curve:
+    """Three bent rings, each in all images."""
+    t = torch.arange(48, dtype=torch.float64) * (6.28318 / 48)
+    waves = torch.stack((t.cos(), t.sin(), 0.2 * (2 * t).sin(), 0.2 * (2 * t).cos()), -1)
+    rings = s.points(3)[..., None, :] + 0.5 * waves @ s.randn(3, 4, 3)
+    images = project_points(s.cameras(4), rings.flatten(-3, -2)[..., None, :, :])
+    return curve_from_samples(images.unflatten(-2, (3, 48)), closed=True)
+
+
 def _features(s: Scene) -> list[Features]:
     one = [s.rand(20, high=9.0) for _ in range(3)]
     return [Features(s.rand(20, 2, high=100.0), *one, s.rand(20, 128)) for _ in range(3)]
@@ -350,6 +359,7 @@ FUNCTIONS: dict[str, Function] = {
     "motion.estimate_trifocal": Function(ROBUST, {"n": 30}),
     "motion.estimate_upright": Function(RAYS, {"n": 30}),
     "motion.factorize_affine": Function({"max_iterations": 20}),
+    "motion.factorize_curves": Function({"curves": _images_of_curves, "samples": 12, "max_iterations": 10}),
     "motion.factorize_points": Function({"max_iterations": 20}),
     "motion.fundamental_from_conics": Function(
         {f"C{i + 1}": lambda s, i=i: _tilted(s)[i] for i in range(2)}

@@ -49,11 +49,11 @@ class Curve:
     @property
     def length(self) -> Float[Tensor, "*batch"]:
         """The length of the polygon through the samples."""
-        return _segments(self).length.sum(-1)
+        return segments_of(self).length.sum(-1)
 
     def tangents(self) -> Float[Tensor, "*batch n d"]:
         """Unit tangents at the samples, forwards; zero in empty slots and of single points."""
-        return torch.nn.functional.normalize(_segments(self).slope, dim=-1)
+        return torch.nn.functional.normalize(segments_of(self).slope, dim=-1)
 
     def reversed(self) -> "Curve":
         """The same curves from their other end; closed ones keep their first sample."""
@@ -69,7 +69,7 @@ class Curve:
         A curve of fewer than two samples, or without length, has none.
         """
         check_options(n=(n, "int >= 2"))
-        s = _segments(self)
+        s = segments_of(self)
         end = s.length.cumsum(-1)
         total = end[..., -1:]
         share = torch.arange(n, dtype=self.x.dtype, device=self.x.device)
@@ -180,7 +180,7 @@ def foot_points(curve: Curve, y: Float[Tensor, "*#batch m d"]) -> FootPoints:
     check_tensors(y=(y, f"m {d}"), curve=(curve.x, f"n {d}"))
     batch = broadcast_shapes(curve.x.shape[:-2], y.shape[:-2])
     n, m = curve.x.shape[-2], y.shape[-2]
-    s = _segments(
+    s = segments_of(
         Curve(
             curve.x.expand(*batch, n, d).reshape(-1, n, d),
             curve.valid.expand(*batch, n).reshape(-1, n),
@@ -188,7 +188,7 @@ def foot_points(curve: Curve, y: Float[Tensor, "*#batch m d"]) -> FootPoints:
         )
     )
     with torch.no_grad():
-        held = _Segments(*(t.detach() for t in s))
+        held = Segments(*(t.detach() for t in s))
         points = y.detach().expand(*batch, m, d).reshape(-1, m, d)
         rows = max(1, _NUMBERS // max(n * d * len(points), 1))
         parts = [_feet(held, points[:, i : i + rows]) for i in range(0, max(m, 1), rows)]
@@ -221,7 +221,7 @@ def curve_crossings(curve: Curve, line: Float[Tensor, "*#batch m 3"], most: int)
     """
     check_tensors(line=(line, "m 3"), curve=(curve.x, "n 2"))
     check_options(most=(most, "int >= 1"))
-    s = _segments(curve)
+    s = segments_of(curve)
     normal, far = line[..., None, :2], line[..., None, 2]
     start = (normal * s.start[..., None, :, :]).sum(-1) + far
     rise = (normal * s.chord[..., None, :, :]).sum(-1)
@@ -248,7 +248,7 @@ def curve_crossings(curve: Curve, line: Float[Tensor, "*#batch m 3"], most: int)
     )
 
 
-class _Segments(NamedTuple):
+class Segments(NamedTuple):
     """Between each sample and the next: start, chord, its length, the slopes by length at both ends."""
 
     start: Float[Tensor, "*batch n d"]
@@ -260,12 +260,12 @@ class _Segments(NamedTuple):
     open: Bool[Tensor, "*batch"]
     """Whether the first and the last of them have ends."""
 
-    def take(self, index: Int[Tensor, "*batch m"]) -> "_Segments":
+    def take(self, index: Int[Tensor, "*batch m"]) -> "Segments":
         """Some of them."""
         rows = (_rows(t, index) for t in (self.start, self.chord, self.slope, self.next_slope))
         start, chord, slope, next_slope = rows
         length, there = self.length.gather(-1, index), self.there.gather(-1, index)
-        return _Segments(start, chord, length, slope, next_slope, there, self.open)
+        return Segments(start, chord, length, slope, next_slope, there, self.open)
 
     def at(self, t: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor, Tensor]:
         """The point at a share of each, and the first and second derivative by the share."""
@@ -282,7 +282,8 @@ class _Segments(NamedTuple):
         )
 
 
-def _segments(curve: Curve) -> _Segments:
+def segments_of(curve: Curve) -> Segments:
+    """The cubics between the samples of curves."""
     # A sample that is no number leaves nothing of its curve.
     sound = (torch.isfinite(curve.x).all(-1) | ~curve.valid).all(-1, keepdim=True)
     valid = curve.valid & sound
@@ -308,10 +309,10 @@ def _segments(curve: Curve) -> _Segments:
     neighbour = torch.where(first, _rows(middle, after), _rows(middle, before))
     has_middle = torch.where(first, _rows(both, after), _rows(both, before))
     slope = torch.where(both, middle, torch.where(has_middle, 2 * single - neighbour, single))
-    return _Segments(x, chord, length, slope, _rows(slope, after), there, ~around[..., 0])
+    return Segments(x, chord, length, slope, _rows(slope, after), there, ~around[..., 0])
 
 
-def _feet(s: _Segments, y: Float[Tensor, "b m d"]) -> tuple[Tensor, ...]:
+def _feet(s: Segments, y: Float[Tensor, "b m d"]) -> tuple[Tensor, ...]:
     """Segment and share of the nearest points, unit tangents, whether there is any, and whether y is beyond an open end."""
     away = y[:, :, None] - s.start[:, None]
     square = s.length.square()[:, None]

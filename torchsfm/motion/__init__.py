@@ -2,6 +2,7 @@
 
 from torchsfm.motion.many_views.average_rotations import AveragedRotations, average_rotations
 from torchsfm.motion.many_views.factorization_affine import AffineFactorization, factorize_affine
+from torchsfm.motion.many_views.factorization_curves import CurveFactorization, factorize_curves
 from torchsfm.motion.many_views.factorization_points import Factorization, factorize_points
 from torchsfm.motion.many_views.position_globally import GlobalPositions, position_globally
 from torchsfm.motion.many_views.quadrifocal_6pt import QuadrifocalFit, quadrifocal_6pt
@@ -53,6 +54,7 @@ __all__ = [
     "AffineFactorization",
     "AveragedRotations",
     "ConicEpipolarFit",
+    "CurveFactorization",
     "Factorization",
     "FocalMotion",
     "FundamentalEstimator",
@@ -76,6 +78,7 @@ __all__ = [
     "estimate_trifocal",
     "estimate_upright",
     "factorize_affine",
+    "factorize_curves",
     "factorize_points",
     "fundamental_7pt",
     "fundamental_8pt",

@@ -88,7 +88,7 @@ def fit_angles(
     rays: Rays, P: Float[Tensor, "p v 3 r"], u: Float[Tensor, "p r n"], steps: int
 ) -> tuple[Fit, list[Tensor], Tensor]:
     """Minimise the squared sines over cameras and points; also the cost after each step, and which problems came to an end."""
-    start = _unit(P, u)
+    start = unit_frame(P, u)
     history = [sine_cost(rays, *start)]
     found = descend(_Sines(rays), start, Options(steps, 1e-10, progress=lambda _, cost: history.append(cost)))
     P, u = found.x
@@ -169,7 +169,7 @@ class _Sines(Problem[_System]):
     def advance(self, here: _System, step: Step) -> _System:
         """The system where a step leads."""
         (P, u), (moved, move) = here.x, step.delta
-        return self.linearize(_unit(P + moved, u + move))
+        return self.linearize(unit_frame(P + moved, u + move))
 
     def rounding(self, here: _System) -> Tensor:
         """What rounding makes of it: predictions are products of units that may cancel, steps come from normal equations."""
@@ -250,7 +250,7 @@ def _balanced(P: Tensor) -> Tensor:
     return balanced
 
 
-def _unit(P: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+def unit_frame(P: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """The frame in which the cameras' joint columns are orthonormal; then each camera and point of norm 1."""
     P, R = orthonormal(P)
     u = R @ u

@@ -165,7 +165,7 @@ def _factorize(x: Tensor, w: Tensor, robust: bool, steps: int) -> tuple[Tensor, 
     # Back to the coordinates that came, each camera and point of norm 1, depths positive as often as can be.
     P, _ = solve(frame, P)
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-300)
-    side, turn = _signs((P.detach() @ u.detach()[:, None])[:, :, 2] * counts)
+    side, turn = signs_of_depths((P.detach() @ u.detach()[:, None])[:, :, 2] * counts)
     P = P * (side * view)[..., None, None]
     X = u.mT * (turn * point)[..., None]
     y = (P.detach() @ X.detach().mT[:, None]).mT
@@ -246,7 +246,7 @@ def _flat(rays: Rays, fit: Fit, v: Tensor, n: Tensor) -> Tensor:
     return fit.cost > of_noise / 3 * homographies.cost
 
 
-def _signs(depths: Tensor) -> tuple[Tensor, Tensor]:
+def signs_of_depths(depths: Tensor) -> tuple[Tensor, Tensor]:
     """Signs of views (p, v) and points (p, n) that make the most of the depths positive."""
     depths = depths.sign()
     turn = torch.where(depths[:, 0] < 0, -1.0, 1.0).to(depths.dtype)

@@ -1,0 +1,170 @@
+"""Cameras and curves from images of curves alone: exact data, laws, noise, what the data do not determine, what is wrong."""
+
+import math
+
+import pytest
+import torch
+from chance import assert_share
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.geometry import Curve, camera_from_krt, curve_from_samples, from_homogeneous, project_points, rotation_from_rotvec
+from torchsfm.motion import CurveFactorization, factorize_curves
+from torchsfm.triangulation import triangulate_points_dlt
+
+F64 = torch.float64
+K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=F64)
+
+
+def cameras(batch: int, v: int, generator: torch.Generator, *, arc: float = 40.0) -> Tensor:
+    """On an arc around the curves, ten units away, turned a little."""
+    kind = {"generator": generator, "dtype": F64}
+    turn = torch.linspace(-0.5, 0.5, v, dtype=F64)[:, None] * math.radians(arc) * torch.tensor([0.0, 1.0, 0.0], dtype=F64)
+    R = rotation_from_rotvec(0.15 * torch.randn(batch, v, 3, **kind)) @ rotation_from_rotvec(turn)
+    t = torch.tensor([0.0, 0.0, 10.0], dtype=F64) + 0.3 * torch.randn(batch, v, 3, **kind)
+    return camera_from_krt(K, R, t)
+
+
+def space_curves(batch: int, c: int, n: int, generator: torch.Generator) -> Tensor:
+    """Bent rings of about one unit."""
+    kind = {"generator": generator, "dtype": F64}
+    t = torch.arange(n, dtype=F64) * (2 * math.pi / n)
+    a = torch.randn(batch, c, 3, 2, 3, **kind) / torch.tensor([1.0, 4.0, 9.0], dtype=F64)[:, None, None]
+    a = 1.5 * a / a.square().sum((-3, -2, -1), keepdim=True).sqrt()
+    waves = torch.stack([torch.stack(((k * t).cos(), (k * t).sin())) for k in (1, 2, 3)])
+    return torch.einsum("bckwd,kwn->bcnd", a, waves) + 0.7 * torch.randn(batch, c, 1, 3, **kind)
+
+
+def images(X: Tensor, P: Tensor) -> Tensor:
+    """(b, v, c, n, 2)."""
+    return torch.stack([project_points(P, X[:, None, k]) for k in range(X.shape[1])], 2)
+
+
+def camera_error(found: CurveFactorization, x: Tensor) -> Tensor:
+    """How far true points in correspondence are from any points that the cameras found would see there, root mean square."""
+    exact = x[..., ::20, :].flatten(2, 3)
+    X = triangulate_points_dlt(exact, found.P, homogeneous=True)
+    seen = from_homogeneous(X[:, None] @ found.P.mT)[0]
+    return (seen - exact).square().sum(-1).mean((-2, -1)).sqrt()
+
+
+def test_exact_curves_that_begin_alike(generator: torch.Generator) -> None:
+    """Equal shares of their lengths are tens of pixels off the points that belong together."""
+    P, X = cameras(10, 6, generator), space_curves(10, 3, 1000, generator)
+    x = images(X, P)
+    found = factorize_curves(curve_from_samples(x, closed=True), aligned=True)
+    right = camera_error(found, x) < 1e-3
+    assert_share(right, 0.95)
+    assert_share(found.status == Status.OK, 0.9)
+    assert right[found.status == Status.OK].all()
+    typical = torch.where(torch.isfinite(found.error), found.error, torch.nan).flatten(1).nanmedian(-1).values
+    assert_share(typical < 1e-6, 0.9)
+    assert_share(found.measured, 0.9)
+    seen = from_homogeneous(found.X.flatten(1, 2)[:, None] @ found.P.mT)[0].unflatten(2, (3, 40))
+    torch.testing.assert_close(seen[right][found.measured[right][:, None].expand(-1, 6, -1, -1)],
+        found.x[right][found.measured[right][:, None].expand(-1, 6, -1, -1)], rtol=0, atol=1e-2)  # fmt: skip
+
+
+def test_curves_that_begin_anywhere_and_run_either_way(generator: torch.Generator) -> None:
+    P, X = cameras(3, 5, generator, arc=20.0), space_curves(3, 3, 300, generator)
+    x = images(X, P)
+    slot = torch.arange(300)
+    back = torch.rand(3, 5, 3, 1, generator=generator) < 0.5
+    start = torch.randint(300, (3, 5, 3, 1), generator=generator)
+    index = (torch.where(back, -slot, slot) + start) % 300
+    curves = curve_from_samples(x.gather(-2, index[..., None].expand_as(x)), closed=True)
+    found = factorize_curves(curves, samples=24)
+    right = camera_error(found, x) < 0.05
+    assert_share(right, 0.7)
+    assert right[found.status == Status.OK].all()
+    assert_share(found.status == Status.OK, 0.5)
+
+
+def test_open_curves(generator: torch.Generator) -> None:
+    P, X = cameras(5, 6, generator), space_curves(5, 4, 1000, generator)[:, :, :600]
+    x = images(X, P)
+    found = factorize_curves(curve_from_samples(x), aligned=True)
+    right = camera_error(found, x) < 1e-2
+    assert_share(right, 0.85)
+    assert right[found.status == Status.OK].all()
+    assert_share(found.status == Status.OK, 0.8)
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0])
+def test_noise(noise: float, generator: torch.Generator) -> None:
+    """Samples eight pixels apart: nearer ones would have to be smoothed."""
+    P, X = cameras(5, 6, generator), space_curves(5, 3, 400, generator)
+    x = images(X, P)
+    apart = x[..., ::8, :]
+    noisy = apart + noise * torch.randn(apart.shape, generator=generator, dtype=F64)
+    found = factorize_curves(curve_from_samples(noisy, closed=True), aligned=True)
+    assert_share(found.status == Status.OK, 0.9)
+    error = camera_error(found, x)
+    assert (error[found.status == Status.OK] < max(3 * noise, 0.5)).all()
+    seen = torch.where(torch.isfinite(found.error), found.error, torch.nan)
+    assert (seen.square().flatten(1).nanmean(-1).sqrt()[found.status == Status.OK] < noise).all()
+
+
+def test_what_curves_do_not_determine(generator: torch.Generator) -> None:
+    P, X = cameras(2, 5, generator), space_curves(2, 3, 300, generator)
+    flat = X.clone()
+    flat[..., 2] = 0.3 * X[..., 0] + 0.2
+    s = torch.linspace(-1, 1, 100, dtype=F64)[:, None]
+    ends = torch.randn(2, 3, 2, 1, 3, generator=generator, dtype=F64)
+    lines = ends[:, :, 0] + s * ends[:, :, 1]
+    R = rotation_from_rotvec(0.2 * torch.randn(2, 5, 3, generator=generator, dtype=F64))
+    still = camera_from_krt(K, R, torch.tensor([0.0, 0.0, 10.0], dtype=F64) @ R.mT)
+    noise = 0.3 * torch.randn(2, 5, 3, 50, 2, generator=generator, dtype=F64)
+    for x, closed in (
+        (images(flat, P), True),
+        (images(lines, P), False),
+        (images(X, still), True),
+        (images(flat, P)[..., ::6, :] + noise, True),
+        (images(X, still)[..., ::6, :] + noise, True),
+    ):
+        found = factorize_curves(curve_from_samples(x, closed=closed), aligned=True)
+        assert (found.status != Status.OK).all()
+        assert_share(found.status == Status.DEGENERATE, 0.7)
+
+
+def test_images_of_other_curves_have_no_consensus(generator: torch.Generator) -> None:
+    P, X = cameras(2, 6, generator), space_curves(2, 3, 300, generator)
+    x = images(X, P)
+    x[:, 3, 1] = x.roll(1, 0)[:, 3, 1]
+    found = factorize_curves(curve_from_samples(x, closed=True), aligned=True)
+    assert (found.status != Status.OK).all()
+
+
+def test_too_few(generator: torch.Generator) -> None:
+    P, X = cameras(2, 2, generator), space_curves(2, 3, 60, generator)
+    found = factorize_curves(curve_from_samples(images(X, P), closed=True))
+    assert (found.status == Status.TOO_FEW).all()
+    assert not found.used_view.any()
+    assert (found.P == 0).all()
+
+
+def test_laws(generator: torch.Generator) -> None:
+    """Views and curves in any order; a batch is its elements; a curve that is not shown changes no other problem."""
+    P, X = cameras(2, 5, generator), space_curves(2, 3, 600, generator)
+    x = images(X, P)
+    curves = curve_from_samples(x, closed=True)
+    found = factorize_curves(curves, aligned=True)
+    views, order = torch.randperm(5, generator=generator), torch.randperm(3, generator=generator)
+    shuffled = curve_from_samples(x[:, views][:, :, order], closed=True)
+    other = factorize_curves(shuffled, aligned=True)
+    alone = factorize_curves(Curve(curves.x[1], curves.valid[1], curves.closed[1]), aligned=True)
+    both = (found.status == Status.OK) & (other.status == Status.OK)
+    assert_share(both, 0.5)
+    assert (camera_error(other, x[:, views])[both] < 1e-2).all()
+    assert alone.status == found.status[1]
+    torch.testing.assert_close(alone.x, found.x[1], rtol=0, atol=1e-2)
+    hidden = x.clone()
+    hidden[0, 2, 1] = torch.nan
+    less = factorize_curves(curve_from_samples(hidden, closed=True), aligned=True)
+    assert torch.isinf(less.error[0, 2, 1]).all()
+    assert torch.isfinite(less.P).all()
+    torch.testing.assert_close(less.x[1:], found.x[1:], rtol=0, atol=1e-2)
+    empty = factorize_curves(Curve(curves.x[:0], curves.valid[:0], curves.closed[:0]))
+    assert empty.P.shape == (0, 5, 3, 4)
+    single = factorize_curves(curve_from_samples(x.float(), closed=True), aligned=True)
+    assert single.P.dtype == torch.float32

@@ -1,0 +1,84 @@
+"""Is what a search for cameras and curves ended at the answer, and do the data determine one?"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.geometry.curve_places import CurvePlaces
+from torchsfm.linalg import eigh, eigvalsh
+from torchsfm.motion.many_views.bilinear_fit import unit_frame
+from torchsfm.motion.many_views.bilinear_steps import reduced
+from torchsfm.motion.many_views.curve_fit import Scene, pinned
+from torchsfm.motion.many_views.curve_search import Found
+from torchsfm.optim.descent import Options, descend
+
+_RIGHT = 0.8
+"""Of all samples that must be measured."""
+_UNDETERMINED = 0.3
+"""Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined."""
+_WHITE = 1.0
+"""The mean square of the difference of neighbouring samples' distances over that of the distances: 2 for noise, 0 for what is
+smooth along the curve."""
+_EXACT = 1e-5
+"""Distances below this part of the curves' extent are what cubics between samples leave, smooth or not."""
+_FLAT_STEPS = 30
+"""Most steps of the homographies that are fitted for comparison: where they do not fit, their minimum does not matter."""
+
+
+def judge(images: CurvePlaces, found: Found, view: Bool[Tensor, "p v"], threshold: Float[Tensor, "p"]) -> Tensor:
+    """What became of each problem (p); `threshold` in the frame in which it was solved."""
+    v = view.sum(-1)
+    counts = found.weight * found.measured[:, None]
+    views = counts.sum(1)
+    observed, points = counts.sum((1, 2, 3)), found.measured.sum((-2, -1))
+    shown = found.weight.sum(1)
+    unknowns = 11 * v - 15
+    enough = (v >= 3) & ((shown - 2).clamp(min=0).sum((-2, -1)) >= unknowns)
+    redundancy = observed - 2 * points - unknowns
+    total = (found.misfit.nan_to_num(0.0, 0.0, 0.0).square() * views).sum((-2, -1))
+    rms = (total / observed.clamp(min=1)).sqrt()
+    # The cameras' information, samples eliminated: fifteen directions of space are free, and absent views.
+    values, _ = eigvalsh(reduced(found.end.end.linear, torch.zeros_like(rms), points=True)[0])
+    first = (15 + 12 * (~view).sum(-1)).clamp(max=values.shape[-1] - 1)
+    least = values.gather(-1, first[:, None])[:, 0]
+    variance = total / redundancy.clamp(min=1)
+    loose = (least <= 1e-11 * values[:, -1]) | (variance > _UNDETERMINED**2 * least) | ~torch.isfinite(least)
+    loose = loose | _flat(images, found, v, redundancy)
+    agreed = points >= _RIGHT * (shown > 0).sum((-2, -1))
+    smooth = (_roughness(found, counts) < _WHITE) & (rms > _EXACT)
+    wrong = ~agreed | smooth | (rms > threshold) | (redundancy < 0)
+    status = torch.where(found.end.status == Status.OK, int(Status.OK), int(Status.NOT_CONVERGED))
+    status = torch.where(wrong, int(Status.NO_CONSENSUS), status)
+    status = torch.where(loose, int(Status.DEGENERATE), status)
+    return torch.where(enough, status, int(Status.TOO_FEW))
+
+
+def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor) -> Bool[Tensor, "p"]:
+    """Whether space explains no more than noise beyond a plane: curves in one, or views without baseline.
+
+    Homographies are fitted too. Of what they leave, a fourth dimension always takes some: of noise, the largest singular value
+    of a matrix of 3 v times n, more than the number of its parameters. Three times more must be gone.
+    """
+    end = found.end.end
+    counts = found.weight * found.measured[:, None]
+    seen = found.measured.flatten(1)[:, None]
+    plane = eigh((end.x.u * seen) @ end.x.u.mT)[1][..., 1:]
+    P, u = unit_frame(end.x.P @ plane[:, None], plane.mT @ end.x.u)
+    x = Scene(P, u, end.x.place)
+    left = descend(pinned(images, counts, x), x, Options(_FLAT_STEPS, 1e-3)).cost
+    n = seen.sum((-2, -1)).double()
+    flat_redundancy = (redundancy + n + 3 * v - 7).clamp(min=1)
+    redundancy = redundancy.clamp(min=0).double()
+    beyond = ((3 * v).sqrt() + n.sqrt()).square() - (3 * v + n - 7)
+    of_noise = redundancy * redundancy / (redundancy + beyond).clamp(min=1) / flat_redundancy
+    return end.cost > of_noise / 3 * left
+
+
+def _roughness(found: Found, counts: Tensor) -> Float[Tensor, "p"]:
+    """The mean square of the difference of neighbouring samples' distances over that of the distances."""
+    r = found.seen.r.unflatten(2, found.misfit.shape[1:])
+    pair = counts[..., 1:] * counts[..., :-1]
+    step = (pair * (r[..., 1:] - r[..., :-1]).square()).sum((1, 2, 3))
+    size = (pair * (r[..., 1:].square() + r[..., :-1].square())).sum((1, 2, 3)) / 2
+    return step / size.clamp_min(1e-300)

@@ -1,0 +1,188 @@
+"""Structure and motion from curves in three or more uncalibrated images, no point of which is in correspondence.
+
+A sample of a space curve is seen on a curve in each of v images, where it may slide: v distances for the two coordinates across
+the curve, v - 2 of which constrain the cameras (Berthilsson, Åström & Heyden 2001). Guesses of how the images of a curve run
+alike, and samples equally far apart along them, are a start for the factorisation of points; from there cameras and samples go
+to the least squares of the distances normal to the image curves.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from torchsfm._types import Status, check_options, check_tensors, tensor_map
+from torchsfm.geometry.curve_places import CurvePlaces, curve_places
+from torchsfm.geometry.curves import Curve
+from torchsfm.motion.many_views.bilinear_fit import unit_frame
+from torchsfm.motion.many_views.curve_fit import Scene
+from torchsfm.motion.many_views.curve_search import Found, approach, finish, typical_misfit
+from torchsfm.motion.many_views.curve_starts import Runs, guess_runs
+from torchsfm.motion.many_views.curve_verdict import judge
+from torchsfm.motion.many_views.factorization_points import factorize_points, signs_of_depths
+from torchsfm.optim.pytree import cut, join, pick
+
+_GUESSES = 8
+"""Ways in which the image curves may run alike that are tried."""
+_GRID = 60
+"""Starts of closed curves that are tried."""
+_POINT_STEPS = 30
+"""Most steps of the factorisation of points at each of its stages."""
+_NUMBERS = 1 << 22
+"""Distances of the problems solved at a time."""
+
+
+@dataclass(frozen=True)
+class CurveFactorization:
+    """Cameras and space curves of many images, up to one projective transformation of space."""
+
+    P: Float[Tensor, "*batch v 3 4"]
+    """Camera matrices, |P| = 1; zero where `used_view` is False."""
+    X: Float[Tensor, "*batch c m 4"]
+    """Samples of the space curves in order, homogeneous, of norm 1."""
+    x: Float[Tensor, "*batch v c m 2"]
+    """The nearest points of the image curves: points in correspondence; zero where an image does not show the curve."""
+    error: Float[Tensor, "*batch v c m"]
+    """Distance of each sample's image from the image curve, in its unit; inf where that does not count: not shown, beyond an
+    open end, or not `measured`."""
+    measured: Bool[Tensor, "*batch c m"]
+    """Samples that three images and more agree on, in order with their neighbours."""
+    used_view: Bool[Tensor, "*batch v"]
+    status: Int8[Tensor, "*batch"]
+    """OK; TOO_FEW: fewer than three views, or fewer samples than the cameras need; DEGENERATE: the curves leave cameras
+    undetermined (straight ones, all in one plane, views without baseline); NO_CONSENSUS: distances are larger than `threshold`,
+    or smooth along the curves, as noise is not: the search ended at the wrong place, or the images do not show the same curves;
+    NOT_CONVERGED."""
+
+
+def factorize_curves(
+    curves: Curve,
+    *,
+    samples: int = 40,
+    oriented: bool = False,
+    aligned: bool = False,
+    threshold: float = 3.0,
+    max_iterations: int = 50,
+) -> CurveFactorization:
+    """Find cameras and space curves from their images in three or more uncalibrated views, up to a projective transformation.
+
+    Which image curve shows which space curve is known; which of its points show the same point is not. Closed curves may begin
+    anywhere and run in any direction in each image. Of an open curve all images show about the same piece. Curves in general
+    position are needed: three bent ones that do not lie in one plane are enough in six views.
+
+    What counts is where smooth curves through the samples go, so these must be exact to what is asked of the cameras: samples
+    of edges, nearer to each other than their noise is small, are smoothed first (`fit_spline`).
+
+    The search ends at a wrong place now and then, more often the farther views are apart (`status` then says `NO_CONSENSUS`).
+
+    Args:
+        curves: The image curves, in pixels, all curves of all views: fields of shape (*batch, v, c, n, 2), (*batch, v, c, n),
+            (*batch, v, c). One with fewer than three samples is not shown. A curve is closed in all images that show it, or in
+            none.
+        samples: Samples of each space curve.
+        oriented: Whether the images of each curve are known to run in the same direction, as edges with their bright side do.
+        aligned: Whether they also begin at about the same point.
+        threshold: Largest root mean square distance of samples from the image curves, in pixels.
+        max_iterations: Most steps at the end.
+
+    Returns:
+        Cameras, samples of the space curves and where they are on the image curves, distances and status. Computed in float64,
+        without derivatives. `x` and `measured` are what `autocalibrate_points` and `bundle_adjust` take for points.
+
+    Raises:
+        ValueError: Wrong shape, dtype, device or option.
+    """
+    check_options(
+        curves=(curves, Curve), samples=(samples, "int >= 8"), oriented=(oriented, bool), aligned=(aligned, bool),
+        threshold=(threshold, "float > 0"), max_iterations=(max_iterations, "int >= 1"),
+    )  # fmt: skip
+    batch = check_tensors(
+        x=(curves.x, "v>=1 c>=1 n>=2 2"), valid=(curves.valid, "v c n: bool"), closed=(curves.closed, "v c: bool")
+    )
+    v, c, n = curves.x.shape[-4:-1]
+    with torch.no_grad():
+        flat = Curve(
+            curves.x.detach().double().expand(*batch, v, c, n, 2).reshape(-1, v, c, n, 2),
+            curves.valid.expand(*batch, v, c, n).reshape(-1, v, c, n),
+            curves.closed.expand(*batch, v, c).reshape(-1, v, c),
+        )
+        guesses = 1 if aligned else _GUESSES
+        size = max(1, _NUMBERS // (guesses * v * c * max(n, 16 * samples)))
+        starts = range(0, max(len(flat.x), 1), size)
+        parts = [_factorize(cut(flat, i, i + size), samples, oriented, aligned, threshold, max_iterations) for i in starts]
+        fields = tensor_map(lambda t: t.to(curves.x.dtype) if t.is_floating_point() else t, join(parts))
+        return tensor_map(lambda t: t.reshape(batch + t.shape[1:]), fields)
+
+
+def _factorize(
+    curves: Curve, m: int, oriented: bool, aligned: bool, threshold: float, max_iterations: int
+) -> CurveFactorization:
+    c = curves.closed.shape[-1]
+    places = curve_places(curves)
+    there = (places.number >= 3) & torch.isfinite(curves.x).all(-1).all(-1)
+    there = there & (there.sum(1, keepdim=True) >= 3)
+    view = there.any(-1)
+    centre, scale = _frames(places, there)
+    x = torch.where(curves.valid[..., None], (curves.x - centre[:, :, None, None]) / scale[:, None, None, None, None], 0)
+    moved = Curve(torch.where(there[..., None, None], x, 0), curves.valid & there[..., None], curves.closed)
+    ways = _ways(moved, there, oriented, aligned)
+    images, found = _search(moved, there, ways, m, max_iterations)
+    status = judge(images, found, view, threshold / scale)
+    rows = scale[:, None, None, None] * found.x.P[:, :, :2] + centre[..., None] * found.x.P[:, :, 2:]
+    P = torch.cat((rows, found.x.P[:, :, 2:]), 2)
+    P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-300)
+    seen = (found.weight * found.measured[:, None]).flatten(2)
+    side, turn = signs_of_depths((P @ found.x.u[:, None])[:, :, 2] * seen)
+    X = (found.x.u * turn[:, None]).mT.unflatten(1, (c, m))
+    counts = (found.weight > 0) & found.measured[:, None]
+    foot = images.at(found.x.place)[0] * scale[:, None, None, None, None] + centre[:, :, None, None]
+    r = found.seen.r.unflatten(2, (c, m)).abs() * scale[:, None, None, None]
+    used = view & (status != Status.TOO_FEW)[:, None]
+    return CurveFactorization(
+        torch.where(used[..., None, None], P * side[..., None, None], 0).nan_to_num(0.0, 0.0, 0.0),
+        X.nan_to_num(0.0, 0.0, 0.0),
+        torch.where(there[..., None, None], foot, 0).nan_to_num(0.0, 0.0, 0.0),
+        torch.where(counts & torch.isfinite(r), r, torch.inf),
+        found.measured,
+        used,
+        status.to(torch.int8),
+    )
+
+
+def _frames(places: CurvePlaces, there: Bool[Tensor, "p v c"]) -> tuple[Tensor, Tensor]:
+    """The centre of each image's curves, and the one scale of all images, (p, v, 2) and (p)."""
+    w = there[..., None, None].to(places.segments.start.dtype) * places.segments.there[..., None]
+    x = places.segments.start
+    number = w.sum((2, 3))
+    centre = (w * x).sum((2, 3)) / number.clamp(min=1)
+    away = (w * (x - centre[:, :, None, None])).square().sum((1, 2, 3, 4))
+    scale = (away / (2 * number.sum((1, 2))).clamp(min=1)).sqrt()
+    return centre, torch.where((scale > 0) & (scale < torch.inf), scale, 1)
+
+
+def _ways(curves: Curve, there: Tensor, oriented: bool, aligned: bool) -> Runs:
+    if aligned:
+        none = torch.zeros(there[:, None].shape, dtype=curves.x.dtype, device=there.device)
+        return Runs(none > 0, none)
+    places = curve_places(curves)
+    return guess_runs(places.at(places.spread(_GRID))[0], there, curves.closed & there, oriented, _GUESSES)
+
+
+def _search(curves: Curve, there: Tensor, ways: Runs, m: int, steps: int) -> tuple[CurvePlaces, Found]:
+    """The image curves as they run alike, and the best that was found for any guess."""
+    p, g = ways.back.shape[:2]
+    each = torch.arange(p, device=there.device).repeat_interleave(g)
+    curves, there = pick((each,), curves), there[each]
+    back = ways.back.flatten(0, 1)
+    other = curves.reversed()
+    images = curve_places(Curve(torch.where(back[..., None, None], other.x, curves.x), curves.valid, curves.closed))
+    place = images.spread(m, ways.start.flatten(0, 1))
+    visible = there[..., None].expand(-1, -1, -1, m)
+    start = factorize_points(images.at(place)[0].flatten(2, 3), visible=visible.flatten(2), max_iterations=_POINT_STEPS)
+    P, u = unit_frame(start.P, start.X.mT)
+    shown = visible.to(u.dtype)
+    x = approach(images, shown, Scene(P, u, place))
+    best = typical_misfit(images, shown, x).view(p, g).argmin(-1) + g * torch.arange(p, device=there.device)
+    images, shown, x = pick((best,), (images, shown, x))
+    return images, finish(images, shown, x, steps)
