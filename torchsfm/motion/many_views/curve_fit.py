@@ -118,7 +118,7 @@ class CurveDistances(Problem[CurveSystem]):
     def sights(self, x: Scene) -> Sights:
         """Where samples are seen, and how far from the image curves."""
         y = x.P @ x.u[:, None]
-        points = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).unflatten(2, x.place.shape[2:])
+        points = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).reshape(*x.place.shape, 2)
         place = self.images.nearest(x.place, points)
         foot, first, _ = self.images.at(place)
         tangent = torch.nn.functional.normalize(first, dim=-1)
@@ -143,7 +143,7 @@ class CurveDistances(Problem[CurveSystem]):
             x = x._replace(u=torch.where(better[:, None], moved.u, x.u))
             masks = (better[:, None, None], better[:, None], better[:, None, None], better[:, None], better[:, None, None])
             fields = [torch.where(b, a, o) for a, o, b in zip(now[:5], seen[:5], masks, strict=True)]
-            place = torch.where(better.unflatten(1, x.place.shape[2:])[:, None], now.place, seen.place)
+            place = torch.where(better.reshape(better.shape[0], 1, *x.place.shape[2:]), now.place, seen.place)
             seen = Sights(fields[0], fields[1], fields[2], fields[3], fields[4], place)
         return x._replace(place=seen.place), seen
 
@@ -189,7 +189,7 @@ class CurveDistances(Problem[CurveSystem]):
 def pinned(images: CurvePlaces, weight: Float[Tensor, "p v c m"], x: Scene) -> CurveDistances:
     """Distances of samples that are pinned where they are, each by the image in which its curve is seen least foreshortened."""
     y = x.P @ x.u[:, None]
-    points = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).unflatten(2, x.place.shape[2:])
+    points = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).reshape(*x.place.shape, 2)
     step = (points - points.roll(1, -2)).square().sum(-1)
     step = torch.where(weight > 0, (step + step.roll(-1, -1)).nan_to_num(0.0, 0.0), -1.0)
     at = torch.zeros_like(weight, dtype=torch.bool).scatter(1, step.argmax(1, keepdim=True), True)

@@ -53,7 +53,7 @@ def approach(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene) -> 
         plain, x = _mended(_inside(images, shown, x), x)
         e = plain.misfit(plain.sights(x)).sqrt()
         trust = (1 + (e / (_TRUSTED * _median(e, plain))).square()).reciprocal().square()
-        weighed = replace(plain, weight=plain.weight * trust.unflatten(1, x.place.shape[2:])[:, None])
+        weighed = replace(plain, weight=plain.weight * trust.reshape(plain.weight[:, :1].shape))
         x = descend(weighed, x, Options(_STEPS, 1e-10)).x
     return x
 
@@ -79,7 +79,7 @@ def _judged(plain: CurveDistances, seen: Sights) -> tuple[Tensor, Tensor]:
     """Distances of samples, and which are as good as most and in order."""
     views = plain.weight.sum(1)
     e = plain.misfit(seen).sqrt()
-    misfit = torch.where(views >= 3, e.unflatten(1, views.shape[1:]) / views.clamp(min=1).sqrt(), torch.inf)
+    misfit = torch.where(views >= 3, e.reshape(views.shape) / views.clamp(min=1).sqrt(), torch.inf)
     typical = _median(e, plain)[..., None] / views.clamp(min=1).sqrt()
     right = (misfit <= (_KEPT * typical).clamp(min=_FINE)) & ~_out_of_order(plain, seen.place)
     return misfit, right
@@ -110,12 +110,12 @@ def _mended(plain: CurveDistances, x: Scene) -> tuple[CurveDistances, Scene]:
     """Wrong samples put between right ones, and let go from there; kept, and pinned there, where that is better."""
     x, seen = plain.settled(x, 0)
     misfit = plain.misfit(seen)
-    e = misfit.sqrt().unflatten(1, x.place.shape[2:])
+    e = misfit.sqrt().reshape(x.place[:, 0].shape)
     bad = (e > _WRONG * _median(misfit.sqrt(), plain)[..., None]) | _out_of_order(plain, seen.place)
     anew, possible = _between(plain, x, bad)
     other = pinned(plain.images, plain.weight, anew)
     anew, now = other.settled(anew, _OWN)
-    taken = possible & (other.misfit(now) < misfit).unflatten(1, e.shape[1:])
+    taken = possible & (other.misfit(now) < misfit).reshape(e.shape)
     u = torch.where(taken.flatten(1)[:, None], anew.u, x.u)
     x = Scene(x.P, u, torch.where(taken[:, None], anew.place, x.place))
     return pinned(plain.images, plain.weight, x), x
@@ -141,7 +141,7 @@ def _between(plain: CurveDistances, x: Scene, bad: Bool[Tensor, "p c m"]) -> tup
     turns = plain.images.number[..., None]
     ends = [of(x.place, i) + i.div(m, rounding_mode="floor")[:, None] * turns for i in (before, after)]
     place = torch.lerp(ends[0], ends[1], share)
-    U = x.u.unflatten(2, bad.shape[1:])
+    U = x.u.reshape(*x.u.shape[:2], *bad.shape[1:])
     a, b = of(U, before), of(U, after)
     b = b * torch.where((a * b).sum(1, keepdim=True) < 0, -1.0, 1.0)
     u = torch.nn.functional.normalize(torch.lerp(a, b, share), dim=1)

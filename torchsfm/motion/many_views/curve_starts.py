@@ -65,7 +65,8 @@ def guess_runs(
             pair = cost[row, order[:, q], order[:, k]].flatten(-2)
             told = told + share[:, None, None, None] * pair[:, :, None].expand(*way.shape[:3], -1).gather(-1, way)
             weight = weight + share
-        told = (total[..., None] + told / weight[:, None, None, None]).unflatten(-1, (2, m))
+        told = total[..., None] + told / weight[:, None, None, None]
+        told = told.reshape(*total.shape, 2, m)
         least = (told <= told.roll(1, -1)) & (told < told.roll(-1, -1))
         told = torch.where(least, told, torch.inf).flatten(2)
         total, index = told.topk(min(_GUESSES, told.shape[-1]), largest=False)

@@ -72,13 +72,15 @@ def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor) -> B
     redundancy = redundancy.clamp(min=0).double()
     beyond = ((3 * v).sqrt() + n.sqrt()).square() - (3 * v + n - 7)
     of_noise = redundancy * redundancy / (redundancy + beyond).clamp(min=1) / flat_redundancy
-    return end.cost > of_noise / 3 * left
+    cost: Tensor = end.cost
+    return cost > of_noise / 3 * left
 
 
 def _roughness(found: Found, counts: Tensor) -> Float[Tensor, "p"]:
     """The mean square of the difference of neighbouring samples' distances over that of the distances."""
-    r = found.seen.r.unflatten(2, found.misfit.shape[1:])
+    r = found.seen.r.reshape(found.weight.shape)
     pair = counts[..., 1:] * counts[..., :-1]
     step = (pair * (r[..., 1:] - r[..., :-1]).square()).sum((1, 2, 3))
     size = (pair * (r[..., 1:].square() + r[..., :-1].square())).sum((1, 2, 3)) / 2
-    return step / size.clamp_min(1e-300)
+    share: Tensor = step / size.clamp_min(1e-300)
+    return share

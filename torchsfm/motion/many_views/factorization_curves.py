@@ -88,7 +88,8 @@ def factorize_curves(
 
     Returns:
         Cameras, samples of the space curves and where they are on the image curves, distances and status. Computed in float64,
-        without derivatives. `x` and `measured` are what `autocalibrate_points` and `bundle_adjust` take for points.
+        without derivatives. `x` are points in correspondence only as far as the curves tell: nothing measures them along a
+        curve.
 
     Raises:
         ValueError: Wrong shape, dtype, device or option.
@@ -134,10 +135,10 @@ def _factorize(
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-300)
     seen = (found.weight * found.measured[:, None]).flatten(2)
     side, turn = signs_of_depths((P @ found.x.u[:, None])[:, :, 2] * seen)
-    X = (found.x.u * turn[:, None]).mT.unflatten(1, (c, m))
+    X = (found.x.u * turn[:, None]).mT.reshape(len(turn), c, m, 4)
     counts = (found.weight > 0) & found.measured[:, None]
     foot = images.at(found.x.place)[0] * scale[:, None, None, None, None] + centre[:, :, None, None]
-    r = found.seen.r.unflatten(2, (c, m)).abs() * scale[:, None, None, None]
+    r = found.seen.r.reshape(found.weight.shape).abs() * scale[:, None, None, None]
     used = view & (status != Status.TOO_FEW)[:, None]
     return CurveFactorization(
         torch.where(used[..., None, None], P * side[..., None, None], 0).nan_to_num(0.0, 0.0, 0.0),
