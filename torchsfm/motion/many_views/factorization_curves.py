@@ -108,12 +108,16 @@ def factorize_curves(
             curves.valid.expand(*batch, v, c, n).reshape(-1, v, c, n),
             curves.closed.expand(*batch, v, c).reshape(-1, v, c),
         )
+        count = len(flat.x)
+        if count == 0:
+            # The shapes of the answer come from one problem without curves.
+            flat = tensor_map(lambda t: t.new_zeros(1, *t.shape[1:]), flat)
         guesses = 1 if aligned else _GUESSES
         size = max(1, _NUMBERS // (guesses * v * c * max(n, 16 * samples)))
-        starts = range(0, max(len(flat.x), 1), size)
+        starts = range(0, len(flat.x), size)
         parts = [_factorize(cut(flat, i, i + size), samples, oriented, aligned, threshold, max_iterations) for i in starts]
         fields = tensor_map(lambda t: t.to(curves.x.dtype) if t.is_floating_point() else t, join(parts))
-        return tensor_map(lambda t: t.reshape(batch + t.shape[1:]), fields)
+        return tensor_map(lambda t: t[:count].reshape(batch + t.shape[1:]), fields)
 
 
 def _factorize(
