@@ -359,7 +359,7 @@ FUNCTIONS: dict[str, Function] = {
     "motion.estimate_trifocal": Function(ROBUST, {"n": 30}),
     "motion.estimate_upright": Function(RAYS, {"n": 30}),
     "motion.factorize_affine": Function({"max_iterations": 20}),
-    "motion.factorize_curves": Function({"curves": _images_of_curves, "samples": 12, "max_iterations": 10}),
+    "motion.factorize_curves": Function({"curves": _images_of_curves, "samples": 16, "oriented": True, "aligned": True}),
     "motion.factorize_points": Function({"max_iterations": 20}),
     "motion.fundamental_from_conics": Function(
         {f"C{i + 1}": lambda s, i=i: _tilted(s)[i] for i in range(2)}

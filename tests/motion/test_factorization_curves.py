@@ -66,16 +66,16 @@ def test_exact_curves_that_begin_alike(generator: torch.Generator) -> None:
 
 
 def test_curves_that_begin_anywhere_and_run_either_way(generator: torch.Generator) -> None:
-    P, X = cameras(4, 5, generator, arc=20.0), space_curves(4, 3, 300, generator)
+    P, X = cameras(6, 5, generator, arc=20.0), space_curves(6, 3, 300, generator)
     x = images(X, P)
     slot = torch.arange(300)
-    back = torch.rand(4, 5, 3, 1, generator=generator) < 0.5
-    start = torch.randint(300, (4, 5, 3, 1), generator=generator)
+    back = torch.rand(6, 5, 3, 1, generator=generator) < 0.5
+    start = torch.randint(300, (6, 5, 3, 1), generator=generator)
     index = (torch.where(back, -slot, slot) + start) % 300
     curves = curve_from_samples(x.gather(-2, index[..., None].expand_as(x)), closed=True)
     found = factorize_curves(curves, samples=24)
     right = camera_error(found, x) < 0.05
-    assert right.any()
+    assert_share(right, 0.6)
     assert right[found.status == Status.OK].all()
 
 
@@ -142,6 +142,14 @@ def test_too_few(generator: torch.Generator) -> None:
     assert (found.status == Status.TOO_FEW).all()
     assert not found.used_view.any()
     assert (found.P == 0).all()
+
+
+def test_too_few_curves(generator: torch.Generator) -> None:
+    """Wrong cameras come as near to one curve, and to two in three views, as right ones."""
+    for v, c in ((6, 1), (3, 2)):
+        P, X = cameras(2, v, generator), space_curves(2, c, 200, generator)
+        found = factorize_curves(curve_from_samples(images(X, P), closed=True), aligned=True)
+        assert (found.status == Status.TOO_FEW).all()
 
 
 def test_laws(generator: torch.Generator) -> None:

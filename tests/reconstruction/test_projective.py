@@ -85,7 +85,7 @@ def test_two_scenes_make_two_models() -> None:
 
 def test_wrong_options() -> None:
     scene = make_scene(points=60)
-    with pytest.raises(ReconstructionError, match="no method 'global'"):
-        run(scene, method="global")
+    with pytest.raises(ReconstructionError, match="no method 'none'"):
+        run(scene, method="none")
     with pytest.raises(ReconstructionError, match="finds the camera itself"):
         run(scene, method="projective", K=torch.eye(3, dtype=torch.float64))

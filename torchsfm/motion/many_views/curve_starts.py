@@ -96,7 +96,7 @@ def _pair_costs(samples: Tensor, there: Tensor, closed: Tensor, oriented: bool) 
     basis, R, _ = qr(x)
     both = torch.stack((x, run(x, torch.ones_like(there), closed)), 3)
     first, second = torch.fft.rfft(basis, dim=-2), torch.fft.rfft(both, dim=-2)
-    product = first.conj()[:, :, None, :, None, :, :, None] * second[:, None, :, :, :, :, None, :]
+    product = first.conj_physical()[:, :, None, :, None, :, :, None] * second[:, None, :, :, :, :, None, :]
     A = torch.fft.irfft(product, n=m, dim=-3)
     size = x.square().sum((-2, -1))[:, None, :, :, None, None]
     rest = (1 - A.square().sum((-2, -1)) / size.clamp_min(1e-300)).clamp(min=0)

@@ -29,13 +29,14 @@ _GRID = 60
 """Starts of closed curves that are tried."""
 _POINT_STEPS = 30
 """Most steps of the factorisation of points at each of its stages."""
-_NUMBERS = 1 << 22
-"""Distances of the problems solved at a time."""
 
 
 @dataclass(frozen=True)
 class CurveFactorization:
-    """Cameras and space curves of many images, up to one projective transformation of space."""
+    """Cameras and space curves of many images, up to one projective transformation of space.
+
+    See the example of `factorize_curves`.
+    """
 
     P: Float[Tensor, "*batch v 3 4"]
     """Camera matrices, |P| = 1; zero where `used_view` is False."""
@@ -49,11 +50,12 @@ class CurveFactorization:
     measured: Bool[Tensor, "*batch c m"]
     """Samples that three images and more agree on, in order with their neighbours."""
     used_view: Bool[Tensor, "*batch v"]
+    """Views that show curves, where the status is not TOO_FEW."""
     status: Int8[Tensor, "*batch"]
-    """OK; TOO_FEW: fewer than three views, or fewer samples than the cameras need; DEGENERATE: the curves leave cameras
-    undetermined (straight ones, all in one plane, views without baseline); NO_CONSENSUS: distances are larger than `threshold`,
-    or smooth along the curves, as noise is not: the search ended at the wrong place, or the images do not show the same curves;
-    NOT_CONVERGED."""
+    """OK; TOO_FEW: fewer than three views or two curves, two curves in three views, or fewer samples than the cameras need;
+    DEGENERATE: the curves leave cameras undetermined (straight ones, all in one plane, views without baseline); NO_CONSENSUS:
+    distances are larger than `threshold`, or smooth along the curves, as noise is not: the search ended at the wrong place, or
+    the images do not show the same curves; NOT_CONVERGED."""
 
 
 def factorize_curves(
@@ -68,8 +70,8 @@ def factorize_curves(
     """Find cameras and space curves from their images in three or more uncalibrated views, up to a projective transformation.
 
     Which image curve shows which space curve is known; which of its points show the same point is not. Closed curves may begin
-    anywhere and run in any direction in each image. Of an open curve all images show about the same piece. Curves in general
-    position are needed: three bent ones that do not lie in one plane are enough in six views.
+    anywhere and run in any direction in each image. Of an open curve all images show about the same piece. Bent curves in
+    general position are needed: two that do not lie in one plane, and three where there are three views only.
 
     What counts is where smooth curves through the samples go, so these must be exact to what is asked of the cameras: samples
     of edges, nearer to each other than their noise is small, are smoothed first (`fit_spline`).
@@ -93,6 +95,18 @@ def factorize_curves(
 
     Raises:
         ValueError: Wrong shape, dtype, device or option.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, 6.2, 60).double()
+        >>> x, y, z = t.cos(), t.sin(), 0.3 * (2 * t).cos()
+        >>> X = torch.stack((torch.stack((x, y, z), -1), torch.stack((z, x, y), -1), torch.stack((y, z, x), -1)))
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0])).double()
+        >>> P = K @ torchsfm.random_poses(6, spread=0.5, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> curves = torchsfm.geometry.curve_from_samples(torchsfm.project_points(P[:, None], X))
+        >>> found = torchsfm.factorize_curves(curves, oriented=True, aligned=True)
+        >>> torchsfm.Status(int(found.status)).name, found.P.shape, found.X.shape
+        ('OK', torch.Size([6, 3, 4]), torch.Size([3, 40, 4]))
     """
     check_options(
         curves=(curves, Curve), samples=(samples, "int >= 8"), oriented=(oriented, bool), aligned=(aligned, bool),
@@ -112,10 +126,10 @@ def factorize_curves(
         if count == 0:
             # The shapes of the answer come from one problem without curves.
             flat = tensor_map(lambda t: t.new_zeros(1, *t.shape[1:]), flat)
-        guesses = 1 if aligned else _GUESSES
-        size = max(1, _NUMBERS // (guesses * v * c * max(n, 16 * samples)))
-        starts = range(0, len(flat.x), size)
-        parts = [_factorize(cut(flat, i, i + size), samples, oriented, aligned, threshold, max_iterations) for i in starts]
+        # One after the other: searches that stop together would share their rounding.
+        parts = [
+            _factorize(cut(flat, i, i + 1), samples, oriented, aligned, threshold, max_iterations) for i in range(len(flat.x))
+        ]
         fields = tensor_map(lambda t: t.to(curves.x.dtype) if t.is_floating_point() else t, join(parts))
         return tensor_map(lambda t: t[:count].reshape(batch + t.shape[1:]), fields)
 
