@@ -20,8 +20,8 @@ WRONG_ANGLE = 5.0
 DEVIATIONS = 3.0
 """So many standard deviations of a camera that is not doubtful stay below that: one chance in 370 to be wrong."""
 EXPLAINED = 2 / 3
-"""Share of the verified matches of a camera's pairs that agree with a right place. Where things repeat along the way, each pair
-has matches of several relations, and a model can agree with one of them only."""
+"""Share of the verified matches of a camera's pairs, and of those of all, that agree with a right model. Where things repeat
+along the way, each pair has matches of several relations, and a model can agree with one of them only."""
 GUESSED_FOCAL = 0.2
 """A focal length at least so uncertain, as a fraction, is a guess where the images do not determine it."""
 
@@ -69,6 +69,7 @@ def examine(
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
     matches, agreeing = (agreement.per_view(one > 0, n, v) for n in (agreement.matches, agreement.agreeing))
+    explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
     outvoted = agreement.balance(v) < 0
     conflicts = missing_correspondences(mapping)
     refuted = conflicts.refuted
@@ -88,6 +89,8 @@ def examine(
             return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
         if int(agreeing[i]) < EXPLAINED * int(matches[i]):
             return f"{int(agreeing[i])} of the {int(matches[i])} matches of its pairs agree with its place, the others do not"
+        if explained < EXPLAINED * verified:
+            return f"{explained} of the {verified} matches of all pairs agree with the model, the others do not"
         if count >= 3 and int(supporting[i]) < 2:
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
         if count < 3 and bool(guessed[i]):
