@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from chance import assert_share, seeded
+from chance import seeded
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -114,19 +114,14 @@ def between_two_places(problem: BundleProblem, share: float, generator: torch.Ge
 
 
 def test_points_between_two_places_do_not_hold_back_the_others() -> None:
-    steps, minima = [], []
+    steps = []
     for stream in range(6):
         g = seeded(stream)
         problem = random_bundle_problem(10, 400, 2400, noise=0.2, generator=g).problem
         problem = between_two_places(problem, 0.3, g)
         found = bundle_adjust_model(problem, free=("focal", "k1"), loss=Cauchy(1.0), tolerance=1e-9, max_iterations=300).result
-        minima.append(found.status == Status.OK)
-        if minima[-1]:
-            steps.append(found.iterations)
-        else:
-            # Five parts in a thousand million above the minimum, a single point may crawl on, and the status says so.
-            assert found.status == Status.NOT_CONVERGED
-    assert_share(torch.tensor(minima), 0.95)
+        assert found.status == Status.OK
+        steps.append(found.iterations)
     # Were all damped until the Hessian is positive, it would be nearly ninety on average.
     assert sum(steps) < 60 * len(steps)
 
