@@ -21,6 +21,9 @@ from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_cos
 
 STRAIGHT = 0.75
 """Steps that lower the cost by less than this part of what they promise left the linear model's reach."""
+TELLING = 1e4
+"""Comparing costs still checks a promise of this many of their rounding errors. Down to there, steps are shortened point by
+point: a single one in a bent valley would hold all others back."""
 POOR = 0.25
 """Of a step that gains less than this fraction of its promise, each eliminated variable takes only what is good for it."""
 
@@ -230,8 +233,8 @@ class _SparseProblem:
         engine = self.engine
         x = move(engine.blocks, engine.layout, here.x, step.delta)
         cost = engine.cost(x)
-        if bool(step.promise <= self.epsilon**0.5 * here.cost):
-            # Near the minimum there is nothing to mend, and nothing that costs could tell.
+        if bool(step.promise <= TELLING * self.epsilon * here.cost):
+            # So near the minimum costs do not tell what is good for a variable.
             return _Place(engine, x, cost)
         if not bool(here.cost - cost > POOR * step.promise):
             x = engine.shorten(here.x, step.delta, x)
