@@ -72,6 +72,11 @@ def _poses(s: Scene) -> Pose:
     return Pose(R, t)
 
 
+def _place(s: Scene) -> Tensor:
+    """Degrees and metres."""
+    return s.rand(3, low=10.0, high=80.0)
+
+
 def _lenses(s: Scene) -> Camera:
     K, _, _ = s.parameters(4)
     return Camera(K, Radial(s.rand(4, low=-0.1, high=0.1), s.rand(4, low=-0.02, high=0.02)))
@@ -469,6 +474,8 @@ FUNCTIONS: dict[str, Function] = {
     "simulation.random_points": Function({"shape": (2,), "generator": _generator}),
     "simulation.random_poses": Function({"shape": (2,), "generator": _generator}),
     "simulation.simulate_images": Function({"poses": _poses, "cameras": _lenses, "generator": _generator}),
+    "geometry.enu_from_geodetic": Function({"place": _place, "origin": _place}),
+    "geometry.geodetic_from_enu": Function({"X": _place, "origin": _place}),
     "tensors.reordered_trifocal": Function({"views": (1, 0, 2)}),
     "simulation.simulate_conics": Function({"shape": (2,), "generator": _generator}),
     "triangulation.triangulate_curves": Function({"curves": _image_curves, "P": lambda s: s.cameras(4), "samples": 12}),
@@ -501,6 +508,9 @@ EXCEPTIONS: dict[str, str] = {
     **{f"images.{name}": FILES for name in ("parse_exif", "read_image", "save_image")},
     "optim.for_slots": "a view of a tensor, not its values",
     "optim.wants_derivative": "a question about tensors, not their values",
+    **{f"reconstruction.{name}": "takes a whole model; tests/test_align*.py spoil it" for name in (
+        "adjust_to_points", "align_models", "align_to_gps", "align_to_ground", "align_to_points", "align_to_positions",
+        "align_upright")},
     "reconstruction.reconstruct_curves": "photographs one after another, and seconds",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.triangulate_photographs": "photographs; its stages are tried by reconstruct_tracks",

@@ -1,17 +1,23 @@
 """`torchsfm align`: a saved model in another world frame, or at another scale."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import torch
 import typer
 
-from torchsfm.cli.export import load
+from torchsfm.cli.export import find_photographs, load
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.formats import write_model
 from torchsfm.formats.registry import format_for
 from torchsfm.geometry import Similarity
+from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.alignment import ControlPoints, align_models, align_to_points
+from torchsfm.reconstruction.control import adjust_to_points
+from torchsfm.reconstruction.gps import align_to_gps
+from torchsfm.reconstruction.report import printable
+from torchsfm.reconstruction.upright import align_to_ground, align_upright
 
 
 def align(
@@ -33,11 +39,30 @@ def align(
         ),
     ] = None,
     scale: Annotated[float | None, typer.Option(help="Multiply all lengths.", show_default=False)] = None,
+    gps: Annotated[
+        bool, typer.Option("--gps", help="To metres east, north and up, by the positions in the photographs' Exif tags.")
+    ] = False,
+    up: Annotated[bool, typer.Option("--up", help="So that z points up, by how the cameras were held.")] = False,
+    ground: Annotated[bool, typer.Option("--ground", help="So that z points up and z = 0 is the ground.")] = False,
+    images: Annotated[
+        Path | None,
+        typer.Option(help="For --gps: the folder of the photographs, unless they lie where they did.", show_default=False),
+    ] = None,
+    bend: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SIGMA",
+            help="For --points: adjust the model to them; SIGMA is how well they were measured, in their unit.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
-    """Move a model to the frame and scale of another one or of measured points, or scale it."""
-    with told(Job(out)):
-        if sum(option is not None for option in (to, points, scale)) != 1:
-            raise UserError("wanted one of --to, --points and --scale")
+    """Move a model to the frame and scale of another one, of GPS, of measured points or of the ground; or scale it."""
+    with told(Job(out)) as job:
+        if sum((to is not None, points is not None, scale is not None, gps, up, ground)) != 1:
+            raise UserError("wanted one of --to, --gps, --points, --up, --ground and --scale")
+        if bend is not None and (points is None or not 0 < bend < float("inf")):
+            raise UserError("--bend: wanted a positive number, together with --points")
         try:
             kind = format_for(out)
         except ValueError as error:
@@ -46,19 +71,58 @@ def align(
         if scale is not None:
             if not 0 < scale < float("inf"):
                 raise UserError(f"--scale: wanted a positive number, got {scale:g}")
-            one = torch.ones((), dtype=source.X.dtype)
+            one = torch.ones((), dtype=torch.float64)
             similarity = Similarity(scale * one, torch.eye(3, dtype=one.dtype), torch.zeros(3, dtype=one.dtype))
-            words = f"scale {scale:g}"
+            moved, words = source.to(torch.float64).transform(similarity), f"scale {scale:g}"
+        elif bend is not None and points is not None:
+            control = read_points(points)
+            job.progress("bundle", 0, 1)
+            bent = adjust_to_points(source, control, sigma=bend)
+            moved, words = bent.model, _good(points, bent.fault(), bent.summary)
         else:
-            found = align_models(source, load(to)) if to is not None else align_to_points(source, read_points(points or out))
-            if fault := found.fault():
-                raise UserError(f"{to or points}: {fault}")
-            similarity, words = found.similarity, found.summary("images" if to is not None else "points")
+            similarity, words = _similarity(source, model, to, points, images, gps=gps, ground=ground)
+            moved = source.to(torch.float64).transform(similarity)
+        job.close()
         try:
-            write_model(source.to(torch.float64).transform(similarity), out, kind.name)
+            write_model(moved, out, kind.name)
         except ValueError as error:
             raise UserError(f"{out}: {' '.join(str(error).split())}") from None
         typer.echo(f"{out}: {words}")
+
+
+def _similarity(
+    source: Reconstruction, model: Path, to: Path | None, points: Path | None, images: Path | None, *, gps: bool, ground: bool
+) -> tuple[Similarity, str]:
+    """Where the model goes, and how well that is known.
+
+    Raises:
+        UserError: It is not known.
+    """
+    if gps:
+        folder = images or find_photographs(model, source)
+        if folder is None:
+            raise UserError(f"{model}: the photographs were not found; say with --images where they lie")
+        placed = align_to_gps(source, folder)
+        return placed.alignment.similarity, _good(folder, placed.fault(), placed.summary)
+    if to is not None or points is not None:
+        found = align_models(source, load(to)) if to is not None else align_to_points(source, read_points(points or model))
+        words = _good(to or points or model, found.fault(), lambda: found.summary("images" if to is not None else "points"))
+        aside = [f"{name} ({d:.3g} off)" for name, d, used in
+                 zip(found.names, found.distance.tolist(), found.used.tolist(), strict=True) if not used]  # fmt: skip
+        return found.similarity, words + (f"; left aside: {', '.join(map(printable, aside[:5]))}" if aside else "")
+    level = align_to_ground(source) if ground else align_upright(source)
+    return level.similarity, _good(model, level.fault(), level.summary)
+
+
+def _good(source: Path, fault: str, summary: Callable[[], str]) -> str:
+    """What to say of an alignment that is determined.
+
+    Raises:
+        UserError: It is not.
+    """
+    if fault:
+        raise UserError(f"{source}: {fault}")
+    return summary()
 
 
 def read_points(path: Path) -> ControlPoints:

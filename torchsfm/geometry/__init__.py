@@ -33,6 +33,7 @@ from torchsfm.geometry.distortion import (
 )
 from torchsfm.geometry.distortion_model import Distortion
 from torchsfm.geometry.flatness import least_number_off, line_and_plane_distances
+from torchsfm.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from torchsfm.geometry.homogeneous import (
     from_homogeneous,
     normalize_sphere,
@@ -119,10 +120,12 @@ __all__ = [
     "ellipse_distance",
     "ellipse_from_conic",
     "ellipsoid_from_dual_quadric",
+    "enu_from_geodetic",
     "epipolar_distance",
     "fit_spline",
     "foot_points",
     "from_homogeneous",
+    "geodetic_from_enu",
     "intersect_conics",
     "intersect_line_conic",
     "intersect_line_plane",

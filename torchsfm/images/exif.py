@@ -1,4 +1,4 @@
-"""What a camera wrote beside the pixels: orientation, maker, model and the numbers that give a focal length.
+"""What a camera wrote beside the pixels: orientation, maker, model, the numbers that give a focal length, and where it was.
 
 The few tags needed are read straight from the bytes (TIFF 6.0; Exif 2.32, JEITA CP-3451; CIPA DC-008), in JPEG, PNG, TIFF and
 WebP files. Metadata is often damaged, so nothing here raises: what cannot be read is absent.
@@ -19,6 +19,7 @@ _WANTED = {
     0x0110: "model",
     0x0112: "orientation",
     0x8769: "exif_offset",
+    0x8825: "gps_offset",
     0x920A: "focal_mm",
     0xA405: "focal_35mm",
     0xA002: "width",
@@ -27,6 +28,9 @@ _WANTED = {
     0xA20F: "plane_y_resolution",
     0xA210: "plane_unit",
 }
+_OF_GPS = {1: "north", 2: "latitude", 3: "east", 4: "longitude", 5: "below", 6: "altitude"}
+"""The tags of the directory of positions, which have numbers of their own."""
+Value = str | int | float | tuple[float | None, ...]
 _MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_DIAGONAL = math.hypot(36.0, 24.0)
 
@@ -59,6 +63,12 @@ class Exif:
     """Pixels per millimetre on the sensor along x, for the size the camera wrote."""
     plane_y_resolution: float | None = None
     """The same along y."""
+    latitude: float | None = None
+    """Where the photograph was taken, degrees of WGS84, northern ones positive; there with the longitude or not at all."""
+    longitude: float | None = None
+    """The same, eastern ones positive."""
+    altitude: float | None = None
+    """Height in metres, above sea level or the ellipsoid, as the camera had it."""
 
     def focal(self, width: int, height: int) -> float | None:
         """The focal length in pixels of an image of the given stored size, or None where the tags do not tell.
@@ -105,6 +115,11 @@ def parse_exif(data: bytes) -> Exif:
         value = tags.get(name)
         return value if isinstance(value, str) else ""
 
+    latitude, longitude = _degrees(tags, "latitude", "north", "S", 90.0), _degrees(tags, "longitude", "east", "W", 180.0)
+    # A receiver that does not know writes zeros.
+    placed = latitude is not None and longitude is not None and (latitude, longitude) != (0, 0)
+    height = tags.get("altitude")
+    up = height if isinstance(height, int | float) and math.isfinite(height) else None
     orientation = integer("orientation") or 1
     per_unit = _MILLIMETRES.get(integer("plane_unit") or 2)
     x_resolution, y_resolution = number("plane_x_resolution"), number("plane_y_resolution")
@@ -118,7 +133,25 @@ def parse_exif(data: bytes) -> Exif:
         height=integer("height"),
         plane_x_resolution=x_resolution / per_unit if x_resolution and per_unit else None,
         plane_y_resolution=y_resolution / per_unit if y_resolution and per_unit else None,
+        latitude=latitude if placed else None,
+        longitude=longitude if placed else None,
+        altitude=None if up is None or not placed else -up if tags.get("below") == 1 else up,
     )
+
+
+def _degrees(tags: dict[str, Value], name: str, side: str, negative: str, limit: float) -> float | None:
+    """An angle written as degrees, minutes and seconds; None where it is none."""
+    parts = tags.get(name)
+    if not isinstance(parts, tuple) or not 1 <= len(parts) <= 3:
+        return None
+    # Minutes or seconds that are absent are 0/0 in some files.
+    numbers = [parts[0], *(part or 0.0 for part in parts[1:])]
+    if any(n is None or not 0 <= n <= limit for n in numbers):
+        return None
+    angle = math.fsum((n or 0.0) / 60.0**k for k, n in enumerate(numbers))
+    if angle > limit:
+        return None
+    return -angle if str(tags.get(side, ""))[:1].upper() == negative else angle
 
 
 def _find_block(data: bytes) -> bytes | None:
@@ -160,40 +193,43 @@ def _find_in_chunks(data: bytes, position: int, wanted: bytes, order: str, *, le
     return None
 
 
-def read_tags(block: bytes) -> dict[str, str | int | float]:
+def read_tags(block: bytes) -> dict[str, Value]:
     """The tags wanted here in a TIFF structure, by name."""
     order = {b"II": "<", b"MM": ">"}.get(block[:2])
-    tags: dict[str, str | int | float] = {}
+    tags: dict[str, Value] = {}
     if order is None or len(block) < 8:
         return tags
     (offset,) = struct.unpack_from(order + "I", block, 4)
-    _read_directory(block, order, offset, tags)
-    second = tags.get("exif_offset")
-    if isinstance(second, int):
-        _read_directory(block, order, second, tags)
+    _read_directory(block, order, offset, _WANTED, tags)
+    for pointer, wanted in (("exif_offset", _WANTED), ("gps_offset", _OF_GPS)):
+        further = tags.get(pointer)
+        if isinstance(further, int):
+            _read_directory(block, order, further, wanted, tags)
     return tags
 
 
-def _read_directory(block: bytes, order: str, offset: int, tags: dict[str, str | int | float]) -> None:
+def _read_directory(block: bytes, order: str, offset: int, wanted: dict[int, str], tags: dict[str, Value]) -> None:
     if offset < 8 or offset + 2 > len(block):
         return
     (count,) = struct.unpack_from(order + "H", block, offset)
     for start in range(offset + 2, min(offset + 2 + 12 * count, len(block) - 11), 12):
         tag, kind, number = struct.unpack_from(order + "HHI", block, start)
-        if tag not in _WANTED or kind not in _SIZES or number == 0:
+        if tag not in wanted or kind not in _SIZES or number == 0:
             continue
         size = _SIZES[kind] * number
         place = start + 8 if size <= 4 else struct.unpack_from(order + "I", block, start + 8)[0]
         if place + size > len(block):
             continue
-        value: str | int | float | None = None
+        value: Value | None = None
         if kind == 2:
             raw = block[place : place + size].split(b"\0")[0]
             value = "".join(c for c in raw.decode("utf-8", "replace") if c.isprintable()).strip()
         elif kind in (5, 10):
-            above, below = struct.unpack_from(order + ("2I" if kind == 5 else "2i"), block, place)
-            value = above / below if below else None
+            form = order + ("2I" if kind == 5 else "2i")
+            pairs = (struct.unpack_from(form, block, place + 8 * k) for k in range(min(number, 3)))
+            ratios = tuple(above / below if below else None for above, below in pairs)
+            value = ratios if wanted[tag] in ("latitude", "longitude") else ratios[0]
         elif kind in _INTEGERS:
             value = struct.unpack_from(order + _INTEGERS[kind], block, place)[0]
         if value is not None:
-            tags.setdefault(_WANTED[tag], value)  # of a tag that is there twice decoders take the first
+            tags.setdefault(wanted[tag], value)  # of a tag that is there twice decoders take the first

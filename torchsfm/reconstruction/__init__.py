@@ -1,7 +1,10 @@
 """How do images become a model? The `Reconstruction`, and the doors from photographs and from tracks."""
 
+from torchsfm.reconstruction.alignment import Alignment, ControlPoints, align_models, align_to_points, align_to_positions
 from torchsfm.reconstruction.conics import Conics
+from torchsfm.reconstruction.control import ControlledModel, adjust_to_points
 from torchsfm.reconstruction.curves import CurveReconstruction, reconstruct_curves
+from torchsfm.reconstruction.gps import GpsAlignment, align_to_gps
 from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
@@ -9,12 +12,20 @@ from torchsfm.reconstruction.models import reconstruct_tracks
 from torchsfm.reconstruction.photographs import reconstruct
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, ReconstructionError, Report, SfmResult
+from torchsfm.reconstruction.similarities import Certainty
+from torchsfm.reconstruction.upright import Levelling, align_to_ground, align_upright
 from torchsfm.reconstruction.view_graph import Verdict
 
 __all__ = [
+    "Alignment",
+    "Certainty",
     "Conics",
+    "ControlPoints",
+    "ControlledModel",
     "CurveReconstruction",
+    "GpsAlignment",
     "ImageReport",
+    "Levelling",
     "Lines",
     "MatchedImages",
     "PairReport",
@@ -23,6 +34,13 @@ __all__ = [
     "Report",
     "SfmResult",
     "Verdict",
+    "adjust_to_points",
+    "align_models",
+    "align_to_gps",
+    "align_to_ground",
+    "align_to_points",
+    "align_to_positions",
+    "align_upright",
     "reconstruct",
     "reconstruct_curves",
     "reconstruct_matches",

@@ -1,21 +1,27 @@
-"""Into another world frame: that of another model, or of points that were measured."""
+"""Into another world frame: that of another model, of camera positions (GPS), or of points that were measured."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status
-from torchsfm.geometry import Similarity, similarity_from_points
+from torchsfm._types import Status, check_one_problem
+from torchsfm.geometry import Similarity
 from torchsfm.reconstruction.evaluation import align_poses
 from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.similarities import (
+    DEVIATION,
+    MOST_SCALE,
+    MOST_TURN,
+    OUTLYING,
+    Certainty,
+    certainty,
+    robust_similarity,
+)
 from torchsfm.triangulation import triangulate_points
-
-OUTLYING = 4.0
-"""Robust standard deviations beyond which a pair of positions does not count."""
-DEVIATION = 1.4826
-"""A normal distribution's standard deviation over its median absolute value."""
 
 
 @dataclass(frozen=True)
@@ -27,28 +33,48 @@ class Alignment:
         names: The images or points that both have.
         distance: How far each is from its place after the similarity, in the other world's unit.
         used: Those that agree; the others are outliers, which the similarity leaves aside.
+        apart: The same as vectors, along the axes of the other world.
+        known: How well places that were measured with errors determine the similarity; None where the poses are compared.
+
+    See the example of `align_to_positions`.
     """
 
     similarity: Similarity
     names: tuple[str, ...]
     distance: Float[Tensor, "n"]
     used: Bool[Tensor, "n"]
+    apart: Float[Tensor, "n 3"] | None = None
+    known: Certainty | None = None
 
     def summary(self, what: str) -> str:
         """One line for people."""
         rms = float(self.distance[self.used].square().mean().sqrt())
         agree = f"{int(self.used.sum())} of {len(self.names)} {what} agree"
-        return f"{agree}, {rms:.4g} apart (RMS), scale {float(self.similarity.scale):.6g}"
+        text = f"{agree}, {rms:.4g} apart (RMS)"
+        if self.apart is not None:
+            along, height = (self.apart[self.used][:, axes].square().sum(-1).mean().sqrt() for axes in (slice(2), slice(2, 3)))
+            text += f", {float(along):.4g} along the ground and {float(height):.4g} in height"
+        text += f", scale {float(self.similarity.scale):.6g}"
+        return text if self.known is None else f"{text}, known to {100 * self.known.scale:.2g} %"
 
     def fault(self) -> str:
         """Why there is no similarity; empty where there is one."""
         match self.similarity.status:
             case None | Status.OK:
-                return ""
+                return self._doubt()
             case Status.TOO_FEW:
                 return f"only {len(self.names)} in common, which is too few"
             case _:
                 return f"the {len(self.names)} in common are at one place or on one line"
+
+    def _doubt(self) -> str:
+        """Why a similarity that fits best is not good enough all the same."""
+        if self.known is None or (self.known.turn <= MOST_TURN and self.known.scale <= MOST_SCALE):
+            return ""
+        off = f"the {len(self.names)} positions are {self.known.sigma:.3g} off"
+        if self.known.scale > MOST_SCALE:
+            return f"{off}, too far to tell the scale: they contradict the model, or are too near each other"
+        return f"{off} and nearly on one line, about which the turn is open by {math.degrees(self.known.turn):.2g} degrees"
 
 
 def align_models(model: Reconstruction, other: Reconstruction) -> Alignment:
@@ -61,6 +87,16 @@ def align_models(model: Reconstruction, other: Reconstruction) -> Alignment:
     Args:
         model: The model.
         other: The other one; images are the same that have the same name.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(4, 20, 60, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> double = torchsfm.Similarity(torch.tensor(2.0).double(), torch.eye(3).double(), torch.ones(3).double())
+        >>> found = torchsfm.reconstruction.align_models(model, model.transform(double))
+        >>> round(float(found.similarity.scale), 6), found.fault()
+        (2.0, '')
     """
     places = {name: i for i, name in enumerate(other.names) if bool(other.registered[i])}
     common = [(i, places[name]) for i, name in enumerate(model.names) if bool(model.registered[i]) and name in places]
@@ -88,6 +124,51 @@ def align_models(model: Reconstruction, other: Reconstruction) -> Alignment:
     return Alignment(fine, names, distance, used)
 
 
+def align_to_positions(
+    model: Reconstruction,
+    names: Sequence[str],
+    positions: Float[Tensor, "k 3"],
+    *,
+    generator: torch.Generator | None = None,
+) -> Alignment:
+    """The similarity that carries the camera centres of a model onto positions that were measured: GPS, a survey, a tracker.
+
+    Up to two fifths of seven positions or more may be wrong; the similarity is that of the least squared distances over those
+    that agree. Three positions not on a line are the least. Where they determine the scale to no better than a tenth, or leave
+    the turn about their line open, for as far off as they are, `fault` says so.
+
+    Args:
+        model: The model, of which images without a pose do not count.
+        names: Images of which the position is known; those that the model does not have are passed over.
+        positions: Where their cameras were, in a frame in metres, say: see `enu_from_geodetic` for latitude and longitude.
+        generator: Source of the samples that are tried; the same ones each time if not given.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(8, 20, 100, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> measured = 10 * model.poses.centre + 1
+        >>> measured[3] += 1000
+        >>> found = torchsfm.reconstruction.align_to_positions(model, model.names, measured)
+        >>> round(float(found.similarity.scale), 6), found.used.tolist().index(False), found.fault()
+        (10.0, 3, '')
+    """
+    check_one_problem(positions=(positions, "k 3"))
+    if len(names) != len(positions):
+        raise ValueError(f"names: wanted {len(positions)}, one for each position, got {len(names)}")
+    model = model.to("cpu", torch.float64)
+    place = {name: i for i, name in enumerate(model.names) if bool(model.registered[i])}
+    finite = positions.isfinite().all(-1).tolist()
+    rows = [k for k, name in enumerate(names) if name in place and finite[k]]
+    both = tuple(names[k] for k in rows)
+    if len(both) < 3:
+        return _nothing(both, Status.TOO_FEW)
+    X = model.poses.centre[[place[name] for name in both]]
+    Y = positions.detach().to("cpu", torch.float64)[rows]
+    return _fit(both, X, Y, generator)
+
+
 @dataclass(frozen=True)
 class ControlPoints:
     """Points whose places were measured, and where images show them.
@@ -98,6 +179,8 @@ class ControlPoints:
         images: Name of the image of each observation.
         x: Where it is, pixels.
         point: Which point it shows.
+
+    See the example of `adjust_to_points`.
     """
 
     names: tuple[str, ...]
@@ -116,6 +199,8 @@ def align_to_points(model: Reconstruction, control: ControlPoints) -> Alignment:
     Args:
         model: The model; observations in images without a pose do not count.
         control: The measured points.
+
+    See the example of `adjust_to_points`, which also bends the model to them.
     """
     model = model.to("cpu", torch.float64)
     place = {name: i for i, name in enumerate(model.names) if bool(model.registered[i])}
@@ -134,10 +219,17 @@ def align_to_points(model: Reconstruction, control: ControlPoints) -> Alignment:
     if len(names) < 3:
         return _nothing(names, Status.TOO_FEW)
     found = triangulate_points(flat[:, seen], model.poses.matrix(), visible=visible[:, seen]).model
-    target = control.X.double()[seen]
-    similarity = similarity_from_points(found, target)
-    used = torch.full((len(names),), bool(similarity.status == Status.OK))
-    return Alignment(similarity, names, (similarity.transform(found) - target).norm(dim=-1), used)
+    return _fit(names, found, control.X.to("cpu", torch.float64)[seen], None)
+
+
+def _fit(
+    names: tuple[str, ...], X: Float[Tensor, "n 3"], Y: Float[Tensor, "n 3"], generator: torch.Generator | None
+) -> Alignment:
+    """The similarity from places of the model to measured ones."""
+    similarity, used = robust_similarity(X, Y, generator)
+    apart = similarity.transform(X) - Y
+    used = used & (similarity.status == Status.OK)
+    return Alignment(similarity, names, apart.norm(dim=-1), used, apart, certainty(similarity, X, Y, used))
 
 
 def _nothing(names: tuple[str, ...], status: Status) -> Alignment:
