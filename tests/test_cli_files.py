@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 from shutil import copy
 
@@ -34,8 +35,14 @@ def odd(courtyard: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
         (folder / name).write_bytes(b"x")
     (folder / "more").mkdir()
     copy(courtyard / "view3.png", folder / "more")
+    (folder / "more" / "c.heic").write_bytes(b"x")
+    (folder / "results").mkdir()
+    copy(courtyard / "view4.png", folder / "results")
+    (folder / "results" / ".lock").touch()
     out = tmp_path_factory.mktemp("out\udce9")
-    status, text, stderr = torchsfm("reconstruct", folder, "--out", out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "pillow_heif", None)
+        status, text, stderr = torchsfm("reconstruct", folder, "--out", out)
     assert status == 0, stderr
     return out, text
 
@@ -43,10 +50,10 @@ def odd(courtyard: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 def test_no_name_costs_the_work(odd: tuple[Path, str]) -> None:
     out, text = odd
     images = report(out)
-    assert [name for name, image in images.items() if image["registered"]] == list(NAMES)
+    assert [name for name, image in images.items() if image["registered"]] == [*NAMES, "more/view3.png"]
     assert "text" in str(images["4 caf\udce9 letter.png"]["reason"])
-    assert Reconstruction.load(out / "model.npz").names == NAMES
-    assert read_colmap(out / "colmap").names == NAMES
+    assert Reconstruction.load(out / "model.npz").names == (*NAMES, "more/view3.png")
+    assert read_colmap(out / "colmap").names == (*NAMES, "more/view3.png")
     assert {"page.html", "points.ply", "report.md"} <= {path.name for path in out.iterdir()}
     text.encode("utf-8")
     assert "\x1b" not in text
@@ -66,13 +73,14 @@ def test_no_name_becomes_markup(odd: tuple[Path, str]) -> None:
 def test_what_was_not_read_is_said(odd: tuple[Path, str]) -> None:
     out, text = odd
     skipped = {entry["name"]: entry["reason"] for entry in json.loads((out / "report.json").read_text())["skipped"]}
-    assert list(skipped) == ["a.heic", "b.HEIC", "film.mp4", "more"]
-    assert "not read: a.heic, b.HEIC (HEIC" in text
-    assert "not read: more (a folder with 1 pictures" in text
+    assert list(skipped) == ["a.heic", "b.HEIC", "film.mp4", "results", "more/c.heic"]
+    assert "not read: a.heic, b.HEIC, more/c.heic (HEIC" in text
+    assert "not read: results (a folder with 1 pictures; it holds masks or results" in text
     assert all(f"| {name} |" in (out / "report.md").read_text() for name in skipped)
 
 
-def test_a_folder_with_nothing_else(tmp_path: Path) -> None:
+def test_a_folder_with_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
     (tmp_path / "a.heic").touch()
     status, _, stderr = torchsfm("reconstruct", tmp_path, "--out", tmp_path / "out")
     assert status == 2
@@ -131,7 +139,7 @@ def test_an_image_with_too_many_pixels_is_left_out_and_said(courtyard: Path, tmp
     save_image(tmp_path / "large.png", torch.zeros(3, HEIGHT + 1, WIDTH))
     words = ["reconstruct", *images, tmp_path / "large.png", "--max-pixels", WIDTH * HEIGHT]
     assert torchsfm(*words, "--out", tmp_path / "out")[0] == 0
-    entry = report(tmp_path / "out")["large.png"]
+    (entry,) = [image for name, image in report(tmp_path / "out").items() if name.endswith("/large.png")]
     assert not entry["registered"]
     assert "400 x 301 are more than the 120000 pixels" in str(entry["reason"])
     words[-1] -= 1

@@ -505,7 +505,7 @@ EXCEPTIONS: dict[str, str] = {
     "formats.export_model": FILES,
     "formats.undistorted_model": "hands a model to undistorted_cameras",
     **{f"images.{name}": FILES for name in ("list_images", "list_skipped", "load_detector", "load_matcher")},
-    **{f"images.{name}": FILES for name in ("parse_exif", "read_image", "save_image")},
+    **{f"images.{name}": FILES for name in ("extract_frames", "parse_exif", "read_image", "save_image")},
     "optim.for_slots": "a view of a tensor, not its values",
     "optim.wants_derivative": "a question about tensors, not their values",
     **{f"reconstruction.{name}": "takes a whole model; tests/test_align*.py spoil it" for name in (

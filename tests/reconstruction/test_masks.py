@@ -83,12 +83,16 @@ def test_other_masks_make_other_stages(courtyard: Path, tmp_path: Path) -> None:
 
 def test_places_between_pixels(tmp_path: Path) -> None:
     save_image(tmp_path / "a.png", torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
-    masks = Masks(tmp_path)
+    masks = Masks(tmp_path, Path("b"))
     x = torch.tensor([[-0.4, -0.4], [3.4, 0.0], [3.6, 0.0], [4.0, 3.0], [7.4, 3.4], [7.4, 7.4], [99.0, 99.0]])
     assert masks.admit(Path("b/a.jpg"), x, (8, 8)).tolist() == [False, False, True, True, True, False, False]
-    assert masks.admit(Path("c.jpg"), x, (8, 8)).all()
+    assert masks.admit(Path("b/c.jpg"), x, (8, 8)).all()
+    assert masks.admit(Path("b/c/a.jpg"), x, (8, 8)).all()
     with pytest.raises(ImageError, match="a mask of 2 x 2 pixels for an image of 8 x 4"):
-        masks.admit(Path("a.jpg"), x, (8, 4))
+        masks.admit(Path("b/a.jpg"), x, (8, 4))
+    (tmp_path / "c").mkdir()
+    (tmp_path / "a.png").rename(tmp_path / "c" / "a.png")
+    assert not masks.admit(Path("b/c/a.jpg"), x, (8, 8)).all()
 
 
 def test_wrong_masks_are_told(courtyard: Path, tmp_path: Path) -> None:

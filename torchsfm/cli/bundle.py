@@ -104,9 +104,13 @@ def bundle(
         result = adjusted.result
         typer.echo(describe(model, names))
         typer.echo(compare_residuals(before, result))
+        job.voice.record.update(
+            cost_before=float(result.initial_cost), cost=float(result.cost), iterations=int(result.iterations),
+            ending=Status(int(result.status)).name, out=None if out is None else str(out),
+        )  # fmt: skip
         typer.echo(f"{ENDINGS.get(result.status, 'ended')} after {result.iterations} iterations, {seconds:.2f} s")
         if result.status in (Status.TOO_FEW, Status.NOT_FINITE):
-            typer.echo(f"torchsfm: {file}: nothing to adjust: no observation of finite numbers", err=True)
+            job.fail(f"{file}: nothing to adjust: no observation of finite numbers")
             raise typer.Exit(NOTHING)
         if out is not None:
             save(adjusted.model, out)

@@ -90,7 +90,7 @@ def calibrate(
             job.close()
             for p in photographs:
                 typer.echo(f"{printable(p.path.name)}: {p.problem}", err=True)
-            typer.echo(f"torchsfm: no photograph shows the whole {board} {pattern.value} pattern", err=True)
+            job.fail(f"no photograph shows the whole {board} {pattern.value} pattern")
             raise typer.Exit(NOTHING)
         place = torch.arange(columns * rows)
         X = size * torch.stack((place % columns, place // columns), -1).double()
@@ -117,9 +117,10 @@ def calibrate(
             (out / "camera.txt").unlink(missing_ok=True)
         write_whole_files({out / name: text.encode() for name, text in texts.items()})
         job.close()
+        job.voice.record["calibration"] = record
         typer.echo(_markdown(record))
         if found.status != Status.OK:
-            typer.echo(f"torchsfm: the photographs do not determine the camera ({record['status']})", err=True)
+            job.fail(f"the photographs do not determine the camera ({record['status']})")
             raise typer.Exit(NOTHING)
         typer.echo(f"{out / 'camera.txt'}  the matrix K, for --intrinsics")
 

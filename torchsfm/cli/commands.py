@@ -12,14 +12,25 @@ import typer
 from torchsfm.cli.align import align
 from torchsfm.cli.bundle import bundle
 from torchsfm.cli.calibrate import calibrate
+from torchsfm.cli.compare import compare, true_errors
 from torchsfm.cli.curves import curves
 from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
-from torchsfm.cli.inputs import photograph_folder, read_intrinsics, read_matched, warn_about_intrinsics
+from torchsfm.cli.inputs import (
+    FRAMES,
+    film_among,
+    photograph_folder,
+    read_film,
+    read_intrinsics,
+    read_matched,
+    warn_about_intrinsics,
+)
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.known_poses import Masks, register, triangulate
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.ranks import Started
-from torchsfm.cli.results import VERSION, compare, finish
+from torchsfm.cli.results import VERSION, finish
+from torchsfm.cli.view import view
+from torchsfm.cli.voice import spoken
 from torchsfm.formats import TARGETS
 from torchsfm.formats.registry import model_files
 from torchsfm.geometry import DISTORTION_MODELS
@@ -32,7 +43,6 @@ app = typer.Typer(
     help="From photographs to calibrated cameras and 3D structure.",
     epilog="Exit status: 0 all good, 1 nothing could be reconstructed, 2 wrong input or usage, or a file that cannot be read or"
     " written (results of an earlier run then stay as they were), 130 interrupted.",
-    add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -82,19 +92,24 @@ def options(
             stream.reconfigure(errors="backslashreplace")
 
 
-@app.command()
 def reconstruct(
     images: Annotated[
         list[Path],
         typer.Argument(
-            help="A folder of images, or image files; or keypoints and matches of other programs: COLMAP's database.db, or"
-            " hloc's two files, features.h5 and matches.h5.",
+            help="A folder of images with its subfolders, image files, a text file that lists images, or a film; or keypoints"
+            " and matches of other programs: COLMAP's database.db, or hloc's two files, features.h5 and matches.h5.",
             show_default=False,
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the model, the page, the report and the finished stages.")],
     masks: Masks = None,
     sequence: Annotated[bool, typer.Option("--sequence", help="The images are frames of a video, in order.")] = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-3, help="Frames a second to take of a film, the sharpest of each moment; 2 if not given.", show_default=False
+        ),
+    ] = None,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -111,7 +126,7 @@ def reconstruct(
         bool | None,
         typer.Option(
             "--shared-camera/--own-cameras",
-            help="Whether one camera took all images of a size; by default as the files' Exif data suggest.",
+            help="Whether one camera took all images of a size; by default as folders and the files' Exif data suggest.",
             show_default=False,
         ),
     ] = None,
@@ -150,15 +165,20 @@ def reconstruct(
 ) -> None:
     """Turn photographs into calibrated cameras and coloured 3D points."""
     started = Started.by()
-    source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
     shown = {"masks": masks, "sequence": sequence, "max_features": max_features, "max_pixels": max_pixels}
     if started.rank > 0:
         with told(Job(out)) as job:
-            if read_matched(images) is None:
+            film = film_among(images, fps)
+            if film is not None or read_matched(images) is None:
                 started.begin(out, resume)
-                job.help(source, threads, started, seed=seed, **shown)
+                source = images if film is None else [out / FRAMES]
+                job.help(source, threads, started, seed=seed, **shown | {"sequence": sequence or film is not None})
         return
     with told(Job(out)) as job, output_folder(out):
+        film = film_among(images, fps)
+        if film is not None:
+            read_film(job, film, fps, max_pixels)
+            images, shown["sequence"] = [out / FRAMES], True
         matched = read_matched(images)
         folder = photograph_folder(images) if matched is None else None
         if targets and folder is None:
@@ -174,7 +194,7 @@ def reconstruct(
         if matched is not None:
             result = job.run_matched(matched, threads, **options)
         else:
-            result = job.run(source, threads, lines=lines, resume=started.begin(out, resume), **shown, **options)
+            result = job.run(images, threads, lines=lines, resume=started.begin(out, resume), **shown, **options)
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
         finish(job, result, folder, {}, max_pixels)
@@ -182,7 +202,6 @@ def reconstruct(
             write_export(job, result.models[0], target, out / target, folder)
 
 
-@app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the rendered images and all results.")] = Path("torchsfm-demo"),
     views: Annotated[int, typer.Option(min=3, max=100, help="Number of photographs to render.")] = 12,
@@ -206,16 +225,17 @@ def demo(
         result = job.run([folder / name for name in names], threads, seed=seed, resume=False)
         compared = {}
         if result.models:
-            compared = compare(result.models[0], truth.poses, truth.cameras.K)
+            model = result.models[0]
+            K = model.cameras.K[model.camera_index]
+            compared = true_errors(model.poses, model.registered, K, truth.poses, truth.cameras.K)
         finish(job, result, folder, compared)
 
 
-@app.command()
 def info(
     folder: Annotated[Path, typer.Argument(help="Folder written by `torchsfm reconstruct`, or a model of any format.")],
 ) -> None:
     """Describe saved models: cameras, points and how well each image fits."""
-    with told(Job(folder)):
+    with told(Job(folder)) as job:
         if unfinished(folder):
             with output_folder(folder):
                 finish_replacing(folder)
@@ -223,7 +243,8 @@ def info(
             found = model_files(folder)
         except ValueError as error:
             raise UserError(" ".join(str(error).split())) from None
-        for _, file in found:
+        models = job.voice.record.setdefault("models", [])
+        for kind, file in found:
             model = load(file)
             typer.echo(f"{file}\n{model.summary()}\n")
             counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
@@ -234,8 +255,15 @@ def info(
             for name, registered, count, mean in zip(names, model.registered.tolist(), counts, errors, strict=True):
                 typer.echo(f"{name:<{width}}  " + (f"{count:>12}  {mean:>14.3f}" if registered else "not registered"))
             typer.echo("")
+            rows = zip(model.names, model.registered.tolist(), counts, errors, strict=True)
+            keys = ("name", "registered", "observations", "mean_error_px")
+            models.append(
+                {"file": str(file), "format": kind.name, "points": model.num_points}
+                | {"images": [dict(zip(keys, row, strict=True)) for row in rows]}
+            )
 
 
-for command in (triangulate, register, align, bundle, calibrate, export, convert):
-    app.command()(command)
-app.command()(curves)
+for command in (
+    reconstruct, demo, info, view, compare, triangulate, register, align, bundle, calibrate, export, convert, curves,
+):  # fmt: skip
+    app.command()(spoken(command))

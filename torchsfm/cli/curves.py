@@ -64,10 +64,11 @@ def curves(
         number = len(found.curve.x)
         length = float(found.curve.length.sum())
         typer.echo(f"{number} curves of length {length:.6g} in all, from {sum(read)} of {model.num_registered} images")
+        job.voice.record.update(curves=number, length=length, files=[str(out / name) for name, _ in written])
         for name, what in written:
             typer.echo(f"{out / name}  {what}")
         if not number:
-            typer.echo("torchsfm: no curves found", err=True)
+            job.fail("no curves found")
             raise typer.Exit(NOTHING)
 
 

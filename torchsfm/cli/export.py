@@ -120,6 +120,7 @@ def convert(
         job.progress("write", 1, 1)
         job.close()
         typer.echo(f"{target}: {kind.what}, {model.num_registered} images, {model.num_points} points")
+        job.voice.record.update(out=str(target), format=kind.name, images=model.num_registered, points=model.num_points)
 
 
 def load(path: Path) -> Reconstruction:
@@ -176,3 +177,4 @@ def write_export(job: Job, model: Reconstruction, target: str, out: Path, images
         raise UserError(" ".join(str(error).split())) from None
     job.close()
     typer.echo(f"{out}  for {target}: {TARGETS[target].what}")
+    job.voice.record.setdefault("exports", []).append({"for": target, "out": str(out), "images": model.num_registered})

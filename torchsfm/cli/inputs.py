@@ -1,6 +1,5 @@
 """What the user gives: photographs, and a file with known intrinsics."""
 
-import os
 from pathlib import Path
 
 import torch
@@ -8,10 +7,15 @@ import typer
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.cli.job import UserError
+from torchsfm.cli.job import Job, UserError
 from torchsfm.formats import read_database, read_hloc
-from torchsfm.reconstruction import MatchedImages, Reconstruction
+from torchsfm.images import FILMS, extract_frames
+from torchsfm.images.film import FPS
+from torchsfm.reconstruction import MatchedImages, Reconstruction, ReconstructionError
+from torchsfm.reconstruction.sources import Sources
 
+FRAMES = "frames"
+"""The folder of a film's frames, beside the results."""
 SQLITE, HDF5 = b"SQLite format 3\0", b"\x89HDF\r\n\x1a\n"
 
 
@@ -37,15 +41,47 @@ def read_matched(inputs: list[Path]) -> MatchedImages | None:
     return None
 
 
-def photograph_folder(images: list[Path]) -> Path | None:
-    """The folder in which images lie under their names in the model; None where they do not lie together."""
-    if len(images) == 1 and not images[0].is_file():
-        return images[0]
-    if len({path.name for path in images}) < len(images):
-        # Then the names begin at the common folder.
-        return Path(os.path.commonpath([path.absolute() for path in images]))
-    folders = {path.parent for path in images}
-    return folders.pop() if len(folders) == 1 else None
+def photograph_folder(images: list[Path]) -> Path:
+    """The folder in which images lie under their names in the model.
+
+    Raises:
+        UserError: There are none, or some are not there.
+    """
+    try:
+        return Sources.of(images).folder
+    except ReconstructionError as error:
+        raise UserError(" ".join(str(error).split())) from None
+
+
+def film_among(images: list[Path], fps: float | None) -> Path | None:
+    """The film that is given instead of images, if one is.
+
+    Raises:
+        UserError: It is not the only thing given, or there is a rate of frames and no film.
+    """
+    films = [path for path in images if path.suffix.lower() in FILMS and not path.is_dir()]
+    if films and len(images) > 1:
+        raise UserError(f"{films[0]}: a film is reconstructed by itself, not with other images")
+    if fps is not None and not films:
+        raise UserError("--fps: wants a film")
+    return films[0] if films else None
+
+
+def read_film(job: Job, film: Path, fps: float | None, max_pixels: int) -> None:
+    """Save frames of a film in the folder of the results.
+
+    Raises:
+        UserError: It cannot be read, or gives a single frame.
+    """
+    try:
+        frames = extract_frames(
+            film, job.out / FRAMES, fps=FPS if fps is None else fps, max_pixels=max_pixels,
+            progress=lambda done, total: job.progress("film", done, total),
+        )  # fmt: skip
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from None
+    if len(frames) < 2:
+        raise UserError(f"{film}: one frame is not enough, two views are the least; --fps takes more of them")
 
 
 def read_intrinsics(path: Path) -> Float[Tensor, "3 3"]:

@@ -12,17 +12,24 @@ from typing import Any, NoReturn
 import torch
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeRemainingColumn
 
 from torchsfm.cli.ranks import Started
+from torchsfm.cli.voice import VOICE, Voice
 from torchsfm.reconstruction import MatchedImages, ReconstructionError, SfmResult, reconstruct, reconstruct_matches
 from torchsfm.reconstruction.photographs import NEIGHBOURS, match_photographs
+from torchsfm.reconstruction.sources import Source
 from torchsfm.reconstruction.stages import saved_stages
 
 NOTHING, WRONG, INTERRUPTED = 1, 2, 130
+PAUSE = 30.0
+"""Seconds between two lines on how far a stage is, where there is no terminal for a bar."""
+LONGEST_ESTIMATE = 1e9
+"""Seconds over which the speed of a stage is averaged: all of it."""
 
 LABELS = {
     "render": "rendering the scene",
+    "film": "reading the film",
     "read": "reading images",
     "pattern": "finding the pattern",
     "problem": "reading",
@@ -57,14 +64,17 @@ class Job:
     bars: Progress | None = None
     reported: float = field(default_factory=time.monotonic)
     tasks: dict[str, TaskID] = field(default_factory=dict)
+    voice: Voice = field(default_factory=VOICE.get)
+    began: tuple[float, int] = (0.0, 0)
+    """When the stage began, and what of it was done then."""
 
     def progress(self, stage: str, done: int, total: int) -> None:
-        """Show how far a stage is: a bar on a terminal, else one line as it begins."""
-        if stage != self.stage:
-            self.stage = stage
-            if not self.terminal:
-                typer.echo(f"{LABELS.get(stage, stage)} ...", err=True)
+        """Show how far a stage is and how long it will take: a bar on a terminal, else a line now and then."""
+        begins, self.stage = stage != self.stage, stage
+        if self.voice.quiet:
+            return
         if not self.terminal:
+            self._line(begins, done, total)
             return
         if self.bars is None:
             columns = (
@@ -72,9 +82,11 @@ class Job:
                 TextColumn("{task.description}"),
                 BarColumn(),
                 MofNCompleteColumn(),
-                TimeElapsedColumn(),
+                TimeRemainingColumn(elapsed_when_finished=True),
             )
-            self.bars = Progress(*columns, console=self.console, get_time=time.monotonic)
+            self.bars = Progress(
+                *columns, console=self.console, get_time=time.monotonic, speed_estimate_period=LONGEST_ESTIMATE
+            )
             self.bars.start()
         if stage not in self.tasks:
             self.tasks[stage] = self.bars.add_task(LABELS.get(stage, stage), total=total)
@@ -82,6 +94,20 @@ class Job:
             self.bars.tasks[-1].start_time = self.reported
         self.bars.update(self.tasks[stage], completed=done, total=total)
         self.reported = time.monotonic()
+
+    def _line(self, begins: bool, done: int, total: int) -> None:
+        """Say that a stage begins, and from time to time how far it is."""
+        now = time.monotonic()
+        if begins:
+            self.began = now, done
+            typer.echo(f"{LABELS.get(self.stage, self.stage)} ...", err=True)
+        elif now < self.reported + PAUSE or done >= total:
+            return
+        else:
+            start, first = self.began
+            left = f", {duration((now - start) * (total - done) / (done - first))} left" if done > first else ""
+            typer.echo(f"{LABELS.get(self.stage, self.stage)}: {done} of {total}{left}", err=True)
+        self.reported = now
 
     def close(self) -> None:
         """Leave the bars as they are and give the terminal back."""
@@ -92,8 +118,13 @@ class Job:
     def complain(self, what: str) -> NoReturn:
         """End for a fault that the user can put right."""
         self.close()
-        typer.echo(f"torchsfm: {what}", err=True)
+        self.fail(what)
         raise typer.Exit(WRONG) from None
+
+    def fail(self, what: str) -> None:
+        """Say in one line what is wrong."""
+        self.voice.record["error"] = what
+        typer.echo(f"torchsfm: {what}", err=True)
 
     def set_threads(self, threads: int | None) -> None:
         """Limit the processor threads of the numerical work."""
@@ -119,7 +150,7 @@ class Job:
         except ReconstructionError as error:
             raise UserError(" ".join(str(error).split())) from None
 
-    def run(self, images: Path | list[Path], threads: int | None, **arguments: Any) -> SfmResult:
+    def run(self, images: Source, threads: int | None, **arguments: Any) -> SfmResult:
         """Reconstruct, with faults of the input told as such."""
         self.set_threads(threads)
         try:
@@ -127,7 +158,7 @@ class Job:
         except ReconstructionError as error:
             raise UserError(" ".join(str(error).split())) from None
 
-    def help(self, images: Path | list[Path], threads: int | None, started: Started, **arguments: Any) -> None:
+    def help(self, images: Source, threads: int | None, started: Started, **arguments: Any) -> None:
         """Work on the stages of a run that another process leads; that one tells what there is to tell of the input."""
         self.set_threads(threads)
         try:
@@ -144,6 +175,13 @@ class Job:
             raise typer.Exit(WRONG) from None
 
 
+def duration(seconds: float) -> str:
+    """A time in words, as exactly as an estimate deserves."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
 @contextmanager
 def told(job: Job) -> Iterator[Job]:
     """End in a line and an exit status instead of a traceback where the user can do something about it."""
@@ -154,7 +192,8 @@ def told(job: Job) -> Iterator[Job]:
         # Without --resume, what an earlier run left there is of no use.
         since = 0 if "--resume" in sys.argv else job.started
         saved = saved_stages(job.out, since)
-        typer.echo(f"interrupted while {LABELS.get(job.stage, 'starting')}", err=True)
+        job.voice.record["error"] = f"interrupted while {LABELS.get(job.stage, 'starting')}"
+        typer.echo(job.voice.record["error"], err=True)
         if saved and sys.argv[1:2] == ["reconstruct"]:
             words = [word for word in sys.argv[1:] if word != "--resume"]
             typer.echo(f"saved in {job.out / 'stages'}: {', '.join(saved)}; to go on from there:", err=True)

@@ -76,10 +76,9 @@ def _run(images: list[Path], model: Path, out: Path, threads: int | None, *, max
     with told(Job(out)) as job, output_folder(out):
         poses = load(model)
         job.set_threads(threads)
-        source: Path | list[Path] = images[0] if len(images) == 1 and not images[0].is_file() else images
         try:
             result = triangulate_photographs(
-                source, poses, out=out, progress=job.progress, max_pixels=max_pixels,
+                images, poses, out=out, progress=job.progress, max_pixels=max_pixels,
                 **options,
             )  # fmt: skip
         except ReconstructionError as error:

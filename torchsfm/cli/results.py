@@ -1,7 +1,6 @@
 """What the user gets: models in all formats, the page, the report, and the true errors where the truth is known."""
 
 import json
-import math
 import shlex
 import sys
 from collections.abc import Callable
@@ -9,47 +8,19 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import torch
 import typer
-from jaxtyping import Float
-from torch import Tensor
 
 from torchsfm.cli.export import PHOTOGRAPHS
 from torchsfm.cli.job import NOTHING, Job
 from torchsfm.cli.output import replacing_results
 from torchsfm.formats import write_colmap, write_lines, write_ply
-from torchsfm.geometry import Pose
 from torchsfm.images import MAX_PIXELS
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import Reconstruction, SfmResult
-from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_rmse
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 
 VERSION = metadata.version("torchsfm")
-
-
-def compare(model: Reconstruction, poses_true: Pose, K_true: Float[Tensor, "v 3 3"]) -> dict[str, str]:
-    """True errors of a model, in words; the images must be those of the truth, in its order."""
-    errors = pose_errors(model.poses, poses_true, model.registered)
-    known = model.registered
-    K = model.cameras.K[model.camera_index]
-    focal, focal_true = K[:, 0, 0][known], K_true[:, 0, 0][known]
-    rotation = errors.image_rotation[known]
-    both = torch.isfinite(errors.pose)
-    rmse = float(position_rmse(model.poses, poses_true, known))
-    distance = torch.pdist(poses_true.centre).max().item()
-    areas = ", ".join(f"{area:.3f}" for area in pose_auc(errors.pose).tolist())
-    words = {
-        "rotation error, mean / largest": f"{rotation.mean():.4f} / {rotation.max():.4f} deg",
-        "relative rotation of pairs, median": f"{errors.rotation[both].median():.4f} deg" if both.any() else "no pairs",
-        "direction of baselines, median": f"{errors.direction[both].median():.4f} deg" if both.any() else "no pairs",
-        "position error (RMS), of the largest distance between cameras": f"{100 * rmse / distance:.3f} %",
-        "focal length, found / true": f"{focal.mean():.2f} / {focal_true.mean():.2f} px",
-        "focal length error": f"{100 * ((focal - focal_true).abs() / focal_true).mean():.3f} %",
-        "pose AUC at 1, 2, 5 deg": areas,
-    }
-    return {key: value for key, value in words.items() if not math.isnan(rmse)}
 
 
 def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, str], max_pixels: int = MAX_PIXELS) -> None:
@@ -72,6 +43,8 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
         texts = {"report.json": json.dumps(record, indent=1), "report.md": report_markdown(record)}
         write_whole_files({out / name: text.encode() for name, text in texts.items()})
     job.close()
+    files = [str(job.out / name) for name, _ in [*written, ("report.md", ""), ("report.json", "")]]
+    job.voice.record.update(record | {"out": str(job.out), "files": files})
     for i, model in enumerate(result.models):
         typer.echo(("" if len(result.models) == 1 else f"model {i}: ") + model.summary())
     typer.echo(result.report.summary())
@@ -80,7 +53,7 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
     for name, what in [*written, ("report.md", "what happened to each image and pair (report.json: the same for programs)")]:
         typer.echo(f"{job.out / name}  {what}")
     if not result.models:
-        typer.echo(f"torchsfm: nothing could be reconstructed: {result.failure()}", err=True)
+        job.fail(f"nothing could be reconstructed: {result.failure()}")
         raise typer.Exit(NOTHING)
 
 

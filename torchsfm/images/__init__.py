@@ -6,10 +6,11 @@ from torchsfm.images.edges import Edges, detect_edges
 from torchsfm.images.ellipses import Ellipses, detect_ellipses
 from torchsfm.images.exif import Exif, parse_exif
 from torchsfm.images.features import Features, detect_features
+from torchsfm.images.film import extract_frames
 from torchsfm.images.fit_ellipse import EllipseFit, fit_ellipse
 from torchsfm.images.hough import HoughLines, hough_lines
 from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
-from torchsfm.images.listing import list_images, list_skipped
+from torchsfm.images.listing import FILMS, SUFFIXES, list_images, list_skipped
 from torchsfm.images.matching import match_descriptors, match_features
 from torchsfm.images.reading import MAX_PIXELS, ImageError, Photograph, read_image, save_image, scale_image
 from torchsfm.images.retrieval import describe_images, retrieve_pairs
@@ -19,7 +20,9 @@ from torchsfm.images.tracking import TrackedPoints, Tracks, track_points, track_
 from torchsfm.images.undistort import Pinholes, undistort_images, undistorted_cameras
 
 __all__ = [
+    "FILMS",
     "MAX_PIXELS",
+    "SUFFIXES",
     "BoardPoints",
     "Corners",
     "Edges",
@@ -45,6 +48,7 @@ __all__ = [
     "detect_ellipses",
     "detect_features",
     "detect_segments",
+    "extract_frames",
     "fit_ellipse",
     "hough_lines",
     "list_images",

@@ -1,12 +1,15 @@
 """What a camera wrote beside the pixels: orientation, maker, model, the numbers that give a focal length, and where it was.
 
 The few tags needed are read straight from the bytes (TIFF 6.0; Exif 2.32, JEITA CP-3451; CIPA DC-008), in JPEG, PNG, TIFF and
-WebP files. Metadata is often damaged, so nothing here raises: what cannot be read is absent.
+WebP files; those of HEIC come from what decodes it. Metadata is often damaged, so nothing here raises: what cannot be read is
+absent.
 """
 
 import math
 import struct
 from dataclasses import dataclass
+
+from torchsfm.images.heif import heif_exif, is_heif
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8}
 _INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i"}
@@ -93,7 +96,9 @@ class Exif:
 
 
 def parse_exif(data: bytes) -> Exif:
-    """The Exif tags in the bytes of an image file (JPEG, PNG, TIFF, WebP); an empty `Exif` where there are none.
+    """The Exif tags in the bytes of an image file (JPEG, PNG, TIFF, WebP, HEIC); an empty `Exif` where there are none.
+
+    A HEIC file tells its decoder how to turn the image, which then stands upright, whatever the tag says: its orientation is 1.
 
     Example:
         >>> import torchsfm
@@ -120,7 +125,7 @@ def parse_exif(data: bytes) -> Exif:
     placed = latitude is not None and longitude is not None and (latitude, longitude) != (0, 0)
     height = tags.get("altitude")
     up = height if isinstance(height, int | float) and math.isfinite(height) else None
-    orientation = integer("orientation") or 1
+    orientation = 1 if is_heif(data) else integer("orientation") or 1
     per_unit = _MILLIMETRES.get(integer("plane_unit") or 2)
     x_resolution, y_resolution = number("plane_x_resolution"), number("plane_y_resolution")
     return Exif(
@@ -163,6 +168,8 @@ def _find_block(data: bytes) -> bytes | None:
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         block = _find_in_chunks(data, 12, b"EXIF", "<", length_first=False)
         return block[6:] if block is not None and block[:6] == b"Exif\0\0" else block
+    if is_heif(data):
+        return heif_exif(data)
     return data if data[:4] in (b"II*\0", b"MM\0*") else None
 
 

@@ -1,6 +1,7 @@
 """What the first bytes of an image file say, before anything is decoded: the size, and whether all of the image is there."""
 
 from torchsfm.images.exif import read_tags
+from torchsfm.images.heif import MISSING, heif_library, heif_size, is_heif
 from torchsfm.images.netpbm import netpbm_size
 
 
@@ -23,7 +24,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
             return _little(data[18:20]), _little(data[20:22])
         # A negative height says that the rows come from the top.
         return _little(data[18:22]), abs(int.from_bytes(data[22:26], "little", signed=True))
-    return netpbm_size(data)
+    return heif_size(data) if is_heif(data) else netpbm_size(data)
 
 
 def is_transparent_png(data: bytes) -> bool:
@@ -49,13 +50,17 @@ def is_complete(data: bytes) -> bool | None:
         return True
     if data[:2] == b"BM":
         return len(data) >= _little(data[2:6])
-    return None
+    return True if is_heif(data) and heif_library() is not None else None
 
 
 def guess_contents(data: bytes) -> str:
     """What a file that is no image may be."""
+    if is_heif(data):
+        return MISSING
     if data[4:8] == b"ftyp":
-        return "HEIC or AVIF: convert it to JPEG or PNG" if data[8:11] in (b"hei", b"hev", b"mif", b"avi") else "a video"
+        return (
+            "a sequence of images, or AVIF: convert it to JPEG or PNG" if data[8:11] in (b"hev", b"msf", b"avi") else "a film"
+        )
     head = data[:512]
     text = sum(byte in b"\t\n\r" or 32 <= byte < 127 for byte in head) > 0.95 * len(head)
     return "it looks like text" if text else "unknown contents"

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchsfm._types import check_options, check_tensors
 from torchsfm.images.exif import parse_exif
 from torchsfm.images.headers import guess_contents, image_size, is_complete, is_transparent_png
+from torchsfm.images.heif import decode_heif, is_heif
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
 
 MAX_PIXELS = 2**28
@@ -89,9 +90,9 @@ def read_image(
 ) -> Photograph:
     """Read one image file.
 
-    JPEG, PNG, PGM and PPM (8 and 16 bits), TIFF, BMP and WebP. The orientation in the Exif tags is applied, so that the image
-    stands upright. What is transparent in a PNG is black in proportion, as colours there are those of the whole pixel; that of
-    other kinds is dropped.
+    JPEG, PNG, PGM and PPM (8 and 16 bits), TIFF, BMP, WebP, and HEIC with the extra `heic`. The orientation in the Exif tags is
+    applied, so that the image stands upright. What is transparent in a PNG or HEIC is black in proportion, as colours there are
+    those of the whole pixel; that of other kinds is dropped.
 
     Args:
         path: The file.
@@ -269,6 +270,12 @@ def _decode(data: bytes, path: Path, *, gray: bool, part: int) -> tuple[NDArray[
         if gray:
             return cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if values.ndim == 3 else values, white
         return values if values.ndim == 3 else np.repeat(values[:, :, None], 3, 2), white
+    if is_heif(data):
+        try:
+            upright = decode_heif(data)
+        except ValueError as error:
+            raise ImageError(f"{path}: damaged, cannot be decoded ({' '.join(str(error).split())[:200]})") from None
+        return cv2.cvtColor(upright, cv2.COLOR_RGB2GRAY) if gray else upright, 255.0
     opaque = not is_transparent_png(data)
     flags = cv2.IMREAD_ANYDEPTH | (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR)
     if part > 1:

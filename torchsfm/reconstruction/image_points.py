@@ -1,10 +1,9 @@
 """The image points of all photographs: read each file, detect features, keep what the later stages need."""
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from threading import Lock
 from typing import overload
 
@@ -33,6 +32,7 @@ class ImagePoints:
     names: tuple[str, ...]
     image_size: Int[Tensor, "v 2"]
     labels: tuple[str, ...]
+    """What tells the camera of one from that of another: their folder, maker, model and focal length."""
     focal: tuple[float | None, ...]
     failures: dict[str, str]
     """Why the other files could not be read, by name."""
@@ -65,22 +65,6 @@ class SavedFeatures(Sequence[Features]):
         shard, k = self.place[number]
         name, x = f"descriptors-{k}", self.x[number]
         return Features(x=x, scale=x[:, 0], angle=x[:, 0], response=x[:, 0], descriptors=self.shards.only(shard, name)[name])
-
-
-def image_names(files: Sequence[Path]) -> list[str]:
-    """A name for each file, no two the same: without its folder, or where that is not enough from the common folder on.
-
-    Raises:
-        ReconstructionError: A file is given twice.
-    """
-    names = [path.name for path in files]
-    if len(set(names)) < len(names):
-        full = [os.path.abspath(path) for path in files]
-        if len(set(full)) < len(full):
-            twice = next(path for i, path in enumerate(full) if path in full[:i])
-            raise ReconstructionError(f"{twice}: given twice")
-        names = [os.path.relpath(path, os.path.commonpath(full)) for path in full]
-    return names
 
 
 def detect_all(
@@ -195,7 +179,9 @@ def _unpack(shards: Shards, files: Sequence[Path], names: Sequence[str]) -> Imag
         files=tuple(path for path, ok in zip(files, readable, strict=True) if ok),
         names=tuple(name for name, ok in zip(names, readable, strict=True) if ok),
         image_size=torch.cat([part["size"] for part in parts]),
-        labels=tuple(record for record, ok in zip(records, readable, strict=True) if ok),
+        labels=tuple(
+            f"{PurePosixPath(name).parent}|{record}" for name, record, ok in zip(names, records, readable, strict=True) if ok
+        ),
         focal=tuple(f or None for part in parts for f in part["focal"].tolist()),
         failures=failures,
         x=x,

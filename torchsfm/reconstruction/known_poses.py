@@ -1,6 +1,5 @@
 """Photographs of which the poses are known: points for them, and poses for further photographs of the same scene."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from torchsfm.reconstruction.photographs import NEIGHBOURS, MatchedPhotographs, 
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.register import register_images
 from torchsfm.reconstruction.report import Progress, ReconstructionError, Report, SfmResult, pair_report
+from torchsfm.reconstruction.sources import Source
 from torchsfm.reconstruction.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
 from torchsfm.reconstruction.tracks import build_tracks
 
@@ -31,7 +31,7 @@ ROUNDS = 4
 
 
 def triangulate_photographs(
-    images: str | Path | Sequence[str | Path],
+    images: Source,
     poses: Reconstruction,
     *,
     refine_poses: bool = False,

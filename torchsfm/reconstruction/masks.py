@@ -1,6 +1,6 @@
 """Masks of photographs: where to look for nothing."""
 
-from collections.abc import Sequence
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm.images import ImageError, read_image
 from torchsfm.reconstruction.report import ReconstructionError
+from torchsfm.reconstruction.sources import Sources
 
 
 @dataclass(frozen=True)
@@ -17,27 +18,32 @@ class Masks:
     """Pictures in a folder whose black parts (below half of white) are those of photographs that do not count.
 
     The mask of `view.jpg` is `view.jpg.png`, `view.png` or `view.jpg`, the first that is there, of the same shape as the
-    upright photograph; a photograph that has none counts as a whole.
+    upright photograph; a photograph that has none counts as a whole. Masks of photographs in subfolders lie in subfolders of
+    the same names.
     """
 
     folder: Path
+    photographs: Path
+    """The folder of the photographs."""
 
     @classmethod
-    def of(cls, folder: str | Path, files: Sequence[Path]) -> "Masks":
+    def of(cls, folder: str | Path, sources: Sources) -> "Masks":
         """Those of some photographs.
 
         Raises:
             ReconstructionError: There is none for any of them.
         """
-        masks = cls(Path(folder))
-        if not any(masks.path(file) for file in files):
-            raise ReconstructionError(f"{folder}: no mask for any image; that of {files[0].name} would be {files[0].name}.png")
+        masks = cls(Path(folder), sources.folder)
+        if not any(map(masks.path, sources.files)):
+            name = sources.names[0]
+            raise ReconstructionError(f"{folder}: no mask for any image; that of {name} would be {name}.png")
         return masks
 
     def path(self, file: Path) -> Path | None:
         """The mask of a photograph; None where there is none."""
         names = (f"{file.name}.png", f"{file.stem}.png", file.name)
-        return next((self.folder / name for name in names if (self.folder / name).is_file()), None)
+        place = self.folder / os.path.relpath(file.parent, self.photographs)
+        return next((place / name for name in names if (place / name).is_file()), None)
 
     def admit(self, file: Path, x: Float[Tensor, "*n 2"], size: tuple[int, int]) -> Bool[Tensor, "*n"]:
         """Which places of a photograph of this width and height count.

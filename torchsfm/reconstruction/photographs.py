@@ -1,6 +1,5 @@
 """The main job: photographs in, cameras and points out."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -11,14 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
-from torchsfm.images import MAX_PIXELS, ImageError, list_images, list_skipped
+from torchsfm.images import MAX_PIXELS
 from torchsfm.reconstruction.find_lines import FoundSegments
-from torchsfm.reconstruction.image_points import ImagePoints, detect_all, image_names
+from torchsfm.reconstruction.image_points import ImagePoints, detect_all
 from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.match_all import match_all
 from torchsfm.reconstruction.models import METHODS, build_models
-from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult, describe_skipped
+from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
 from torchsfm.reconstruction.segments import detect_all_segments
+from torchsfm.reconstruction.sources import Source, Sources
 from torchsfm.reconstruction.stages import Stages, fingerprint
 from torchsfm.reconstruction.view_graph import ViewGraph
 
@@ -27,7 +27,7 @@ NEIGHBOURS = 20
 
 
 def reconstruct(
-    images: str | Path | Sequence[str | Path],
+    images: Source,
     *,
     sequence: bool = False,
     camera: str | None = None,
@@ -52,14 +52,15 @@ def reconstruct(
     poses, points, focal length and distortion. Images that have nothing in common form several models.
 
     Args:
-        images: A folder, without its subfolders, or image files. What else in the folder may hold photographs is named in the
-            report with the reason why it was not read.
+        images: A folder with its subfolders, image files, a text file with the path of an image on each line, or several of
+            these. Names are paths from the folder on. What else in a folder may hold photographs is named in the report with
+            the reason why it was not read. For a film see `extract_frames`.
         sequence: The images are consecutive frames of a video: corners are tracked through it, and features are matched
             between frames that are near in time or look alike, instead of between all.
         camera: Name of the distortion model, one of `torchsfm.DISTORTION_MODELS`. By default "radial", or "pinhole"
             when `K` is given.
-        shared_camera: Whether one camera took all images of the same size. By default it did where the files name the same
-            camera and focal length, or name none.
+        shared_camera: Whether one camera took all images of the same size. By default it did where they lie in one folder and
+            the files name the same camera and focal length, or name none.
         K: Known intrinsics of all images, in pixels; they are not adjusted.
         free_principal_point: Estimate the principal point too, of models of four images or more, expected within 1 % of the
             image's size from its centre, instead of holding it there.
@@ -152,7 +153,7 @@ class MatchedPhotographs:
 
 
 def match_photographs(
-    images: str | Path | Sequence[str | Path],
+    images: Source,
     *,
     sequence: bool,
     max_features: int,
@@ -173,11 +174,12 @@ def match_photographs(
     Raises:
         ReconstructionError: No such folder, or fewer than two readable images.
     """
-    files, skipped = _files(images)
-    names = image_names(files)
+    sources = Sources.of(images, without=[folder for folder in (out, masks) if folder is not None])
+    files, names = sources.files, sources.names
     # What is saved depends on these alone; cameras and models are made from it each time.
     options: dict[str, Any] = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
-    found = None if masks is None else Masks.of(masks, files)
+    options["names"] = names
+    found = None if masks is None else Masks.of(masks, sources)
     if found is not None:
         options["masks"] = fingerprint([path for file in files if (path := found.path(file))], {})
     stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options), first)
@@ -185,25 +187,4 @@ def match_photographs(
     graph = match_all(
         points, stages, progress, seed, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels, masks=found
     )
-    return MatchedPhotographs(tuple(names), tuple(skipped), points, graph, stages, found)
-
-
-def _files(images: str | Path | Sequence[str | Path]) -> tuple[list[Path], list[tuple[str, str]]]:
-    """The image files, and what was passed over in their folder, with the reason."""
-    skipped: list[tuple[str, str]] = []
-    try:
-        if isinstance(images, str | Path):
-            files = list_images(images)
-            skipped = [(path.name, reason) for path, reason in list_skipped(images)]
-        else:
-            files = [Path(path) for path in images]
-    except ImageError as error:
-        raise ReconstructionError(str(error)) from None
-    if not files:
-        others = "".join(f"; not read: {text}" for text in describe_skipped(skipped))
-        raise ReconstructionError(f"{images}: no images in this folder{others}")
-    if len(files) == 1:
-        raise ReconstructionError(f"{files[0]}: one image is not enough, two views are the least")
-    if missing := [path for path in files if not path.is_file()]:
-        raise ReconstructionError(f"{missing[0]}: no such file")
-    return files, skipped
+    return MatchedPhotographs(names, sources.skipped, points, graph, stages, found)

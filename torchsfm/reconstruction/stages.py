@@ -194,7 +194,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(count)
 
 
-def fingerprint(files: list[Path], options: dict[str, Any]) -> str:
+def fingerprint(files: Sequence[Path], options: dict[str, Any]) -> str:
     """A digest of names, sizes and modification times of files, and of options."""
     listing = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
     text = json.dumps([listing, options], sort_keys=True, default=str)

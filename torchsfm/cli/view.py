@@ -1,0 +1,60 @@
+"""`torchsfm view`: the page of a model in the browser."""
+
+import tempfile
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from torchsfm.cli.export import find_photographs, load
+from torchsfm.cli.job import Job, UserError, told
+from torchsfm.formats.registry import model_files
+from torchsfm.plot import write_page
+
+PAGE = "page.html"
+
+
+def view(
+    model: Annotated[
+        Path, typer.Argument(help="Folder written by `torchsfm reconstruct`, or a model of any format.", show_default=False)
+    ],
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Folder with the photographs under their names, to be shown at the cameras.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Where to write the page; by default that of the run, else a temporary file.", show_default=False),
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page, or only say where it is.")] = True,
+) -> None:
+    """Show a model in the browser, to turn with the mouse."""
+    with told(Job(out or model)) as job:
+        page = model / PAGE
+        if images is not None and not images.is_dir():
+            raise UserError(f"{images}: no such folder")
+        if images is not None or out is not None or not page.is_file():
+            page = write(model, images, out)
+        job.close()
+        job.voice.record["page"] = str(page.absolute())
+        if browser and not webbrowser.open(page.absolute().as_uri()):
+            typer.echo(f"{page}  no browser was found here: open it in one")
+        else:
+            typer.echo(f"{page}  open it in a browser and turn the model with the mouse" if not browser else str(page))
+
+
+def write(model: Path, images: Path | None, out: Path | None) -> Path:
+    """Write the page of what a path holds.
+
+    Raises:
+        UserError: It holds no model.
+    """
+    try:
+        models = [load(file) for _, file in model_files(model)]
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from None
+    if out is not None and out.is_dir():
+        out = out / PAGE
+    target = out or Path(tempfile.mkdtemp(prefix="torchsfm-")) / PAGE
+    return write_page(models, target, title=model.name or "Model", images=images or find_photographs(model, models[0]))
