@@ -9,10 +9,12 @@ from pathlib import Path
 import jaxtyping
 import pytest
 import torch
+import type_checks
 from chance import seeded, set_seed, stream_seed
 from hypothesis import settings
 
 torch.set_num_threads(1)
+type_checks.install()
 # No run remembers another.
 settings.register_profile("torchsfm", deadline=None, database=None)
 settings.load_profile("torchsfm")
