@@ -18,7 +18,7 @@ from torch import Tensor
 from torchsfm.geometry import Curve, Pose
 from torchsfm.geometry.rotations import random_rotation
 from torchsfm.geometry.similarity import Similarity
-from torchsfm.images import save_image
+from torchsfm.images import read_image, save_image
 from torchsfm.plot import up_direction, write_page
 from torchsfm.plot.framing import frame
 from torchsfm.reconstruction.lines import Lines
@@ -151,12 +151,60 @@ def test_photographs_are_put_in_small(model: Reconstruction, tmp_path: Path) -> 
     for name in model.names[:2]:
         save_image(folder / name, torch.rand(3, 48, 64))
     (folder / model.names[2]).write_text("no image")
-    rows = content(write_page(model, tmp_path / "page.html", images=folder, thumbnail=32))["models"][0]["images"]
-    for row in rows[:2]:
-        head, _, body = row["photo"].partition(",")
+    photos = content(write_page(model, tmp_path / "page.html", images=folder, thumbnail=32))["photos"]
+    assert sorted(photos) == sorted(model.names[:2])
+    for text in photos.values():
+        head, _, body = text.partition(",")
         assert head == "data:image/jpeg;base64"
-        assert base64.b64decode(body)[:3] == b"\xff\xd8\xff"
-    assert all("photo" not in row for row in rows[2:])
+        (tmp_path / "copy.jpg").write_bytes(base64.b64decode(body))
+        assert read_image(tmp_path / "copy.jpg").size == (32, 24)
+
+
+def test_all_photographs_together_keep_the_limit(model: Reconstruction, tmp_path: Path, generator: torch.Generator) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for i, name in enumerate(model.names):
+        # Some compress well, some do not at all.
+        save_image(folder / name, 0.5 + (0.1 * i) * (torch.rand(3, 300, 400, generator=generator) - 0.5))
+    before = math.inf
+    for limit in (10**6, 100_000, 40_000, 12_000, 3_000, 0):
+        photos = content(write_page(model, tmp_path / "page.html", images=folder, photo_bytes=limit))["photos"]
+        total = sum(len(text) for text in photos.values())
+        assert total <= min(limit, before)
+        assert len(photos) == (5 if limit >= 40_000 else len(photos))
+        # The limit is used, not only kept.
+        assert not 40_000 <= limit <= 100_000 or total > 0.4 * limit
+        before = total
+    assert not photos
+
+
+def test_every_observation_is_in_the_page(model: Reconstruction, tmp_path: Path, generator: torch.Generator) -> None:
+    shuffled = torch.randperm(len(model.x), generator=generator)
+    mixed = replace(model, x=model.x[shuffled], view=model.view[shuffled], point=model.point[shuffled])
+    shown = content(write_page(mixed, tmp_path / "page.html"))["models"][0]
+    views, places = unpack(shown["views"], "<u2"), unpack(shown["places"], "<u2").reshape(-1, 2)
+    residuals = unpack(shown["residuals"], "<f2").reshape(-1, 2)
+    point = np.repeat(np.arange(len(model.X)), unpack(shown["tracks"], "<u2"))
+    key = {(int(v), int(p)): i for i, (v, p) in enumerate(zip(model.view, model.point, strict=True))}
+    at = [key[pair] for pair in zip(views.tolist(), point.tolist(), strict=True)]
+    assert len(set(at)) == len(model.x)
+    size = model.image_size[model.view[at]].numpy()
+    assert np.allclose(places / 65535 * size - 0.5, model.x[at].numpy(), atol=float(size.max()) / 65535)
+    assert np.allclose(residuals, (model.projections() - model.x)[at].numpy(), rtol=1e-3, atol=1e-6)
+
+
+def test_pairs_are_those_of_the_report(model: Reconstruction, tmp_path: Path) -> None:
+    images = (*(ImageReport(name, 0, features=9) for name in model.names), ImageReport("broken.jpg", None, "cut short"))
+    pairs, one = torch.tensor([[0, 1], [4, 2]]), torch.tensor([1, 0])
+    table = PairReport(pairs, torch.tensor([70, 20]), torch.tensor([60, 5]), torch.tensor([65, 4]), one)
+    shown = content(write_page(model, tmp_path / "page.html", report=Report(images, table, {})))["pairs"]
+    assert shown["names"] == list(model.names)
+    assert unpack(shown["pairs"], "<u4").tolist() == [0, 1, 4, 2]
+    assert unpack(shown["inliers"], "<u4").tolist() == [65, 5]
+    assert [shown["verdicts"][v] for v in unpack(shown["verdict"], "u1")] == ["general", "unrelated"]
+    assert content(write_page(model, tmp_path / "page.html"))["pairs"] is None
+    with pytest.raises(ValueError, match="no image 4 among the 2"):
+        write_page(model, tmp_path / "page.html", report=Report(images[:2], table, {}))
 
 
 def test_empty_and_broken_models_still_make_a_page(model: Reconstruction, tmp_path: Path) -> None:
@@ -194,6 +242,8 @@ def test_wrong_arguments(model: Reconstruction, tmp_path: Path) -> None:
         write_page([], tmp_path / "page.html")
     with pytest.raises(ValueError, match="thumbnail"):
         write_page(model, tmp_path / "page.html", thumbnail=0)
+    with pytest.raises(ValueError, match="photo_bytes"):
+        write_page(model, tmp_path / "page.html", photo_bytes=-1)
     (tmp_path / "page").write_text("a file, not a folder")
     with pytest.raises(OSError, match="page"):
         write_page(model, tmp_path / "page" / "page.html")
@@ -273,6 +323,7 @@ def test_lines_are_drawn_and_can_be_hidden(model: Reconstruction, tmp_path: Path
     positions = unpack(shown["positions"], "<f4").reshape(-1, 3)
     assert np.allclose(unpack(shown["lineEnds"], "<f4").reshape(-1, 2, 3), positions[points[keep].numpy()], atol=1e-6)
     assert np.array_equal(unpack(shown["lineColors"], "u1").reshape(-1, 3), (color[keep] * 255).round().numpy().astype("u1"))
+    assert shown["lineCounts"] == {"lines": 5}
     assert "5 lines" in shown["summary"]
     assert 'id="lines"' in path.read_text()
 
@@ -289,4 +340,5 @@ def test_curves_are_drawn_from_sample_to_sample(model: Reconstruction, tmp_path:
     expected = X[np.array([[int(a), int(b)] for a, b in pairs])]
     assert np.allclose(unpack(shown["lineEnds"], "<f4").reshape(-1, 2, 3), expected, atol=1e-6)
     assert len(unpack(shown["lineColors"], "u1")) == 3 * len(pairs)
+    assert shown["lineCounts"] == {"curves": len(pairs)}
     assert "3 curves" in shown["summary"]

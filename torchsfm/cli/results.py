@@ -63,7 +63,14 @@ def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path, ma
         return []
     total = 1 + 3 * len(result.models) + 2 * sum(model.lines is not None for model in result.models)
     job.progress("write", 0, total)
-    write_page(result.models, out / "page.html", report=result.report, images=folder, max_pixels=max_pixels)
+    write_page(
+        result.models,
+        out / "page.html",
+        title=job.out.resolve().name,
+        report=result.report,
+        images=folder,
+        max_pixels=max_pixels,
+    )
     written = [("page.html", "open it in a browser and turn the model with the mouse")]
     formats: list[tuple[str, str, Callable[[Reconstruction, Path], Any], str]] = [
         ("model", ".npz", Reconstruction.save, "the model, for Reconstruction.load and torchsfm info"),

@@ -90,7 +90,7 @@ class Report:
 
     Attributes:
         images: One entry per input file, in the order of the input.
-        pairs: The comparison of all pairs, with indices into the images that could be read.
+        pairs: The comparison of all pairs, with indices into the images that could be read (see `compared_names`).
         seconds: Wall-clock time of each stage.
         focal_source: Where each camera's first focal length came from: "given", "exif", "autocalibration", "fundamental
             matrices" or "default".
@@ -108,6 +108,14 @@ class Report:
     autocalibration: tuple[str, ...] = ()
     skipped: tuple[tuple[str, str], ...] = ()
     calibrations: tuple[Calibration, ...] = ()
+
+    def compared_names(self) -> list[str]:
+        """Names of the images that could be read, by the numbers that `pairs` has for them."""
+        return [
+            image.name
+            for image in self.images
+            if image.model is not None or image.features > 0 or image.reason.startswith("only 0 features")
+        ]
 
     def summary(self) -> str:
         """A few lines for people."""

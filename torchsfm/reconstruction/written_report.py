@@ -12,7 +12,7 @@ from torchsfm._types import Status
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import ImageReport, SfmResult, printable
+from torchsfm.reconstruction.report import SfmResult, printable
 from torchsfm.reconstruction.view_graph import Verdict
 
 Record = dict[str, Any]
@@ -48,7 +48,7 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         images.append(entry | {"features": image.features, "observations": count, "mean_error_px": error})
         images[-1] |= {"doubt": image.doubt, "rotation_sigma_deg": _finite(image.rotation_sigma)}
         images[-1] |= {"position_sigma": _finite(image.position_sigma)}
-    names = [image.name for image in report.images if _readable(image)]
+    names = report.compared_names()
     table = report.pairs
     columns = (table.pairs, table.num_matches, table.fundamental_inliers, table.homography_inliers, table.verdict)
     pairs = [
@@ -128,11 +128,6 @@ def _deviation(image: Record, key: str, factor: float) -> str:
     if not image["registered"]:
         return ""
     return "unknown" if image[key] is None else f"{factor * image[key]:.3g}"
-
-
-def _readable(image: ImageReport) -> bool:
-    """Whether the file could be read: pairs count only those that could."""
-    return image.model is not None or image.features > 0 or image.reason.startswith("only 0 features")
 
 
 def _model_record(model: Reconstruction, found: Calibration | None) -> Record:
