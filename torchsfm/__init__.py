@@ -26,6 +26,7 @@ from torchsfm.autocalibration import (
     Autocalibration as Autocalibration,
     PlaneCalibration as PlaneCalibration,
     ViewGraphFocals as ViewGraphFocals,
+    autocalibrate_curves as autocalibrate_curves,
     autocalibrate_points as autocalibrate_points,
     calibrate_planes as calibrate_planes,
     calibrate_view_graph as calibrate_view_graph,

@@ -28,6 +28,7 @@ from torchsfm.geometry import (
     project_points,
     project_quadric,
     rotation_from_rotvec,
+    to_homogeneous,
 )
 from torchsfm.images import Features, detect_segments
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
@@ -156,12 +157,17 @@ def _image_curve(s: Scene) -> Curve:
     return tensor_map(lambda t: t[(*(slice(None),) * len(s.batch), 0)], _image_curves(s))
 
 
-def _images_of_curves(s: Scene) -> Curve:
-    """Three bent rings, each in all images."""
+def _rings(s: Scene) -> Tensor:
+    """Three bent rings, always the same ones."""
     t = torch.arange(48, dtype=torch.float64) * (6.28318 / 48)
     waves = torch.stack((t.cos(), t.sin(), 0.2 * (2 * t).sin(), 0.2 * (2 * t).cos()), -1)
-    rings = s.points(3)[..., None, :] + 0.5 * waves @ s.randn(3, 4, 3)
-    images = project_points(s.cameras(4), rings.flatten(-3, -2)[..., None, :, :])
+    bends = (s.points(15)[..., 3:, :] - s.points(15).mean(-2, keepdim=True)).unflatten(-2, (3, 4))
+    return s.points(3)[..., None, :] + 0.4 * waves @ bends
+
+
+def _images_of_curves(s: Scene) -> Curve:
+    """The rings in all images."""
+    images = project_points(s.cameras(4), _rings(s).flatten(-3, -2)[..., None, :, :])
     return curve_from_samples(images.unflatten(-2, (3, 48)), closed=True)
 
 
@@ -278,6 +284,9 @@ BUNDLE_SIZES = {"m": 60, "n": 20, "v": 4, "f": 4, "g": 1, "k": 1}
 TWO_VIEWS = {"estimator": FundamentalEstimator(), "data": lambda s: tuple(s.images(2, 30).unbind(-3))}
 
 FUNCTIONS: dict[str, Function] = {
+    "autocalibration.autocalibrate_curves": Function(
+        SIZED | {"X": lambda s: to_homogeneous(_rings(s)[..., ::3, :]), "curves": _images_of_curves}, {"v": 4, "c": 3, "m": 16}
+    ),
     "autocalibration.autocalibrate_points": Function(SIZED, {"n": 20}),
     "autocalibration.calibrate_planes": Function({"X": lambda s: _board(s)[0], "x": lambda s: _board(s)[1]}),
     "autocalibration.calibrate_view_graph": Function(

@@ -2,7 +2,8 @@
 
 from torchsfm.autocalibration.algebraic_fit import IntrinsicsEstimate
 from torchsfm.autocalibration.assumption_fit import AssumptionFit
-from torchsfm.autocalibration.autocalibrate_points import Autocalibration, autocalibrate_points
+from torchsfm.autocalibration.autocalibrate_curves import autocalibrate_curves
+from torchsfm.autocalibration.autocalibrate_points import autocalibrate_points
 from torchsfm.autocalibration.calibrate_planes import PlaneCalibration, calibrate_planes
 from torchsfm.autocalibration.calibrate_view_graph import ViewGraphFocals, calibrate_view_graph
 from torchsfm.autocalibration.constant_intrinsics import constant_intrinsics, intrinsics_from_modulus
@@ -15,6 +16,7 @@ from torchsfm.autocalibration.orientation import Orientation, orient_projective
 from torchsfm.autocalibration.planar_scene import intrinsics_from_plane
 from torchsfm.autocalibration.plane_at_infinity import metric_upgrade, plane_at_infinity_from_intrinsics
 from torchsfm.autocalibration.rotating_camera import intrinsics_from_rotations
+from torchsfm.autocalibration.upgrade_cameras import Autocalibration
 
 __all__ = [
     "Assumption",
@@ -27,6 +29,7 @@ __all__ = [
     "Orientation",
     "PlaneCalibration",
     "ViewGraphFocals",
+    "autocalibrate_curves",
     "autocalibrate_points",
     "calibrate_planes",
     "calibrate_view_graph",

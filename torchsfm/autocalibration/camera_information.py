@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.geometry.projection import camera_slopes, point_slopes
+from torchsfm.linalg import eigh
 
 _ENTRIES = 2_000_000
 """Entries of the matrix of couplings between cameras and points held at once; bounds memory, changes no result."""
@@ -35,6 +36,7 @@ def camera_information(
     weights: Float[Tensor, "b v n"],
     fields: Float[Tensor, "b v n 2 k"],
     *,
+    normal: Float[Tensor, "b v n 2"] | None = None,
     coupled: bool = True,
 ) -> CameraInformation:
     """The normal equations.
@@ -44,6 +46,8 @@ def camera_information(
         X: Homogeneous points.
         weights: Of the observations, 0 where there is none.
         fields: Displacements of the image points.
+        normal: Unit vectors, for samples of curves: of these only the distance along the normal of the image curve is
+            measured, and they move across the space curve.
         coupled: With the points eliminated; else taken as known, which leaves one block per view.
     """
     b, v, n = weights.shape
@@ -60,19 +64,28 @@ def camera_information(
         z = torch.where((y[2] != 0) & (w > 0), y[2], 1.0)
         uv, inverse = y[:2] / z, w.sqrt() / z
         J = camera_slopes(point, uv, inverse).flatten(1, 2).movedim((0, 1), (-2, -1))
-        blocks += torch.einsum("bvnri,bvnrj->bvij", J, J)
         field = fields[:, :, part] * w.sqrt()[..., None, None]
+        if normal is not None:
+            across = normal[:, :, part, None]
+            J, field = across @ J, across @ field
+        blocks += torch.einsum("bvnri,bvnrj->bvij", J, J)
         right += torch.einsum("bvnri,bvnrk->bvik", J, field).flatten(1, 2)
         left_over += torch.einsum("bvnri,bvnrj->bij", field, field)
         if not coupled:
             continue
         DP = point_slopes(P.movedim((2, 3), (0, 1))[..., None], uv, inverse).movedim((0, 1), (-2, -1))
+        if normal is not None:
+            DP = across @ DP
         V = torch.einsum("bvnri,bvnrj->bnij", DP, DP)
         size = V.diagonal(dim1=-2, dim2=-1).sum(-1)
         size = torch.where(size > 0, size, 1.0)[..., None, None]
         # The point's own scale is determined by nothing, and so is a point seen by one camera along its ray.
         Yn = Y / Y.norm(dim=-1, keepdim=True).clamp_min(1e-300)
         V = V + size * (Yn[..., :, None] * Yn[..., None, :] + 1e-13 * torch.eye(4, dtype=P.dtype, device=P.device))
+        if normal is not None:
+            # Along its curve a sample is held: that is where the normals together tell least.
+            along = eigh(V)[1][..., :1]
+            V = V + size * (along @ along.mT)
         L, info = torch.linalg.cholesky_ex(V)
         good = (info == 0)[..., None, None]
         L = torch.where(good, L, torch.eye(4, dtype=P.dtype, device=P.device))

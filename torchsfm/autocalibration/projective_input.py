@@ -1,6 +1,7 @@
 """A projective reconstruction made ready for autocalibration: scaled images, signs, one frame, and weights."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,6 +16,16 @@ MAX_COUPLED = 120
 """Beyond this many views the covariance between different cameras is left out: it grows with the square of their number."""
 NOISE_FLOOR = 0.01
 """Image noise in pixels that is assumed at least: better measurements do not exist, and exact ones need a scale."""
+
+
+class Sightings(NamedTuple):
+    """What was seen of the structure."""
+
+    x: Float[Tensor, "*#batch v n 2"] | None
+    """Where, in pixels; None where nothing but the cameras tells."""
+    visible: Bool[Tensor, "*#batch v n"]
+    normal: Float[Tensor, "*#batch v n 2"] | None = None
+    """Unit vectors, where only the distance along them was measured: across a curve."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +83,11 @@ class CanonicalCameras:
 
 
 def canonical_cameras(
-    P: Float[Tensor, "b v 3 4"], X: Float[Tensor, "b n 4"], visible: Bool[Tensor, "b v n"], image_size: Float[Tensor, "b v 2"]
+    P: Float[Tensor, "b v 3 4"],
+    X: Float[Tensor, "b n 4"],
+    visible: Bool[Tensor, "b v n"],
+    image_size: Float[Tensor, "b v 2"],
+    numbers: int = 2,
 ) -> CanonicalCameras:
     """Scale, orient and move cameras and points to the frame of the view with most points, whatever the order of the views.
 
@@ -81,13 +96,14 @@ def canonical_cameras(
         X: Homogeneous points.
         visible: Which points each view sees.
         image_size: Width and height.
+        numbers: How many are measured of each point in a view.
     """
     b, v = visible.shape[:2]
     point_good = torch.isfinite(X).all(-1) & (X != 0).any(-1)
     view_good = torch.isfinite(P).flatten(-2).all(-1) & (P != 0).flatten(-2).any(-1)
     visible = visible & point_good[:, None] & view_good[..., None]
-    # A view needs as many points as a camera has unknowns.
-    present = visible.sum(-1) >= 6
+    # A view needs as many numbers as a camera has unknowns.
+    present = numbers * visible.sum(-1) >= 11
     visible = visible & present[..., None]
     finite = present.any(-1)
     X = torch.where(point_good[..., None], X, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=X.dtype, device=X.device))
@@ -132,8 +148,7 @@ def _widest(P: Float[Tensor, "b v 3 4"], X: Float[Tensor, "b n 4"], visible: Boo
 def prepare_cameras(
     P: Float[Tensor, "b v 3 4"],
     X: Float[Tensor, "b n 4"],
-    x: Float[Tensor, "b v n 2"] | None,
-    visible: Bool[Tensor, "b v n"],
+    seen: Sightings,
     image_size: Float[Tensor, "b v 2"],
     noise: Float[Tensor, "b"] | None,
     distortion_sigma: float,
@@ -147,25 +162,27 @@ def prepare_cameras(
     Args:
         P: Cameras in pixels.
         X: Homogeneous points.
-        x: Observations in pixels, which tell noise and distortion.
-        visible: Which points each view sees.
+        seen: The observations; where they are tells noise and distortion.
         image_size: Width and height.
         noise: Standard deviation of the observations per coordinate, in pixels; from x if None, else 1.
         distortion_sigma: Standard deviation of the distortion before any image was seen; 0 for none.
     """
+    x, visible, normal = seen
     if x is not None:
         visible = visible & torch.isfinite(x).all(-1)
-    c = canonical_cameras(P, X, visible, image_size)
+    c = canonical_cameras(P, X, visible, image_size, 2 if normal is None else 1)
     b, v = visible.shape[:2]
+    row = torch.arange(b, device=P.device)[:, None]
     kept = torch.zeros_like(c.visible)
-    kept[torch.arange(b, device=P.device)[:, None], c.order] = c.visible
-    sigma = _noise(torch.nan_to_num(P), torch.nan_to_num(X), x, kept) if noise is None else noise
+    kept[row, c.order] = c.visible
+    sigma = _noise(torch.nan_to_num(P), torch.nan_to_num(X), Sightings(x, kept, normal)) if noise is None else noise
     sigma = torch.where(torch.isfinite(sigma), sigma, 1.0).clamp_min(NOISE_FLOOR)
     precision = (1 / (sigma[:, None] * c.image[..., 0, 0])).square()
     weights = c.visible.to(P.dtype) * torch.where(c.present, precision, 0.0)[..., None]
     fields = _fields(c, x)
     coupled = v <= MAX_COUPLED
-    information = camera_information(c.P, c.X, weights, fields, coupled=coupled)
+    across = None if normal is None else normal[row, c.order]
+    information = camera_information(c.P, c.X, weights, fields, normal=across, coupled=coupled)
     if coupled:
         covariance: Tensor = covariance_in_frame(c.P, information.matrix, torch.zeros(b, dtype=torch.long, device=P.device))
     else:
@@ -261,15 +278,20 @@ def _frame(P: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(regular[:, None, None], frame, eye), regular
 
 
-def _noise(P: Tensor, X: Tensor, x: Tensor | None, visible: Tensor) -> Tensor:
+def _noise(P: Tensor, X: Tensor, seen: Sightings) -> Tensor:
+    x, visible, normal = seen
     if x is None:
         return torch.ones(len(P), dtype=P.dtype, device=P.device)
     h = torch.einsum("bvij,bnj->bvni", P, X)
     z = torch.where(h[..., 2] != 0, h[..., 2], 1.0)
-    square = (torch.where(visible[..., None], x, 0.0) - h[..., :2] / z[..., None]).square().sum(-1)
+    residual = torch.where(visible[..., None], x, 0.0) - h[..., :2] / z[..., None]
+    square = (residual if normal is None else (residual * normal).sum(-1, keepdim=True)).square().sum(-1)
     total = torch.where(visible, square, 0.0).sum((-2, -1))
     views = (visible.sum(-1) > 0).sum(-1)
-    redundancy = 2 * visible.sum((-2, -1)) - 11 * views - 3 * (visible.sum(-2) > 1).sum(-1) + 15
+    # A point may move in space, a sample across its curve, and none tells more than is measured of it.
+    rows, free = (2, 3) if normal is None else (1, 2)
+    measured = rows * visible.sum(-2)
+    redundancy = (measured - measured.clamp(max=free)).sum(-1) - 11 * views + 15
     return (total / redundancy.clamp_min(1)).sqrt()
 
 
