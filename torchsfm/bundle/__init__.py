@@ -6,6 +6,7 @@ from torchsfm.bundle.bundle_adjust_model import AdjustedModel, BundleModel, bund
 from torchsfm.bundle.bundle_adjust_projective import ProjectiveBundleResult, bundle_adjust_projective
 from torchsfm.bundle.bundle_covariance import BundleCovariance, bundle_covariance
 from torchsfm.bundle.conics import BundleConics
+from torchsfm.bundle.curves import BundleCurves
 from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.intrinsics_covariance import intrinsics_covariance
 from torchsfm.bundle.lines import BundleLines
@@ -17,6 +18,7 @@ __all__ = [
     "AdjustedModel",
     "BundleConics",
     "BundleCovariance",
+    "BundleCurves",
     "BundleLines",
     "BundleModel",
     "BundleResult",

@@ -42,7 +42,7 @@ class BundleTerms(TypedDict, total=False):
             the mean for "focal" and absolute otherwise, for all cameras or (g,) for each. An observation's distance counts in
             units of 1 pixel.
         intrinsics_mean: Where these are centred; the cameras given if not given.
-        structure: What the views see besides points: `BundleLines`, `BundleConics`. One of a kind.
+        structure: What the views see besides points: `BundleLines`, `BundleConics`, `BundleCurves`. One of a kind.
 
     See the example of `bundle_adjust`.
     """
@@ -176,7 +176,8 @@ class Bundle:
             blocks["sensor"] = Block(_pose_rows(self.rig.cam_from_rig), RigidMotion(), self.fixed_sensors)
             through, names = RigProjection(projection), ("pose", "sensor", "camera")
             of_view = (self.rig.frame, self.rig.sensor, self.start.camera_index)
-        sight = Sight(names, of_view, projection, view_poses, cameras[self.start.camera_index])
+        seen_by = cameras[self.start.camera_index]
+        sight = Sight(names, of_view, projection, through.residual, through.linearize, view_poses, seen_by)
         terms = [Term(through.residual, (*names, "point"), (*sight.at(view), point), data, *options, through.linearize)]
         for some in self.structure:
             blocks[some.block] = some.variables(sight)

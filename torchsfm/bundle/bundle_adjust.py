@@ -58,7 +58,7 @@ class BundleResult:
     """What was seen besides points, adjusted, in the order given."""
     structure_residuals: tuple[Float[Tensor, "_ _"], ...] = ()
     """Of each observation of it the residuals, inf where it does not count: of a segment the signed distances of both ends,
-    pixels; of an ellipse five numbers in units of their standard deviations."""
+    pixels; of an ellipse five numbers in units of their standard deviations; of an edge point the signed distance, pixels."""
 
 
 def bundle_adjust(
@@ -75,12 +75,12 @@ def bundle_adjust(
 ) -> BundleResult:
     """Minimise the reprojection error over poses, cameras and structure together (Triggs et al. 2000; HZ 18.1).
 
-    Points, and lines and conics where `structure` has some, are eliminated by the Schur complement (poses, where there are many
-    more poses than structure). Seven dimensions of gauge (place, orientation, size of the world) are free unless something
-    holds them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does no harm: the
-    damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Fixed and unobserved
-    poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a pinhole shows them
-    mirrored): leave them out, or use a loss. Computed in float64.
+    Points, and lines, conics and curves where `structure` has some, are eliminated by the Schur complement (poses, where there
+    are many more poses than structure). Seven dimensions of gauge (place, orientation, size of the world) are free unless
+    something holds them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does no harm:
+    the damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Fixed and
+    unobserved poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a pinhole
+    shows them mirrored): leave them out, or use a loss. Computed in float64.
 
     Args:
         problem: Views of points, with estimates of everything.

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchsfm.bundle.blocks import BundleTerms
 from torchsfm.bundle.bundle_adjust import BundleResult, bundle_adjust
 from torchsfm.bundle.conics import BundleConics
+from torchsfm.bundle.curves import BundleCurves
 from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.lines import BundleLines
 from torchsfm.bundle.structure import Structure
@@ -60,7 +61,7 @@ class BundleModel(Protocol):
 
 @runtime_checkable
 class ModelStructure(Protocol):
-    """What a model has besides points, in its members `lines` and `conics`."""
+    """What a model has besides points, in its members `lines`, `conics` and `curves`."""
 
     def bundle(self, *, unit: float = 1.0, loss: Loss | None = None) -> Structure:
         """As a part of a bundle in which image points have the standard deviation `unit`, pixels."""
@@ -104,8 +105,9 @@ class AdjustedModel(Generic[M]):
 def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedModel[M]:
     """Minimise the reprojection error over all poses, cameras and points of a model; `bundle_adjust` for what holds a bundle.
 
-    Lines and conics, where the model has some in members `lines` and `conics`, are adjusted with the points, unless `structure`
-    has others. Everything else in the model (names, colours, observations) stays. Views without observations keep their poses.
+    Lines, conics and curves, where the model has some in members of these names, are adjusted with the points, unless
+    `structure` has others. Everything else in the model (names, colours, observations) stays. Views without observations keep
+    their poses.
 
     Args:
         model: A `Reconstruction`, a `BundleProblem`, or a frozen dataclass with their members.
@@ -127,7 +129,7 @@ def bundle_adjust_model(model: M, **options: Unpack[BundleOptions]) -> AdjustedM
     """
     problem = BundleProblem(model.poses, model.cameras, model.camera_index, model.X, model.x, model.view, model.point)
     others = options.get("structure", ())
-    members = {"lines": BundleLines.block, "conics": BundleConics.block}
+    members = {"lines": BundleLines.block, "conics": BundleConics.block, "curves": BundleCurves.block}
     own = {
         name: some
         for name, block in members.items()

@@ -1,5 +1,6 @@
 """What views see besides points: kinds of structure that a bundle adjusts together with them, each in a file of its own."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -20,6 +21,10 @@ class Sight:
     index: tuple[Int[Tensor, "v"], ...]
     """Which variable of each block belongs to each view."""
     projection: Projection
+    residual: Callable[..., Tensor]
+    """Of points, by all of these variables, (m, 2) pixels; see `Projection`."""
+    linearize: Callable[..., Tensor]
+    """The same with derivatives."""
     poses: Pose
     """Of the views, at the start."""
     cameras: Camera

@@ -1,0 +1,367 @@
+"""Curves in a bundle: samples that move across, seen as image curves no point of which corresponds to any in another view."""
+
+import dataclasses
+
+import pytest
+import torch
+from chance import assert_unit_variance
+from torch import Tensor
+
+from torchsfm.bundle import BundleCurves, BundleLines, BundleResult, Rig, bundle_adjust, bundle_covariance
+from torchsfm.bundle.blocks import Bundle
+from torchsfm.geometry import (
+    BrownConrady,
+    BundleProblem,
+    Camera,
+    Distortion,
+    KannalaBrandt,
+    NoDistortion,
+    Pose,
+    Radial,
+    intrinsics,
+    pluecker_from_points,
+    random_rotation,
+    rotation_from_rotvec,
+    rotvec_from_rotation,
+)
+from torchsfm.optim import Huber
+from torchsfm.optim.terms import Workspace, lift_of, linearize, prepare, term_residual
+
+F64 = torch.float64
+LENSES = {
+    "none": NoDistortion,
+    "radial": lambda: Radial(*torch.tensor([-0.25, 0.08], dtype=F64)),
+    "brown": lambda: BrownConrady(*torch.tensor([-0.2, 0.05, 0.01, 0.004, -0.003], dtype=F64)),
+    "fisheye": lambda: KannalaBrandt(*torch.tensor([-0.05, 0.01, 0.0, 0.0], dtype=F64)),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    problem: BundleProblem
+    curves: BundleCurves
+    centre: Tensor
+    """Of the helix that each sample is on, (n, 3)."""
+    axes: Tensor
+    """Two directions of its turn and that of its rise, (n, 3, 3); without the first two it is straight."""
+    place: Tensor
+    """Of each sample."""
+
+    def at(self, sample: Tensor, place: Tensor) -> Tensor:
+        turn = torch.stack((place.cos() - 1, place.sin(), place), -1)
+        return self.centre[sample] + (turn[..., None, :] @ self.axes[sample])[..., 0, :]
+
+    def project(self, sample: Tensor, view: Tensor, place: Tensor) -> Tensor:
+        cameras = self.problem.cameras[self.problem.camera_index[view]]
+        return cameras.project(self.problem.poses[view].transform(self.at(sample, place)[:, None]))[:, 0]
+
+
+def make_scene(
+    generator: torch.Generator,
+    *,
+    lens: str = "none",
+    views: int = 5,
+    points: int = 30,
+    samples: int = 24,
+    noise: float = 0.0,
+    apart: float = 0.3,
+    bend: float = 1.0,
+) -> Scene:
+    """Views on an arc; of each sample an edge point some pixels along the image curve, noise across it."""
+    angle = torch.linspace(-0.5, 0.5, views, dtype=F64)
+    turn = torch.stack((0.15 * torch.cos(4 * angle), angle, 0.1 * torch.sin(5 * angle)), -1)
+    poses = Pose(rotation_from_rotvec(turn), torch.tensor([[0.1, -0.1, 4.0]], dtype=F64).repeat(views, 1))
+    poses = poses.retract(0.1 * torch.randn(views, 6, generator=generator, dtype=F64))
+    distortion: Distortion = LENSES[lens]()
+    K = intrinsics(torch.tensor(700.0, dtype=F64), torch.tensor([320.0, 240.0], dtype=F64), 1.02)
+    cameras = Camera(K[None], type(distortion).from_parameters(distortion.parameters()[None]))
+    index = torch.zeros(views, dtype=torch.long)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=F64)
+
+    def randn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=F64)
+
+    X = 2 * rand(points, 3) - 1
+    view, point = torch.cartesian_prod(torch.arange(views), torch.arange(points)).unbind(1)
+    x = cameras[index[view]].project(poses[view].transform(X[point, None]))[:, 0]
+    problem = BundleProblem(poses, cameras, index, X, x + noise * randn(*x.shape), view, point)
+    # Curves that run towards a camera have images with cusps: of many, those that do so the least.
+    many = 8 * samples
+    axes = random_rotation(many, generator=generator, dtype=F64) * torch.tensor([0.5 * bend, 0.5 * bend, 0.8])[:, None]
+    empty = BundleCurves(X[:0], X[:0], x[:0], x[:0], view[:0], view[:0])
+    scene = Scene(problem, empty, 2 * rand(many, 3) - 1, axes, 0.5 * randn(many))
+    seen, sample = torch.cartesian_prod(torch.arange(views), torch.arange(many)).unbind(1)
+    h = 1e-4
+    ends = [scene.project(sample, seen, scene.place[sample] + step) for step in (-h, h)]
+    speed = (ends[1] - ends[0]).norm(dim=-1).reshape(views, many) / (2 * h)
+    best = speed.amin(0).topk(samples).indices
+    scene = Scene(problem, empty, scene.centre[best], scene.axes[best], scene.place[best])
+    seen, sample = torch.cartesian_prod(torch.arange(views), torch.arange(samples)).unbind(1)
+    speed, here = speed[:, best].flatten(), scene.place
+    tangent = scene.at(torch.arange(samples), here + h) - scene.at(torch.arange(samples), here - h)
+    place = here[sample] + apart * (2 * rand(len(sample)) - 1) / speed
+    before, image, after = (scene.project(sample, seen, place + step) for step in (-h, 0, h))
+    first, second = (after - before) / (2 * h), (after - 2 * image + before) / h**2
+    normal = torch.stack((-first[:, 1], first[:, 0]), -1) / first.norm(dim=-1, keepdim=True)
+    curvature = (normal * second).sum(-1) / first.square().sum(-1)
+    image = image + noise * randn(len(image))[:, None] * normal
+    curves = BundleCurves(scene.at(torch.arange(samples), here), tangent, image, 3 * normal, seen, sample, curvature)
+    return dataclasses.replace(scene, curves=curves)
+
+
+def without_points(problem: BundleProblem) -> BundleProblem:
+    return dataclasses.replace(problem, X=problem.X[:0], x=problem.x[:0], view=problem.view[:0], point=problem.point[:0])
+
+
+def disturbed(scene: Scene, generator: torch.Generator, size: float = 0.003) -> tuple[BundleProblem, BundleCurves]:
+    """All but the first two poses moved, points, and samples across their curves."""
+    step = size * torch.randn(len(scene.problem.poses.t), 6, generator=generator, dtype=F64)
+    step[:2] = 0
+    X = scene.problem.X + size * torch.randn(scene.problem.X.shape, generator=generator, dtype=F64)
+    along = scene.curves.tangent / scene.curves.tangent.norm(dim=-1, keepdim=True)
+    move = size * torch.randn(along.shape, generator=generator, dtype=F64)
+    samples = scene.curves.X + move - (move * along).sum(-1, keepdim=True) * along
+    problem = dataclasses.replace(scene.problem, poses=scene.problem.poses.retract(step), X=X)
+    return problem, dataclasses.replace(scene.curves, X=samples)
+
+
+def first_two(problem: BundleProblem) -> Tensor:
+    return torch.arange(len(problem.poses.t)) < 2
+
+
+def adjusted(result: BundleResult) -> BundleCurves:
+    (curves,) = result.structure
+    assert isinstance(curves, BundleCurves)
+    return curves
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_residuals_are_distances_from_image_curves(generator: torch.Generator, lens: str) -> None:
+    """Of what a sample that is off shows, to the true image curve, wherever on it the edge point is."""
+    scene = make_scene(generator, lens=lens, apart=2.0)
+    _, curves = disturbed(scene, generator)
+    blocks, terms = Bundle(scene.problem, structure=(curves,)).problem()
+    found = term_residual(terms[1], {name: b.x for name, b in blocks.items()})[:, 0]
+    share = torch.linspace(-0.1, 0.1, 20001, dtype=F64)
+    for k in range(0, len(curves.x), 7):
+        view, sample = curves.view[k].expand(len(share)), curves.sample[k].expand(len(share))
+        image = scene.project(sample, view, scene.place[sample] + share)
+        camera = scene.problem.cameras[0]
+        own = camera.project(scene.problem.poses[view[:1]].transform(curves.X[sample[:1], None]))[0, 0]
+        nearest = (image - own).norm(dim=-1).min(0)
+        assert 0 < nearest.indices < len(share) - 1
+        torch.testing.assert_close(found[k].abs(), nearest.values, rtol=2e-3, atol=3e-3)
+        # Positive to the side of the normal.
+        side = ((own - image[nearest.indices]) * curves.normal[k]).sum()
+        assert side * found[k] > -1e-2
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_exact_data_are_recovered(generator: torch.Generator, lens: str) -> None:
+    scene = make_scene(generator, lens=lens)
+    problem, curves = disturbed(scene, generator)
+    result = bundle_adjust(problem, fixed_poses=first_two(problem), structure=[curves], tolerance=1e-14)
+    assert result.cost < 1e-6
+    assert (adjusted(result).X - scene.curves.X).abs().max() < 1e-4
+    assert (result.poses.t - scene.problem.poses.t).abs().max() < 1e-6
+    assert result.structure_residuals[0].shape == (len(curves.x), 1)
+    assert result.structure_residuals[0].abs().max() < 1e-3
+
+
+def test_curves_alone_determine_poses(generator: torch.Generator) -> None:
+    scene = make_scene(generator, samples=60, views=6, apart=0.1)
+    problem, curves = disturbed(scene, generator)
+    result = bundle_adjust(
+        without_points(problem), free=(), fixed_poses=first_two(problem), structure=[curves], tolerance=1e-14
+    )
+    assert (result.poses.t - scene.problem.poses.t).abs().max() < 1e-5
+    assert (rotvec_from_rotation((result.poses @ scene.problem.poses.inverse()).R)).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("lens", ["none", "radial"])
+def test_two_samples_of_a_straight_curve_are_a_line(generator: torch.Generator, lens: str) -> None:
+    """What they say of cameras is what a segment says whose ends are the images of the samples."""
+    scene = make_scene(generator, lens=lens, apart=0.0, bend=0.0, samples=10, points=8)
+    other = dataclasses.replace(scene, place=scene.place + 0.8)
+    both = [
+        torch.stack(
+            [s.project(scene.curves.sample, scene.curves.view, s.place[scene.curves.sample]) for s in (scene, other)], 1
+        ),
+        torch.stack([s.at(torch.arange(10), s.place) for s in (scene, other)], 1),
+    ]
+    lines = BundleLines(pluecker_from_points(*both[1].unbind(1)), both[0], scene.curves.view, scene.curves.sample)
+    d = both[0][:, 1] - both[0][:, 0]
+    twice = BundleCurves(
+        both[1].flatten(0, 1), (both[1][:, 1] - both[1][:, 0]).repeat_interleave(2, 0), both[0].flatten(0, 1),
+        torch.stack((-d[:, 1], d[:, 0]), -1).repeat_interleave(2, 0), scene.curves.view.repeat_interleave(2),
+        2 * scene.curves.sample.repeat_interleave(2) + torch.arange(2).repeat(len(d)),
+    )  # fmt: skip
+    if lens != "none":
+        # A lens bends the chord: the normals are those at the ends.
+        ahead = [s.project(scene.curves.sample, scene.curves.view, s.place[scene.curves.sample] + 1e-6) for s in (scene, other)]
+        d = (torch.stack(ahead, 1) - both[0]).flatten(0, 1)
+        twice = dataclasses.replace(twice, normal=torch.stack((-d[:, 1], d[:, 0]), -1))
+    options = {"sigma": 0.3, "fixed_poses": first_two(scene.problem)}
+    of_lines, of_curves = (bundle_covariance(scene.problem, structure=[some], **options) for some in (lines, twice))
+    torch.testing.assert_close(of_curves.poses, of_lines.poses, rtol=1e-6, atol=0)
+    torch.testing.assert_close(of_curves.cameras, of_lines.cameras, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("lens", ["none", "radial"])
+def test_errors_are_those_of_the_covariance(generator: torch.Generator, lens: str) -> None:
+    """Of poses and of samples across, in units of the covariance, which is the Cramer-Rao bound: chi-square of 6 and of 2."""
+    poses, samples = [], []
+    scene = make_scene(generator, lens=lens, points=12, samples=20)
+    held = first_two(scene.problem)
+    options = {"sigma": 0.2, "fixed_poses": held}
+    C = bundle_covariance(scene.problem, structure=[scene.curves], **options)
+    alone = bundle_covariance(scene.problem, **options)
+    assert (C.poses[~held].diagonal(dim1=1, dim2=2) < 0.98 * alone.poses[~held].diagonal(dim1=1, dim2=2)).all()
+    values, vectors = torch.linalg.eigh(C.structure[0])
+    along = torch.nn.functional.normalize(scene.curves.tangent, dim=-1)
+    assert (C.structure[0] @ along[..., None]).abs().max() < 1e-9 * values[:, 1].min()
+    to_unit = (vectors / values.clamp_min(1e-300).sqrt()[:, None])[..., 1:].mT
+    normal = scene.curves.normal / scene.curves.normal.norm(dim=-1, keepdim=True)
+    for _ in range(10):
+        noise = 0.2 * torch.randn(scene.problem.x.shape, generator=generator, dtype=F64)
+        aside = 0.2 * torch.randn(len(normal), 1, generator=generator, dtype=F64)
+        noisy = dataclasses.replace(scene.problem, x=scene.problem.x + noise)
+        seen = dataclasses.replace(scene.curves, x=scene.curves.x + aside * normal)
+        result = bundle_adjust(noisy, structure=[seen], tolerance=1e-9, fixed_poses=held)
+        turn = result.poses @ scene.problem.poses.inverse()
+        step = torch.cat((rotvec_from_rotation(turn.R), turn.t), -1)[~held]
+        factor = torch.linalg.cholesky(C.poses[~held])
+        poses.append(torch.linalg.solve_triangular(factor, step[..., None], upper=False)[..., 0])
+        samples.append((to_unit @ (adjusted(result).X - scene.curves.X)[..., None])[..., 0])
+    # Errors within a trial depend on each other, those of one pose or sample in several do not.
+    for scores in (poses, samples):
+        assert_unit_variance(torch.stack(scores).movedim(1, -1).flatten(0, 1), dim=0)
+
+
+def test_a_rig_of_one_changes_nothing(generator: torch.Generator) -> None:
+    scene = make_scene(generator, noise=0.5)
+    problem, curves = disturbed(scene, generator)
+    views = len(problem.poses.t)
+    rig = Rig(Pose.identity(1, dtype=F64), torch.zeros(views, dtype=torch.long), torch.arange(views))
+    options = {"fixed_poses": first_two(problem), "structure": [curves], "tolerance": 1e-13}
+    plain = bundle_adjust(problem, **options)
+    rigged = bundle_adjust(problem, rig=rig, fixed_sensors=torch.tensor([True]), **options)
+    assert rigged.cost == pytest.approx(plain.cost, rel=1e-9)
+    assert (adjusted(rigged).X - adjusted(plain).X).abs().max() < 1e-6
+
+
+def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> None:
+    scene = make_scene(generator, noise=0.5)
+    problem, curves = disturbed(scene, generator)
+    fixed = torch.zeros(len(curves.X), dtype=torch.bool)
+    fixed[3] = True
+    weights = (curves.sample != 5).to(F64)
+    x, normal, tangent = curves.x.clone(), curves.normal.clone(), curves.tangent.clone()
+    x[curves.sample == 7], normal[curves.sample == 9], tangent[11] = torch.nan, 0.0, 0.0
+    changed = dataclasses.replace(curves, fixed=fixed, weights=weights, x=x, normal=normal, tangent=tangent)
+    result = bundle_adjust(problem, structure=[changed], tolerance=1e-13)
+    after = adjusted(result).X
+    assert (after == curves.X).all(1).nonzero()[:, 0].tolist() == [3, 5, 7, 9, 11]
+    assert after.isfinite().all()
+    dead = torch.isin(curves.sample, torch.tensor([5, 7, 9, 11]))
+    assert torch.equal(result.structure_residuals[0].isinf().all(1), dead)
+    # They are as if they were not there.
+    some = {name: getattr(curves, name)[~dead] for name in ("x", "normal", "curvature", "view", "sample")}
+    others = dataclasses.replace(curves, fixed=fixed, **some)
+    again = bundle_adjust(problem, structure=[others], tolerance=1e-13)
+    assert again.cost == pytest.approx(result.cost, rel=1e-7)
+    covariance = bundle_covariance(problem, structure=[changed]).structure[0]
+    assert torch.equal(covariance[3], torch.zeros(3, 3, dtype=F64))
+    assert covariance[[5, 7, 9, 11]].diagonal(dim1=1, dim2=2).isinf().all()
+
+
+def test_a_loss_resists_wrong_edges(generator: torch.Generator) -> None:
+    scene = make_scene(generator, noise=0.2, samples=60)
+    problem, curves = disturbed(scene, generator)
+    wrong = torch.rand(len(curves.x), generator=generator) < 0.1
+    x = torch.where(wrong[:, None], curves.x + 20 * torch.randn(curves.x.shape, generator=generator, dtype=F64), curves.x)
+    off = [
+        (adjusted(bundle_adjust(problem, fixed_poses=first_two(problem), structure=[some])).X - scene.curves.X)
+        .norm(dim=-1)
+        .median()
+        for loss in (None, Huber(0.5))
+        for some in [dataclasses.replace(curves, x=x, loss=loss)]
+    ]
+    assert off[1] < 0.5 * off[0]
+
+
+def test_the_world_comes_back_with_its_curves(generator: torch.Generator) -> None:
+    scene = make_scene(generator, noise=0.5)
+    problem, curves = disturbed(scene, generator)
+    free = bundle_adjust(problem, structure=[curves], tolerance=1e-12)
+    first = bundle_adjust(problem, structure=[curves], tolerance=1e-12, gauge="first")
+    assert torch.equal(first.poses.R[0], problem.poses.R[0])
+    assert not torch.allclose(first.poses.t[1:], free.poses.t[1:], rtol=0, atol=1e-6)
+    moved = dataclasses.replace(problem, poses=first.poses, cameras=first.cameras, X=first.X)
+    held = {"free": (), "fixed_poses": torch.ones(len(problem.poses.t), dtype=torch.bool)}
+    again = bundle_adjust(moved, structure=[adjusted(first)], max_iterations=0, **held)
+    assert again.initial_cost == pytest.approx(free.cost, rel=1e-9)
+    # Directions turn with the world: across the curve is where it was.
+    turn = first.poses.R[0].mT @ free.poses.R[0]
+    torch.testing.assert_close(adjusted(first).tangent, curves.tangent @ turn.mT, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["x", "normal", "curvature"])
+def test_derivatives_by_image_curves(generator: torch.Generator, name: str) -> None:
+    scene = make_scene(generator, lens="radial", noise=0.5, samples=6, points=8, views=4)
+    problem, curves = disturbed(scene, generator)
+    probe = torch.randn(curves.X.shape, generator=generator, dtype=F64)
+
+    def found(values: Tensor) -> Tensor:
+        some = dataclasses.replace(curves, **{name: values})
+        held = torch.arange(4) != 2
+        result = bundle_adjust(problem, free=(), fixed_poses=held, structure=[some], tolerance=1e-16, max_iterations=100)
+        return (adjusted(result).X * probe).sum() + result.poses.t[2].sum()
+
+    values = getattr(curves, name)
+    leaf = values.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(found(leaf), leaf)
+    step = torch.randn(values.shape, generator=generator, dtype=F64)
+    size = {"x": 1e-4, "normal": 1e-3, "curvature": 1e-4}[name]
+    numeric = (found(values + size * step) - found(values - size * step)) / (2 * size)
+    torch.testing.assert_close((slope * step).sum(), numeric.detach(), rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("rigged", [False, True])
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_written_derivatives_are_those_of_the_residuals(generator: torch.Generator, lens: str, rigged: bool) -> None:
+    """By every variable, with skew and numbers held in some cameras."""
+    scene = make_scene(generator, lens=lens, noise=1.0, apart=3.0)
+    problem, curves = disturbed(scene, generator)
+    names = ("focal", "aspect", "skew", "principal_point", *problem.cameras.distortion.parameter_names)
+    views = len(problem.poses.t)
+    sensors = Pose.identity(2, dtype=F64).retract(0.1 * torch.randn(2, 6, generator=generator, dtype=F64))
+    rig = Rig(sensors, torch.arange(views) % 2, torch.arange(views)) if rigged else None
+    held = {"skew": torch.tensor([not rigged])}
+    blocks, terms = Bundle(problem, free=names, fixed_intrinsics=held, rig=rig, structure=(curves,)).problem()
+    blocks, terms, _ = prepare(blocks, terms[1:2])
+    x = {name: block.x for name, block in blocks.items()}
+    found, wanted = [], []
+    for term, slopes in ((terms[0], found), (dataclasses.replace(terms[0], linearize=None), wanted)):
+        sizes = [blocks[name].tangent for name in term.blocks]
+        slopes += [curves.x.new_empty(1, size, len(term.index[0])).permute(2, 0, 1) for size in sizes]
+        lifts = {name: lift_of(block, x[name]) for name, block in blocks.items()}
+        slopes.append(linearize(term, x, lifts, slopes[:], Workspace(curves.x))[0])
+    for mine, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-9 * float(other.abs().max()))
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_curves(generator: torch.Generator) -> None:
+    scene = make_scene(generator)
+    curves = scene.curves
+    with pytest.raises(ValueError, match=r"weights: wanted"):
+        dataclasses.replace(curves, weights=torch.ones(3, dtype=F64))
+    with pytest.raises(ValueError, match=r"curvature: wanted"):
+        dataclasses.replace(curves, curvature=torch.ones(3, dtype=F64))
+    with pytest.raises(ValueError, match=r"sample: wanted numbers from 0 to 23"):
+        dataclasses.replace(curves, sample=curves.sample + 1)
+    with pytest.raises(ValueError, match=r"structure.view: wanted numbers from 0 to 4"):
+        bundle_adjust(scene.problem, structure=[dataclasses.replace(curves, view=curves.view + 1)])
