@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchsfm.formats import write_curves_ply
+from torchsfm.formats import write_curves
 from torchsfm.geometry import Camera, Pose, krt_from_camera
 from torchsfm.images import ImageError, read_image
-from torchsfm.reconstruction import CurveReconstruction, reconstruct_curves
+from torchsfm.reconstruction import Curves, reconstruct_curves
 
 Array = NDArray[np.float64]
 STEP, CELLS = 0.005, 256
@@ -37,18 +37,18 @@ def photographs(files: list[Path]) -> Iterator[Tensor | None]:
             yield None
 
 
-def samples(found: CurveReconstruction, step: float) -> Array:
+def samples(found: Curves, step: float) -> Array:
     """Points of the curves, so far apart."""
     points = [np.zeros((0, 3))]
-    for x, n, closed in zip(found.curve.x, found.curve.number.tolist(), found.curve.closed.tolist(), strict=True):
-        line = x[:n].numpy()
+    for x, closed in zip(found.X.split(found.number.tolist()), found.closed.tolist(), strict=True):
+        line = x.numpy()
         line = np.concatenate((line, line[:1])) if closed else line
         s = np.concatenate(([0.0], np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum()))
         points.append(np.stack([np.interp(np.arange(0, s[-1], step), s, line[:, k]) for k in range(3)], -1))
     return np.concatenate(points)
 
 
-def emap(found: CurveReconstruction, truth: Array) -> list[float]:
+def emap(found: Curves, truth: Array) -> list[float]:
     """Accuracy and completeness in thousandths, then precision, recall and F in per cent at each limit."""
     x = samples(found, STEP)
     _, cell = np.unique(np.floor((x + 1) / 2 * CELLS), axis=0, return_inverse=True)
@@ -75,11 +75,11 @@ def abc(folder: Path, out: Path | None) -> None:
         acc, comp, *shares = emap(found, truth["points"].astype(np.float64))
         columns = [" ".join(f"{v:.1f}" for v in shares[i : i + 3]) for i in (0, 3, 6)]
         print(
-            f"| {place.name} | {len(found.curve.x)} | {acc:.2f} | {comp:.2f} | {' | '.join(columns)} | {seconds:.0f} |",
+            f"| {place.name} | {len(found)} | {acc:.2f} | {comp:.2f} | {' | '.join(columns)} | {seconds:.0f} |",
             flush=True,
         )
         if out is not None:
-            write_curves_ply(found.curve, out / f"{place.name}.ply")
+            write_curves(found, out / f"{place.name}.ply")
 
 
 def pavilion(folder: Path, out: Path | None) -> None:
@@ -106,7 +106,7 @@ def pavilion(folder: Path, out: Path | None) -> None:
         columns = [f"{100 * (accuracy < d).mean():.1f} {100 * (completeness < d).mean():.1f}" for d in (0.01, 0.02, 0.05)]
         print(f"| {least} | {len(x)} | {np.median(accuracy):.4f} | {' | '.join(columns)} | {seconds:.0f} |", flush=True)
         if out is not None:
-            write_curves_ply(found.curve, out / f"pavilion-{least}.ply")
+            write_curves(found, out / f"pavilion-{least}.ply")
 
 
 def main() -> None:

@@ -105,6 +105,31 @@ def test_lines_are_found_written_and_reported(finished: tuple[Path, str], courty
     assert same_model(out / "model.npz", finished[0] / "model.npz")
 
 
+def test_curves_are_found_written_and_reported(finished: tuple[Path, str], courtyard: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished[0], tmp_path / "out")
+    out = tmp_path / "out"
+    status, text, _ = torchsfm("reconstruct", courtyard, "--out", out, "--seed", 3, "--curves", "--resume")
+    assert status == 0
+    model = Reconstruction.load(out / "model.npz")
+    assert model.curves is not None
+    assert len(model.curves) > 0
+    assert (model.curves.support() >= 3).double().mean() > 0.75
+    assert float(model.curve_residuals().mean()) < 1
+    assert f"{len(model.curves)} curves" in text
+    assert len(read_ply(out / "curves.ply").X) == len(model.curves.X)
+    assert len(json.loads((out / "curves.json").read_text())["curves"]) == len(model.curves)
+    record = json.loads((out / "report.json").read_text())
+    assert record["models"][0]["curves"]["samples"] == len(model.curves.X)
+    assert {"edges", "curves"} <= set(record["seconds"])
+    assert f"| curves | {len(model.curves)} of" in (out / "report.md").read_text()
+    assert f"{len(model.curves)} curves" in torchsfm("info", out)[1]
+    # Results without curves leave none behind.
+    status, _, _ = torchsfm("reconstruct", courtyard, "--out", out, "--seed", 3, "--resume")
+    assert status == 0
+    assert not list(out.glob("curves*"))
+    assert same_model(out / "model.npz", finished[0] / "model.npz")
+
+
 def test_info_describes_a_saved_model(finished: tuple[Path, str]) -> None:
     out, _ = finished
     for path in (out, out / "model.npz"):

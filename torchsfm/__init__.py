@@ -35,6 +35,7 @@ from torchsfm.bundle import (
     AdjustedModel as AdjustedModel,
     BundleCovariance as BundleCovariance,
     BundleConics as BundleConics,
+    BundleCurves as BundleCurves,
     BundleLines as BundleLines,
     BundleModel as BundleModel,
     BundleResult as BundleResult,
@@ -78,6 +79,7 @@ from torchsfm.formats import (
     write_openmvg as write_openmvg,
     write_opensfm as write_opensfm,
     write_conics as write_conics,
+    write_curves as write_curves,
     write_lines as write_lines,
     write_ply as write_ply,
     write_tum as write_tum,
@@ -163,6 +165,7 @@ from torchsfm.plot import (
 from torchsfm.reconstruction import (
     MatchedImages as MatchedImages,
     Conics as Conics,
+    Curves as Curves,
     Lines as Lines,
     Reconstruction as Reconstruction,
     ReconstructionError as ReconstructionError,

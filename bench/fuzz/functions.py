@@ -508,7 +508,7 @@ EXCEPTIONS: dict[str, str] = {
         "bal", "bundler", "colmap", "database", "hloc", "libmv", "model", "nerfstudio", "nvm", "openmvg", "opensfm", "ply",
         "vgg")},
     **{f"formats.write_{name}": FILES for name in (
-        "bal", "bundler", "colmap", "curves_json", "curves_ply", "database", "gltf", "kitti", "model", "nerfstudio", "nvm",
+        "bal", "bundler", "colmap", "curves", "database", "gltf", "kitti", "model", "nerfstudio", "nvm",
         "openmvg", "opensfm", "ply", "tum")},
     **{f"formats.{name}_{what}": FILES for name in ("read", "write") for what in ("lines", "conics")},
     "formats.export_model": FILES,

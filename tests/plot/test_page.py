@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import small_model
 import torch
 from chance import seeded
 from torch import Tensor
 
-from torchsfm.geometry import Curve, Pose
+from torchsfm.geometry import Pose
 from torchsfm.geometry.rotations import random_rotation
 from torchsfm.geometry.similarity import Similarity
 from torchsfm.images import read_image, save_image
@@ -328,17 +329,20 @@ def test_lines_are_drawn_and_can_be_hidden(model: Reconstruction, tmp_path: Path
     assert 'id="lines"' in path.read_text()
 
 
-def test_curves_are_drawn_from_sample_to_sample(model: Reconstruction, tmp_path: Path, generator: torch.Generator) -> None:
-    at = torch.randint(len(model.X), (3, 5), generator=generator)
-    valid = torch.arange(5) < torch.tensor([5, 3, 4])[:, None]
-    closed = torch.tensor([False, True, False])
-    path = write_page(model, tmp_path / "page.html", curves=Curve(model.X[at], valid, closed))
+def test_curves_are_drawn_from_sample_to_sample(tmp_path: Path) -> None:
+    model = small_model.with_curves(small_model.make())
+    curves = model.curves
+    assert curves is not None
+    broken = curves.X.clone()
+    broken[3] = torch.nan
+    points = replace(model, X=curves.X, color=curves.color, x=model.x[:0], view=model.view[:0], point=model.point[:0])
+    path = write_page(replace(points, curves=replace(curves, X=broken)), tmp_path / "page.html")
     shown = content(path)["models"][0]
     X = unpack(shown["positions"], "<f4").reshape(-1, 3)
-    pairs = [(at[0, i], at[0, i + 1]) for i in range(4)] + [(at[1, i], at[1, (i + 1) % 3]) for i in range(3)]
-    pairs += [(at[2, i], at[2, i + 1]) for i in range(3)]
-    expected = X[np.array([[int(a), int(b)] for a, b in pairs])]
-    assert np.allclose(unpack(shown["lineEnds"], "<f4").reshape(-1, 2, 3), expected, atol=1e-6)
-    assert len(unpack(shown["lineColors"], "u1")) == 3 * len(pairs)
+    pairs = [(i, (i + 1) % 16) for i in range(16)] + [(i, i + 1) for i in range(16, 27)] + [(28, 29)]
+    pairs = [(a, b) for a, b in pairs if 3 not in (a, b)]
+    assert np.allclose(unpack(shown["lineEnds"], "<f4").reshape(-1, 2, 3), X[np.array(pairs)], atol=1e-6)
+    expected = (curves.color[[a for a, _ in pairs]] * 255).round().numpy().astype("u1")
+    assert np.array_equal(unpack(shown["lineColors"], "u1").reshape(-1, 3), expected)
     assert shown["lineCounts"] == {"curves": len(pairs)}
-    assert "3 curves" in shown["summary"]
+    assert "3 curves, in 3.0 images" in shown["summary"]

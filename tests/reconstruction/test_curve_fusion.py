@@ -29,7 +29,7 @@ def pieces(arcs: list[tuple[int, torch.Tensor]], noise: float, generator: torch.
     piece = torch.repeat_interleave(torch.arange(len(arcs)), number)
     image = torch.repeat_interleave(torch.tensor([i for i, _ in arcs]), number)
     one = torch.ones(len(X), dtype=F64)
-    return Pieces(X, piece, image, 0.004 * one, 0.004 * one)
+    return Pieces(X, piece, image, torch.arange(len(X)), 0.004 * one, 0.004 * one)
 
 
 def ring(first: float, last: float, step: float = 0.01) -> torch.Tensor:

@@ -7,9 +7,9 @@ import torch
 from painted_box import FOCAL, camera, orbit, photograph, true_curves
 from torch import Tensor
 
-from torchsfm.geometry import Camera, Similarity, random_rotation
+from torchsfm.geometry import Camera, Similarity, project_points, random_rotation
 from torchsfm.geometry.distortion import Radial
-from torchsfm.reconstruction import CurveReconstruction, reconstruct_curves
+from torchsfm.reconstruction import Curves, reconstruct_curves
 
 VIEWS = 12
 PIXEL = 6.5 / FOCAL
@@ -22,15 +22,15 @@ def images() -> list[Tensor]:
 
 
 @pytest.fixture(scope="module")
-def found(images: list[Tensor]) -> CurveReconstruction:
+def found(images: list[Tensor]) -> Curves:
     return reconstruct_curves(images, camera(VIEWS), orbit(VIEWS))
 
 
-def samples(found: CurveReconstruction) -> Tensor:
-    return found.curve.x[found.curve.valid]
+def samples(found: Curves) -> Tensor:
+    return found.X
 
 
-def test_every_curve_is_found_and_nothing_else(found: CurveReconstruction) -> None:
+def test_every_curve_is_found_and_nothing_else(found: Curves) -> None:
     truth, x = true_curves(), samples(found)
     gap = torch.cdist(x, torch.cat(list(truth.values()))).amin(-1)
     assert gap.mean() < 0.4 * PIXEL
@@ -38,10 +38,9 @@ def test_every_curve_is_found_and_nothing_else(found: CurveReconstruction) -> No
     for name in ("upper", "upright", "circle"):
         assert (torch.cdist(truth[name], x).amin(-1) < 4 * PIXEL).float().mean() > 0.95, name
     # The circle goes around, and each curve is there once.
-    around = found.curve.x[found.curve.closed]
-    assert len(around) == 1
-    assert len(found.curve.x) < 20
-    assert found.curve.length.sum() < 1.05 * sum(len(v) for v in truth.values()) * 0.005
+    assert found.closed.sum() == 1
+    assert len(found) < 20
+    assert found.length().sum() < 1.05 * sum(len(v) for v in truth.values()) * 0.005
 
 
 def test_edges_are_found_against_changing_backgrounds() -> None:
@@ -54,26 +53,35 @@ def test_edges_are_found_against_changing_backgrounds() -> None:
     assert (gap < 2 * PIXEL).float().mean() > 0.99
 
 
-def test_what_is_said_of_samples(found: CurveReconstruction) -> None:
-    valid = found.curve.valid
-    assert (found.images[valid] >= 3).all()
-    assert (found.images[~valid] == 0).all()
+def test_what_is_said_of_samples(found: Curves) -> None:
+    assert (found.number.diff() <= 0).all()
     assert torch.isfinite(found.sigma).all()
-    assert 0.1 * PIXEL < found.sigma[valid].median() < 3 * PIXEL
-    assert (found.curve.number.diff() <= 0).all()
+    assert 0.1 * PIXEL < found.sigma.median() < 3 * PIXEL
+    assert found.color.min() >= 0
+    assert found.color.max() <= 1
+    # Edges in most images that see a curve, on its image and square to it.
+    support = found.support()
+    assert (support >= 3).float().mean() > 0.99
+    assert support.double().mean() > 0.4 * VIEWS
+    y = project_points(orbit(VIEWS)[found.view], found.X[found.sample, None], camera(VIEWS)[found.view])[:, 0]
+    across = ((y - found.x) * found.normal).sum(-1)
+    assert across.abs().mean() < 0.3
+    ahead = found.X + 0.1 * PIXEL * found.tangents()
+    y = project_points(orbit(VIEWS)[found.view], ahead[found.sample, None], camera(VIEWS)[found.view])[:, 0] - y
+    assert ((y * found.normal).sum(-1).abs() < 0.6 * y.norm(dim=-1)).all()
 
 
-def test_splines_stay_near_the_samples(found: CurveReconstruction) -> None:
+def test_splines_stay_near_the_samples(found: Curves) -> None:
     splines = found.splines(PIXEL)
     t = torch.linspace(0, 1, 400, dtype=torch.float64)
     for i, spline in enumerate(splines):
-        x = found.curve.x[i, : int(found.curve.number[i])]
-        assert spline.closed == bool(found.curve.closed[i])
+        x = found.X[found.curve == i]
+        assert spline.closed == bool(found.closed[i])
         assert torch.cdist(x, spline.at(t)).amin(-1).max() < 3 * PIXEL
         assert len(spline.control) <= max(4, len(x))
 
 
-def test_the_world_may_be_another_one(images: list[Tensor], found: CurveReconstruction, generator: torch.Generator) -> None:
+def test_the_world_may_be_another_one(images: list[Tensor], found: Curves, generator: torch.Generator) -> None:
     t = 10 * torch.randn(3, generator=generator, dtype=torch.float64)
     moved = Similarity(torch.tensor(0.02).double(), random_rotation(generator=generator, dtype=torch.float64), t)
     other = reconstruct_curves(images, camera(VIEWS), moved.transform_pose(orbit(VIEWS)))
@@ -82,7 +90,7 @@ def test_the_world_may_be_another_one(images: list[Tensor], found: CurveReconstr
     assert abs(len(mapped) - len(samples(other))) < 0.05 * len(mapped)
 
 
-def test_an_image_may_be_missing_and_lenses_may_distort(found: CurveReconstruction) -> None:
+def test_an_image_may_be_missing_and_lenses_may_distort(found: Curves) -> None:
     bent = Radial(torch.full((VIEWS,), -0.3).double(), torch.full((VIEWS,), 0.05).double())
     cameras = replace(camera(VIEWS), distortion=bent)
     some: list[Tensor | None] = list(photograph(orbit(VIEWS), cameras[0]))
@@ -98,7 +106,7 @@ def test_nothing_to_see(images: list[Tensor]) -> None:
     blank = [torch.full_like(image, 0.5) for image in images]
     for seen in (blank, [None] * VIEWS, [images[0], *blank[1:]]):
         none = reconstruct_curves(seen, camera(VIEWS), orbit(VIEWS))
-        assert none.curve.x.shape[0] == 0
+        assert len(none) == len(none.X) == len(none.x) == 0
         assert none.splines(1.0) == []
 
 

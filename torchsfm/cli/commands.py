@@ -147,6 +147,9 @@ def reconstruct(
     lines: Annotated[
         bool, typer.Option("--lines", help="Find straight lines too, and adjust cameras by points and lines together.")
     ] = False,
+    curves: Annotated[
+        bool, typer.Option("--curves", help="Find curves in space too, with the cameras found: from edges of the images.")
+    ] = False,
     max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
     max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,
     targets: Annotated[
@@ -185,6 +188,8 @@ def reconstruct(
             raise UserError("--for: wants a folder of images; torchsfm export has the option --images")
         if lines and matched is not None:
             raise UserError("--lines: wants images, in which line segments are found")
+        if curves and matched is not None:
+            raise UserError("--curves: wants images, in which edges are found")
         check_exports(out, targets or [])
         K = None if intrinsics is None else read_intrinsics(intrinsics)
         options = {
@@ -194,7 +199,7 @@ def reconstruct(
         if matched is not None:
             result = job.run_matched(matched, threads, **options)
         else:
-            result = job.run(images, threads, lines=lines, resume=started.begin(out, resume), **shown, **options)
+            result = job.run(images, threads, lines=lines, curves=curves, resume=started.begin(out, resume), **shown, **options)
         if K is not None and result.models:
             warn_about_intrinsics(K, result.models[0])
         finish(job, result, folder, {}, max_pixels)

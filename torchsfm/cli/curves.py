@@ -7,17 +7,18 @@ from typing import Annotated
 
 import torch
 import typer
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.cli.job import NOTHING, Job, UserError, told
 from torchsfm.cli.output import output_folder, replacing_results
-from torchsfm.formats import write_curves_json, write_curves_ply
+from torchsfm.formats import write_curves
 from torchsfm.formats.problem import as_reconstruction
 from torchsfm.formats.registry import read_model_or_problem
-from torchsfm.geometry import Camera
 from torchsfm.images import MAX_PIXELS, ImageError, read_image
 from torchsfm.plot import write_page
-from torchsfm.reconstruction import CurveReconstruction, Reconstruction, reconstruct_curves
+from torchsfm.reconstruction import Curves, Reconstruction, reconstruct_curves
+from torchsfm.reconstruction.find_curves import scaled
 from torchsfm.reconstruction.report import printable
 
 
@@ -47,22 +48,23 @@ def curves(
         known = known[torch.tensor(there)]
         files = [file for file, found in zip(files, there, strict=True) if found]
         read: list[bool] = []
+        share = shares(model.image_size[known], max_size)
         found = reconstruct_curves(
             photographs(files, max_size, max_pixels, read),
-            scaled(model, known, max_size),
+            scaled(model.cameras[model.camera_index[known]], share),
             model.poses[known],
             points=model.X[torch.isfinite(model.X).all(-1)],
             neighbours=neighbours,
             threshold=threshold,
             progress=job.progress,
         )
+        found = found.in_images(known, 1 / share)
         job.progress("write", 0, 1)
         with replacing_results(out) as folder:
             written = write(found, model, images, folder, max_pixels)
         job.progress("write", 1, 1)
         job.close()
-        number = len(found.curve.x)
-        length = float(found.curve.length.sum())
+        number, length = len(found), float(found.length().sum())
         typer.echo(f"{number} curves of length {length:.6g} in all, from {sum(read)} of {model.num_registered} images")
         job.voice.record.update(curves=number, length=length, files=[str(out / name) for name, _ in written])
         for name, what in written:
@@ -84,17 +86,11 @@ def load(path: Path) -> Reconstruction:
         raise UserError(" ".join(str(error).split())) from None
 
 
-def scaled(model: Reconstruction, known: Tensor, max_size: int) -> Camera:
-    """The cameras of images, for the size that they are read in."""
-    size = model.image_size[known].double()
+def shares(size: Int[Tensor, "v 2"], max_size: int) -> Float[Tensor, "v 2"]:
+    """How many pixels along x and y images are read in for one that they have."""
+    size = size.double()
     small = (size * (max_size / size.amax(-1, keepdim=True)).clamp(max=1)).round().clamp(min=1)
-    share = small / size
-    cameras = model.cameras[model.camera_index[known]]
-    K = cameras.K.clone()
-    # Pixel centres have whole coordinates.
-    K[:, :2] *= share[:, :, None].to(K)
-    K[:, :2, 2] += ((share - 1) / 2).to(K)
-    return replace(cameras, K=K)
+    return small / size
 
 
 def photographs(files: list[Path], max_size: int, max_pixels: int, read: list[bool]) -> Iterator[Tensor | None]:
@@ -111,22 +107,18 @@ def photographs(files: list[Path], max_size: int, max_pixels: int, read: list[bo
         yield pixels
 
 
-def write(
-    found: CurveReconstruction, model: Reconstruction, images: Path, folder: Path, max_pixels: int
-) -> list[tuple[str, str]]:
+def write(found: Curves, model: Reconstruction, images: Path, folder: Path, max_pixels: int) -> list[tuple[str, str]]:
     """Write the curves in all forms; names and what they are."""
-    samples = found.curve.x[found.curve.valid]
-    tolerance = float(found.sigma[found.curve.valid].median()) if len(samples) else 1.0
-    write_curves_ply(found.curve, folder / "curves.ply")
-    write_curves_json(found.splines(tolerance), folder / "curves.json")
+    write_curves(found, folder / "curves.ply")
+    write_curves(found, folder / "curves.json")
     none = torch.zeros(0, dtype=torch.long)
     # The page shows the samples as points that no image has observed.
     shown = replace(
-        model, X=samples.to(model.X), color=torch.full_like(samples, 0.5).to(model.X), x=model.x[:0], view=none, point=none
+        model, X=found.X.to(model.X), color=found.color.to(model.X), x=model.x[:0], view=none, point=none, curves=found
     )
-    write_page(shown, folder / "page.html", title="Curves", images=images, curves=found.curve, max_pixels=max_pixels)
+    write_page(shown, folder / "page.html", title="Curves", images=images, max_pixels=max_pixels)
     return [
         ("page.html", "open it in a browser and turn the curves with the mouse"),
-        ("curves.ply", "samples, and edges between them"),
-        ("curves.json", f"cubic B-splines, {tolerance:.3g} from the samples at most where these are dense"),
+        ("curves.ply", "samples, coloured, and edges between them"),
+        ("curves.json", "cubic B-splines"),
     ]

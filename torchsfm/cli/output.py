@@ -18,7 +18,7 @@ from torchsfm.reconstruction.files import HELD, PARTIAL, lock_file
 
 LOCK, WRITING, WRITTEN, ARRIVING = ".lock", ".writing", ".written", ".arriving"
 RESULTS = re.compile(
-    r"report\.(json|md)|page\.html|curves\.(ply|json)|(model|points|lines)(-\d+)?\.(npz|ply|txt)"
+    r"report\.(json|md)|page\.html|(model|points|lines|curves)(-\d+)?\.(npz|ply|txt|json)"
     r"|colmap(-\d+)?/((cameras|frames|images|points3D|rigs)\.bin|unregistered\.txt)"
 )
 """The files that a run leaves, as paths within the folder."""

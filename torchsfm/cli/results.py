@@ -13,7 +13,7 @@ import typer
 from torchsfm.cli.export import PHOTOGRAPHS
 from torchsfm.cli.job import NOTHING, Job
 from torchsfm.cli.output import replacing_results
-from torchsfm.formats import write_colmap, write_lines, write_ply
+from torchsfm.formats import write_colmap, write_curves, write_lines, write_ply
 from torchsfm.images import MAX_PIXELS
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import Reconstruction, SfmResult
@@ -61,7 +61,7 @@ def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path, ma
     """Write the page of all models, and each model in all formats that can hold it; return what to look at."""
     if not result.models:
         return []
-    total = 1 + 3 * len(result.models) + 2 * sum(model.lines is not None for model in result.models)
+    total = 1 + sum(3 + 2 * (model.lines is not None) + 2 * (model.curves is not None) for model in result.models)
     job.progress("write", 0, total)
     write_page(
         result.models,
@@ -81,8 +81,13 @@ def write_models(job: Job, result: SfmResult, folder: Path | None, out: Path, ma
         ("lines", ".ply", write_lines, "coloured lines for viewers"),
         ("lines", ".txt", write_lines, "the lines and the segments that show them, for torchsfm.formats.read_lines"),
     ]
+    of_curves: list[tuple[str, str, Callable[[Reconstruction, Path], Any], str]] = [
+        ("curves", ".ply", write_curves, "samples of the curves, coloured, and edges between them"),
+        ("curves", ".json", write_curves, "the curves as cubic B-splines"),
+    ]
     for i, model in enumerate(result.models):
-        for stem, suffix, write, what in formats + (of_lines if model.lines is not None else []):
+        wanted = formats + (of_lines if model.lines is not None else []) + (of_curves if model.curves is not None else [])
+        for stem, suffix, write, what in wanted:
             job.progress("write", len(written), total)
             name = f"{stem}{suffix}" if i == 0 else f"{stem}-{i}{suffix}"
             try:

@@ -5,7 +5,7 @@ from torchsfm.formats.bundler import read_bundler, write_bundler
 from torchsfm.formats.colmap import read_colmap, write_colmap
 from torchsfm.formats.colmap_database import read_database, write_database
 from torchsfm.formats.conics import read_conics, write_conics
-from torchsfm.formats.curves import write_curves_json, write_curves_ply
+from torchsfm.formats.curves import write_curves
 from torchsfm.formats.export import TARGETS, export_model
 from torchsfm.formats.gltf import write_gltf
 from torchsfm.formats.hloc import read_hloc
@@ -47,8 +47,7 @@ __all__ = [
     "write_bundler",
     "write_colmap",
     "write_conics",
-    "write_curves_json",
-    "write_curves_ply",
+    "write_curves",
     "write_database",
     "write_gltf",
     "write_kitti",

@@ -1,87 +1,90 @@
-"""Curves in space for other programs: PLY with edges between samples, JSON with splines."""
+"""Curves in space for other programs: PLY and OBJ with edges between samples, JSON with splines."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from torchsfm._types import check_tensors
-from torchsfm.geometry import Curve, Spline
 from torchsfm.reconstruction.files import whole_file
+from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.reconstruction import Reconstruction
 
 
-def write_curves_ply(curves: Curve, path: str | Path) -> None:
-    """Write space curves as binary little-endian PLY: their samples as vertices, in order, and edges from each to the next.
+def write_curves(curves: Curves | Reconstruction, path: str | Path) -> None:
+    """Write curves in space, in the format that the name ends with.
 
-    MeshLab, Blender and Open3D show them as lines; programs that know only points show the samples. A property `curve` of the
-    vertices says which curve it is.
+    `.ply` (binary) has the samples as coloured vertices, in order, and edges from each to the next: MeshLab, Blender and Open3D
+    show them as lines, programs that know only points show the samples. A property `curve` of the vertices says which curve it
+    is. `.obj` has coloured vertices and a line element `l` for each curve. `.json` has cubic B-splines, of each its degree,
+    knots and control points, as NURBS programs and SciPy take them; samples are no farther from them than half of the samples
+    are known to be, where they are dense enough to tell. The control points of a closed spline end with its first three once
+    more: its ends then meet smoothly.
 
     Args:
-        curves: The curves (c, n).
+        curves: The curves, or a model with some.
         path: File to write; its folder must be there.
 
     Raises:
-        ValueError: Wrong shape.
+        ValueError: The model has no curves, or the name ends otherwise.
         OSError: The file cannot be written.
 
     Example:
         >>> import torch, torchsfm
-        >>> t = torch.linspace(0, 6, 100)
-        >>> helix = torch.stack((t.cos(), t.sin(), t), -1)
-        >>> torchsfm.formats.write_curves_ply(torchsfm.geometry.curve_from_samples(helix[None]), "curves.ply")
+        >>> scene = torchsfm.render_sequence(views=3, width=96, height=72, generator=torch.Generator().manual_seed(0))
+        >>> found = torchsfm.reconstruction.reconstruct_curves(scene.images, scene.cameras, scene.poses, points=scene.X)
+        >>> torchsfm.write_curves(found, "curves.ply")
+        >>> len(torchsfm.read_ply("curves.ply").X) == len(found.X)
+        True
     """
-    check_tensors(x=(curves.x, "c n 3"), valid=(curves.valid, "c n: bool"), closed=(curves.closed, "c: bool"))
-    valid = curves.valid.cpu()
-    row, slot = valid.nonzero().unbind(-1)
-    number = valid.sum(-1)
-    first = number.cumsum(0) - number
-    after = torch.where(slot + 1 < number[row], slot + 1, 0)
-    there = (after > 0) | (curves.closed.cpu() & (number > 2))[row]
-    real = "<f8" if curves.x.dtype == torch.float64 else "<f4"
-    vertices = np.empty(len(row), dtype=[("x", real), ("y", real), ("z", real), ("curve", "<i4")])
-    x = curves.x.detach().cpu()[valid].numpy()
-    for i, axis in enumerate("xyz"):
-        vertices[axis] = x[:, i]
-    vertices["curve"] = row.numpy()
-    edges = np.empty(int(there.sum()), dtype=[("vertex1", "<i4"), ("vertex2", "<i4")])
-    edges["vertex1"] = (first[row] + slot)[there].numpy()
-    edges["vertex2"] = (first[row] + after)[there].numpy()
+    path = Path(path)
+    some = curves.curves if isinstance(curves, Reconstruction) else curves
+    if some is None:
+        raise ValueError("curves: wanted curves or a model with some, got a model in which none were looked for")
+    writers = {".ply": _ply, ".obj": _obj, ".json": _json}
+    if path.suffix not in writers:
+        raise ValueError(f"path: wanted a name that ends with one of {', '.join(writers)}, got {path.name!r}")
+    some = some.detached()
+    sound = torch.ones_like(some.closed).index_fill(0, some.curve[~some.X.isfinite().all(-1)], value=False)
+    content = writers[path.suffix](some.select(sound))
+    with whole_file(path) as file:
+        file.write(content)
+
+
+def _ply(curves: Curves) -> bytes:
+    real = "<f8" if curves.X.element_size() == 8 else "<f4"
+    columns = [(axis, real) for axis in "xyz"] + [("curve", "<i4")] + [(name, "u1") for name in ("red", "green", "blue")]
+    vertices = np.empty(len(curves.X), dtype=columns)
+    levels = (curves.color.nan_to_num(0).clamp(0, 1) * 255).round().numpy()
+    for i, (axis, channel) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+        vertices[axis], vertices[channel] = curves.X[:, i].numpy(), levels[:, i]
+    vertices["curve"] = curves.curve.numpy()
+    edges = curves.links().numpy().astype("<i4")
     word = "double" if real == "<f8" else "float"
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property {word} {axis}" for axis in "xyz"] + ["property int curve", f"element edge {len(edges)}"]
+    header += [f"property {word} {axis}" for axis in "xyz"] + ["property int curve"]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue")] + [f"element edge {len(edges)}"]
     header += ["property int vertex1", "property int vertex2", "end_header"]
-    with whole_file(path) as file:
-        file.write(("\n".join(header) + "\n").encode("ascii"))
-        file.write(vertices.tobytes())
-        file.write(edges.tobytes())
+    return ("\n".join(header) + "\n").encode("ascii") + vertices.tobytes() + edges.tobytes()
 
 
-def write_curves_json(splines: Sequence[Spline], path: str | Path) -> None:
-    """Write cubic B-splines as JSON: of each its degree, knots and control points, as NURBS programs and SciPy take them.
+def _obj(curves: Curves) -> bytes:
+    rows = ["# curves of a model: vertices with colours, and a line element for each curve"]
+    for x, shade in zip(curves.X.tolist(), curves.color.nan_to_num(0).clamp(0, 1).tolist(), strict=True):
+        rows.append("v " + " ".join(map(repr, [*x, *(round(c, 4) for c in shade)])))
+    first = 1
+    for number, closed in zip(curves.number.tolist(), curves.closed.tolist(), strict=True):
+        slots = list(range(first, first + number)) + ([first] if closed and number > 2 else [])
+        rows.append("l " + " ".join(map(str, slots)))
+        first += number
+    return ("\n".join(rows) + "\n").encode("ascii")
 
-    The control points of a closed spline end with its first three once more: its ends then meet smoothly.
 
-    Args:
-        splines: Splines, one each, with control points (k, 3).
-        path: File to write; its folder must be there.
-
-    Raises:
-        ValueError: Wrong shape.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import torch, torchsfm
-        >>> control = torch.tensor([[0.0, 0.0, 0.0], [1.0, 2.0, 0.0], [3.0, 2.0, 0.0], [4.0, 0.0, 0.0]])
-        >>> torchsfm.formats.write_curves_json([torchsfm.geometry.Spline(control, closed=False)], "curves.json")
-    """
+def _json(curves: Curves) -> bytes:
+    known = curves.sigma[curves.sigma.isfinite() & (curves.sigma > 0)]
     records = []
-    for spline in splines:
-        check_tensors(control=(spline.control, "k>=4 d"))
-        control = torch.cat((spline.control, spline.control[:3])) if spline.closed else spline.control
-        records.append(
-            {"closed": spline.closed, "degree": 3, "knots": spline.knots().tolist(), "control_points": control.tolist()}
-        )
-    with whole_file(path) as file:
-        file.write(json.dumps({"curves": records}, allow_nan=False).encode())
+    for spline in curves.splines(float(known.median()) if len(known) else 1.0):
+        control = spline.control.tolist()
+        control += control[:3] if spline.closed else []
+        records.append({"closed": spline.closed, "degree": 3, "knots": spline.knots().tolist(), "control_points": control})
+    return json.dumps({"curves": records}, allow_nan=False).encode()

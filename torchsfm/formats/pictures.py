@@ -30,6 +30,7 @@ def registered_only(model: Reconstruction) -> Reconstruction:
     seen = keep[model.view]
     lines = None if model.lines is None else segments_where(model.lines, keep[model.lines.view])
     conics = None if model.conics is None else model.conics.seen_where(keep[model.conics.view])
+    curves = None if model.curves is None else model.curves.seen_where(keep[model.curves.view])
     return replace(
         model,
         names=tuple(name for name, kept in zip(model.names, keep.tolist(), strict=True) if kept),
@@ -42,6 +43,7 @@ def registered_only(model: Reconstruction) -> Reconstruction:
         point=model.point[seen],
         lines=None if lines is None else replace(lines, view=number[lines.view]),
         conics=None if conics is None else replace(conics, view=number[conics.view]),
+        curves=None if curves is None else replace(curves, view=number[curves.view]),
     )
 
 
@@ -85,9 +87,13 @@ def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: boo
         ends, there = _moved(lines.x, lenses[index[lines.view]], pinholes[index[lines.view]])
         lines = segments_where(replace(lines, x=ends), there)
     conics = None if model.conics is None else model.conics.seen_where(torch.zeros_like(model.conics.view, dtype=torch.bool))
+    curves = model.curves
+    if curves is not None:
+        arcs, there = _moved(curves.arcs(), lenses[index[curves.view]], pinholes[index[curves.view]])
+        curves = curves.shown_as(arcs).seen_where(there)
     return replace(
         model, cameras=pinholes, camera_index=index, image_size=size[index], x=x[shown], view=model.view[shown],
-        point=model.point[shown], lines=lines, conics=conics,
+        point=model.point[shown], lines=lines, conics=conics, curves=curves,
     )  # fmt: skip
 
 

@@ -9,7 +9,6 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
-from torchsfm.geometry import Curve
 from torchsfm.images import MAX_PIXELS, read_image, save_image
 from torchsfm.plot.page_content import model_content, pairs_content
 from torchsfm.reconstruction.files import whole_file
@@ -30,7 +29,6 @@ def write_page(
     title: str = "Reconstruction",
     report: Report | None = None,
     images: str | Path | None = None,
-    curves: Curve | None = None,
     unit: str = "",
     thumbnail: int = 800,
     photo_bytes: int = 8_000_000,
@@ -38,11 +36,12 @@ def write_page(
 ) -> Path:
     """Write a self-contained interactive page of one model or of several.
 
-    It shows the coloured points, lines if there are any, and the cameras, upright, with axes and a scale bar; doubtful
-    cameras are marked. Distances can be measured between two points; clicking a point shows how every image saw it, clicking a
-    camera its image with the residuals; points can be coloured and filtered by track length and error; a table lists every
-    image, a matrix every pair. Mouse, touch and keys do the same. It needs a browser with WebGL 2 and nothing else. Points,
-    lines and cameras are stored as 32-bit floats, image points to 1/65535 of the image's size, residuals as 16-bit floats.
+    It shows the coloured points, lines and curves if there are any, and the cameras, upright, with axes and a scale bar;
+    doubtful cameras are marked. Distances can be measured between two points; clicking a point shows how every image saw it,
+    clicking a camera its image with the residuals; points can be coloured and filtered by track length and error; a table lists
+    every image, a matrix every pair. Mouse, touch and keys do the same. It needs a browser with WebGL 2 and nothing else.
+    Points, lines and cameras are stored as 32-bit floats, image points to 1/65535 of the image's size, residuals as 16-bit
+    floats.
 
     Args:
         reconstruction: The model, or models to choose from, the most interesting first.
@@ -51,7 +50,6 @@ def write_page(
         report: Tells why images were not registered, which pairs were compared, and of files that could not be read.
         images: Folder with the photographs under their names. If given, small copies are put into the page and shown at
             the cameras; photographs that cannot be read are left out.
-        curves: Curves in space (c, n) to draw with the first model.
         unit: Name of the models' unit of length, such as "m"; empty where their scale is arbitrary.
         thumbnail: Longer side of these copies in pixels, at most.
         photo_bytes: What all copies together may add to the page. Each may use an equal share and is made as small as that asks
@@ -90,9 +88,7 @@ def write_page(
         "unit": unit,
         "photos": photos,
         "pairs": None if report is None else pairs_content(report),
-        "models": [
-            model_content(model, number, report, len(models), None if number else curves) for number, model in enumerate(models)
-        ],
+        "models": [model_content(model, number, report, len(models)) for number, model in enumerate(models)],
     }
     # Inside a script element only "<" could end the data early.
     text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -11,15 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import Curve
 from torchsfm.plot.framing import Framing, frame
 from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Report
 from torchsfm.reconstruction.view_graph import Verdict
-
-_CURVES = torch.tensor([0.95, 0.55, 0.15])
-"""Red, green and blue of curves."""
 
 
 def _pack(tensor: Tensor, dtype: type[np.generic]) -> str:
@@ -39,9 +35,7 @@ def _quantile(values: Tensor, q: float) -> float:
     return float(ordered[min(len(ordered) - 1, int(q * len(ordered)))])
 
 
-def model_content(
-    model: Reconstruction, number: int, report: Report | None, count: int, curves: Curve | None
-) -> dict[str, Any]:
+def model_content(model: Reconstruction, number: int, report: Report | None, count: int) -> dict[str, Any]:
     """Everything the scripts need to draw model `number` of `count`."""
     model = model.to("cpu", torch.float64)
     # A camera with numbers that are not finite cannot be drawn.
@@ -82,7 +76,7 @@ def model_content(
         track = model.num_observations / max(model.num_points, 1)
         summary.append(f"{model.num_observations:,} observations, mean track {track:.1f}")
         summary.append(f"residuals: mean {float(residuals.mean()):.3g}, median {_quantile(residuals, 0.5):.3g} px")
-    strokes = _strokes(model, curves)
+    strokes = _strokes(model)
     summary += [stroke.summary for stroke in strokes.values()]
     ends = torch.cat([model.X.new_zeros(0, 2, 3), *(stroke.ends for stroke in strokes.values())])
     shades = torch.cat([model.X.new_zeros(0, 3), *(stroke.color for stroke in strokes.values())])
@@ -141,7 +135,7 @@ class _Stroke:
     summary: str
 
 
-def _strokes(model: Reconstruction, curves: Curve | None) -> dict[str, _Stroke]:
+def _strokes(model: Reconstruction) -> dict[str, _Stroke]:
     """Lines, ellipses and curves, those kinds that there are."""
     strokes: dict[str, _Stroke] = {}
     if model.lines is not None:
@@ -161,19 +155,15 @@ def _strokes(model: Reconstruction, curves: Curve | None) -> dict[str, _Stroke]:
             text += f", mean error {float(model.conic_residuals().nan_to_num().mean()):.3g} px"
         shades = conics.color.repeat_interleave(len(chords) // max(len(conics), 1), 0)
         strokes["ellipses"] = _Stroke(chords, shades, text)
-    if curves is not None:
-        pieces = _segments(curves).to(model.X)
-        strokes["curves"] = _Stroke(pieces, _CURVES.to(pieces).expand(len(pieces), 3), f"{len(curves.x):,} curves")
+    if model.curves is not None:
+        links = model.curves.links()
+        links = links[model.curves.X.isfinite().all(-1)[links].all(-1)]
+        text = f"{len(model.curves):,} curves"
+        if len(model.curves.x):
+            support = float(model.curves.support().double().mean())
+            text += f", in {support:.1f} images, mean error {float(model.curve_residuals().nan_to_num().mean()):.3g} px"
+        strokes["curves"] = _Stroke(model.curves.X[links], model.curves.color[links[:, 0]], text)
     return strokes
-
-
-def _segments(curves: Curve) -> Float[Tensor, "s 2 3"]:
-    """From each sample of curves to the next."""
-    x, valid, number = curves.x.detach().cpu(), curves.valid.cpu(), curves.number.cpu()
-    after = (torch.arange(x.shape[-2]) + 1) % number[:, None].clamp(min=1)
-    there = valid & ((after > 0) | curves.closed.cpu()[:, None])
-    following = x.gather(1, torch.where(valid, after, 0)[..., None].expand_as(x))
-    return torch.stack((x[there], following[there]), 1)
 
 
 def _frustum_size(model: Reconstruction, radius: float) -> float:

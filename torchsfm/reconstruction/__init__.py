@@ -3,11 +3,12 @@
 from torchsfm.reconstruction.alignment import Alignment, ControlPoints, align_models, align_to_points, align_to_positions
 from torchsfm.reconstruction.conics import Conics
 from torchsfm.reconstruction.control import ControlledModel, adjust_to_points
-from torchsfm.reconstruction.curves import CurveReconstruction, reconstruct_curves
+from torchsfm.reconstruction.curves import reconstruct_curves
 from torchsfm.reconstruction.gps import GpsAlignment, align_to_gps
 from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
+from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.models import reconstruct_tracks
 from torchsfm.reconstruction.photographs import reconstruct
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -22,7 +23,7 @@ __all__ = [
     "Conics",
     "ControlPoints",
     "ControlledModel",
-    "CurveReconstruction",
+    "Curves",
     "GpsAlignment",
     "ImageReport",
     "Levelling",

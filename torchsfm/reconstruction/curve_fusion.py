@@ -29,6 +29,8 @@ class FusedCurves(NamedTuple):
     """Which curve; those of one are in consecutive places, in order."""
     images: Int[Tensor, "n"]
     """From how many images' edges the sample was found."""
+    source: Int[Tensor, "n"]
+    """Of which sample of the pieces it is the mean with those near."""
     sigma: Float[Tensor, "n"]
     closed: Bool[Tensor, "c"]
 
@@ -78,6 +80,7 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
         X[index],
         curve.to(X.device),
         images[index],
+        index,
         pieces.sigma[index],
         torch.tensor(closed, dtype=torch.bool, device=X.device),
     )

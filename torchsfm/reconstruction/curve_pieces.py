@@ -36,6 +36,8 @@ class Pieces(NamedTuple):
     piece: Int[Tensor, "n"]
     image: Int[Tensor, "n"]
     """Whose edge it is."""
+    edge: Int[Tensor, "n"]
+    """Which edge point of that image."""
     sigma: Float[Tensor, "n"]
     """Standard deviation across the curve, in its worse direction, for noise of one pixel in every image."""
     pixel: Float[Tensor, "n"]
@@ -91,7 +93,7 @@ def image_pieces(
     own = points[0]
     rank = torch.arange(len(own.x), device=own.x.device)
     taken = (rank - torch.searchsorted(own.chain, own.chain)) % _EVERY == 0
-    own = EdgePoints(own.x[taken], own.tangent[taken], own.chain[taken])
+    own, edge = EdgePoints(own.x[taken], own.tangent[taken], own.chain[taken]), rank[taken]
     groups, offset = [], 0
     for part in _groups(own.chain):
         samples = _samples(EdgePoints(own.x[part], own.tangent[part], own.chain[part]), P[0])
@@ -105,7 +107,8 @@ def image_pieces(
         depth = torch.linalg.vector_norm(X[keep] - samples.centre, dim=-1)
         number = piece[keep] + offset
         pixel = depth / torch.linalg.vector_norm(P[0, 0, :3])
-        groups.append(Pieces(X[keep], number, torch.full_like(number, image), sigma[keep], pixel))
+        source = torch.zeros_like(piece).masked_scatter(there, edge[part])[keep]
+        groups.append(Pieces(X[keep], number, torch.full_like(number, image), source, sigma[keep], pixel))
         offset += len(length)
     return Pieces(*(torch.cat(field) for field in zip(*groups, strict=True)))
 

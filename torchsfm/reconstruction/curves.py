@@ -1,18 +1,19 @@
 """Curves in space from photographs with known cameras: edges, followed through the images around, fused, linked."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import check_options, check_tensors
-from torchsfm.geometry import Camera, Curve, Pose, Spline, fit_spline
-from torchsfm.images import Edges, detect_edges
-from torchsfm.reconstruction.curve_fusion import fuse_pieces, piece_tangents
+from torchsfm.geometry import Camera, Pose
+from torchsfm.reconstruction.curve_fusion import fuse_pieces
 from torchsfm.reconstruction.curve_pieces import Pieces, image_pieces
-from torchsfm.reconstruction.edge_maps import EdgePoints
+from torchsfm.reconstruction.curve_tracks import track_samples
+from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
 
 _ANGLE = 15.0
@@ -25,29 +26,6 @@ _AGREE = 4
 """Images, the followed one included, that must see a sample."""
 
 
-@dataclass(frozen=True)
-class CurveReconstruction:
-    """Curves in space, sample by sample.
-
-    See the example of `reconstruct_curves`.
-    """
-
-    curve: Curve
-    """The curves (c, n), the longest first."""
-    images: Int[Tensor, "c n"]
-    """From how many images' edges each sample was found; 0 in empty slots."""
-    sigma: Float[Tensor, "c n"]
-    """Standard deviation of each sample across the curve for noise of one pixel in the images that see it from one image's
-    edge; those of several images were averaged. 0 in empty slots."""
-
-    def splines(self, tolerance: float) -> list[Spline]:
-        """A cubic B-spline for each curve, of as few control points, by doubling, as leave no sample farther away than this."""
-        check_options(tolerance=(tolerance, "float > 0"))
-        return [
-            _spline(self.curve.x[i, : int(n)], bool(self.curve.closed[i]), tolerance) for i, n in enumerate(self.curve.number)
-        ]
-
-
 def reconstruct_curves(
     images: Iterable[Float[Tensor, "c h w"] | None],
     cameras: Camera,
@@ -58,7 +36,7 @@ def reconstruct_curves(
     threshold: float = 2.0,
     least_images: int = 3,
     progress: Progress | None = None,
-) -> CurveReconstruction:
+) -> Curves:
     """Find the curves in space that the edges of photographs are images of.
 
     The edges of each image, linked into curves, are followed through the images around it: along the ray of an edge point those
@@ -79,7 +57,7 @@ def reconstruct_curves(
         progress: Called as the work goes on.
 
     Returns:
-        The curves, in the world of the poses.
+        The curves, the longest first, in the world of the poses, with the edge points that show them.
 
     Raises:
         ValueError: Wrong shape, dtype, device or option; another number of images than of cameras.
@@ -89,8 +67,8 @@ def reconstruct_curves(
         >>> scene = torchsfm.render_sequence(views=3, width=96, height=72, generator=torch.Generator().manual_seed(0))
         >>> images, cameras, poses = scene.images, scene.cameras, scene.poses
         >>> found = torchsfm.reconstruction.reconstruct_curves(images, cameras, poses, points=scene.X)
-        >>> found.curve.x.shape[-1], len(found.curve.x) > 0
-        (3, True)
+        >>> found.X.shape[-1], len(found) > 0, bool((found.support() >= 2).float().mean() > 0.9)
+        (3, True, True)
     """
     check_tensors(K=(cameras.K, "3 3"), R=(poses.R, "3 3"), t=(poses.t, "3"))
     check_options(
@@ -102,23 +80,83 @@ def reconstruct_curves(
         raise ValueError(
             f"cameras, poses: wanted one of each for every image, got {tuple(cameras.K.shape[:-2])} and {tuple(poses.shape)}"
         )
-    edges, size = _edges(images, cameras, v, report)
+    edges = []
+    height = width = 8
+    for i, image in enumerate(images):
+        report("edges", i, v)
+        if i >= v:
+            raise ValueError(f"images: wanted {v}, as many as cameras, got more")
+        if image is not None:
+            height, width = max(height, image.shape[-2]), max(width, image.shape[-1])
+        edges.append(ImageEdges.none() if image is None else ImageEdges.of(image))
+    report("edges", v, v)
+    if len(edges) != v:
+        raise ValueError(f"images: wanted {v}, as many as cameras, got {len(edges)}")
+    return curves_of_edges(
+        edges, (height, width), cameras, poses, points=points, neighbours=neighbours, threshold=threshold,
+        least_images=least_images, progress=report,
+    )  # fmt: skip
+
+
+def curves_of_edges(
+    edges: Sequence[ImageEdges],
+    size: tuple[int, int],
+    cameras: Camera,
+    poses: Pose,
+    *,
+    points: Float[Tensor, "n 3"] | None,
+    neighbours: int = 10,
+    threshold: float = 2.0,
+    least_images: int = 3,
+    progress: Progress,
+) -> Curves:
+    """`reconstruct_curves` from the edges of images, of which `size` is the largest height and width."""
+    v = len(edges)
+    seen = [own.seen_by(cameras[i]) for i, own in enumerate(edges)]
+    kept, lines = [own for own, _ in seen], [straight for _, straight in seen]
     P = cameras.K.double() @ poses.matrix().double()
     around = neighbouring_views(P, size, None if points is None else points.double(), neighbours)
     pieces = []
     for i, near in enumerate(around):
-        report("follow", i, v)
-        near = [j for j in near if len(edges[j].x)]
-        if near and len(edges[i].x):
+        progress("follow", i, v)
+        near = [j for j in near if len(lines[j].x)]
+        if near and len(lines[i].x):
             views = [i, *near]
             agree = min(_AGREE, len(views))
             pieces.append(
                 image_pieces(
-                    i, [edges[j] for j in views], P[views], size, threshold=threshold, least_views=agree, shortest=_SHORTEST
+                    i, [lines[j] for j in views], P[views], size, threshold=threshold, least_views=agree, shortest=_SHORTEST
                 )
             )
-    report("follow", v, v)
-    return _packed(pieces, least_images, poses.R)
+    progress("follow", v, v)
+    if not sum(len(p.piece) for p in pieces):
+        return _no_curves(poses.R)
+    offset, shifted = 0, []
+    for p in pieces:
+        shifted.append(p._replace(piece=p.piece + offset))
+        offset += int(p.piece.amax()) + 1 if len(p.piece) else 0
+    together = Pieces(*(torch.cat(field) for field in zip(*shifted, strict=True)))
+    fused = fuse_pieces(together, least_images=least_images, shortest=_SHORTEST)
+    # The longest first.
+    number = torch.bincount(fused.curve, minlength=len(fused.closed))
+    order = number.argsort(descending=True, stable=True)
+    curve = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))[fused.curve]
+    moved = curve.argsort(stable=True)
+    X, source, like = fused.X[moved], fused.source[moved], poses.R
+    count = torch.tensor([len(own) for own in kept], device=like.device)
+    edge = together.edge[source] + (count.cumsum(0) - count)[together.image[source]]
+    color = torch.cat([own.color for own in kept])[edge]
+    curves = replace(
+        _no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
+        sigma=fused.sigma[moved].to(like),
+    )  # fmt: skip
+    return track_samples(curves, kept, lines, P, size, threshold)
+
+
+def _no_curves(like: Tensor) -> Curves:
+    none = like.new_zeros(0)
+    x, index = none.reshape(0, 2), none.long()
+    return Curves(none.reshape(0, 3), index, none.bool(), none.reshape(0, 3), none, x, x, none, none, index, index)
 
 
 def neighbouring_views(
@@ -165,80 +203,3 @@ def _depths(centres: Tensor, axes: Tensor, P: Tensor, size: tuple[int, int], poi
     scale = torch.linalg.vector_norm(P[:, 2, :3], dim=-1, keepdim=True)
     known = torch.where(inside, y[..., 2] / scale, torch.nan).nanmedian(-1).values
     return torch.where(known.isnan(), depth, known)
-
-
-def _edges(
-    images: Iterable[Tensor | None], cameras: Camera, v: int, report: Progress
-) -> tuple[list[EdgePoints], tuple[int, int]]:
-    """The edges of each image, without distortion, and the largest height and width."""
-    found: list[EdgePoints] = []
-    height = width = 8
-    for i, image in enumerate(images):
-        report("edges", i, v)
-        if i >= v:
-            raise ValueError(f"images: wanted {v}, as many as cameras, got more")
-        if image is None:
-            found.append(_straight(None, cameras[i]))
-            continue
-        height, width = max(height, image.shape[-2]), max(width, image.shape[-1])
-        found.append(_straight(detect_edges(image), cameras[i]))
-    report("edges", v, v)
-    if len(found) != v:
-        raise ValueError(f"images: wanted {v}, as many as cameras, got {len(found)}")
-    return found, (height, width)
-
-
-def _straight(edges: Edges | None, camera: Camera) -> EdgePoints:
-    """Edge points as a camera without distortion sees them."""
-    if edges is None:
-        none = torch.zeros(0, 2, dtype=torch.float64, device=camera.K.device)
-        return EdgePoints(none, none, torch.zeros(0, dtype=torch.long, device=camera.K.device))
-    n = int(edges.valid.sum())
-    d, valid = camera.unproject(edges.x[:n].to(camera.K))
-    y = d.double() @ camera.K.double().mT
-    good = valid & (d[:, 2] > 0.1)
-    x = y[good, :2] / y[good, 2:]
-    chain, out = edges.chain[:n][good], (~good).long().cumsum(0)[good]
-    # What is taken out of a chain leaves two.
-    new = torch.zeros_like(chain)
-    new[1:] = (chain[1:] != chain[:-1]) | (out[1:] != out[:-1])
-    chain = new.cumsum(0)
-    return EdgePoints(x, piece_tangents(x, chain), chain)
-
-
-def _packed(pieces: list[Pieces], least_images: int, like: Tensor) -> CurveReconstruction:
-    """The curves of all pieces, the longest first, of the dtype and on the device of a tensor."""
-    offset, shifted = 0, []
-    for p in pieces:
-        shifted.append(p._replace(piece=p.piece + offset))
-        offset += int(p.piece.amax()) + 1 if len(p.piece) else 0
-    if not offset:
-        none = like.new_zeros(0, 2)
-        return CurveReconstruction(Curve(like.new_zeros(0, 2, 3), none.bool(), none[:, 0].bool()), none.long(), none)
-    together = Pieces(*(torch.cat(field) for field in zip(*shifted, strict=True)))
-    fused = fuse_pieces(together, least_images=least_images, shortest=_SHORTEST)
-    number = torch.bincount(fused.curve, minlength=len(fused.closed))
-    order = number.argsort(descending=True, stable=True)
-    place = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
-    slot = torch.arange(len(fused.curve), device=order.device) - (number.cumsum(0) - number)[fused.curve]
-    row, most = place[fused.curve], int(number.amax()) if len(number) else 2
-
-    def lay(values: Tensor) -> Tensor:
-        out = values.new_zeros(len(number), most, *values.shape[1:])
-        out[row, slot] = values
-        return out
-
-    x, sigma = lay(fused.X).to(like.dtype), lay(fused.sigma).to(like.dtype)
-    return CurveReconstruction(
-        Curve(x, lay(torch.ones_like(fused.curve, dtype=torch.bool)), fused.closed[order]), lay(fused.images), sigma
-    )
-
-
-def _spline(x: Float[Tensor, "n 3"], closed: bool, tolerance: float) -> Spline:
-    curve = Curve(x, torch.ones(len(x), dtype=torch.bool, device=x.device), torch.tensor(closed, device=x.device))
-    controls = 4
-    while True:
-        spline, gap = fit_spline(curve, controls, closed=closed)
-        if float(gap.amax()) <= tolerance or 2 * controls > len(x):
-            return spline
-        controls *= 2

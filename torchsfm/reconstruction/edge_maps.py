@@ -40,10 +40,14 @@ class EdgeMaps:
 
     def near(self, y: Float[Tensor, "v *batch 2"]) -> Nearest:
         """The edge points nearest to points of each image, as far as a pixel's nearest tells."""
-        index = self.look_up(self.table, y, len(self.x) - 1)
+        index = self.nearest(y)
         tangent = self.tangent[index]
         away = y - self.x[index]
         return Nearest(away[..., 1] * tangent[..., 0] - away[..., 0] * tangent[..., 1], tangent)
+
+    def nearest(self, y: Float[Tensor, "v *batch 2"]) -> Int[Tensor, "v *batch"]:
+        """Which edge points these are; the last one, which is none, where none is near."""
+        return self.look_up(self.table, y, len(self.x) - 1)
 
     def closeness(self, threshold: float) -> Float[Tensor, "v h w"]:
         """The biweight of each pixel's distance from an edge: 1 on it, 0 beyond the threshold."""

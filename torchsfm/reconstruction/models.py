@@ -15,6 +15,7 @@ from torchsfm.reconstruction.adjust import LOSS
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.doubt import Standing, examine
+from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
 from torchsfm.reconstruction.global_start import global_start
 from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
@@ -54,6 +55,7 @@ def build_models(
     stages: Stages,
     progress: Progress,
     segments: Callable[[], FoundSegments] | None = None,
+    edges: Callable[[], FoundEdges] | None = None,
 ) -> SfmResult:
     """Reconstruct every component of a view graph.
 
@@ -73,6 +75,7 @@ def build_models(
         stages: Timing and saving.
         progress: Called as images are registered.
         segments: Finds the segments of all images where lines are wanted.
+        edges: Finds the edges of all images where curves are wanted.
     """
     if camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
@@ -136,13 +139,17 @@ def build_models(
             if segments is not None:
                 with stages.timed("lines"):
                     model, lines = find_lines(model, segments(), known.prior(model))
+            curves = None
+            if edges is not None:
+                with stages.timed("curves"):
+                    curves = find_curves(model, edges(), progress)
             if not found:
                 reasons |= failed
             taken = taken | model.registered
             standing = examine(
                 model, open_numbers=free, prior=known.prior(model), threshold=options.reprojection, uncertain=uncertain
             )
-            finished = replace(model.reconstruction(), lines=lines)
+            finished = replace(model.reconstruction(), lines=lines, curves=curves)
             found.append((finished, standing, calibration_of(model, known.prior(model), loss=LOSS)))
             if stages.folder is not None:
                 _save_model(found[-1][0], stages.folder, len(found) - 1)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS
+from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges
 from torchsfm.reconstruction.find_lines import FoundSegments
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all
 from torchsfm.reconstruction.masks import Masks
@@ -36,6 +37,7 @@ def reconstruct(
     free_principal_point: bool = True,
     method: str = "incremental",
     lines: bool = False,
+    curves: bool = False,
     masks: str | Path | None = None,
     max_features: int = 8192,
     max_pixels: int = MAX_PIXELS,
@@ -71,6 +73,8 @@ def reconstruct(
             focal length.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
+        curves: Find curves in space, too, with the cameras that have been found: edges of the photographs, followed through the
+            images around (`reconstruct_curves`). They are in `Reconstruction.curves`.
         masks: Folder of masks, in which nothing counts that is black: see `Masks` for their names. The mask of `view.jpg` is
             `view.jpg.png` or `view.png`.
         max_features: Features per image.
@@ -111,6 +115,11 @@ def reconstruct(
         found = seen.stages.run("segments", lambda: detect_all_segments(seen.points.files, max_pixels, report, seen.masks))
         return FoundSegments.of(found)
 
+    def edges() -> FoundEdges:
+        return FoundEdges.of(
+            seen.stages.run("edges", lambda: detect_all_edges(seen.points.files, max_pixels, report, seen.masks))
+        )
+
     result = build_models(
         seen.graph,
         None,
@@ -127,6 +136,7 @@ def reconstruct(
         stages=seen.stages,
         progress=report,
         segments=cache(segments) if lines else None,
+        edges=cache(edges) if curves else None,
     )
     return replace(result, report=replace(result.report, skipped=seen.skipped))
 

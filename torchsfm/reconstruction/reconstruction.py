@@ -12,11 +12,13 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.bundle.conics import ellipse_distances
+from torchsfm.bundle.curves import edge_distances
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, Similarity
 from torchsfm.reconstruction.conics import Conics
 from torchsfm.reconstruction.files import load_arrays, whole_file
 from torchsfm.reconstruction.lines import Lines
+from torchsfm.reconstruction.model_curves import Curves
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Reconstruction:
         point: Point of each observation.
         lines: Lines and the segments that show them, where lines were looked for.
         conics: Ellipses in space and the measured ones that show them, where there are some.
+        curves: Curves in space and the edge points that show them, where curves were looked for.
 
     Example:
         >>> import torch, torchsfm
@@ -65,6 +68,7 @@ class Reconstruction:
     point: Int[Tensor, "m"]
     lines: Lines | None = None
     conics: Conics | None = None
+    curves: Curves | None = None
 
     @property
     def num_registered(self) -> int:
@@ -127,6 +131,12 @@ class Reconstruction:
         apart = ellipse_distances(self.poses, self.cameras[self.camera_index], self.conics.bundle())
         return apart.square().mean(-1).sqrt()
 
+    def curve_residuals(self) -> Float[Tensor, "k"]:
+        """Distances of samples of curves from each edge point that shows them, across the edge, in pixels."""
+        if self.curves is None:
+            return self.X.new_zeros(0)
+        return edge_distances(self.poses, self.cameras[self.camera_index], self.curves.bundle()).abs()
+
     def transform(self, similarity: Similarity) -> "Reconstruction":
         """The same model in another world frame, `X' = s R X + t`; reprojections do not change."""
         poses = similarity.transform_pose(self.poses)
@@ -136,7 +146,8 @@ class Reconstruction:
         )
         lines = None if self.lines is None else self.lines.transform(similarity)
         conics = None if self.conics is None else self.conics.transform(similarity)
-        return replace(self, X=similarity.transform(self.X), poses=poses, lines=lines, conics=conics)
+        curves = None if self.curves is None else self.curves.transform(similarity)
+        return replace(self, X=similarity.transform(self.X), poses=poses, lines=lines, conics=conics, curves=curves)
 
     def summary(self) -> str:
         """A few lines for people: what was registered, how many points, how well they fit, the cameras found."""
@@ -155,6 +166,11 @@ class Reconstruction:
         if self.conics is not None and len(self.conics):
             views, error = self.conics.support().double().mean(), self.conic_residuals().mean()
             lines.append(f"{len(self.conics)} ellipses, in {views:.2f} images each, {error:.3f} px off")
+        if self.curves is not None and len(self.curves):
+            views, error = self.curves.support().double().mean(), self.curve_residuals().mean()
+            lines.append(
+                f"{len(self.curves)} curves, {len(self.curves.X)} samples, in {views:.2f} images each, {error:.3f} px off"
+            )
         used = torch.unique(self.camera_index[self.registered]).tolist()
         for index in used:
             camera = self.cameras[index]
@@ -174,7 +190,7 @@ class Reconstruction:
             for f in fields(self)
             if isinstance(getattr(self, f.name), Tensor)
         }
-        for prefix, some in (("line", self.lines), ("conic", self.conics)):
+        for prefix, some in (("line", self.lines), ("conic", self.conics), ("curve", self.curves)):
             if some is not None:
                 arrays |= {f"{prefix}_{f.name}": getattr(some, f.name).detach().cpu().numpy() for f in fields(some)}
         distortion = self.cameras.distortion
@@ -208,6 +224,7 @@ class Reconstruction:
         tensors = {name: torch.from_numpy(arrays[name]) for name in LAYOUT if name not in ("names", "camera_model")}
         lines = {name.removeprefix("line_"): torch.from_numpy(arrays[name]) for name in LINES if "line_ends" in arrays}
         conics = {name.removeprefix("conic_"): torch.from_numpy(arrays[name]) for name in CONICS if "conic_centre" in arrays}
+        curves = {name.removeprefix("curve_"): torch.from_numpy(arrays[name]) for name in CURVES if "curve_X" in arrays}
         distortion = DISTORTION_MODELS[str(arrays["camera_model"])].from_parameters(tensors.pop("camera_distortion"))
         return cls(
             names=tuple(arrays["names"].tolist()),
@@ -215,6 +232,7 @@ class Reconstruction:
             poses=Pose(tensors.pop("pose_R"), tensors.pop("pose_t")),
             lines=Lines(**lines) if lines else None,
             conics=Conics(**conics) if conics else None,
+            curves=Curves(**curves) if curves else None,
             **tensors,
         )
 
@@ -255,6 +273,20 @@ CONICS = {
     "conic_conic": ("q", "integers"),
 }
 """Those of a model with ellipses."""
+CURVES = {
+    "curve_X": ("s 3", "numbers"),
+    "curve_curve": ("s", "integers"),
+    "curve_closed": ("r", "yes or no"),
+    "curve_color": ("s 3", "numbers"),
+    "curve_sigma": ("s", "numbers"),
+    "curve_x": ("o 2", "numbers"),
+    "curve_normal": ("o 2", "numbers"),
+    "curve_curvature": ("o", "numbers"),
+    "curve_weight": ("o", "numbers"),
+    "curve_view": ("o", "integers"),
+    "curve_sample": ("o", "integers"),
+}
+"""Those of a model with curves."""
 KINDS = {"text": "U", "integers": "i", "numbers": "f", "yes or no": "b"}
 
 
@@ -265,7 +297,8 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
         ValueError: One is missing, has the wrong shape or type, is not finite where it must be, or points at what is not there.
     """
     sizes: dict[str, int] = {}
-    layout = LAYOUT | (LINES if "line_ends" in arrays else {}) | (CONICS if "conic_centre" in arrays else {})
+    others = {"line_ends": LINES, "conic_centre": CONICS, "curve_X": CURVES}
+    layout = LAYOUT | {name: what for first, some in others.items() if first in arrays for name, what in some.items()}
     for name, (shape, kind) in layout.items():
         if name not in arrays:
             raise ValueError(f"it has no array '{name}'")
@@ -283,11 +316,13 @@ def _check(arrays: dict[str, NDArray[Any]]) -> None:
     if model is None or model.num_parameters != sizes["p"]:
         raise ValueError(f"camera_model: there is no {str(arrays['camera_model'])[:40]!r} with {sizes['p']} parameters")
     limits = {"camera_index": "c", "view": "v", "point": "n", "line_view": "v", "line_line": "l"}
-    limits |= {"conic_view": "v", "conic_conic": "e"}
+    limits |= {"conic_view": "v", "conic_conic": "e", "curve_view": "v", "curve_sample": "s", "curve_curve": "r"}
     for name, limit in ((name, sizes[letter]) for name, letter in limits.items() if name in layout):
         bad = (arrays[name] < 0) | (arrays[name] >= limit)
         if bad.any():
             raise ValueError(f"{name}: there is no number {arrays[name][bad][0]} among {limit}")
+    if "curve_curve" in layout and (np.diff(arrays["curve_curve"]) < 0).any():
+        raise ValueError("curve_curve: not ascending")
     for name in ("camera_K", "camera_distortion", "pose_R", "pose_t"):
         rows = arrays[name][arrays["registered"]] if name.startswith("pose") else arrays[name]
         if not np.isfinite(rows).all():

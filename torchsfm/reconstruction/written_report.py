@@ -169,6 +169,7 @@ def _model_record(model: Reconstruction, found: Calibration | None) -> Record:
         "cameras": cameras,
         **adjustment,
         **_lines_record(model),
+        **_curves_record(model),
     }
 
 
@@ -180,6 +181,20 @@ def _lines_record(model: Reconstruction) -> Record:
         "lines": {
             "count": len(model.lines),
             "segments": len(model.lines.x),
+            "mean_images": float(support.double().mean()) if len(support) else 0.0,
+            "mean_error_px": float(apart.mean()) if len(apart) else 0.0,
+        }
+    }
+
+
+def _curves_record(model: Reconstruction) -> Record:
+    if model.curves is None:
+        return {}
+    support, apart = model.curves.support(), model.curve_residuals()
+    return {
+        "curves": {
+            "count": len(model.curves),
+            "samples": len(model.curves.X),
             "mean_images": float(support.double().mean()) if len(support) else 0.0,
             "mean_error_px": float(apart.mean()) if len(apart) else 0.0,
         }
@@ -204,6 +219,10 @@ def _models_text(record: Record) -> list[str]:
             rows.append(["lines", f"{found['count']:,} of {found['segments']:,} segments"])
             rows.append(["images of a line, mean", f"{found['mean_images']:.2f}"])
             rows.append(["ends of segments off their lines, mean", f"{found['mean_error_px']:.3f} px"])
+        if found := model.get("curves"):
+            rows.append(["curves", f"{found['count']:,} of {found['samples']:,} samples"])
+            rows.append(["images of a sample, mean", f"{found['mean_images']:.2f}"])
+            rows.append(["samples off the edges, mean", f"{found['mean_error_px']:.3f} px"])
         if "converged" in model:
             ending = "converged" if model["converged"] else "did not converge"
             rows.append(["last adjustment", f"{ending} in {model['adjustment_steps']} steps"])

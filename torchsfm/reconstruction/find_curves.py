@@ -1,0 +1,104 @@
+"""Curves after points: the edges of photographs are followed through the placed views."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.geometry import Camera
+from torchsfm.images import ImageError, read_image
+from torchsfm.reconstruction.curves import curves_of_edges
+from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.report import Progress
+from torchsfm.reconstruction.stages import Arrays
+
+EDGE_SIZE = 1600
+"""Longer side, in pixels, to which larger images are scaled down."""
+
+
+@dataclass(frozen=True)
+class FoundEdges:
+    """What `detect_all_edges` found."""
+
+    edges: tuple[ImageEdges, ...]
+    """Of each image, in pixels of the size that it was read in; none of one that could not be read."""
+    size: Int[Tensor, "v 2"]
+    """Width and height of that size."""
+    zoom: Float[Tensor, "v 2"]
+    """Pixels of the image for one of these, along x and y."""
+
+    @classmethod
+    def of(cls, arrays: Arrays) -> "FoundEdges":
+        """From saved tensors."""
+        counts = arrays["count"].tolist()
+        parts = zip(*(torch.split(arrays[field.name], counts) for field in fields(ImageEdges)), strict=True)
+        return cls(tuple(ImageEdges(*part) for part in parts), arrays["size"], arrays["zoom"])
+
+
+def detect_all_edges(files: Sequence[Path], max_pixels: int, progress: Progress, masks: Masks | None = None) -> Arrays:
+    """Edges of all files as tensors to save, those of a file after those of the one before; none of what cannot be read."""
+
+    def work(path: Path) -> tuple[ImageEdges, tuple[int, int], tuple[float, float]]:
+        try:
+            photo = read_image(path, max_size=EDGE_SIZE, max_pixels=max_pixels)
+        except ImageError:
+            return ImageEdges.none(), (1, 1), (1.0, 1.0)
+        found = ImageEdges.of(photo.pixels)
+        zoom = photo.size[0] / photo.width, photo.size[1] / photo.height
+        if masks is not None:
+            found = found.where(masks.admit(path, (found.x + 0.5) * torch.tensor(zoom) - 0.5, photo.size))
+        return found, (photo.width, photo.height), zoom
+
+    found: list[tuple[ImageEdges, tuple[int, int], tuple[float, float]]] = []
+    with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
+        for result in pool.map(work, files):
+            found.append(result)
+            progress("edges", len(found), len(files))
+    edges = [e for e, _, _ in found]
+    joined = {field.name: torch.cat([getattr(e, field.name) for e in edges]) for field in fields(ImageEdges)}
+    size, zoom = torch.tensor([s for _, s, _ in found]), torch.tensor([z for _, _, z in found], dtype=torch.float64)
+    return joined | {"count": torch.tensor([len(e) for e in edges]), "size": size, "zoom": zoom}
+
+
+def find_curves(mapping: Mapping, found: FoundEdges, progress: Progress) -> Curves:
+    """Find the curves in space of a finished model.
+
+    Args:
+        mapping: The model.
+        found: Edges of all its images.
+        progress: Called as the work goes on.
+
+    Returns:
+        The curves, and the edge points that show them in pixels of the images.
+    """
+    known = mapping.registered.nonzero()[:, 0]
+    zoom, size = found.zoom[known], found.size[known]
+    cameras = scaled(mapping.cameras[mapping.camera_index[known]], 1 / zoom)
+    points = mapping.X[_seen(mapping)]
+    height_width = (int(size[:, 1].amax()), int(size[:, 0].amax())) if len(known) else (8, 8)
+    edges = [found.edges[i] for i in known.tolist()]
+    curves = curves_of_edges(edges, height_width, cameras, mapping.poses[known], points=points, progress=progress)
+    return curves.in_images(known, zoom)
+
+
+def scaled(cameras: Camera, share: Float[Tensor, "v 2"]) -> Camera:
+    """Cameras of images that have so many times the pixels along x and y."""
+    K = cameras.K.clone()
+    # Pixel centres have whole coordinates.
+    K[:, :2] *= share[:, :, None].to(K)
+    K[:, :2, 2] += ((share - 1) / 2).to(K)
+    return replace(cameras, K=K)
+
+
+def _seen(mapping: Mapping) -> Bool[Tensor, "n"]:
+    """Points that views observe."""
+    seen = torch.zeros(len(mapping.X), dtype=torch.bool)
+    seen[mapping.point[mapping.observations()]] = True
+    return seen & mapping.X.isfinite().all(-1)
