@@ -12,9 +12,10 @@ import pytest
 import torch
 from browser import CHROMIUM, Browser
 
-from torchsfm.geometry import Pose
+from torchsfm.geometry import Curve, Pose
 from torchsfm.images import save_image
 from torchsfm.plot import write_page
+from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, Report
 from torchsfm.reconstruction.view_graph import Verdict
@@ -98,7 +99,7 @@ STATES = {
 }
 
 
-@pytest.mark.parametrize(("size", "touch"), [(WIDE, False), (PHONE, True)])
+@pytest.mark.parametrize(("size", "touch"), [(WIDE, False), (PHONE, True), (PHONE[::-1], True), ((960, 600), False)])
 def test_nothing_is_cut_off_or_covered(browser: Browser, page: Path, size: tuple[int, int], touch: bool) -> None:
     browser.open(page, size, touch=touch)
     for state, script in STATES.items():
@@ -203,6 +204,26 @@ def test_points_cameras_and_photographs_can_be_hidden(browser: Browser, page: Pa
     at = browser.run("projector()(...positionOf(0))")
     assert browser.run(f"pointAt({at[0]}, {at[1]}, 1e4)") == -1
     assert browser.run(f"cameraAt({at[0]}, {at[1]}, 1e4)") == -1
+
+
+def test_lines_and_curves_can_be_hidden_each_by_itself(browser: Browser, model: Reconstruction, tmp_path: Path) -> None:
+    none = torch.zeros(0, dtype=torch.long)
+    lines = Lines(
+        model.X[:20].reshape(10, 2, 3), model.color[:10], model.x.new_zeros(0, 2, 2), model.x.new_zeros(0), none, none
+    )
+    curves = Curve(model.X[40:60].reshape(2, 10, 3), torch.ones(2, 10, dtype=torch.bool), torch.zeros(2, dtype=torch.bool))
+    browser.open(write_page(replace(model, lines=lines), tmp_path / "page.html", curves=curves))
+    browser.run("$('points').click(), $('cameras').click()")
+    assert browser.run("[$('lines'), $('ellipses'), $('curves')].map(e => e.hidden)") == [False, True, False]
+    both = browser.run(INKED)
+    one = []
+    for kind in ("lines", "curves"):
+        browser.run(f"$('{kind}').click()")
+        one.append(browser.run(INKED))
+        browser.run(f"$('{kind}').click()")
+    assert 0 < min(one) <= max(one) < both <= sum(one)
+    browser.run("$('lines').click(), $('curves').click()")
+    assert browser.run(INKED) == 0
 
 
 def test_the_matrix_of_pairs_is_that_of_the_report(browser: Browser, model: Reconstruction, page: Path) -> None:
@@ -404,6 +425,15 @@ def test_names_stay_text_in_every_panel(browser: Browser, model: Reconstruction,
     listed = browser.run("[...document.querySelectorAll('td:first-child bdi')].map(e => e.textContent.replace('⚠ ', ''))")
     assert listed == list(EVIL)
     assert browser.complaints == []
+
+
+def test_scroll_bars_are_as_dark_as_the_page(browser: Browser, page: Path) -> None:
+    browser.open(page)
+    bars = "['#list', '#matter', '#panel'].map(s => getComputedStyle(document.querySelector(s)))"
+    bars += ".map(s => [s.colorScheme, Number(/\\d+/.exec(s.scrollbarColor))])"
+    assert all(scheme == "dark" and red < 90 for scheme, red in browser.run(bars))
+    browser.run("$('theme').click()")
+    assert all(scheme == "light" and red > 160 for scheme, red in browser.run(bars))
 
 
 def test_nothing_is_drawn_while_nothing_changes(browser: Browser, page: Path) -> None:

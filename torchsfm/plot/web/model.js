@@ -76,5 +76,5 @@ function mark(index) {  // the points that a camera sees
 // ---- numbers for people
 const brief = v => v < 10 ? v.toFixed(2) : v < 1e4 ? v.toFixed(0) : v.toExponential(0);
 const px = v => brief(v) + " px";
-const many = (count, what) => `${count.toLocaleString("en")} ${what}${count == 1 ? "" : "s"}`;
+const many = (count, one, more = one + "s") => `${count.toLocaleString("en")} ${count == 1 ? one : more}`;
 const length = v => `${Number((v * model.factor).toPrecision(4)).toString()} ${model.unit || "units"}`.replace(/^1 units$/, "1 unit");

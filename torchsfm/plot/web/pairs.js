@@ -44,7 +44,7 @@ function pairText(table, i, j) {
   if (i == j) return table.names[i];
   const cell = cellOf(table, i, j), [a, b] = [i, j].map(k => model.number.get(table.names[k]));
   const common = a !== undefined && b !== undefined ? `\n${many(shared(a, b), "point")} of this model in common` : "";
-  const found = !cell ? "not compared" : !cell.verdict ? "" : `${many(cell.matches, "match").replace("matchs", "matches")}, ${cell.inliers.toLocaleString("en")} agree\n${cell.refused ? "refused: too few agree" : `verified (${cell.verdict})`}`;
+  const found = !cell ? "not compared" : !cell.verdict ? "" : `${many(cell.matches, "match", "matches")}, ${cell.inliers.toLocaleString("en")} agree\n${cell.refused ? "refused: too few agree" : `verified (${cell.verdict})`}`;
   return `${table.names[i]} – ${table.names[j]}\n${found || "points in common only: this page was made without a report"}${common}`;
 }
 
@@ -81,8 +81,9 @@ function showPairs() {
     draw();
   };
   const under = event => { const box = face.getBoundingClientRect(); return [event.clientY - box.top, event.clientX - box.left].map(v => Math.max(0, Math.min(n - 1, Math.floor(v / box.width * n)))); };
-  face.onpointerdown = face.onpointermove = event => { if (event.type == "pointerdown" || event.pointerType == "mouse" && !event.buttons && !pinned) { pinned = event.type == "pointerdown" ? !pinned : pinned; go(...under(event)); } };
   let pinned = false;  // a click keeps the pair while the mouse goes to its buttons
+  face.onpointerdown = event => { pinned = !pinned; go(...under(event)); };
+  face.onpointermove = event => { if (event.pointerType == "mouse" && !pinned) go(...under(event)); };
   face.onkeydown = event => {
     const by = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key];
     if (by) { event.preventDefault(); go(...at.map((v, k) => Math.max(0, Math.min(n - 1, v + by[k])))); }

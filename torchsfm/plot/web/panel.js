@@ -93,7 +93,7 @@ $("model").onchange = () => load(+$("model").value);
 $("reset").onclick = () => leave(true);
 $("leave").onclick = () => leave(true);
 $("theme").onclick = () => { const root = document.documentElement; root.dataset.theme = root.dataset.theme == "dark" ? "light" : "dark"; draw(); };
-const narrow = matchMedia("(max-width: 720px)");  // the panel lies over the picture
+const narrow = matchMedia("(max-width: 900px)");  // the panel lies over the picture
 function showPanel(on) {
   document.body.classList.toggle("bare", !on);
   if (on && narrow.matches) closeDetails();
