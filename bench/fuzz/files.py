@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -44,9 +45,11 @@ from torchsfm.formats import (
     write_ply,
 )
 from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics, random_rotation
-from torchsfm.images import Photograph, parse_exif, read_image, save_image
+from torchsfm.images import Photograph, extract_frames, parse_exif, read_image, save_image
+from torchsfm.images.heif import heif_library
 from torchsfm.reconstruction import MatchedImages, Reconstruction
 from torchsfm.reconstruction.files import load_arrays
+from torchsfm.reconstruction.sources import Sources
 
 FILES_PER_TRIAL = 10
 MAX_SECONDS = 5.0
@@ -150,6 +153,8 @@ def _faults(found: Any) -> list[str]:
         case VggScene():
             tensors = {"x": found.x, "P": found.P, "X": found.X, "segments": found.segments, "L": found.L}
             return [f"{name} is not finite" for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]
+        case list():
+            return [fault for one in found for fault in _faults(one)]
         case PointCloud():
             return [] if found.X.ndim == 2 and found.X.shape[1] == 3 else [f"shape {tuple(found.X.shape)}"]
         case Photograph():
@@ -175,6 +180,24 @@ def _photograph(path: Path) -> Photograph:
     parse_exif(path.read_bytes())
     read_image(path, max_size=16, max_pixels=MAX_PIXELS)
     return read_image(path, max_pixels=MAX_PIXELS)
+
+
+def _listed(folder: Path) -> Sources:
+    return Sources.of(folder / "list.txt")
+
+
+def _frames(path: Path) -> list[Photograph]:
+    """The frames that a film gives."""
+    return [read_image(frame) for frame in extract_frames(path, path.with_name("frames"), max_pixels=MAX_PIXELS)]
+
+
+def _film(path: Path) -> bytes:
+    """A few frames; none where OpenCV writes no films."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 2.0, (32, 24))
+    for level in range(3):
+        writer.write(np.full((24, 32, 3), 80 * level, np.uint8))
+    writer.release()
+    return path.read_bytes() if path.exists() else b""
 
 
 def _in_zip(data: bytes, damage: Callable[[bytes], bytes]) -> bytes:
@@ -211,6 +234,16 @@ def _formats() -> list[Format]:
         write_nerfstudio(model, folder / "transforms.json")
         nerfstudio = _files(folder, "transforms.json") | _files(folder, "points.ply")
         formats.append(Format("nerfstudio", nerfstudio, read_model))
+        if heif_library() is not None:
+            heic = io.BytesIO()
+            heif_library().encode("RGB", (24, 20), bytes(range(240)) * 6, heic)
+            formats.append(Format("image.heic", {"a.heic": heic.getvalue()}, _photograph))
+        (folder / "photos").mkdir()
+        for name in ("a.jpg", "b c.jpg"):
+            (folder / "photos" / name).touch()
+        formats.append(Format("list of images", _files(folder, "photos") | {"list.txt": b"# both\na.jpg\nb c.jpg\n"}, _listed))
+        film = _film(folder / "a.avi")
+        formats += [Format("film", {"a.avi": film}, _frames)] if film else []
         K = model.cameras.K.clone()
         K[:, :2, 2] -= 0.5
         middle = replace(model, cameras=Camera(K, model.cameras.distortion))
@@ -220,6 +253,7 @@ def _formats() -> list[Format]:
             ("nvm", "model.nvm", straight),
             ("openmvg", "sfm_data.json", middle),
             ("opensfm", "reconstruction.json", middle),
+            ("kapture", "", replace(middle, names=("a.jpg", "b c.jpg", "d/e.jpg", "f.jpg"))),
         ):
             (folder / name).mkdir()
             write_model(one, folder / name / stem, name)
@@ -253,7 +287,9 @@ def _formats() -> list[Format]:
 def _files(folder: Path, name: str) -> Files:
     """A file, or all files of a folder."""
     path = folder / name
-    return {entry.name: entry.read_bytes() for entry in (sorted(path.iterdir()) if path.is_dir() else [path])}
+    if not path.is_dir():
+        return {path.name: path.read_bytes()}
+    return {entry.relative_to(path).as_posix(): entry.read_bytes() for entry in sorted(path.rglob("*")) if entry.is_file()}
 
 
 def _problem(g: torch.Generator) -> tuple[BundleProblem, Reconstruction]:

@@ -505,10 +505,10 @@ EXCEPTIONS: dict[str, str] = {
     "bundle.bundle_adjust_model": "hands a model to bundle_adjust",
     "cli.main": "a program; its options and files are tested in tests/test_cli.py",
     **{f"formats.read_{name}": FILES for name in (
-        "bal", "bundler", "colmap", "database", "hloc", "libmv", "model", "nerfstudio", "nvm", "openmvg", "opensfm", "ply",
-        "vgg")},
+        "bal", "bundler", "colmap", "database", "hloc", "kapture", "libmv", "model", "nerfstudio", "nvm", "openmvg", "opensfm",
+        "ply", "vgg")},
     **{f"formats.write_{name}": FILES for name in (
-        "bal", "bundler", "colmap", "curves", "database", "gltf", "kitti", "model", "nerfstudio", "nvm",
+        "bal", "bundler", "colmap", "curves", "database", "gltf", "kapture", "kitti", "model", "nerfstudio", "nvm",
         "openmvg", "opensfm", "ply", "tum")},
     **{f"formats.{name}_{what}": FILES for name in ("read", "write") for what in ("lines", "conics")},
     "formats.export_model": FILES,

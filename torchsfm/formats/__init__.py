@@ -9,6 +9,7 @@ from torchsfm.formats.curves import write_curves
 from torchsfm.formats.export import TARGETS, export_model
 from torchsfm.formats.gltf import write_gltf
 from torchsfm.formats.hloc import read_hloc
+from torchsfm.formats.kapture import read_kapture, write_kapture
 from torchsfm.formats.libmv import read_libmv
 from torchsfm.formats.lines import read_lines, write_lines
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
@@ -33,6 +34,7 @@ __all__ = [
     "read_conics",
     "read_database",
     "read_hloc",
+    "read_kapture",
     "read_libmv",
     "read_lines",
     "read_model",
@@ -50,6 +52,7 @@ __all__ = [
     "write_curves",
     "write_database",
     "write_gltf",
+    "write_kapture",
     "write_kitti",
     "write_lines",
     "write_model",

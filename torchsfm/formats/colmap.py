@@ -73,7 +73,7 @@ def write_colmap(
     keys = torch.cat([model.camera_index[:, None], model.image_size.to(model.camera_index.dtype)], -1)
     used, index = torch.unique(keys, dim=0, return_inverse=True)
     cameras = {
-        i: ColmapCamera(*_colmap_parameters(model.cameras[camera], camera, (width, height), models))
+        i: ColmapCamera(*colmap_parameters(model.cameras[camera], camera, (width, height), models))
         for i, (camera, width, height) in enumerate(used.tolist(), start=1)
     }
     camera_ids = (index + 1).tolist()
@@ -206,7 +206,7 @@ def _read_files(folder: Path) -> ColmapModel:
     raise ValueError(f"{folder} does not hold a COLMAP model (cameras, images and points3D, as .bin or .txt)")
 
 
-def _colmap_parameters(
+def colmap_parameters(
     camera: Camera, index: int, size: tuple[int, int], models: Collection[str]
 ) -> tuple[str, int, int, tuple[float, ...]]:
     """Choose the COLMAP model that holds a camera exactly: its name, the size of the images, the parameters."""
@@ -230,18 +230,24 @@ def _colmap_parameters(
 
 def _cameras_from_colmap(cameras: dict[int, ColmapCamera]) -> Camera:
     """Join cameras into one batch, of the first distortion model that holds them all."""
-    lenses = []
-    for camera_id, camera in cameras.items():
-        known = [model for model in DISTORTION_MODELS.values() if camera.model in model.colmap]
-        if not known:
-            raise ValueError(f"camera {camera_id} has COLMAP's model {camera.model}, which has no equal here")
-        _, focals, names = PARAMETERS[camera.model]
-        fx, fy, cx, cy, *rest = camera.parameters[: 2 - focals] + camera.parameters
-        values = dict(zip(names, rest, strict=True))
-        if lost := [name for name, value in values.items() if value != 0 and name not in known[0].parameter_names]:
-            raise ValueError(f"camera {camera_id} is a {camera.model} with {' and '.join(lost)}, which has no equal here")
-        lenses.append(Lens((fx, fy), (cx - HALF_PIXEL, cy - HALF_PIXEL), known[0], values))
-    return join_cameras(lenses)
+    return join_cameras([lens_from_colmap(camera, str(camera_id)) for camera_id, camera in cameras.items()])
+
+
+def lens_from_colmap(camera: ColmapCamera, name: str) -> Lens:
+    """What a camera of COLMAP is here.
+
+    Raises:
+        ValueError: It has no equal, which the message says of the camera of this name.
+    """
+    known = [model for model in DISTORTION_MODELS.values() if camera.model in model.colmap]
+    if not known:
+        raise ValueError(f"camera {name} has COLMAP's model {camera.model}, which has no equal here")
+    _, focals, names = PARAMETERS[camera.model]
+    fx, fy, cx, cy, *rest = camera.parameters[: 2 - focals] + camera.parameters
+    values = dict(zip(names, rest, strict=True))
+    if lost := [key for key, value in values.items() if value != 0 and key not in known[0].parameter_names]:
+        raise ValueError(f"camera {name} is a {camera.model} with {' and '.join(lost)}, which has no equal here")
+    return Lens((fx, fy), (cx - HALF_PIXEL, cy - HALF_PIXEL), known[0], values)
 
 
 def _read_unregistered(path: Path, camera_of: dict[int, int]) -> dict[int, tuple[int, str]]:

@@ -15,6 +15,7 @@ from torchsfm.formats.bal import read_bal, write_bal
 from torchsfm.formats.bundler import read_bundler, write_bundler
 from torchsfm.formats.colmap import TABLES, read_colmap, write_colmap
 from torchsfm.formats.gltf import write_gltf
+from torchsfm.formats.kapture import read_kapture, write_kapture
 from torchsfm.formats.libmv import read_libmv
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchsfm.formats.nvm import read_nvm, write_nvm
@@ -42,6 +43,8 @@ class Format:
     write: Callable[[Reconstruction, Path], None] | None = None
     marks: re.Pattern[bytes] | None = None
     """What the first bytes of a file match that is of this format."""
+    within: str = ""
+    """The file by which a folder is known to be of this format."""
 
     def named(self, path: Path) -> bool:
         """Whether a file of this name is of the format."""
@@ -65,6 +68,7 @@ FORMATS: tuple[Format, ...] = (
     Format("bundler", "Bundler's bundle.out, with list.txt", ("bundle.out", ".out"), read_bundler, write_bundler,
            re.compile(rb"# Bundle")),
     Format("nvm", "VisualSFM's NVM_V3", ("model.nvm", ".nvm"), read_nvm, write_nvm, re.compile(rb"NVM_V3")),
+    Format("kapture", "a kapture dataset, a folder", (), read_kapture, write_kapture, within="sensors/sensors.txt"),
     Format("gltf", "points and cameras as binary glTF", (".glb",), None, write_gltf),
     Format("tum", "camera poses in the form of TUM", (".tum",), None, write_tum),
     Format("kitti", "camera poses in the form of KITTI", (".kitti",), None, write_kitti),
@@ -113,6 +117,8 @@ def _within(folder: Path) -> list[tuple[Format, Path]]:
     if tables:
         return [(FORMATS_BY_NAME["colmap"], place) for place in tables]
     for kind in FORMATS:
+        if kind.within and (folder / kind.within).is_file():
+            return [(kind, folder)]
         if kind.marks is not None:
             files = [path for path in sorted(folder.iterdir()) if path.name in kind.files and path.is_file()]
             if files:
