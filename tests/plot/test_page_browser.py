@@ -12,10 +12,11 @@ import pytest
 import torch
 from browser import CHROMIUM, Browser
 
-from torchsfm.geometry import Curve, Pose
+from torchsfm.geometry import Pose
 from torchsfm.images import save_image
 from torchsfm.plot import write_page
 from torchsfm.reconstruction.lines import Lines
+from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, Report
 from torchsfm.reconstruction.view_graph import Verdict
@@ -211,8 +212,13 @@ def test_lines_and_curves_can_be_hidden_each_by_itself(browser: Browser, model: 
     lines = Lines(
         model.X[:20].reshape(10, 2, 3), model.color[:10], model.x.new_zeros(0, 2, 2), model.x.new_zeros(0), none, none
     )
-    curves = Curve(model.X[40:60].reshape(2, 10, 3), torch.ones(2, 10, dtype=torch.bool), torch.zeros(2, dtype=torch.bool))
-    browser.open(write_page(replace(model, lines=lines), tmp_path / "page.html", curves=curves))
+    empty = model.x.new_zeros(0)
+    curves = Curves(
+        X=model.X[40:60], curve=torch.arange(20) // 10, closed=torch.zeros(2, dtype=torch.bool), color=model.color[40:60],
+        sigma=model.x.new_ones(20), x=model.x.new_zeros(0, 2), normal=model.x.new_zeros(0, 2), curvature=empty, weight=empty,
+        view=none, sample=none,
+    )  # fmt: skip
+    browser.open(write_page(replace(model, lines=lines, curves=curves), tmp_path / "page.html"))
     browser.run("$('points').click(), $('cameras').click()")
     assert browser.run("[$('lines'), $('ellipses'), $('curves')].map(e => e.hidden)") == [False, True, False]
     both = browser.run(INKED)
