@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import pluecker_from_points, random_rotation, rotation_angle, rotation_from_rotvec
+from torchsfm.motion import TrifocalEstimator
 from torchsfm.tensors import trifocal_from_cameras
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -121,6 +122,31 @@ def _three_views(kind: type, batch: tuple[int, ...], n: int, generator: torch.Ge
     H[:3, :3] = K.inverse()
     model = canonical_frame((torch.stack(P, -3) @ H)[..., 1:, :, :], signed=False)[..., 1:, :, :]
     return Scene(kind(), tuple(x), model, _tensor_error, _wrong_last_of_three, noise)
+
+
+def _three_views_with_lines(kind: type, batch: tuple[int, ...], n: int, generator: torch.Generator, noise: float) -> Scene:
+    """Of seven data four are points, of more as many as not; every view has a piece of its own of each line."""
+    scene = _three_views(TrifocalEstimator, batch, 3 * n, generator, 0.0)
+    order = torch.rand(*batch, n, generator=generator, dtype=torch.float64).argsort(-1)[..., None]
+    line = order >= 4 if n == 7 else order % 2 == 0
+    data = []
+    for x in scene.data:
+        point, a, b = x.unflatten(-2, (3, n)).unbind(-3)
+        cut = 0.3 * torch.rand(2, *batch, n, 1, generator=generator, dtype=torch.float64)
+        point = point + noise * torch.randn(point.shape, generator=generator, dtype=torch.float64)
+        ends = torch.cat((a + cut[0] * (b - a), b + cut[1] * (a - b)), -1)
+        ends = ends + noise * torch.randn(ends.shape, generator=generator, dtype=torch.float64)
+        data.append(torch.where(line, ends, torch.cat((point, point), -1)))
+    return Scene(kind(), (*data, line.double()), scene.model, _tensor_error, _wrong_pieces, noise)
+
+
+def _wrong_pieces(data: tuple[Tensor, ...], wrong: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Spread points and segments of the second or of the third image over it."""
+    *views, kind = data
+    half = torch.rand(wrong.shape, generator=generator) < 0.5
+    for i, hit in ((1, wrong & half), (2, wrong & ~half)):
+        views[i] = _wrong_segments((views[i], views[i], kind), hit, generator)[0]
+    return *views, kind
 
 
 def _tensor_error(A: Tensor, B: Tensor) -> Tensor:
@@ -243,6 +269,7 @@ _SCENES: dict[str, Callable[..., Scene]] = {
     "relative_pose": _two_views,
     "upright_pose": _two_views,
     "homography": _plane,
+    "point_line_trifocal": _three_views_with_lines,
     "trifocal": _three_views,
     "camera": _camera,
     "point_line_camera": _point_line_camera,

@@ -10,6 +10,9 @@ from bench.cases import scenes
 from bench.cases.case import Case, Sample, up_to_scale
 from bench.cases.scenes import K
 from torchsfm import Solutions, Status, quadrifocal_6pt, trifocal_6pt, trifocal_7pt
+from torchsfm.geometry import line_from_points
+from torchsfm.motion import trifocal_4p3l
+from torchsfm.motion.three_views.trifocal_4p3l import equations as equations_of_points_and_lines
 from torchsfm.motion.three_views.trifocal_6pt import equations
 from torchsfm.tensors import (
     quadrifocal_from_cameras,
@@ -29,6 +32,13 @@ def image_points(v: int, n: int) -> Scene:
         return (x.to(dtype),), K @ torch.cat((R, t[..., None]), -1)
 
     return scene
+
+
+def points_and_lines(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+    """Four points and three lines in three images, and the cameras."""
+    (x,), P = image_points(3, 10)(family, batch, generator, torch.float64)
+    l = line_from_points(x[..., 4:7, :], x[..., 7:, :])  # noqa: E741
+    return (x[..., :4, :].to(dtype), l.to(dtype)), P
 
 
 def tensor_error(models: Tensor, truth: Tensor) -> Tensor:
@@ -52,6 +62,16 @@ def cameras_of(door: Callable[[Tensor], Any]) -> Callable[..., Solutions[Tensor]
 FAMILIES = scenes.HARD
 
 CASES: tuple[Case, ...] = (
+    Case(
+        "trifocal_4p3l",
+        size=7,
+        slots=3,
+        solve=trifocal_4p3l,
+        scene=points_and_lines,
+        error=tensor_error,
+        families=FAMILIES,
+        equations=equations_of_points_and_lines,
+    ),
     Case(
         "trifocal_6pt",
         size=6,

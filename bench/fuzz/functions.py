@@ -370,7 +370,13 @@ FUNCTIONS: dict[str, Function] = {
     "motion.estimate_fundamentals": Function({"threshold": 2.0, "generator": _generator, "slots": 2}, {"n": 30}),
     "motion.estimate_homographies": Function({"threshold": 2.0, "generator": _generator, "slots": 2}, {"n": 30}, planar=True),
     "motion.estimate_homography": Function(ROBUST, {"n": 30}, planar=True),
-    "motion.estimate_trifocal": Function(ROBUST, {"n": 30}),
+    "motion.estimate_trifocal": Function(
+        ROBUST
+        | {"l": _sometimes_lines(lambda s: _all_segments(s)[..., :3, :, :, :])}
+        | {"mask": lambda s: _of_each(s, 30) < 0.95, "weights": lambda s: _of_each(s, 30)}
+        | {"quality": lambda s: None if s.generator.initial_seed() % 3 else _of_each(s, 30)},
+        {"n": 30},
+    ),
     "motion.estimate_upright": Function(RAYS, {"n": 30}),
     "motion.factorize_affine": Function({"max_iterations": 20}),
     "motion.factorize_curves": Function({"curves": _images_of_curves, "samples": 16, "oriented": True, "aligned": True}),

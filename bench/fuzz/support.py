@@ -21,6 +21,7 @@ from torchsfm.geometry import (
     to_homogeneous,
 )
 from torchsfm.motion import HomographyEstimator, TrifocalEstimator
+from torchsfm.motion.three_views.line_reprojection import squared_line_distance
 
 Arguments = Mapping[str, Any]
 Judge = Callable[[Any, Arguments], Iterator[str]]
@@ -146,7 +147,11 @@ def _three_views(P: Tensor, a: Arguments) -> Tensor:
     """Whatever the signs of the cameras, which the frame of `canonical_cameras` does not keep."""
     signs = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]], dtype=P.dtype)[..., None, None]
     x = [v[..., None, :, :] for v in a["x"].unbind(-3)]
-    return TrifocalEstimator().squared_residual(signs * P[..., None, 1:, :, :], *x).amin(-2).sqrt()
+    squared = TrifocalEstimator().squared_residual(signs * P[..., None, 1:, :, :], *x).amin(-2)
+    if a.get("l") is not None:
+        ends = [list(v.flatten(-2).unbind(-1)) for v in a["l"].unbind(-4)]
+        squared = torch.cat((squared, squared_line_distance(P[..., 1:, :, :], ends)), -1)
+    return squared.sqrt()
 
 
 def _projections(P: Tensor, a: Arguments) -> Tensor:

@@ -7,6 +7,8 @@ from torchsfm.motion.many_views.factorization_points import Factorization, facto
 from torchsfm.motion.many_views.position_globally import GlobalPositions, position_globally
 from torchsfm.motion.many_views.quadrifocal_6pt import QuadrifocalFit, quadrifocal_6pt
 from torchsfm.motion.three_views.estimate_trifocal import TrifocalEstimator, estimate_trifocal
+from torchsfm.motion.three_views.point_line_trifocal import PointLineTrifocalEstimator
+from torchsfm.motion.three_views.trifocal_4p3l import trifocal_4p3l
 from torchsfm.motion.three_views.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.three_views.trifocal_7pt import TrifocalFit, trifocal_7pt
 from torchsfm.motion.two_views.essential_5pt import essential_5pt
@@ -32,7 +34,14 @@ from torchsfm.motion.two_views.relative_6pt_focal import FocalMotion, relative_6
 from torchsfm.motion.two_views.relative_known_rotation_2pt import relative_known_rotation_2pt
 from torchsfm.motion.two_views.relative_upright_3pt import relative_upright_3pt
 
-ESTIMATORS = (FundamentalEstimator, HomographyEstimator, RelativePoseEstimator, TrifocalEstimator, UprightPoseEstimator)
+ESTIMATORS = (
+    FundamentalEstimator,
+    HomographyEstimator,
+    PointLineTrifocalEstimator,
+    RelativePoseEstimator,
+    TrifocalEstimator,
+    UprightPoseEstimator,
+)
 """What `ransac` can estimate here; the contract tests and the benchmark run over them."""
 SOLVERS = (
     essential_5pt,
@@ -44,6 +53,7 @@ SOLVERS = (
     relative_6pt_focal,
     relative_known_rotation_2pt,
     relative_upright_3pt,
+    trifocal_4p3l,
     trifocal_6pt,
 )
 """What returns `Solutions` of a sample here; the contract tests run over them, on the scenes of `bench/cases/`."""
@@ -61,6 +71,7 @@ __all__ = [
     "GlobalPositions",
     "HomographyEstimator",
     "PlaneMotion",
+    "PointLineTrifocalEstimator",
     "QuadrifocalFit",
     "RelativePoseEstimator",
     "SelectedMotion",
@@ -93,6 +104,7 @@ __all__ = [
     "relative_6pt_focal",
     "relative_known_rotation_2pt",
     "relative_upright_3pt",
+    "trifocal_4p3l",
     "trifocal_6pt",
     "trifocal_7pt",
 ]

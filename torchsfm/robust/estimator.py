@@ -1,7 +1,7 @@
 """What robust estimation needs to know of a problem, and nothing more.
 
-`Estimator` is all that a problem must bring. `NeverZero`, `Differentiable`, `Diagnosed` and `WithAlternatives` say what it may
-bring besides, each by a few members; an estimator that has them is asked.
+`Estimator` is all that a problem must bring. `NeverZero`, `Mixed`, `Differentiable`, `Diagnosed` and `WithAlternatives` say
+what it may bring besides, each by a few members; an estimator that has them is asked.
 """
 
 from collections.abc import Callable
@@ -108,6 +108,28 @@ def is_never_zero(estimator: object) -> bool:
 
 
 _NEVER_ZERO: WeakKeyDictionary[type, bool] = WeakKeyDictionary()
+
+
+@runtime_checkable
+class Mixed(Protocol):
+    """An estimator whose data are of several kinds, of which a sample must hold so many each.
+
+    Samplers that know nothing better then draw such samples, one mixture after the other.
+
+    Example:
+        >>> import torchsfm
+        >>> torchsfm.motion.PointLineTrifocalEstimator().mixtures  # seven points, or four points and three lines
+        ((7, 0), (4, 3))
+    """
+
+    @property
+    def mixtures(self) -> tuple[tuple[int, ...], ...]:
+        """How many data of each kind, `sample_size` together; none where any sample will do."""
+        ...
+
+    def kinds(self, *data: Any) -> Int[Tensor, "*batch n"]:
+        """The kind of each datum, from 0 on."""
+        ...
 
 
 @runtime_checkable

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm.robust.estimator import Mixed
+from torchsfm.robust.mixtures import draw_mixtures, share_of_mixtures
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import draw_samples, draw_weighted, prosac_pools, uniform_numbers
 
@@ -48,6 +50,8 @@ class Sampler(Protocol):
 class Uniform:
     """Every sample is as likely as every other; with weights, a datum as likely as it counts.
 
+    Of data of several kinds (see `Mixed`) all samples of the same mixture are.
+
     Example:
         >>> import torch, torchsfm
         >>> g = torch.Generator().manual_seed(0)
@@ -59,6 +63,8 @@ class Uniform:
 
     def draw(self, problems: Problems, part: Tensor, drawn: Tensor, number: int, seed: int) -> Int[Tensor, "g m number"]:
         """Independent samples."""
+        if isinstance(problems.estimator, Mixed):
+            return draw_mixtures(problems, part, drawn, number, seed, problems.inside)
         size, count = problems.estimator.sample_size, problems.count[part]
         if problems.weight is None:
             return draw_samples(seed, count, drawn, number, size)
@@ -66,6 +72,8 @@ class Uniform:
 
     def needed(self, problems: Problems, near: Tensor, confidence: float) -> Float[Tensor, "p"]:
         """By the exact probability of such a sample."""
+        if isinstance(problems.estimator, Mixed):
+            return draws(share_of_mixtures(problems, near, problems.inside), confidence)
         size = problems.estimator.sample_size
         if problems.weight is None:
             share = share_of_samples(near.sum(-1, keepdim=True), problems.count[:, None], size)[:, 0]
@@ -181,6 +189,8 @@ class Among:
 
     def draw(self, problems: Problems, part: Tensor, drawn: Tensor, number: int, seed: int) -> Int[Tensor, "g m number"]:
         """Independent samples."""
+        if isinstance(problems.estimator, Mixed):
+            return draw_mixtures(problems, part, drawn, number, seed, self.chosen)
         chosen = self.chosen[part]
         ranking = chosen.to(torch.int8).argsort(dim=-1, descending=True, stable=True)
         pool = chosen.sum(-1, keepdim=True).expand(-1, number)
@@ -188,6 +198,8 @@ class Among:
 
     def needed(self, problems: Problems, near: Tensor, confidence: float) -> Float[Tensor, "p"]:
         """By the exact probability of such a sample."""
+        if isinstance(problems.estimator, Mixed):
+            return draws(share_of_mixtures(problems, near, self.chosen), confidence)
         size = problems.estimator.sample_size
         both = (near & self.chosen).sum(-1, keepdim=True)
         return draws(share_of_samples(both, self.chosen.sum(-1, keepdim=True), size)[:, 0], confidence)

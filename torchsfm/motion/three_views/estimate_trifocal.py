@@ -7,16 +7,25 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions
+from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.linalg import damped_solve
 from torchsfm.motion.three_views.multilinear_fit import frame_directions, free_directions, inverse_similarity
+from torchsfm.motion.three_views.point_line_trifocal import PointLineTrifocalEstimator
 from torchsfm.motion.three_views.three_view_parallax import alternatives_of_plane, planar, planar_suspected
 from torchsfm.motion.three_views.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.three_views.trifocal_reprojection import linear_depths, normal_equations, squared_distance
 from torchsfm.motion.two_views.collinear import collinear, collinear_suspected
 from torchsfm.motion.two_views.normalization import common_scale_of_views
 from torchsfm.motion.two_views.plane_and_parallax import more_than_chance, most_by_chance
-from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
+from torchsfm.robust import (
+    Degeneracy,
+    RansacOptions,
+    RobustResult,
+    Weigh,
+    check_counts,
+    check_door,
+    estimate_robustly,
+)
 from torchsfm.tensors import canonical_cameras
 from torchsfm.tensors.canonical import canonical_frame
 
@@ -163,29 +172,36 @@ def _rows(x: Tensor) -> list[Tensor]:
 
 def estimate_trifocal(
     x: Float[Tensor, "*#batch 3 n 2"],
+    l: Float[Tensor, "*#batch 3 k 2 2"] | None = None,  # noqa: E741
     *,
     threshold: float | Float[Tensor, "*#batch"] | None,
     **options: Unpack[RansacOptions],
 ) -> RobustResult[Float[Tensor, "*batch 3 3 4"]]:
-    """Three projective cameras for each triplet of images, from correspondences of which many may be wrong.
+    """Three projective cameras for each triplet of images, from points, and lines, of which many may be wrong.
 
     LO-RANSAC over six-point samples; where most inliers are in a plane, also over its homographies and pairs of points off it
     (as DEGENSAC does for two views); then a robust minimum of the reprojection error over the cameras and all points. Computed
     in float64, hypotheses scored in float32. `trifocal_from_cameras` makes the tensor of them. Points of one plane, or centres
     that coincide, leave the cameras open.
 
+    With lines a datum is a point or a line, all points before all lines: `mask`, `quality`, `weights` and the result's
+    `inliers` have n + k entries. Samples are of points, and of four points and three lines, by turns; where fewer than four
+    points are given, of thirteen lines, which cost many more samples where much is wrong.
+
     Args:
-        x: Points in the three images.
+        x: Points in the three images; there may be none with lines.
+        l: Segments of the same lines in the three images, two points each. They need not show the same piece of a line.
         threshold: Largest distance of an inlier, in the unit of the points: the root of the sum of squared distances in the
-            three images to those of one point in space. None where it is not known: more than half of the correspondences must
-            then be right (`LeastMedian`).
+            three images to those of one point in space; of a line, of all six ends of its segments from the images of one line.
+            None where it is not known: more than half of the correspondences must then be right (`LeastMedian`).
         **options: See `RansacOptions`.
 
     Returns:
         Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, support, iterations, status, degeneracy
         (PLANAR: homographies relate all inliers but so few as chance explains; COLLINEAR: so many are on a line in an image;
-        the cameras are then some of many), covariance (36 x 36, of rank 18). The cameras carry their derivatives with respect
-        to the inliers (see `ransac`).
+        with lines UNDETERMINED: a large change of the cameras is not seen by more than so few; the cameras are then some of
+        many), covariance (36 x 36, of rank 18). The cameras carry their derivatives with respect to the inliers (see
+        `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.
@@ -194,16 +210,46 @@ def estimate_trifocal(
         >>> import torch, torchsfm
         >>> g = torch.Generator().manual_seed(0)
         >>> X, P = torchsfm.random_points(100, generator=g), torchsfm.random_poses(3, generator=g).matrix()
-        >>> found = torchsfm.estimate_trifocal(torchsfm.project_points(P, X), threshold=1e-3, generator=g)
+        >>> x = torchsfm.project_points(P, X)
+        >>> found = torchsfm.estimate_trifocal(x, threshold=1e-3, generator=g)
         >>> bool(found.model.allclose(torchsfm.tensors.canonical_cameras(P), atol=1e-6))
         True
+        >>> segments = torch.stack((x[:, :40], x[:, 40:80]), -2)  # forty lines besides five points
+        >>> found = torchsfm.estimate_trifocal(x[:, 80:85], segments, threshold=1e-3, generator=g)
+        >>> found.inliers.sum(), bool(found.model.allclose(torchsfm.tensors.canonical_cameras(P), atol=1e-6))
+        (tensor(45), True)
     """
-    check_door({"x": (x, "3 n 2")}, threshold, options)
-    y, S, scale = common_scale_of_views(list(x.double().unbind(-3)), options.get("mask"))
+    data: dict[str, tuple[Tensor | None, str]] = {"x": (x, "3 n 2"), "l": (l, "?3 k 2 2")}
+    check_door(data, threshold, options, of_datum="n" if l is None else "m")
+    estimator: TrifocalEstimator | PointLineTrifocalEstimator
+    mask = options.get("mask")
+    if l is None:
+        rows, S, scale = common_scale_of_views(list(x.double().unbind(-3)), mask)
+        estimator = TrifocalEstimator()
+    else:
+        check_counts(x.shape[-2] + l.shape[-3], **{name: options.get(name) for name in ("mask", "quality", "weights")})  # type: ignore[arg-type]
+        rows, S, scale = _table(x.double(), l.double(), mask)
+        estimator = PointLineTrifocalEstimator(7 if x.shape[-2] >= 4 else 13)
     S_inverse = inverse_similarity(torch.stack(S, -3))
 
     def back(model: Tensor) -> Tensor:
         first = torch.eye(3, 4, dtype=model.dtype, device=model.device).expand(*model.shape[:-3], 1, 3, 4)
         return canonical_cameras(S_inverse @ torch.cat((first, model), -3))
 
-    return estimate_robustly(TrifocalEstimator(), *y, threshold=threshold, dtype=x.dtype, scale=scale, back=back, **options)
+    return estimate_robustly(estimator, *rows, threshold=threshold, dtype=x.dtype, scale=scale, back=back, **options)
+
+
+def _table(x: Tensor, l: Tensor, mask: Tensor | None) -> tuple[list[Tensor], list[Tensor], Tensor]:  # noqa: E741
+    """The rows of points and lines of moderate size around 0, and what they are; NaN for segments that are none."""
+    batch = broadcast_shapes(x.shape[:-3], l.shape[:-4])
+    n, k = x.shape[-2], l.shape[-3]
+    ends = l.expand(*batch, 3, k, 2, 2)
+    none = ((ends[..., 0, :] == ends[..., 1, :]).all(-1) | ~ends.isfinite().flatten(-2).all(-1)).any(-2)
+    ends = torch.where(none[..., None, :, None, None], torch.nan, ends)
+    # A line has two places in an image.
+    places = torch.cat((x.expand(*batch, 3, n, 2), ends[..., 0, :], ends[..., 1, :]), -2)
+    each = None if mask is None else torch.cat((mask, mask[..., n:]), -1)
+    views, S, scale = common_scale_of_views(list(places.unbind(-3)), each)
+    rows = [torch.cat((v[..., : n + k, :], torch.cat((v[..., :n, :], v[..., n + k :, :]), -2)), -1) for v in views]
+    kind = torch.cat((x.new_zeros(n, 1), x.new_ones(k, 1)))
+    return [*rows, kind], S, scale
