@@ -93,3 +93,26 @@ def test_a_few_bad_steps_do_not_hold_back_the_others(generator: torch.Generator)
     trial = schur.move(blocks, engine.layout, x, step)
     better = engine.shorten(x, step, trial)["p"]
     torch.testing.assert_close(better, offset)
+
+
+@pytest.mark.parametrize("eliminate", ["p", None])
+def test_no_derivative_along_a_flat_valley(eliminate: str | None, generator: torch.Generator) -> None:
+    """Two linked places between two far measurements: the answer follows these across the line they lie on, not along it."""
+    n = 12
+
+    def noise() -> Tensor:
+        return torch.randn(n, 2, generator=generator, dtype=F64)
+
+    start, along = 5 * noise(), torch.nn.functional.normalize(noise(), dim=-1)
+    a, b = start - 9 * along, start + 7 * along
+    blocks, each = {"p": Block(start + 0.1 * noise()), "q": Block(start + 0.1 * noise())}, torch.arange(n)
+    first = a.clone().requires_grad_()
+    far = [Term(lambda x, m: x - m, (name,), (each,), (m,), Huber(1.0)) for name, m in (("p", first), ("q", b))]
+    link = Term(lambda p, q: q - p, ("p", "q"), (each, each))
+    found = sparse_levenberg_marquardt(blocks, [*far, link], eliminate=eliminate)
+    k1, k2 = (1 / (found.x[name] - m).detach().norm(dim=1) for name, m in (("p", a), ("q", b)))
+    share = {"p": k1 * (k2 + 1) / (k1 + k2 + k1 * k2), "q": k1 / (k1 + k2 + k1 * k2)}
+    across = torch.eye(2, dtype=F64) - along[:, :, None] * along[:, None]
+    for name, k in ((name, k) for name in ("p", "q") for k in range(2)):
+        (slope,) = torch.autograd.grad(found.x[name][:, k].sum(), first, retain_graph=True)
+        torch.testing.assert_close(slope, share[name][:, None] * across[:, k], rtol=1e-4, atol=1e-5)

@@ -6,8 +6,14 @@ Blocks come as the distinct entries of their upper triangle row by row, each row
 import torch
 from torch import Tensor
 
+from torchsfm.linalg import eigh
+
 SPHERE = 1e-5
 """Share of a sphere in the measure of a step, small enough to leave points far away as free as others."""
+FLAT = 1e-6
+"""Of the Gauss-Newton curvature, a part that counts as none."""
+STIFF = 1e8
+"""In units of the Gauss-Newton curvature, one that nothing moves against."""
 Triangle = list[list[Tensor]]
 """Lower triangular factors, entry by entry, with the reciprocals of the diagonal in its place."""
 
@@ -40,6 +46,22 @@ def measure(V: Tensor, q: int) -> Tensor:
     for a in range(q):
         measured[place(a, a, q)] += round_
     return measured
+
+
+def hold(V: Tensor, metric: Tensor, q: int) -> None:
+    """Make blocks stiff, in place, along directions in which next to nothing is left of the curvature that `metric` has."""
+    measured = measure(metric, q)
+    _, curved = factor(V - FLAT * measured, q)
+    flat = (~curved).nonzero()[:, 0]
+    rows = torch.tensor([[place(min(a, b), max(a, b), q) for b in range(q)] for a in range(q)], device=V.device)
+    root = torch.linalg.cholesky_ex(measured[:, flat][rows].permute(2, 0, 1))[0]
+    half = torch.linalg.solve_triangular(root, V[:, flat][rows].permute(2, 0, 1), upper=False)
+    values, vectors, _ = eigh(torch.linalg.solve_triangular(root, half.mT, upper=False))
+    held = root @ (vectors * (values <= FLAT)[:, None])
+    stiff = STIFF * held @ held.mT
+    for a in range(q):
+        for b in range(a, q):
+            V[place(a, b, q), flat] += stiff[:, a, b]
 
 
 def product(V: Tensor, x: Tensor) -> Tensor:

@@ -96,8 +96,9 @@ def sparse_covariance(
             covariance[free] = torch.where(known[free][:, None, None], kept, covariance[free])
         found[name], determined[name], columns[name] = covariance, known, place
     families = zip(layout.families, inverse.determined, strict=True)
-    unknowns = layout.size - inverse.nullity + sum(int(good.sum()) * family.point_size for family, good in families)
-    return SparseCovariance(found, determined, inverse.kept, columns, inverse.nullity, rows - unknowns, squares)
+    nullity = layout.size - inverse.root.shape[1]
+    unknowns = layout.size - nullity + sum(int(good.sum()) * family.point_size for family, good in families)
+    return SparseCovariance(found, determined, inverse.kept, columns, nullity, rows - unknowns, squares)
 
 
 def marginal_covariance(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.linalg import eigh
-from torchsfm.optim.batched_cholesky import Triangle, backward, diagonal, factor, floor, forward, measure, place, product
+from torchsfm.optim.batched_cholesky import FLAT, Triangle, backward, diagonal, factor, floor, forward, measure, place, product
 from torchsfm.optim.descent import Step
 from torchsfm.optim.layout import Family, Layout
 from torchsfm.optim.retained_blocks import RetainedBlocks
@@ -135,8 +135,14 @@ class NormalEquations:
         kept = -scale * (vectors @ ((vectors.mT @ (scale * slope)) / values.abs().clamp_min(NULL)))
         return kept, ok & kept.isfinite().all()
 
-    def invert(self) -> "Inverse":
-        """The inverse without damping; its pseudo-inverse where a gauge is free."""
+    def invert(self, like: "Inverse | None" = None) -> "Inverse":
+        """The inverse without damping; its pseudo-inverse where a gauge is free.
+
+        Args:
+            like: For a system with exact second derivatives, the inverse of the Gauss-Newton one at the same place. What that
+                leaves out is left out, and so are directions in which next to nothing of the curvature is left: there the
+                minimum is not a single one (robust losses far from their centre).
+        """
         size = self.layout.size
         S = self.squares.dense()
         triangles: list[Triangle] = []
@@ -150,13 +156,16 @@ class NormalEquations:
             part.reduce(S, L, torch.zeros_like(pivots))
             triangles.append(L)
             determined.append(torch.stack([L[a][a] > 0 for a in range(part.q)]).all(0))
-        scale = floor(self.diagonal).rsqrt()
-        values, vectors, ok = eigh(scale[:, None] * S[:size, :size] * scale)
-        null = values <= NULL * values.amax(-1, keepdim=True) if size else values > 0
-        inverse = torch.where(null, 0.0, 1 / torch.where(null, 1.0, values))
-        vectors = scale[:, None] * vectors
-        kept = torch.where(ok, (vectors * inverse) @ vectors.mT, torch.inf)
-        return Inverse(self, triangles, kept, int(null.sum()), [known & ok for known in determined])
+        S = S[:size, :size]
+        if like is None:
+            scale = floor(self.diagonal).rsqrt()
+            values, vectors, ok = eigh(scale[:, None] * S * scale)
+            seen, vectors = values > NULL * values[-1:], scale[:, None] * vectors
+        else:
+            values, vectors, ok = eigh(like.root.mT @ (S.tril() + S.tril(-1).mT) @ like.root)
+            seen, vectors = values > FLAT, like.root @ vectors
+        root = torch.where(ok, vectors[:, seen] * values[seen].rsqrt(), torch.inf)
+        return Inverse(self, triangles, root, root @ root.mT, [known & ok for known in determined])
 
     def information(self, columns: Tensor) -> Tensor:
         """What the problem says of some retained variables: the system left when all other variables are eliminated.
@@ -219,10 +228,10 @@ class Inverse:
     system: NormalEquations
     triangles: list[Triangle]
     """The factors of each family's V."""
+    root: Tensor
+    """A root of `kept`, (size, rank)."""
     kept: Tensor
     """The inverse of the reduced system: the covariance of the retained variables, (size, size)."""
-    nullity: int
-    """Dimensions of the gauge."""
     determined: list[Tensor]
     """Which eliminated variables of each family the residuals determine, given the others."""
 

@@ -18,7 +18,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsfm.optim.batched_cholesky import backward, factor, forward, measure, place
+from torchsfm.optim.batched_cholesky import backward, factor, forward, hold, measure, place
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.normal_equations import Eliminated, NormalEquations
 from torchsfm.optim.retained_blocks import RetainedBlocks, Runs, find_runs
@@ -116,11 +116,11 @@ class Elimination:
             rows = [part.coupling for part in self.eliminated if isinstance(part.coupling, RowCoupling)]
             self.clusters = find_clusters(layout, rows)
 
-    def curve(self, x: dict[str, Tensor], system: NormalEquations) -> NormalEquations:
+    def curve(self, x: dict[str, Tensor], system: NormalEquations, *, minimum: bool = False) -> NormalEquations:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
 
         An eliminated variable between two minima of its own keeps its Gauss-Newton block: it must not hold back all others.
-        The system holds until the next call.
+        At a `minimum` it is held where the cost is flat along it. The system holds until the next call.
         """
         if self._exact is None:
             self._exact = Elimination(self.blocks, self.layout, "dense" if self.clusters is None else "pcg")
@@ -135,7 +135,10 @@ class Elimination:
             q = own.q
             for a in range(q):
                 own.V[place(a, q, q)] = given.V[place(a, q, q)]
-            own.V.copy_(torch.where(factor(own.V - BENT * measure(given.V, q), q)[1], own.V, given.V))
+            if minimum:
+                hold(own.V, given.V, q)
+            else:
+                own.V.copy_(torch.where(factor(own.V - BENT * measure(given.V, q), q)[1], own.V, given.V))
             eliminated.append(replace(own, metric=given.V))
         return replace(system, eliminated=eliminated, squares=exact.squares, curved=True)
 

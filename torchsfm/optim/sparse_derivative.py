@@ -3,7 +3,7 @@
 At the minimum the gradient g(x, inputs) vanishes, so `dx = -H^-1 dg/dinputs` (implicit function theorem). Backward takes one
 solution `u = H^-1 v` with the Schur complement, and then one derivative: of the slope of the cost along u with respect to all
 inputs. With a free gauge, u is the solution without a part along the gauge, so the derivative of anything that does not
-depend on the gauge is right, and nothing blows up.
+depend on the gauge is right, and nothing blows up. The same goes for directions in which a robust loss left no curvature.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchsfm.optim.layout import Layout, lay_out
-from torchsfm.optim.normal_equations import Inverse
 from torchsfm.optim.schur import Elimination
 from torchsfm.optim.terms import Block, Term, term_cost, term_residual
 
 Hessian = Literal["exact", "gauss-newton"]
 """Which second derivatives of the cost to use."""
-SWEEPS = 30
-"""Most steps of conjugate gradients; Gauss-Newton is so good a preconditioner that a few are enough."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +105,13 @@ class _Optimum(torch.autograd.Function):
         layout = lay_out(problem.blocks, terms, problem.eliminate)
         if not layout.pieces:
             return _through(problem, layout, leaves, gradients, {})
-        inverse = Elimination(problem.blocks, layout, "dense").linearize(at).invert()
+        engine = Elimination(problem.blocks, layout, "dense")
+        system = engine.linearize(at)
+        inverse = system.invert()
+        if problem.hessian == "exact":
+            inverse = engine.curve(at, system, minimum=True).invert(inverse)
         v = _pull(problem.blocks, layout, dict(zip(problem.blocks, gradients, strict=True)))
-        u = _solve(problem, layout, inverse, terms, at, v)
+        u = system.split(*inverse.apply(*system.join(v)))
         return _through(problem, layout, leaves, gradients, u)
 
 
@@ -139,52 +140,6 @@ def _move(problem: _Problem, layout: Layout, x: dict[str, Tensor], steps: dict[s
 
 def _cost(terms: Sequence[Term], x: dict[str, Tensor]) -> Tensor:
     return torch.stack([term_cost(t, term_residual(t, x)) for t in terms]).sum()
-
-
-def _solve(
-    problem: _Problem, layout: Layout, inverse: Inverse, terms: list[Term], at: dict[str, Tensor], v: dict[str, Tensor]
-) -> dict[str, Tensor]:
-    """`H^-1 v` by conjugate gradients on the exact Hessian, preconditioned by the Gauss-Newton one."""
-    system = inverse.system
-
-    def precondition(r: dict[str, Tensor]) -> dict[str, Tensor]:
-        return system.split(*inverse.apply(*system.join(r)))
-
-    u = precondition(v)
-    if problem.hessian != "exact":
-        return u
-    with torch.enable_grad():
-        delta = {name: torch.zeros_like(value).requires_grad_() for name, value in v.items()}
-        cost = _cost(terms, _move(problem, layout, at, delta))
-        gradient = torch.autograd.grad(cost, list(delta.values()), create_graph=True)
-
-    def apply(p: dict[str, Tensor]) -> dict[str, Tensor]:
-        products = torch.autograd.grad(
-            gradient, list(delta.values()), [p[name] for name in delta], retain_graph=True, materialize_grads=True
-        )
-        return dict(zip(delta, products, strict=True))
-
-    def dot(a: dict[str, Tensor], b: dict[str, Tensor]) -> Tensor:
-        return torch.stack([(a[name] * b[name]).sum() for name in a]).sum()
-
-    r = {name: v[name] - h for name, h in apply(u).items()}
-    z = precondition(r)
-    p, rz = z, dot(r, z)
-    first = dot(v, u).abs()
-    for _ in range(SWEEPS):
-        if not float(rz) > 1e-22 * float(first):
-            break
-        product = apply(p)
-        curvature = dot(p, product)
-        if not float(curvature) > 0:
-            break
-        alpha = rz / curvature
-        u = {name: u[name] + alpha * p[name] for name in u}
-        r = {name: r[name] - alpha * product[name] for name in r}
-        z = precondition(r)
-        before, rz = rz, dot(r, z)
-        p = {name: z[name] + rz / before * p[name] for name in p}
-    return u
 
 
 def _through(
