@@ -43,7 +43,7 @@ def finish(job: Job, result: SfmResult, folder: Path | None, truth: dict[str, st
         texts = {"report.json": json.dumps(record, indent=1), "report.md": report_markdown(record)}
         write_whole_files({out / name: text.encode() for name, text in texts.items()})
     job.close()
-    files = [str(job.out / name) for name, _ in [*written, ("report.md", ""), ("report.json", "")]]
+    files = [str(job.out / name) for name in (*dict(written), "report.md", "report.json") if (job.out / name).exists()]
     job.voice.record.update(record | {"out": str(job.out), "files": files})
     for i, model in enumerate(result.models):
         typer.echo(("" if len(result.models) == 1 else f"model {i}: ") + model.summary())

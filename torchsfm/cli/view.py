@@ -57,4 +57,4 @@ def write(model: Path, images: Path | None, out: Path | None) -> Path:
     if out is not None and out.is_dir():
         out = out / PAGE
     target = out or Path(tempfile.mkdtemp(prefix="torchsfm-")) / PAGE
-    return write_page(models, target, title=model.name or "Model", images=images or find_photographs(model, models[0]))
+    return write_page(models, target, title=model.resolve().name, images=images or find_photographs(model, models[0]))
