@@ -8,8 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import check_options, check_tensors
+from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose
 from torchsfm.reconstruction.curve_fusion import fuse_pieces
+from torchsfm.reconstruction.curve_noise import measured_weights
 from torchsfm.reconstruction.curve_pieces import Pieces, image_pieces
 from torchsfm.reconstruction.curve_tracks import track_samples
 from torchsfm.reconstruction.image_edges import ImageEdges
@@ -150,7 +152,8 @@ def curves_of_edges(
         _no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
-    return track_samples(curves, kept, lines, P, size, threshold)
+    tracked = track_samples(curves, kept, lines, P, size, threshold)
+    return measured_weights(tracked, edge_distances(poses, cameras, tracked.bundle()))
 
 
 def _no_curves(like: Tensor) -> Curves:

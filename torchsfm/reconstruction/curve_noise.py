@@ -1,0 +1,65 @@
+"""What edge points are worth: how far they are from the curves that they show, and how many along a curve are so alike."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm.reconstruction.model_curves import Curves
+
+LEAST_SCALE = 0.2
+"""Distances smaller than this part of what edges' own variances say are no reason to weigh them more."""
+LAGS = 64
+"""Samples along a curve, the most, whose distances from edges may still be alike."""
+ALIKE = 0.05
+"""Correlation, the least, that is told from none."""
+
+
+def measured_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
+    """The curves with edge points weighed so that they count as if each were independent of the others.
+
+    Their own variances, scaled so that distances from them are as large as these say (of robust mean size: one distance an edge
+    point, less the two numbers of each sample), and times how many along a curve are alike: what is wrong with an edge, its
+    shadow or round corner, is wrong with a long piece of it.
+
+    Args:
+        curves: The curves.
+        apart: Signed distances of samples from each edge point.
+    """
+    sound = apart.isfinite()
+    if not sound.any():
+        return curves
+    r, view, sample = (t[sound] for t in (apart * curves.weight.sqrt(), curves.view, curves.sample))
+    redundancy = max(0.1, 1 - 2 * len(torch.unique(sample)) / len(r))
+    scale = max(float(r.abs().median()) / 0.6745 / redundancy**0.5, LEAST_SCALE)
+    return replace(curves, weight=curves.weight / (scale**2 * alike(r, view, sample, curves.curve)))
+
+
+def alike(r: Float[Tensor, "k"], view: Int[Tensor, "k"], sample: Int[Tensor, "k"], curve: Int[Tensor, "n"]) -> float:
+    """How many neighbours along curves have distances from edges that say together what one would: at least 1.
+
+    The sum of the correlations of distances in one image, as normal numbers have them whose signs agree as often, up to the
+    first that is none.
+
+    Args:
+        r: Distances.
+        view: Image of each.
+        sample: Sample of each, no two the same in one image.
+        curve: Curve of each sample.
+    """
+    size = len(curve)
+    key, order = (view * size + sample).sort()
+    sign, own, total = r[order].sign(), sample[order], 1.0
+    for lag in range(1, LAGS + 1):
+        place = torch.searchsorted(key, key + lag).clamp(max=len(key) - 1)
+        after = (own + lag).clamp(max=size - 1)
+        both = (key[place] == key + lag) & (own + lag < size) & (curve[after] == curve[own])
+        if not both.any():
+            break
+        correlation = math.sin(math.pi / 2 * float((sign * sign[place])[both].mean()))
+        if correlation < ALIKE:
+            break
+        total += 2 * correlation
+    return total
