@@ -112,6 +112,7 @@ from torchsfm.images import (
     ImageError as ImageError,
     Photograph as Photograph,
     Segments as Segments,
+    TrackedCurves as TrackedCurves,
     Tracks as Tracks,
     detect_edges as detect_edges,
     detect_ellipses as detect_ellipses,
@@ -122,6 +123,7 @@ from torchsfm.images import (
     match_features as match_features,
     match_segments as match_segments,
     read_image as read_image,
+    track_curves as track_curves,
     track_points as track_points,
     track_sequence as track_sequence,
 )

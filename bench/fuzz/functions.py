@@ -30,11 +30,11 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
     to_homogeneous,
 )
-from torchsfm.images import Features, detect_segments
+from torchsfm.images import Edges, Features, detect_edges, detect_segments
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
 from torchsfm.optim import Block, Cauchy, Term
 from torchsfm.reconstruction import ReconstructionError
-from torchsfm.simulation import random_bundle_problem
+from torchsfm.simulation import paint_shapes, random_bundle_problem
 from torchsfm.tensors import fundamental_from_cameras
 
 
@@ -169,6 +169,14 @@ def _images_of_curves(s: Scene) -> Curve:
     """The rings in all images."""
     images = project_points(s.cameras(4), _rings(s).flatten(-3, -2)[..., None, :, :])
     return curve_from_samples(images.unflatten(-2, (3, 48)), closed=True)
+
+
+def _moving_edges(s: Scene) -> Edges:
+    """Of a disc in three images."""
+    place = s.rand(2, low=18.0, high=22.0)
+    discs = [Ellipse(place + i, torch.tensor([11.0, 8.0]).to(place), torch.tensor(0.3).to(place)) for i in range(3)]
+    images = [paint_shapes([disc], torch.tensor([0.2, 0.9]).to(place), width=48, height=44) for disc in discs]
+    return detect_edges(torch.stack(images), max_edgels=200)
 
 
 def _features(s: Scene) -> list[Features]:
@@ -346,6 +354,7 @@ FUNCTIONS: dict[str, Function] = {
         {"features": _features, "neighbours": 1, "words": 4, "generator": _generator}, batched=False
     ),
     "images.scale_image": Function({"image": lambda s: s.rand(32, 40)}),
+    "images.track_curves": Function({"edges": _moving_edges}, batched=False),
     "images.track_points": Function(
         {"image1": lambda s: s.rand(1, 40, 40), "image2": lambda s: s.rand(1, 40, 40), "x1": lambda s: s.rand(6, 2, high=39.0)}
     ),

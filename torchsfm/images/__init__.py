@@ -2,6 +2,7 @@
 
 from torchsfm.images.boards import BoardPoints, detect_chessboard, detect_circles_grid
 from torchsfm.images.corners import Corners, detect_corners
+from torchsfm.images.curve_tracking import TrackedCurves, track_curves
 from torchsfm.images.edges import Edges, detect_edges
 from torchsfm.images.ellipses import Ellipses, detect_ellipses
 from torchsfm.images.exif import Exif, parse_exif
@@ -37,6 +38,7 @@ __all__ = [
     "Photograph",
     "Pinholes",
     "Segments",
+    "TrackedCurves",
     "TrackedPoints",
     "Tracks",
     "describe_images",
@@ -63,6 +65,7 @@ __all__ = [
     "retrieve_pairs",
     "save_image",
     "scale_image",
+    "track_curves",
     "track_points",
     "track_sequence",
     "undistort_images",
