@@ -5,18 +5,12 @@ from typing import Any
 
 import pytest
 import torch
-from command_line import photograph
 
 from torchsfm.reconstruction import match_all
 from torchsfm.reconstruction.image_points import SavedFeatures
 from torchsfm.reconstruction.match_all import NEAR_IMAGES, VERIFIED_AT_ONCE, PairShards
 from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
 from torchsfm.reconstruction.view_graph import ViewGraph
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return photograph(tmp_path_factory.mktemp("courtyard"))
 
 
 def matched(folder: Path, out: Path | None = None, **options: Any) -> MatchedPhotographs:
@@ -58,6 +52,7 @@ def test_shards_divide_the_pairs(images: int, share: float, generator: torch.Gen
         assert sum(each) / len(each) < 0.6
 
 
+@pytest.mark.usefixtures("unchecked")  # the checks of annotations read an item, too
 def test_an_image_is_read_for_the_pairs_at_hand_alone(courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = matched(courtyard)
     asked: list[int] = []
