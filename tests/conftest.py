@@ -73,6 +73,14 @@ def data() -> Path:
     return Path(folder)
 
 
+@pytest.fixture(scope="session")
+def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of five photographs of one scene, to look at and not to change."""
+    from command_line import photograph  # not before the type checker is in place
+
+    return photograph(tmp_path_factory.mktemp("courtyard"))
+
+
 @pytest.fixture
 def unchecked() -> Iterator[None]:
     """Switch the runtime type checker off, to see the library's own errors for wrong shapes and dtypes."""

@@ -18,7 +18,6 @@ from command_line import (
     arc,
     assert_one_line,
     copies,
-    photograph,
     render,
     report,
     same_model,
@@ -33,12 +32,6 @@ from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.stages import saved_stages
 from torchsfm.simulation import look_at
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five photographs of one scene."""
-    return photograph(tmp_path_factory.mktemp("courtyard"))
 
 
 @pytest.fixture(scope="module")

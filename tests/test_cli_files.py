@@ -8,7 +8,7 @@ from shutil import copy
 
 import pytest
 import torch
-from command_line import FOCAL, HEIGHT, WIDTH, assert_one_line, photograph, report, torchsfm
+from command_line import FOCAL, HEIGHT, WIDTH, assert_one_line, report, torchsfm
 from full_disk import full_disk
 
 from torchsfm.formats import read_colmap
@@ -17,11 +17,6 @@ from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import printable
 
 NAMES = ("1 caf\udce9.png", "2 <img src=x onerror=alert(1)>|.png", "3 new\nline \x1b[31m.png")
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return photograph(tmp_path_factory.mktemp("courtyard"))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from chance import stream_seed
-from command_line import photograph, same_model, torchsfm
+from command_line import same_model, torchsfm
 
 from torchsfm.cli.output import output_folder
 from torchsfm.formats import read_colmap, read_ply
@@ -23,9 +23,9 @@ pytestmark = pytest.mark.slow
 KILLS = 50
 
 
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return sorted(photograph(tmp_path_factory.mktemp("courtyard")).iterdir())
+@pytest.fixture
+def courtyard(courtyard: Path) -> list[Path]:
+    return sorted(courtyard.iterdir())
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch.distributed
 from chance import stream_seed
-from command_line import copies, photograph, same_model, torchsfm
+from command_line import copies, same_model, torchsfm
 
 from torchsfm.cli import ranks
 from torchsfm.cli.ranks import Started
@@ -20,11 +20,6 @@ from torchsfm.reconstruction.stages import saved_stages
 
 KILLS = 20
 LAUNCHED = {"RANK": "1", "WORLD_SIZE": "3", "MASTER_ADDR": "localhost", "MASTER_PORT": "29500"}
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return photograph(tmp_path_factory.mktemp("courtyard"))
 
 
 def test_what_the_environment_says() -> None:

@@ -15,7 +15,7 @@ import pytest
 import small_model
 import torch
 from chance import seeded
-from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, photograph, report, torchsfm
+from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, report, torchsfm
 
 from torchsfm.cli import job
 from torchsfm.cli.job import Job, duration
@@ -24,11 +24,6 @@ from torchsfm.formats import write_colmap
 from torchsfm.geometry import Pose, Similarity, random_rotation, rotation_from_rotvec
 from torchsfm.images import read_image
 from torchsfm.reconstruction import Reconstruction
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return photograph(tmp_path_factory.mktemp("courtyard"))
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import FOCAL, HEIGHT, VIEWS, WIDTH, arc, assert_one_line, photograph, torchsfm
+from command_line import FOCAL, HEIGHT, VIEWS, WIDTH, arc, assert_one_line, torchsfm
 
 from torchsfm.formats import write_colmap
 from torchsfm.geometry import Camera, Pose, intrinsics, rotation_angle, rotation_from_rotvec
@@ -13,11 +13,6 @@ from torchsfm.images import ImageError, save_image
 from torchsfm.reconstruction import Reconstruction, ReconstructionError, triangulate_photographs
 
 F64 = torch.float64
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return photograph(tmp_path_factory.mktemp("courtyard"))
 
 
 @pytest.fixture(scope="module")

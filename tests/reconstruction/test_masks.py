@@ -4,17 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, photograph, torchsfm
+from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, torchsfm
 
 from torchsfm.images import ImageError, save_image
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
-
-
-@pytest.fixture(scope="module")
-def courtyard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return photograph(tmp_path_factory.mktemp("courtyard"))
 
 
 def mask(*, width: int = WIDTH, height: int = HEIGHT) -> torch.Tensor:
