@@ -94,7 +94,7 @@ STATES = {
     "an image": "showImage(0)",
     "an image that was not registered": "showImage(3)",
     "pairs": "showPairs()",
-    "looking through": "closeDetails(), lookThrough(0)",
+    "looking through": "lookThrough(0)",
     "looking through, and its residuals": "showImage(0)",
     "measuring": "escape(), escape(), startMeasuring(true), measureTo(positionOf(0)), measureTo(positionOf(1))",
 }
@@ -414,6 +414,10 @@ def test_fingers_turn_pinch_and_tap(browser: Browser, page: Path) -> None:
     assert browser.run("$('subject').textContent") == "view_0.png"
     box: dict[str, Any] = browser.run("details.getBoundingClientRect().toJSON()")
     assert 0.4 * PHONE[1] < box["height"] < 0.7 * PHONE[1], "a part of the picture stays to be seen"
+    visible = browser.run("model.images.filter(c => c.pose).map(c => projector()(...c.centre)[1])")
+    assert max(visible) < box["top"], "and the model moves there"
+    browser.run("lookThrough(0)")
+    assert browser.run("details.hidden")
 
 
 def test_names_stay_text_in_every_panel(browser: Browser, model: Reconstruction, tmp_path: Path) -> None:
