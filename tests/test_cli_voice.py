@@ -150,9 +150,9 @@ def test_view_opens_the_page_of_a_run(saved: Path, monkeypatch: pytest.MonkeyPat
     page = Path(opened[1].removeprefix("file://"))
     assert page.read_text().startswith("<!")
     assert (saved.parent / "page.html").read_text() == "the page of the run"
-    status, _, _ = torchsfm("view", saved, "--out", saved.parent / "new" / "a.html", "--no-browser")
+    status, _, _ = torchsfm("view", saved, "--out", saved.parent / "new" / "a.html", "--unit", "ft", "--no-browser")
     assert status == 0
-    assert (saved.parent / "new" / "a.html").is_file()
+    assert '"unit":"ft"' in (saved.parent / "new" / "a.html").read_text()
     assert len(opened) == 2
 
 

@@ -27,6 +27,9 @@ def view(
         Path | None,
         typer.Option(help="Where to write the page; by default that of the run, else a temporary file.", show_default=False),
     ] = None,
+    unit: Annotated[
+        str, typer.Option(help="Name of the unit that the model is in, such as m; without it lengths are in units.")
+    ] = "",
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page, or only say where it is.")] = True,
 ) -> None:
     """Show a model in the browser, to turn with the mouse."""
@@ -34,8 +37,8 @@ def view(
         page = model / PAGE
         if images is not None and not images.is_dir():
             raise UserError(f"{images}: no such folder")
-        if images is not None or out is not None or not page.is_file():
-            page = write(model, images, out)
+        if images is not None or out is not None or unit or not page.is_file():
+            page = write(model, images, out, unit)
         job.close()
         job.voice.record["page"] = str(page.absolute())
         if browser and not webbrowser.open(page.absolute().as_uri()):
@@ -44,7 +47,7 @@ def view(
             typer.echo(f"{page}  open it in a browser and turn the model with the mouse" if not browser else str(page))
 
 
-def write(model: Path, images: Path | None, out: Path | None) -> Path:
+def write(model: Path, images: Path | None, out: Path | None, unit: str) -> Path:
     """Write the page of what a path holds.
 
     Raises:
@@ -57,4 +60,5 @@ def write(model: Path, images: Path | None, out: Path | None) -> Path:
     if out is not None and out.is_dir():
         out = out / PAGE
     target = out or Path(tempfile.mkdtemp(prefix="torchsfm-")) / PAGE
-    return write_page(models, target, title=model.resolve().name, images=images or find_photographs(model, models[0]))
+    photographs = images or find_photographs(model, models[0])
+    return write_page(models, target, title=model.resolve().name, images=photographs, unit=unit)
