@@ -532,9 +532,9 @@ EXCEPTIONS: dict[str, str] = {
     **{f"images.{name}": FILES for name in ("extract_frames", "parse_exif", "read_image", "save_image")},
     "optim.for_slots": "a view of a tensor, not its values",
     "optim.wants_derivative": "a question about tensors, not their values",
-    **{f"reconstruction.{name}": "takes a whole model; tests/test_align*.py spoil it" for name in (
+    **{f"reconstruction.{name}": "takes a whole model; tests of models spoil it" for name in (
         "adjust_to_points", "align_models", "align_to_gps", "align_to_ground", "align_to_points", "align_to_positions",
-        "align_upright")},
+        "align_upright", "merge_models", "part_of_model")},
     "reconstruction.reconstruct_curves": "photographs one after another, and seconds",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.triangulate_photographs": "photographs; its stages are tried by reconstruct_tracks",

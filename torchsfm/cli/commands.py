@@ -26,6 +26,7 @@ from torchsfm.cli.inputs import (
 )
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.known_poses import Masks, register, triangulate
+from torchsfm.cli.merge import merge
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.ranks import Started
 from torchsfm.cli.results import VERSION, finish
@@ -269,6 +270,7 @@ def info(
 
 
 for command in (
-    reconstruct, demo, info, view, compare, triangulate, register, align, bundle, calibrate, export, convert, curves,
+    reconstruct, demo, info, view, compare, triangulate, register, align, merge, bundle, calibrate, export, convert,
+    curves,
 ):  # fmt: skip
     app.command()(spoken(command))

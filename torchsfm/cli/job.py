@@ -41,6 +41,7 @@ LABELS = {
     "segments": "finding line segments",
     "refine": "refining the model",
     "bundle": "adjusting",
+    "merge": "joining the models",
     "edges": "finding edges",
     "follow": "following edges through images",
     "write": "writing results",

@@ -8,6 +8,7 @@ from torchsfm.reconstruction.gps import GpsAlignment, align_to_gps
 from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
+from torchsfm.reconstruction.merge import MergedModel, merge_models, part_of_model
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.models import reconstruct_tracks
 from torchsfm.reconstruction.photographs import reconstruct
@@ -29,6 +30,7 @@ __all__ = [
     "Levelling",
     "Lines",
     "MatchedImages",
+    "MergedModel",
     "PairReport",
     "Reconstruction",
     "ReconstructionError",
@@ -42,6 +44,8 @@ __all__ = [
     "align_to_points",
     "align_to_positions",
     "align_upright",
+    "merge_models",
+    "part_of_model",
     "reconstruct",
     "reconstruct_curves",
     "reconstruct_matches",
