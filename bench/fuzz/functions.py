@@ -520,8 +520,8 @@ EXCEPTIONS: dict[str, str] = {
     "bundle.bundle_adjust_model": "hands a model to bundle_adjust",
     "cli.main": "a program; its options and files are tested in tests/test_cli.py",
     **{f"formats.read_{name}": FILES for name in (
-        "bal", "bundler", "colmap", "database", "hloc", "kapture", "libmv", "model", "nerfstudio", "nvm", "openmvg", "opensfm",
-        "ply", "vgg")},
+        "bal", "bundler", "colmap", "database", "features", "hloc", "kapture", "libmv", "model", "nerfstudio", "nvm", "openmvg",
+        "opensfm", "ply", "vgg")},
     **{f"formats.write_{name}": FILES for name in (
         "bal", "bundler", "colmap", "curves", "database", "gltf", "kapture", "kitti", "model", "nerfstudio", "nvm",
         "openmvg", "opensfm", "ply", "tum")},
@@ -537,6 +537,8 @@ EXCEPTIONS: dict[str, str] = {
         "align_upright", "merge_models", "part_of_model")},
     "reconstruction.reconstruct_curves": "photographs one after another, and seconds",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
+    "reconstruction.register_photographs": "photographs; tests/test_register.py spoils them",
+    "reconstruction.saved_features": FILES,
     "reconstruction.triangulate_photographs": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.reconstruct_matches": "lists of tensors; its stages are tried by reconstruct_tracks",
     **{f"robust.{name}": "what doors have in common; each door is tried" for name in (

@@ -48,7 +48,7 @@ def photograph_folder(images: list[Path]) -> Path:
         UserError: There are none, or some are not there.
     """
     try:
-        return Sources.of(images).folder
+        return Sources.of(images, least=1).folder
     except ReconstructionError as error:
         raise UserError(" ".join(str(error).split())) from None
 

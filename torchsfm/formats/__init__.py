@@ -3,7 +3,7 @@
 from torchsfm.formats.bal import read_bal, write_bal
 from torchsfm.formats.bundler import read_bundler, write_bundler
 from torchsfm.formats.colmap import read_colmap, write_colmap
-from torchsfm.formats.colmap_database import read_database, write_database
+from torchsfm.formats.colmap_database import read_database, read_features, write_database
 from torchsfm.formats.conics import read_conics, write_conics
 from torchsfm.formats.curves import write_curves
 from torchsfm.formats.export import TARGETS, export_model
@@ -33,6 +33,7 @@ __all__ = [
     "read_colmap",
     "read_conics",
     "read_database",
+    "read_features",
     "read_hloc",
     "read_kapture",
     "read_libmv",

@@ -19,10 +19,13 @@ from torch import Tensor
 from torchsfm.formats.colmap_model import MAX_SIZE, PARAMETERS
 from torchsfm.formats.joining import reading
 from torchsfm.reconstruction.files import whole_file
+from torchsfm.reconstruction.known_features import KnownFeatures
 from torchsfm.reconstruction.matched import MatchedImages
 
 HALF_PIXEL = 0.5
 MAX_IMAGES = 2147483647
+SIFT = 128
+"""Numbers of a descriptor."""
 MODELS = {parameters.number: parameters for parameters in PARAMETERS.values()}
 DEFAULT_FOCAL = 1.2
 """Focal length over the longer side of the image that COLMAP, too, starts from where nothing tells it."""
@@ -109,6 +112,50 @@ def read_database(path: str | Path) -> MatchedImages:
             matches=tuple(matches),
             camera_index=torch.tensor([number_of[camera_id] for _, _, camera_id in rows], dtype=torch.long),
             focal=tuple(focal for _, focal in taken),
+        )
+
+
+def read_features(path: str | Path) -> KnownFeatures:
+    """Read keypoints with their descriptors from COLMAP's database, for `register_photographs`.
+
+    COLMAP's descriptors are RootSIFT, times 512 as bytes, unless it was told otherwise; they become those of
+    `detect_features`, times 256. Images without descriptors are left out.
+
+    Args:
+        path: The file, which is not changed.
+
+    Raises:
+        ValueError: The file is no such database, a damaged one, or holds no descriptors; one line that says why.
+        OSError: It cannot be read.
+
+    Example:
+        >>> import torchsfm
+        >>> known = torchsfm.formats.read_features("database.db")  # doctest: +SKIP
+        >>> model = torchsfm.read_colmap("sparse/0")  # doctest: +SKIP
+        >>> result = torchsfm.reconstruction.register_photographs("new/", model, known)  # doctest: +SKIP
+    """
+    path = Path(path)
+    matched = read_database(path)
+    with reading(path, "a COLMAP database"), _opened(path) as database:
+        if not _has_table(database, "descriptors"):
+            raise ValueError("it has no table descriptors")
+        numbers = [image_id for (image_id,) in database.execute("SELECT image_id FROM images ORDER BY image_id")]
+        place = {image_id: i for i, image_id in enumerate(numbers)}
+        found: dict[int, Tensor] = {}
+        for image_id, count, columns, data in database.execute("SELECT image_id, rows, cols, data FROM descriptors"):
+            table = _table(data, count, columns, np.dtype("u1"), SIFT)
+            i = place[image_id]
+            if table.shape != (len(matched.keypoints[i]), SIFT):
+                raise ValueError(f"the descriptors of image {image_id} are of shape {table.shape}")
+            found[i] = torch.from_numpy(((table.astype(np.uint16) + 1) // 2).clip(max=127).astype(np.uint8))
+        chosen = [i for i in sorted(found) if len(found[i])]
+        if not chosen:
+            raise ValueError("it holds no descriptors")
+        return KnownFeatures(
+            tuple(matched.names[i] for i in chosen),
+            tuple(matched.keypoints[i] for i in chosen),
+            tuple(found[i] for i in chosen),
+            ("",) * len(chosen),
         )
 
 

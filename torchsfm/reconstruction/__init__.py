@@ -5,8 +5,10 @@ from torchsfm.reconstruction.conics import Conics
 from torchsfm.reconstruction.control import ControlledModel, adjust_to_points
 from torchsfm.reconstruction.curves import reconstruct_curves
 from torchsfm.reconstruction.gps import GpsAlignment, align_to_gps
+from torchsfm.reconstruction.known_features import KnownFeatures, saved_features
 from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
+from torchsfm.reconstruction.localise import register_photographs
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
 from torchsfm.reconstruction.merge import MergedModel, merge_models, part_of_model
 from torchsfm.reconstruction.model_curves import Curves
@@ -27,6 +29,7 @@ __all__ = [
     "Curves",
     "GpsAlignment",
     "ImageReport",
+    "KnownFeatures",
     "Levelling",
     "Lines",
     "MatchedImages",
@@ -50,5 +53,7 @@ __all__ = [
     "reconstruct_curves",
     "reconstruct_matches",
     "reconstruct_tracks",
+    "register_photographs",
+    "saved_features",
     "triangulate_photographs",
 ]

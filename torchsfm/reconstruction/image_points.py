@@ -75,6 +75,7 @@ def detect_all(
     max_pixels: int,
     progress: Progress,
     masks: Masks | None = None,
+    least: int = 2,
 ) -> ImagePoints:
     """Features of all files, those that masks admit.
 
@@ -86,9 +87,10 @@ def detect_all(
         max_pixels: Larger images are left out.
         progress: Called as the work goes on.
         masks: Where nothing is to be found.
+        least: How many files must be images.
 
     Raises:
-        ReconstructionError: Fewer than two files could be read.
+        ReconstructionError: Fewer files could be read.
     """
     size = min(max(math.ceil(len(files) / SHARDS), 1), MOST_IMAGES)
     done = [0]
@@ -123,7 +125,7 @@ def detect_all(
         return _pack(found)
 
     count = math.ceil(len(files) / size)
-    return _unpack(stages.shards("features", count, shard, threads=max(1, torch.get_num_threads())), files, names)
+    return _unpack(stages.shards("features", count, shard, threads=max(1, torch.get_num_threads())), files, names, least)
 
 
 def nearest_colors(pixels: Float[Tensor, "c h w"], x: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
@@ -158,17 +160,22 @@ def _label(photo: Photograph) -> str:
     return "|".join([photo.make, photo.model, focal]).replace("\0", "")
 
 
-def _unpack(shards: Shards, files: Sequence[Path], names: Sequence[str]) -> ImagePoints:
+def camera_label(name: str, record: str) -> str:
+    """What tells the camera of a file from others: its folder, and what the file says of it."""
+    return f"{PurePosixPath(name).parent}|{record}"
+
+
+def _unpack(shards: Shards, files: Sequence[Path], names: Sequence[str], least: int) -> ImagePoints:
     """What shards say of files to be known under these names.
 
     Raises:
-        ReconstructionError: Fewer than two files could be read.
+        ReconstructionError: Fewer files could be read than there must be.
     """
     parts = [shards.only(k, "readable", "records", "focal", "size", "count", "x", "color") for k in range(len(shards))]
     records = [r for part in parts for r in bytes(part["records"].numpy()).decode("utf-8", "surrogateescape").split("\0")]
     readable = [bool(ok) for part in parts for ok in part["readable"]]
     failures = {name: record for name, record, ok in zip(names, records, readable, strict=True) if not ok}
-    if sum(readable) < 2:
+    if sum(readable) < least:
         worst = next(iter(failures.values()))
         raise ReconstructionError(f"{sum(readable)} of {len(files)} files can be read as images; first failure: {worst}")
     x, color = (
@@ -179,9 +186,7 @@ def _unpack(shards: Shards, files: Sequence[Path], names: Sequence[str]) -> Imag
         files=tuple(path for path, ok in zip(files, readable, strict=True) if ok),
         names=tuple(name for name, ok in zip(names, readable, strict=True) if ok),
         image_size=torch.cat([part["size"] for part in parts]),
-        labels=tuple(
-            f"{PurePosixPath(name).parent}|{record}" for name, record, ok in zip(names, records, readable, strict=True) if ok
-        ),
+        labels=tuple(camera_label(name, record) for name, record, ok in zip(names, records, readable, strict=True) if ok),
         focal=tuple(f or None for part in parts for f in part["focal"].tolist()),
         failures=failures,
         x=x,

@@ -1,5 +1,6 @@
 """Photographs of which the poses are known: points for them, and poses for further photographs of the same scene."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from torchsfm.reconstruction.report import Progress, ReconstructionError, Report
 from torchsfm.reconstruction.sources import Source
 from torchsfm.reconstruction.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
 from torchsfm.reconstruction.tracks import build_tracks
+from torchsfm.reconstruction.view_graph import ViewGraph
 
 ROUNDS = 4
 """Of triangulation, completion and adjustment; little changes after the second."""
@@ -91,7 +93,9 @@ def triangulate_photographs(
     reasons = dict.fromkeys((place < 0).nonzero()[:, 0].tolist(), "has no pose in the given model")
     with seen.stages.timed("map"):
         report("map", 0, len(place))
-        mapping, options, own = _start(seen, poses.to("cpu", torch.float64), place, generator)
+        mapping, options, own = start_mapping(
+            seen.graph, seen.points.labels, seen.points.focal, poses.to("cpu", torch.float64), place, generator
+        )
         given = mapping
         mapping = _structure(mapping, options)
         if refine_poses:
@@ -99,18 +103,41 @@ def triangulate_photographs(
                 mapping = _structure(adjust(mapping, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE), options)
             mapping = _moved_back(mapping, given)
         if register and len(mapping.X):
-            mapping, reasons = _register(mapping, options, own, report)
+            mapping, reasons = place_images(mapping, options, own, report)
         report("map", int(mapping.registered.sum()), len(place))
-        graph = mapping.graph
-        names = mapping.cameras.distortion.parameter_names
-        standing = examine(mapping, open_numbers=("focal", *names) if bool(own.any()) else (), prior=options.prior(mapping),
-                           threshold=options.reprojection)  # fmt: skip
+        result = result_of(mapping, options, own, reasons, seen.points.failures, seen.names)
+    course = replace(result.report, seconds=dict(seen.stages.seconds), skipped=seen.skipped)
+    return replace(result, report=course)
+
+
+def result_of(
+    mapping: Mapping,
+    options: MappingOptions,
+    own: Bool[Tensor, "g"],
+    reasons: dict[int, str],
+    failures: dict[str, str],
+    order: Sequence[str],
+) -> SfmResult:
+    """The finished model with what is thought of it.
+
+    Args:
+        mapping: The model.
+        options: How it was made.
+        own: Cameras that were estimated.
+        reasons: Why images have no pose, by index.
+        failures: Files that could not be read, with the reason.
+        order: All files in the order of the input.
+    """
+    graph = mapping.graph
+    names = mapping.cameras.distortion.parameter_names
+    standing = examine(mapping, open_numbers=("focal", *names) if bool(own.any()) else (), prior=options.prior(mapping),
+                       threshold=options.reprojection)  # fmt: skip
     found = [(mapping.reconstruction(), standing)] if len(mapping.X) else []
-    verdict = graph.verdicts(mapping.cameras.K[mapping.camera_index], torch.zeros(len(place), dtype=torch.bool))
+    known = torch.zeros(len(graph.names), dtype=torch.bool)
+    verdict = graph.verdicts(mapping.cameras.K[mapping.camera_index], known)
     pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
-    reports = image_reports(graph, found, reasons, seen.points.failures, seen.names)
-    course = Report(reports, pairs, dict(seen.stages.seconds), skipped=seen.skipped)
-    return SfmResult(tuple(model for model, _ in found), course)
+    reports = image_reports(graph, found, reasons, failures, order)
+    return SfmResult(tuple(model for model, _ in found), Report(reports, pairs, {}))
 
 
 def _places(seen: MatchedPhotographs, poses: Reconstruction) -> Int[Tensor, "v"]:
@@ -135,15 +162,28 @@ def _places(seen: MatchedPhotographs, poses: Reconstruction) -> Int[Tensor, "v"]
     return place
 
 
-def _start(
-    seen: MatchedPhotographs, poses: Reconstruction, place: Int[Tensor, "v"], generator: torch.Generator
+def start_mapping(
+    graph: ViewGraph,
+    labels: Sequence[str],
+    focal: Sequence[float | None],
+    poses: Reconstruction,
+    place: Int[Tensor, "v"],
+    generator: torch.Generator,
 ) -> tuple[Mapping, MappingOptions, Bool[Tensor, "g"]]:
-    """The photographs with the poses and cameras of the model, without points; and which cameras are not the model's."""
-    graph, points = seen.graph, seen.points
-    group = group_cameras(points.image_size, points.labels, None)
+    """Photographs with the poses and cameras of a model, without points; and which cameras are not the model's.
+
+    Args:
+        graph: The photographs and their verified matches.
+        labels: What their files say of the cameras.
+        focal: Focal length in pixels stated in each file.
+        poses: The model.
+        place: Which of its images each photograph is, or -1.
+        generator: Source of randomness.
+    """
+    group = group_cameras(graph.image_size, labels, None)
     kind = type(poses.cameras.distortion)
     name = next(name for name, model in DISTORTION_MODELS.items() if model is kind)
-    guessed, source = guess_cameras(graph, group, model=name, K=None, exif_focal=points.focal)
+    guessed, source = guess_cameras(graph, group, model=name, K=None, exif_focal=focal)
     camera = torch.where(place >= 0, poses.camera_index[place.clamp(min=0)], -1)
     for i in (place < 0).nonzero()[:, 0].tolist():
         like = ((group == group[i]) & (place >= 0)).nonzero()[:, 0]
@@ -223,7 +263,7 @@ def _moved_back(mapping: Mapping, given: Mapping) -> Mapping:
     return replace(mapping, X=back.transform(mapping.X), poses=Pose(R, torch.where(keep[:, None], poses.t, mapping.poses.t)))
 
 
-def _register(
+def place_images(
     mapping: Mapping, options: MappingOptions, own: Bool[Tensor, "g"], progress: Progress
 ) -> tuple[Mapping, dict[int, str]]:
     """Poses for the images that have none, and why some get none."""

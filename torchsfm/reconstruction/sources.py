@@ -30,7 +30,7 @@ class Sources:
     skipped: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def of(cls, images: Source, without: Collection[str | Path] = ()) -> "Sources":
+    def of(cls, images: Source, without: Collection[str | Path] = (), *, least: int = 2) -> "Sources":
         """What there is behind folders, image files and lists.
 
         Folders are searched with all their subfolders. A list is a text file with the path of an image on each line, from the
@@ -40,9 +40,10 @@ class Sources:
         Args:
             images: One of these, or several in order.
             without: Folders in which nothing is looked for.
+            least: How many images there must be.
 
         Raises:
-            ReconstructionError: There are fewer than two images, one is given twice, or something is not there.
+            ReconstructionError: There are fewer images than that, one is given twice, or something is not there.
         """
         given = [Path(images)] if isinstance(images, str | Path) else [Path(path) for path in images]
         files: list[Path] = []
@@ -64,7 +65,7 @@ class Sources:
                 files += _listed(path) if _is_list(path) else [path]
         if not files:
             raise ReconstructionError("no images given")
-        if len(files) == 1:
+        if len(files) < least:
             raise ReconstructionError(f"{files[0]}: one image is not enough, two views are the least")
         for path in files:
             if not path.is_file():
