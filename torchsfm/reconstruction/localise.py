@@ -120,7 +120,7 @@ def register_photographs(
         mapping = replace(mapping, registered=mapping.registered & ~absent)
         result = result_of(mapping, choices, own, reasons, new.failures, (*model.names, *sources.names))
     course = replace(result.report, seconds=dict(stages.seconds), skipped=sources.skipped)
-    models = tuple(replace(found, lines=model.lines, conics=model.conics) for found in result.models)
+    models = tuple(replace(found, lines=model.lines, conics=model.conics, curves=model.curves) for found in result.models)
     return SfmResult(models, course)
 
 

@@ -78,7 +78,7 @@ def merge_models(a: Reconstruction, b: Reconstruction, *, fixed_cameras: bool = 
     The similarity between the worlds is that of the shared cameras or of the shared points, which are those that have an
     observation at the same place in a shared image, whichever more of the shared points agree with; a single shared image is
     enough where it shows enough of them. Points that are one become one; cameras that took the same images are one, and begin
-    as in the first model. Lines and conics are left out.
+    as in the first model. Lines, conics and curves are left out.
 
     Args:
         a: The first model, whose world frame and scale stay.
@@ -149,7 +149,7 @@ def part_of_model(model: Reconstruction, images: Bool[Tensor, "v"]) -> Reconstru
 
     Args:
         model: The model.
-        images: Which of its images to keep. Lines and conics are left out.
+        images: Which of its images to keep. Lines, conics and curves are left out.
 
     See the example of `merge_models`.
     """
@@ -171,6 +171,7 @@ def part_of_model(model: Reconstruction, images: Bool[Tensor, "v"]) -> Reconstru
         point=number[model.point[kept]],
         lines=None,
         conics=None,
+        curves=None,
     )
 
 
