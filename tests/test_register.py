@@ -117,7 +117,7 @@ def test_by_the_database_of_colmap(photographs: Path, run: Path, tmp_path: Path)
     write_colmap(old, tmp_path / "sparse" / "0")
     assert find_features(None, tmp_path / "sparse" / "0", old).names == known.names
     new = copies(photographs, tmp_path / "new", NEW)
-    status, _, stderr = torchsfm("register", new, "--into", tmp_path / "sparse", "--out", tmp_path / "out")
+    status, _, stderr = torchsfm("register", new, "--into", tmp_path / "sparse" / "0", "--out", tmp_path / "out")
     assert status == 0, stderr
     model = Reconstruction.load(tmp_path / "out" / "model.npz")
     assert bool(model.registered.all())
@@ -125,7 +125,7 @@ def test_by_the_database_of_colmap(photographs: Path, run: Path, tmp_path: Path)
     with sqlite3.connect(tmp_path / "database.db") as database:
         database.execute("UPDATE descriptors SET rows = rows - 1 WHERE image_id = 2")
     database.close()
-    status, _, stderr = torchsfm("register", new, "--into", tmp_path / "sparse", "--out", tmp_path / "no")
+    status, _, stderr = torchsfm("register", new, "--into", tmp_path / "sparse" / "0", "--out", tmp_path / "no")
     assert status == 2
     assert_one_line(stderr, "database")
     assert not (tmp_path / "no" / "model.npz").exists()

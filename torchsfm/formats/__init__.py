@@ -14,6 +14,18 @@ from torchsfm.formats.libmv import read_libmv
 from torchsfm.formats.lines import read_lines, write_lines
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchsfm.formats.nvm import read_nvm, write_nvm
+from torchsfm.formats.objects import (
+    camera_from_kornia,
+    camera_from_nerfstudio,
+    camera_from_opencv,
+    camera_from_pytorch3d,
+    kornia_from_camera,
+    model_from_pycolmap,
+    nerfstudio_from_camera,
+    opencv_from_camera,
+    pycolmap_from_model,
+    pytorch3d_from_camera,
+)
 from torchsfm.formats.openmvg import read_openmvg, write_openmvg
 from torchsfm.formats.opensfm import read_opensfm, write_opensfm
 from torchsfm.formats.pictures import undistorted_model
@@ -27,7 +39,17 @@ __all__ = [
     "TARGETS",
     "PointCloud",
     "VggScene",
+    "camera_from_kornia",
+    "camera_from_nerfstudio",
+    "camera_from_opencv",
+    "camera_from_pytorch3d",
     "export_model",
+    "kornia_from_camera",
+    "model_from_pycolmap",
+    "nerfstudio_from_camera",
+    "opencv_from_camera",
+    "pycolmap_from_model",
+    "pytorch3d_from_camera",
     "read_bal",
     "read_bundler",
     "read_colmap",
