@@ -23,9 +23,9 @@ import torchsfm
 NOT_CALLED = {"cli"}
 # Their examples are shown and not run: they want files that nothing here writes, or photographs and seconds.
 NOT_RUN = {
-    "formats.read_hloc", "formats.read_libmv", "formats.read_vgg", "images.extract_frames", "images.load_detector",
-    "images.load_matcher", "reconstruction.align_to_gps", "reconstruction.reconstruct",
-    "reconstruction.triangulate_photographs",
+    "formats.pycolmap_from_model", "formats.read_features", "formats.read_hloc", "formats.read_libmv", "formats.read_vgg",
+    "images.extract_frames", "images.load_detector", "images.load_matcher", "reconstruction.align_to_gps",
+    "reconstruction.reconstruct", "reconstruction.register_photographs", "reconstruction.triangulate_photographs",
 }  # fmt: skip
 
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?(?!\w)")
