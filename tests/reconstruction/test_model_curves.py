@@ -163,8 +163,8 @@ def test_edges_of_photographs(tmp_path: Path) -> None:
     found = FoundEdges.of(arrays)
     assert told[-1] == ("edges", 3, 3)
     assert [len(edges) > 50 for edges in found.edges] == [True, True, False]
-    assert found.size.tolist()[:2] == [[200, 150], [1600, 1200]]
-    torch.testing.assert_close(found.zoom[:2], torch.tensor([[1.0, 1.0], [1.5, 1.5]], dtype=F64))
+    assert found.size.tolist()[:2] == [[200, 150], [1000, 750]]
+    torch.testing.assert_close(found.zoom[:2], torch.tensor([[1.0, 1.0], [2.4, 2.4]], dtype=F64))
     for edges, zoom, scale in zip(found.edges, found.zoom[:, 0], (1, 12), strict=False):
         middle = torch.tensor([90 * scale - 0.5, 75 * scale - 0.5])
         away = ((edges.x + 0.5) * zoom - 0.5 - middle) / scale

@@ -19,8 +19,10 @@ from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.stages import Arrays
 
-EDGE_SIZE = 1600
-"""Longer side, in pixels, to which larger images are scaled down."""
+EDGE_SIZE = 1000
+"""Longer side, in pixels, to which larger images are scaled down: they have more edges, each with more depths to look at."""
+SHORTEST = 16
+"""Edge points of the shortest chains."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ def detect_all_edges(files: Sequence[Path], max_pixels: int, progress: Progress,
             photo = read_image(path, max_size=EDGE_SIZE, max_pixels=max_pixels)
         except ImageError:
             return ImageEdges.none(), (1, 1), (1.0, 1.0)
-        found = ImageEdges.of(photo.pixels)
+        found = ImageEdges.of(photo.pixels, min_edgels=SHORTEST)
         zoom = photo.size[0] / photo.width, photo.size[1] / photo.height
         if masks is not None:
             found = found.where(masks.admit(path, (found.x + 0.5) * torch.tensor(zoom) - 0.5, photo.size))

@@ -34,9 +34,9 @@ class ImageEdges:
         return len(self.x)
 
     @classmethod
-    def of(cls, image: Float[Tensor, "c h w"]) -> "ImageEdges":
-        """Those of an image."""
-        found = detect_edges(image)
+    def of(cls, image: Float[Tensor, "c h w"], *, min_edgels: int = 8) -> "ImageEdges":
+        """Those of an image, in chains of so many or more."""
+        found = detect_edges(image, min_edgels=min_edgels)
         n = int(found.valid.sum())
         x, chain = found.x[:n], found.chain[:n]
         tangent = piece_tangents(x, chain)

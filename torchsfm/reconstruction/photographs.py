@@ -73,8 +73,9 @@ def reconstruct(
             focal length.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
-        curves: Find curves in space, too, with the cameras that have been found: edges of the photographs, followed through the
-            images around (`reconstruct_curves`). They are in `Reconstruction.curves`.
+        curves: Find curves in space, too, with the cameras that have been found: edges of the photographs, scaled down to a
+            thousand pixels, followed through the images around (`reconstruct_curves`). They are in `Reconstruction.curves`, and
+            `bundle_adjust_model` adjusts cameras, points and curves together.
         masks: Folder of masks, in which nothing counts that is black: see `Masks` for their names. The mask of `view.jpg` is
             `view.jpg.png` or `view.png`.
         max_features: Features per image.
