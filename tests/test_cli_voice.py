@@ -91,8 +91,11 @@ def test_faults_are_told_to_programs(tmp_path: Path) -> None:
         status, text, stderr = torchsfm(*words, "--quiet")
         assert (status, text) == (2, "")
         assert_one_line(stderr, found["error"])
-    status, text, _ = torchsfm("info", "--jsonn", tmp_path)
-    assert (status, text) == (2, "")
+    for words in (("info", "--inof", tmp_path), ("compare", tmp_path), ("bundle", tmp_path, "--max-iterations", "many")):
+        status, found, stderr = spoken(*words)
+        assert status == 2
+        assert found["error"] in " ".join(stderr.replace("│", " ").split())
+        assert torchsfm(*words)[:2] == (2, "")
 
 
 def test_numbers_that_json_has_not() -> None:

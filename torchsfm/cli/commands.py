@@ -31,7 +31,7 @@ from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.cli.ranks import Started
 from torchsfm.cli.results import VERSION, finish
 from torchsfm.cli.view import view
-from torchsfm.cli.voice import spoken
+from torchsfm.cli.voice import Commands, spoken
 from torchsfm.formats import TARGETS
 from torchsfm.formats.registry import model_files
 from torchsfm.geometry import DISTORTION_MODELS
@@ -41,6 +41,7 @@ from torchsfm.simulation import render_sequence
 
 app = typer.Typer(
     name="torchsfm",
+    cls=Commands,
     help="From photographs to calibrated cameras and 3D structure.",
     epilog="Exit status: 0 all good, 1 nothing could be reconstructed, 2 wrong input or usage, or a file that cannot be read or"
     " written (results of an earlier run then stay as they were), 130 interrupted.",
