@@ -64,6 +64,8 @@ def _opened(data: bytes) -> Any:
     if library is None:
         return None
     try:
-        return library.open_heif(io.BytesIO(data))
+        image = library.open_heif(io.BytesIO(data))
+        # A file may open and hold no image.
+        return image if image.size else None
     except (ValueError, RuntimeError, EOFError, OSError, SyntaxError, KeyError, IndexError):
         return None
