@@ -1,0 +1,135 @@
+"""Known poses, new photographs in old models, and models joined, on real photographs whose poses were measured.
+
+    TORCHSFM_DATA=/path/to/data python -m bench.doors [--out FOLDER]
+
+reconstructs castle-P19 whole, in two halves that share three images, and without one image, and prints how good the merged
+halves are beside the whole, where the image left out is placed beside where the whole model has it, and for fountain-P11 what
+points the true poses give beside free ones. With `--out`, what was finished there is not computed again.
+"""
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from bench.real_data import PhotographSet, data_folder, strecha
+from torchsfm.geometry import Camera, Pose, rotation_angle
+from torchsfm.reconstruction import (
+    Reconstruction,
+    align_models,
+    merge_models,
+    reconstruct,
+    register_photographs,
+    saved_features,
+    triangulate_photographs,
+)
+from torchsfm.reconstruction.evaluation import align_poses, pose_auc, pose_errors, position_rmse
+
+SHARED = 3
+LEFT_OUT = 9
+
+
+def true_poses(photographs: PhotographSet, names: tuple[str, ...]) -> Pose:
+    """The measured poses of images."""
+    rows = torch.stack([torch.from_numpy(photographs.poses[name]) for name in names])
+    return Pose(rows[:, :, :3], rows[:, :, 3])
+
+
+def true_camera(photographs: PhotographSet) -> Camera:
+    """The measured intrinsics of the camera that took all images, which are free of distortion."""
+    path = photographs.paths[0]
+    rows = [line.split() for line in (path.parent.parent / "gt" / f"{path.stem}.txt").read_text().splitlines()[:3]]
+    return Camera(torch.tensor([[float(word) for word in row] for row in rows], dtype=torch.float64)[None])
+
+
+def model_of(paths: list[Path], out: Path) -> Reconstruction:
+    """The model of some photographs, made once."""
+    if not (out / "model.npz").exists():
+        reconstruct(paths, shared_camera=True, out=out, resume=True).model.save(out / "model.npz")
+    return Reconstruction.load(out / "model.npz")
+
+
+def describe(name: str, model: Reconstruction, truth: Pose) -> str:
+    """A row of the table of models against the truth."""
+    errors = pose_errors(model.poses, truth, model.registered)
+    areas = " / ".join(f"{area:.3f}" for area in pose_auc(errors.pose).tolist())
+    rmse = 1000 * float(position_rmse(model.poses, truth, model.registered))
+    rotation = float(errors.image_rotation[model.registered].mean())
+    error = float(model.residuals().mean())
+    return f"| {name} | {model.num_registered} | {model.num_points} | {error:.3f} | {areas} | {rmse:.1f} | {rotation:.4f} |"
+
+
+def merging(castle: PhotographSet, out: Path) -> None:
+    """The two halves of the court against the whole."""
+    middle = (len(castle.paths) + SHARED) // 2
+    whole = model_of(castle.paths, out / "whole")
+    first, second = model_of(castle.paths[:middle], out / "first"), model_of(castle.paths[middle - SHARED :], out / "second")
+    merged = merge_models(first, second)
+    print("\n| model | images | points | error, px | AUC at 1 / 2 / 5 deg | position, RMS mm | rotation, mean deg |")
+    print("|---|---|---|---|---|---|---|")
+    for name, model in (("whole", whole), ("first", first), ("second", second), ("merged", merged.model)):
+        print(describe(name, model, true_poses(castle, model.names)))
+    print(merged.fault() or merged.summary())
+
+
+def placing(castle: PhotographSet, out: Path) -> None:
+    """An image that the model was made without."""
+    whole = model_of(castle.paths, out / "whole")
+    rest = [path for i, path in enumerate(castle.paths) if i != LEFT_OUT]
+    without = model_of(rest, out / "without")
+    features = saved_features(out / "without", without)
+    assert features is not None
+    placed = register_photographs([castle.paths[LEFT_OUT]], without, features).model
+    name = castle.paths[LEFT_OUT].name
+    i, j = placed.names.index(name), whole.names.index(name)
+    if not bool(placed.registered[i]):
+        print(f"{name} found no pose")
+        return
+    # Both in metres of the truth, the one on the other by the images that both were made of.
+    metric = whole.transform(align_poses(whole.poses, true_poses(castle, whole.names), whole.registered))
+    found = without_image(placed, i)
+    moved = placed.transform(align_models(found, metric).similarity)
+    gap = 1000 * float((moved.poses.centre[i] - metric.poses.centre[j]).norm())
+    turn = float(rotation_angle(moved.poses.R[i] @ metric.poses.R[j].mT).rad2deg())
+    seen = int((placed.view == i).sum())
+    print(f"{name}: {gap:.1f} mm and {turn:.4f} deg from where the whole model has it, by {seen} points")
+
+
+def without_image(model: Reconstruction, image: int) -> Reconstruction:
+    """The model with one pose less."""
+    registered = model.registered.clone()
+    registered[image] = False
+    return replace(model, registered=registered)
+
+
+def pointing(fountain: PhotographSet, out: Path) -> None:
+    """Points by the true poses beside those of free ones, in the same images with the same features."""
+    free = model_of(fountain.paths, out / "free")
+    posed = replace(free, cameras=true_camera(fountain), poses=true_poses(fountain, free.names))
+    fixed = triangulate_photographs(fountain.paths, posed, out=out / "fixed", resume=True).model
+    for name, model in (("free", free), ("fixed", fixed)):
+        lengths = model.track_lengths().double().mean()
+        print(f"fountain, {name} poses: {model.num_points} points, {float(lengths):.2f} images each, "
+              f"{float(model.residuals().mean()):.3f} px mean, {float(model.residuals().median()):.3f} px median")  # fmt: skip
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    data = data_folder()
+    if data is None:
+        parser.error("TORCHSFM_DATA names no folder with the photographs")
+    with tempfile.TemporaryDirectory() as temporary:
+        out = arguments.out or Path(temporary)
+        castle, fountain = strecha(data, "castle-P19"), strecha(data, "fountain-P11")
+        merging(castle, out / "castle")
+        placing(castle, out / "castle")
+        pointing(fountain, out / "fountain")
+
+
+if __name__ == "__main__":
+    main()
