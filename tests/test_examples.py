@@ -97,6 +97,15 @@ def test_nothing_known(tmp_path: Path) -> None:
     assert "autocalibration: OK" not in sideways
 
 
+def test_curves_alone(tmp_path: Path) -> None:
+    text = run("curves_alone.py", tmp_path)
+    assert "projective: OK" in text
+    assert "metric: OK" in text
+    assert number(r"median distance ([\d.]+) px", text) < 0.05
+    assert number(r"focal length: ([\d.]+) px", text) == pytest.approx(500.0, rel=0.02)
+    assert number(r"at most ([\d.]+) degrees", text) < 0.5
+
+
 def test_lines_and_curves(tmp_path: Path) -> None:
     text = run("lines_and_curves.py", tmp_path)
     assert number(r"direction off by ([\d.]+) degrees", text) < 1
