@@ -13,6 +13,8 @@ from test_known_poses import truth
 from torchsfm.cli.known_poses import find_features
 from torchsfm.formats import read_features, write_colmap, write_database
 from torchsfm.geometry import rotation_angle
+from torchsfm.images import detect_features, read_image, save_image
+from torchsfm.images.matching import match_descriptors
 from torchsfm.reconstruction import (
     KnownFeatures,
     MatchedImages,
@@ -154,8 +156,6 @@ def test_wrong_input_is_told(photographs: Path, run: Path, tmp_path: Path) -> No
 
 
 def test_a_photograph_of_something_else_finds_no_pose(run: Path, tmp_path: Path, generator: torch.Generator) -> None:
-    from torchsfm.images import save_image
-
     old = Reconstruction.load(run / "model.npz")
     known = saved_features(run, old)
     assert known is not None
@@ -167,3 +167,18 @@ def test_a_photograph_of_something_else_finds_no_pose(run: Path, tmp_path: Path,
     assert result.model.registered.tolist() == [True] * 4 + [False]
     assert result.report.images[4].reason
     assert torch.equal(result.model.poses.t[:4], old.poses.t)
+
+
+@pytest.mark.reference
+def test_colmap_describes_features_alike(photographs: Path, tmp_path: Path) -> None:
+    """Its features match those found here as these match each other, at the same places, the half pixel included."""
+    pycolmap = pytest.importorskip("pycolmap")
+    old = copies(photographs, tmp_path / "old", "view0.png")
+    pycolmap.extract_features(tmp_path / "database.db", old)
+    theirs = read_features(tmp_path / "database.db")
+    first, second = (detect_features(read_image(photographs / f"view{i}.png")) for i in range(2))
+    same = match_descriptors(theirs.descriptors[0], first.descriptors)
+    assert len(same) > 0.5 * len(theirs.x[0])
+    assert float((theirs.x[0][same[:, 0]] - first.x[same[:, 1]]).norm(dim=-1).median()) < 0.1
+    across = match_descriptors(theirs.descriptors[0], second.descriptors)
+    assert len(across) > 0.8 * len(match_descriptors(first.descriptors, second.descriptors))
