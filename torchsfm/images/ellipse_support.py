@@ -13,6 +13,12 @@ from torchsfm.images.false_alarms import aligned
 
 _BENT = 3
 """How far edges are bent by others that they meet, in pixels."""
+_CLEAR = 4.5
+"""From how far on edges do not move each other, in widths of their profiles: by 4 e^-10 of these."""
+_STEP = 0.5
+"""In which other edges are looked for, in pixels, """
+_NEAREST = 2.0
+"""and from where: edges that are nearer are one."""
 _BORDER = 4.0
 """Where there are no edges, in pixels from the border."""
 
@@ -58,6 +64,31 @@ def edge_map(
     # Of two at one pixel the later one, on every device.
     at = at.scatter_reduce(0, place, own, "amax")
     return EdgeMap(x, gradient, at.reshape(shape))
+
+
+def crowded(edges: EdgeMap, image: Int[Tensor, " n"], width: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Whether there is another edge across so near that smoothing moves both.
+
+    The gradients of two edges add: their tops are moved apart, or towards each other.
+
+    Args:
+        edges: The edge points.
+        image: Which image each is in.
+        width: Of the profile of each.
+    """
+    h, w = edges.at.shape[1:]
+    reach = _CLEAR * width
+    normal = torch.nn.functional.normalize(edges.gradient, dim=-1)
+    found = torch.zeros_like(image, dtype=torch.bool)
+    number = int(float(reach.max() - _NEAREST) / _STEP) + 1 if len(reach) else 0
+    for k in range(number):
+        away = _NEAREST + _STEP * k
+        for side in (-away, away):
+            column, row = (edges.x + side * normal).round().long().unbind(-1)
+            inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+            place = (image * h + row.clamp(0, h - 1)) * w + column.clamp(0, w - 1)
+            found |= inside & (away <= reach) & (edges.at.flatten()[place] >= 0)
+    return found
 
 
 def find_support(ellipses: Ellipse, image: Int[Tensor, " n"], edges: EdgeMap, reach: int) -> Support:

@@ -12,7 +12,7 @@ from torchsfm.geometry import Ellipse, ellipse_distance
 from torchsfm.geometry.conics import ellipse_of_shape
 from torchsfm.images.edges import detect_edges
 from torchsfm.images.ellipse_moments import conic_moments, ellipse_of_moments, residual
-from torchsfm.images.ellipse_support import Support, edge_map, find_support, keep_the_best
+from torchsfm.images.ellipse_support import Support, crowded, edge_map, find_support, keep_the_best
 from torchsfm.images.elliptic_arcs import Arcs, compatible_pairs, find_arcs
 from torchsfm.images.false_alarms import CHANCE, log_tail
 from torchsfm.images.fit_ellipse import fit_ellipse
@@ -34,6 +34,8 @@ _EXACT = 0.02
 """Errors of edge points without noise, in pixels."""
 _BENT = 4.5
 """Distances that edge points do not have by chance, in units of their median: three standard deviations."""
+_CROWDED = 0.75
+"""Share of edge points next to other edges up to which they are left out."""
 _ROUNDS = 2
 """Fits that are made to leave out edge points, """
 _FEW = 3
@@ -146,7 +148,8 @@ def detect_ellipses(
     support = support.chosen(good[support.ellipse] & support.aligned)
     kept = keep_the_best(rank, support, len(x), _SHARED)
     found = {name: values[kept] for name, values in found.items()}
-    more, good = _refined(x, variance, support, kept, 2 * math.sqrt(math.pi) * blur, max_scatter)
+    moved = crowded(edgels, of_image, edges.width.flatten()[place].double())
+    more, good = _refined(x, variance, support, moved, kept, 2 * math.sqrt(math.pi) * blur, max_scatter)
     good &= more["semi_axes"][:, 1] >= min_radius
     found |= more
     laid = lay_in_slots(found, good, found["count"].double(), of[kept], batch, max_ellipses, image.dtype)
@@ -213,9 +216,9 @@ def _judge(support: Support, n: int, log_pixels: float) -> dict[str, Tensor]:
 
 
 def _refined(
-    x: Tensor, variance: Tensor, support: Support, kept: Tensor, tied: float, scatter: float
+    x: Tensor, variance: Tensor, support: Support, moved: Tensor, kept: Tensor, tied: float, scatter: float
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Ellipses of least orthogonal distances, and which are determined."""
+    """Ellipses of least orthogonal distances to edge points that other edges have not `moved`, and which are determined."""
     rows = kept[support.ellipse]
     new = kept.long().cumsum(0) - 1
     of, edgel = new[support.ellipse[rows]], support.edgel[rows]
@@ -226,10 +229,11 @@ def _refined(
     points, weights = x.new_zeros(n, width, 2), x.new_zeros(n, width)
     points[of, slot] = x[edgel]
     weights[of, slot] = 1 / (variance[edgel] + _EXACT**2)
-    bent = torch.zeros_like(weights, dtype=torch.bool)
-    bent[of, slot] = ~support.inner[rows]
-    some = 2 * bent.sum(-1, keepdim=True) < count[:, None]
-    weights = torch.where(bent & some, 0.0, weights)
+    for wrong, most in ((~support.inner[rows], 0.5), (moved[edgel], _CROWDED)):
+        bent = torch.zeros_like(weights, dtype=torch.bool)
+        bent[of, slot] = wrong
+        some = (bent & (weights > 0)).sum(-1, keepdim=True) < most * (weights > 0).sum(-1, keepdim=True)
+        weights = torch.where(bent & some, 0.0, weights)
     near = weights
     for _ in range(_ROUNDS):
         first = fit_ellipse(points, weights=weights, max_iterations=_FEW)
