@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
+from torchsfm.autocalibration.circle_outlines import centre_weights, circle_points, outline_centres
 from torchsfm.geometry import Camera, Distortion, Pose, Radial
 from torchsfm.geometry.intrinsic_parameters import (
     ASPECT,
@@ -89,22 +90,25 @@ def calibrate_planes(
     distortion: type[Distortion] = Radial,
     free: Sequence[str] = ("focal", "aspect", "principal_point"),
     loss: Loss | None = None,
+    radius: float | None = None,
     max_iterations: int = 60,
 ) -> PlaneCalibration:
-    """Calibrate a camera from views of points on a plane, whose places on it are known.
+    """Calibrate a camera from views of points, or of circles, on a plane, whose places on it are known.
 
     Needs three views of different directions, or fewer with fewer free parameters. Views parallel to the image, or to each
     other, add nothing. Where x or X require a gradient the answer carries its derivative, that of the optimum.
 
     Args:
-        x: Image points in pixels.
-        X: Points on the plane, in any unit.
+        x: Image points in pixels; of circles the centres of the ellipses that fit their outlines.
+        X: Points on the plane, in any unit; the centres of circles.
         image_size: Width and height in pixels, whose middle is the first guess of the principal point, and stays it where that
             is not free; the middle of the observations by default.
         visible: Which points each view sees; all by default. What stands elsewhere is not looked at.
         distortion: The distortion model.
         free: Which of "focal" (always), "aspect", "skew", "principal_point" are estimated; all of the distortion is.
         loss: Of squared distances in pixels, see `torchsfm.optim.loss`; the squares if not given.
+        radius: Of the circles, in the unit of X; points if not given. The middle of a circle is not seen in the middle of its
+            outline, the less so the larger it is: what the outlines look like through the lens is taken into account.
         max_iterations: Most steps of the optimiser.
 
     Returns:
@@ -126,7 +130,7 @@ def calibrate_planes(
     batch = check_tensors(x=(x, "v>=1 n>=4 2"), X=(X, "n 2"), visible=(visible, "?v n : bool"))
     check_options(
         image_size=(image_size, "?2 float > 0"), free=(free, Sequence), loss=(loss, Callable | None),
-        max_iterations=(max_iterations, "int >= 0"),
+        radius=(radius, "?float > 0"), max_iterations=(max_iterations, "int >= 0"),
     )  # fmt: skip
     columns = tuple(sorted(set(intrinsic_columns(free))))
     if "focal" not in free:
@@ -145,7 +149,7 @@ def calibrate_planes(
     columns += tuple(range(HEAD, HEAD + distortion.num_parameters))
     q = len(columns)
     weights = seen.double().flatten(-2)
-    problem = _Problem(PixelProjection(distortion, columns, SKEW in columns))
+    problem = _Problem(PixelProjection(distortion, columns, SKEW in columns), radius)
     result = levenberg_marquardt(
         problem.residual,
         start,
@@ -207,9 +211,10 @@ def _lengths(covariance: Tensor, found: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Reprojection of the plane's points, and its derivatives."""
+    """Reprojection of the plane's points, or of its circles, and its derivatives."""
 
     projection: PixelProjection
+    radius: float | None
 
     def retract(self, u: _Unknowns, delta: Tensor) -> _Unknowns:
         free = self.projection.free
@@ -222,17 +227,25 @@ class _Problem:
         return _Unknowns(row, turn @ u.R, moved)
 
     def residual(self, u: _Unknowns, x: Tensor, X: Tensor) -> Tensor:
-        pixels = self.projection.pixels(*_seen(u, X))
+        pixels = self.projection.pixels(*_seen(u, self._outlined(X)))
+        if self.radius is not None:
+            pixels = outline_centres(centre_weights(pixels), pixels)
         return (pixels.movedim(0, -1) - x).flatten(-3, -2)
+
+    def _outlined(self, X: Tensor) -> Tensor:
+        return X if self.radius is None else circle_points(X, self.radius)
 
     def linearize(self, u: _Unknowns, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
         """Residuals and Jacobian; every view depends on its own pose alone, so that all poses are differentiated at once."""
         b, v, n = x.shape[:3]
         q = len(self.projection.free)
-        ray, row = _seen(u, X)
-        local = x.new_empty(2, 6 + q, b, v, n)
+        ray, row = _seen(u, self._outlined(X))
+        local = x.new_empty(2, 6 + q, b, v, ray.shape[-1])
         pixels = self.projection.linearize(ray, row, local[:, 3:6], local[:, 6:])
         turn_slopes(ray, local[:, 3:6], local)
+        if self.radius is not None:
+            K = centre_weights(pixels)
+            pixels, local = outline_centres(K, pixels), outline_centres(K[:, :, None], local)
         J = x.new_zeros(b, v, n, 2, q + 6 * v)
         J[..., :q] = local[:, 6:].permute(2, 3, 4, 0, 1)
         J[..., q:].view(b, v, n, 2, v, 6).diagonal(dim1=1, dim2=4).copy_(local[:, :6].permute(2, 4, 0, 1, 3))

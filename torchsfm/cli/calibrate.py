@@ -52,6 +52,9 @@ class _Photograph:
     path: Path
     size: tuple[int, int] = (0, 0)
     x: Float[Tensor, "n 2"] | None = None
+    """Corners, or centres of the outlines of circles."""
+    radius: float | None = None
+    """Of the circles, in units of the distance between neighbours."""
     rms: float | None = None
     problem: str = ""
 
@@ -98,7 +101,7 @@ def calibrate(
         try:
             found = calibrate_planes(
                 x, X, image_size=(float(seen[0].size[0]), float(seen[0].size[1])), distortion=DISTORTION_MODELS[camera],
-                free=tuple(word.strip() for word in free.split(",")), loss=Huber(loss_scale),
+                free=tuple(word.strip() for word in free.split(",")), loss=Huber(loss_scale), radius=_radius(seen, size),
             )  # fmt: skip
         except ValueError as error:
             raise UserError(" ".join(str(error).split())) from None
@@ -155,7 +158,8 @@ def _find(job: Job, images: list[Path], pattern: Pattern, columns: int, rows: in
             continue
         points = detect(image, columns, rows)
         if bool(points.found):
-            p.x = points.x
+            p.x = points.x if points.outlines is None else points.outlines
+            p.radius = None if points.radius is None else float(points.radius)
         else:
             p.problem = "the pattern is not found, or not all of it"
     job.progress("pattern", len(photographs), len(photographs))
@@ -165,6 +169,12 @@ def _find(job: Job, images: list[Path], pattern: Pattern, columns: int, rows: in
         if p.x is not None and p.size != usual:
             p.x, p.problem = None, f"has {p.size[0]} x {p.size[1]} pixels, most have {usual[0]} x {usual[1]}"
     return photographs
+
+
+def _radius(seen: list[_Photograph], size: float) -> float | None:
+    """Of the circles of the board, as most photographs show it."""
+    shown = sorted(p.radius for p in seen if p.radius is not None)
+    return size * shown[len(shown) // 2] if shown else None
 
 
 def _record(

@@ -17,6 +17,8 @@ from torchsfm.images.plane_grids import grid_homography, grid_in_points
 
 _WINDOW = 11
 """Largest half side of the square around a corner that says where it is, in pixels."""
+_SIZE = math.log(1.25)
+"""How far the logarithm of a radius may be from that of the known one."""
 _ROUNDS = 4
 """Improvements of the vanishing line by the centres, and of the centres by the vanishing line."""
 
@@ -34,6 +36,10 @@ class BoardPoints:
     x: Float[Tensor, "*batch n 2"]
     """In pixels."""
     found: Bool[Tensor, "*batch"]
+    outlines: Float[Tensor, "*batch n 2"] | None = None
+    """Centres of the ellipses that fit the outlines of circles, of which `x` are the middles, but for what a lens bends."""
+    radius: Float[Tensor, "*batch"] | None = None
+    """Of circles, in units of the distance between neighbours."""
 
 
 def detect_chessboard(image: Float[Tensor, "*batch c h w"], columns: int, rows: int) -> BoardPoints:
@@ -85,8 +91,8 @@ def detect_circles_grid(
     """Find the centres of circles in a rectangular grid, all circles of one size.
 
     The ellipses of `detect_ellipses` are linked to a grid. An ellipse's centre is not where the circle's centre is: that is the
-    pole of the vanishing line of the board, which the grid tells. How lenses bend within a circle is not taken into account:
-    with circles nearly as large as can be, a strong distortion moves focal lengths by some thousandths.
+    pole of the vanishing line of the board, which the grid tells. How lenses bend within a circle is not taken into account;
+    `calibrate_planes` does that, given `outlines` and `radius` of the result.
 
     Args:
         image: Grey (c = 1) or red, green, blue images.
@@ -96,7 +102,7 @@ def detect_circles_grid(
         max_ellipses: The most ellipses of an image that are looked at.
 
     Returns:
-        The centres, where all circles are seen and nothing continues the grid.
+        The centres, where all circles are seen and nothing continues the grid; those of their outlines, and their radius.
 
     Raises:
         ValueError: A shape or an option is wrong.
@@ -115,11 +121,13 @@ def detect_circles_grid(
     batch, flat = _gray(image, columns, rows, 2)
     x = torch.zeros(len(flat), rows * columns, 2, dtype=image.dtype, device=image.device)
     found = torch.zeros(len(flat), dtype=torch.bool, device=image.device)
+    outlines, radius = torch.zeros_like(x), torch.zeros_like(x[:, 0, 0])
     for i, gray in enumerate(flat):
-        centres = _circles(detect_ellipses(gray[None], max_ellipses), columns, rows, ratio)
-        if centres is not None:
-            x[i], found[i] = centres.to(x), True
-    return BoardPoints(x.reshape(*batch, rows * columns, 2), found.reshape(batch))
+        circles = _circles(detect_ellipses(gray[None], max_ellipses), columns, rows, ratio)
+        if circles is not None:
+            x[i], outlines[i], radius[i], found[i] = *(v.to(x) for v in circles), True
+    shape = (*batch, rows * columns, 2)
+    return BoardPoints(x.reshape(shape), found.reshape(batch), outlines.reshape(shape), radius.reshape(batch))
 
 
 def _gray(image: Tensor, columns: int, rows: int, least: int) -> tuple[torch.Size, Tensor]:
@@ -135,8 +143,8 @@ def _least_distance(x: np.ndarray) -> float:
     return min(float(np.linalg.norm(np.diff(x, axis=k), axis=-1).min()) for k in (0, 1))
 
 
-def _circles(ellipses: Ellipses, columns: int, rows: int, ratio: float | None) -> Tensor | None:
-    """The centres of the circles, row by row."""
+def _circles(ellipses: Ellipses, columns: int, rows: int, ratio: float | None) -> tuple[Tensor, Tensor, Tensor] | None:
+    """The middles of the circles and the centres of their outlines, row by row, and their median radius."""
     valid = ellipses.valid
     each = Ellipse(*(v[valid].double() for v in (ellipses.ellipse.centre, ellipses.ellipse.semi_axes, ellipses.ellipse.angle)))
     order = grid_in_points(each.centre, shape_of_ellipse(each), columns, rows)
@@ -151,22 +159,22 @@ def _circles(ellipses: Ellipses, columns: int, rows: int, ratio: float | None) -
         x = pole[:, :2] / pole[:, 2:]
     if not bool(x.isfinite().all()):
         return None
-    if ratio is not None and not _of_size(chosen, H, ratio):
-        return None
-    return _seen_from_the_front(x.reshape(rows, columns, 2)).reshape(-1, 2)
-
-
-def _of_size(circles: Ellipse, H: Tensor, ratio: float) -> bool:
-    """Whether areas are those of circles of this radius, within a quarter of the radius."""
     # On the board, in units of the distance between neighbours: H' C H.
-    on_board = H.mT @ conic_from_ellipse(circles) @ H
+    on_board = H.mT @ conic_from_ellipse(chosen) @ H
     radius = (on_board[:, :2, :2].det().clamp_min(1e-300).pow(-1.5) * -on_board.det()).clamp_min(0).sqrt()
-    return bool(((radius / ratio).log().abs() < math.log(1.25)).all())
+    if ratio is not None and not bool(((radius / ratio).log().abs() < _SIZE).all()):
+        return None
+    both = torch.cat((x, chosen.centre), -1).reshape(rows, columns, 4)
+    both = _seen_from_the_front(both).reshape(-1, 4)
+    return both[:, :2], both[:, 2:], radius.median()
 
 
 def _seen_from_the_front(x: Tensor) -> Tensor:
-    """Rows and columns (rows, columns, 2) so that x turns to y; the end that is nearer to the top left corner is the first."""
-    along, down = x[0, -1] - x[0, 0], x[-1, 0] - x[0, 0]
+    """Rows and columns (rows, columns, k) so that x turns to y; the end that is nearer to the top left corner is the first.
+
+    The place of each is in the first two of its numbers.
+    """
+    along, down = (end[:2] - x[0, 0, :2] for end in (x[0, -1], x[-1, 0]))
     if float(along[0] * down[1] - along[1] * down[0]) < 0:
         x = x.flip(1)
-    return x if float(x[0, 0].sum()) <= float(x[-1, -1].sum()) else x.flip(0, 1)
+    return x if float(x[0, 0, :2].sum()) <= float(x[-1, -1, :2].sum()) else x.flip(0, 1)
