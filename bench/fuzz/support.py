@@ -63,7 +63,10 @@ def robust(distance: Distance, sample_size: int) -> Judge:
 def _sizes(a: Arguments, inliers: Tensor) -> Tensor:
     """The largest coordinate of each datum."""
     data = [v for v in a.values() if isinstance(v, Tensor) and v.is_floating_point() and v.shape[:-1] == inliers.shape]
-    if a.get("l") is not None:
+    if a.get("l") is not None and "X" not in a:
+        # Of all views together.
+        data = [torch.cat((a["x"].abs().amax((-3, -1)), a["l"].abs().amax((-4, -2, -1))), -1)[..., None]]
+    elif a.get("l") is not None:
         parts = [[a["x"], a["X"]], [a["l"].flatten(-2), a["L"]]]
         data = [torch.cat([torch.cat(part, -1).abs().amax(-1) for part in parts], -1)[..., None]]
     return torch.cat(data, -1).abs().amax(-1) if data else torch.zeros_like(inliers, dtype=torch.float64)
