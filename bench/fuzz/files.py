@@ -9,10 +9,12 @@ import gzip
 import io
 import resource
 import shutil
+import sqlite3
 import tempfile
 import time
 import zipfile
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ import torch
 
 from bench.fuzz.campaign import Target, Trial, main
 from bench.fuzz.mutations import mend_png, mutate
+from torchsfm.cli.align import read_points
 from torchsfm.cli.inputs import read_intrinsics
 from torchsfm.cli.job import UserError
 from torchsfm.formats import (
@@ -32,6 +35,7 @@ from torchsfm.formats import (
     read_colmap,
     read_conics,
     read_database,
+    read_features,
     read_libmv,
     read_lines,
     read_model,
@@ -47,7 +51,7 @@ from torchsfm.formats import (
 from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics, random_rotation
 from torchsfm.images import Photograph, extract_frames, parse_exif, read_image, save_image
 from torchsfm.images.heif import heif_library
-from torchsfm.reconstruction import MatchedImages, Reconstruction
+from torchsfm.reconstruction import ControlPoints, KnownFeatures, MatchedImages, Reconstruction
 from torchsfm.reconstruction.files import load_arrays
 from torchsfm.reconstruction.sources import Sources
 
@@ -150,6 +154,12 @@ def _faults(found: Any) -> list[str]:
                 limit = torch.tensor([len(found.keypoints[i]), len(found.keypoints[j])])
                 faults += [] if bool(((rows >= 0) & (rows < limit)).all()) else ["matches are out of range"]
             return faults
+        case KnownFeatures():
+            counts = zip(found.names, found.x, found.descriptors, found.labels, strict=True)
+            return [f"{name} has other counts" for name, x, d, _ in counts if len(x) != len(d) or d.dtype != torch.uint8]
+        case ControlPoints():
+            good = bool(found.X.isfinite().all()) and bool(found.x.isfinite().all())
+            return [] if good and bool((found.point < len(found.names)).all()) else ["places"]
         case VggScene():
             tensors = {"x": found.x, "P": found.P, "X": found.X, "segments": found.segments, "L": found.L}
             return [f"{name} is not finite" for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]
@@ -166,6 +176,16 @@ def _faults(found: Any) -> list[str]:
 
 def _megabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _describe(path: Path, counts: list[int]) -> None:
+    """Add descriptors to a database, so many of each image."""
+    with closing(sqlite3.connect(path)) as database:
+        columns = "image_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL, data BLOB"
+        database.execute(f"CREATE TABLE descriptors ({columns})")
+        for i, count in enumerate(counts):
+            database.execute("INSERT INTO descriptors VALUES (?, ?, 128, ?)", (i + 1, count, bytes(range(128)) * count))
+        database.commit()
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -263,6 +283,11 @@ def _formats() -> list[Format]:
         matched = MatchedImages(model.names[:3], model.image_size[:3], keypoints, pairs, (rows, rows))
         write_database(matched, folder / "database.db")
         formats.append(Format("database", _files(folder, "database.db"), read_database))
+        _describe(folder / "database.db", [len(x) for x in keypoints])
+        formats.append(Format("database of features", _files(folder, "database.db"), read_features))
+        formats.append(
+            Format("control points", {"points.txt": b"p 1 2 3 a b.jpg 4 5\n# more\nq 0 2 1 c.jpg 7 5\n"}, read_points)
+        )
         model.save(folder / "model.npz")
         formats.append(Format("model", _files(folder, "model.npz"), Reconstruction.load, _in_zip))
         np.savez(folder / "stage.npz", a=np.arange(5), b=np.array("text"))

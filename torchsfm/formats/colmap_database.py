@@ -9,6 +9,7 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -229,9 +230,11 @@ def _has_table(database: sqlite3.Connection, name: str) -> bool:
     return bool(database.execute(query, (name,)).fetchone()[0])
 
 
-def _table(data: bytes | None, rows: int, columns: int, kind: np.dtype, least: int) -> NDArray:  # type: ignore[type-arg]
-    """A table of numbers as the database holds it."""
-    data = data or b""
+def _table(data: Any, rows: Any, columns: Any, kind: np.dtype, least: int) -> NDArray:  # type: ignore[type-arg]
+    """A table of numbers as the database holds it, where a damaged one may hold anything."""
+    data = b"" if data is None else data
+    if not (isinstance(rows, int) and isinstance(columns, int) and isinstance(data, bytes)):
+        raise ValueError(f"{str(rows)[:20]} x {str(columns)[:20]} is no size of a table of numbers")
     if rows and (columns < least or rows < 0 or len(data) != rows * columns * kind.itemsize):
         raise ValueError(f"{len(data)} bytes are no table of {rows} x {columns} numbers")
     return np.frombuffer(data, kind).reshape(rows, columns) if rows else np.empty((0, least), kind)
