@@ -193,6 +193,14 @@ def test_bad_problems(generator: torch.Generator) -> None:
     assert torch.equal(good.model[0], bad.model[0])
 
 
+def test_nothing_agrees_on_nothing(generator: torch.Generator) -> None:
+    """Cameras that make one plane of all lines are no answer."""
+    x = 640 * torch.rand(12, 3, 30, 2, generator=generator, dtype=F64)
+    l = 640 * torch.rand(12, 3, 40, 2, 2, generator=generator, dtype=F64)  # noqa: E741
+    found = estimate_trifocal(x, l, threshold=3.0, generator=seeded(), max_iterations=300)
+    assert (found.status != Status.OK).all()
+
+
 def test_wrong_arguments(unchecked: None) -> None:
     x, l = torch.zeros(3, 9, 2), torch.zeros(3, 5, 2, 2)  # noqa: E741
     with pytest.raises(ValueError, match="l"):

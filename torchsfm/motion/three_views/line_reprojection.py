@@ -19,6 +19,8 @@ from torchsfm.motion.two_views.epipolar_fit import forms
 
 Rows = Sequence[Tensor]
 _TINY = 1e-30
+_BLIND = 1e-8
+"""Squared slopes, in units of what they are differences of, that are rounding."""
 _STEPS = 3
 """Of Gauss-Newton towards ends that one line has."""
 
@@ -48,7 +50,8 @@ def squared_line_distance(model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Row
         model: The second and third camera.
         x: Four rows for each of three views, the coordinates of both ends.
     """
-    return _squared(_nearest(model, x), x)
+    moved = _nearest(model, x)
+    return _squared(moved, x).masked_fill(_blind(_transfer(model, moved)), torch.inf)
 
 
 def line_equations(
@@ -73,7 +76,7 @@ def line_equations(
     F = [torch.stack(torch.broadcast_tensors(*e), -2) for e in entries]  # type: ignore[no-untyped-call]
     first, mixed, second = (s[..., None, :] for s in (first, mixed, second))
     J = torch.stack((F[0] * first, (F[1] - mixed * F[0]) * second), -2)
-    return _squared(moved, x), r, J
+    return _squared(moved, x).masked_fill(_blind(there), torch.inf), r, J
 
 
 def _transfer(model: Tensor, x: Sequence[Rows]) -> Transfer:
@@ -121,6 +124,13 @@ def _transfer(model: Tensor, x: Sequence[Rows]) -> Transfer:
                     total = total + one_slope[0] * other[0] + one_slope[1] * other[1]
         products.append(total)
     return Transfer([m, *lines], planes, f, J, products)
+
+
+def _blind(at: Transfer) -> Tensor:
+    """Where cameras would agree with any line: those that make one plane of all lines, and what is no segment."""
+    (n2, w2), (n3, w3) = at.planes
+    second, third = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2] + w * w for n, w in ((n2, w2), (n3, w3)))
+    return ~(at.S[0] + at.S[2] > _BLIND * second * third)
 
 
 def _factor(at: Transfer) -> tuple[Tensor, Tensor, Tensor]:
