@@ -20,7 +20,7 @@ from torchsfm.motion.three_views.trifocal_reprojection import linear_depths, nor
 from torchsfm.robust import Degeneracy, Weigh, constant_weights
 from torchsfm.tensors.canonical import canonical_frame
 
-_MOTION = 0.5
+_MOTION = 0.3
 """A change of the cameras, of norm 1 each, that should be seen."""
 _FIT_STEPS = 4
 """Steps from the linear tensor of lines to the nearest that three cameras have."""
