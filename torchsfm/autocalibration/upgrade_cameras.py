@@ -28,7 +28,7 @@ _FAR = 3.0
 class Autocalibration:
     """Metric cameras and points, or samples of curves, and how far the data determine them.
 
-    See the examples of `autocalibrate_points` and `autocalibrate_curves`.
+    See the example of `autocalibrate_points`, and for curves that of `autocalibrate_curves`.
     """
 
     K: Float[Tensor, "*batch v 3 3"]
