@@ -75,6 +75,24 @@ def test_parts_become_the_whole(shared: int, generator: torch.Generator) -> None
     assert len(key) == found.model.num_observations
 
 
+def test_a_model_merged_with_itself_stays(generator: torch.Generator) -> None:
+    """Also one with features of several orientations, at one place each."""
+    model = whole_model(generator)
+    again = model.point < 40
+    model = replace(
+        model,
+        X=torch.cat((model.X, model.X[:40])),
+        color=torch.cat((model.color, model.color[:40])),
+        x=torch.cat((model.x, model.x[again])),
+        view=torch.cat((model.view, model.view[again])),
+        point=torch.cat((model.point, model.point[again] + len(model.X))),
+    )
+    found = merge_models(model, model)
+    assert not found.fault()
+    assert found.shared_points == found.model.num_points == model.num_points
+    assert found.model.num_observations == model.num_observations
+
+
 def in_both(model: Reconstruction, a: Reconstruction, b: Reconstruction) -> torch.Tensor:
     """Points of the whole that both parts have."""
     kept = []

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -192,17 +192,21 @@ def _as_kind(cameras: Camera, kind: type[Distortion]) -> Camera:
 
 
 def _same_observations(a: Reconstruction, b: Reconstruction, both: list[tuple[int, int]]) -> Int[Tensor, "k 2"]:
-    """Pairs of observations, of a and of b, that are at the same place in a shared image, each the other's nearest."""
+    """Pairs of observations, of a and of b, that are at the same place in a shared image, each the other's nearest.
+
+    Where several are at the very same place (features of two orientations), the first of a is that of b, and so on.
+    """
     found = [torch.zeros(0, 2, dtype=torch.long)]
     for i, j in both:
         first, second = (a.view == i).nonzero()[:, 0], (b.view == j).nonzero()[:, 0]
         if not len(first) or not len(second):
             continue
+        mine, theirs = _numbered(a.x[first]), _numbered(b.x[second])
         distance, nearest = [], []
         back = torch.full((len(second),), torch.inf, dtype=a.x.dtype)
         owner = torch.zeros(len(second), dtype=torch.long)
         for start in range(0, len(first), BLOCK):
-            gap = torch.cdist(a.x[first[start : start + BLOCK]], b.x[second], compute_mode="donot_use_mm_for_euclid_dist")
+            gap = torch.cdist(mine[start : start + BLOCK], theirs, compute_mode="donot_use_mm_for_euclid_dist")
             least = gap.min(dim=1)
             distance.append(least.values)
             nearest.append(least.indices)
@@ -213,6 +217,15 @@ def _same_observations(a: Reconstruction, b: Reconstruction, both: list[tuple[in
         good = (near <= SAME) & (owner[to] == torch.arange(len(first)))
         found.append(torch.stack((first[good], second[to[good]]), 1))
     return torch.cat(found)
+
+
+def _numbered(x: Float[Tensor, "m 2"]) -> Float[Tensor, "m 3"]:
+    """Image points with a third coordinate: how many at the very same place came before."""
+    _, place, count = torch.unique(x, dim=0, return_inverse=True, return_counts=True)
+    order = torch.argsort(place, stable=True)
+    before = torch.empty_like(place)
+    before[order] = torch.arange(len(x)) - (count.cumsum(0) - count)[place[order]]
+    return torch.cat((x, before[:, None].to(x)), 1)
 
 
 def _similarity(
