@@ -14,6 +14,8 @@ from torchsfm.optim.loss import Loss, loss_slope
 from torchsfm.optim.pytree import Places, leaves, norm, pick, places, put
 
 Linearize = Callable[..., tuple[Tensor, Tensor]]
+WIDE = 1 << 20
+"""Numbers, of variables and data, for which rows of exact Hessians are found at once."""
 
 
 @dataclass(frozen=True)
@@ -150,19 +152,24 @@ class DenseProblem:
 
     def curve(self, here: DenseSystem, where: Tensor) -> DenseSystem:
         """The exact second derivatives of the cost in some elements; not always positive."""
-        at = places(where)
-        some, x = self.pick(at), pick(at, here.x)
-        first = leaves(x)[0]
-        with torch.enable_grad():
-            delta = first.new_zeros((first.shape[0], self.tangent)).requires_grad_()
-            cost = some.cost(self.retract(x, delta))
-            (slope,) = torch.autograd.grad(cost.sum(), delta, create_graph=True, materialize_grads=True)
-            if slope.requires_grad:
-                sums = [s.sum() for s in slope.unbind(-1)]
-                rows = [torch.autograd.grad(s, delta, retain_graph=True, materialize_grads=True)[0] for s in sums]
-            else:
-                rows = [torch.zeros_like(delta)] * self.tangent
-        return replace(here, hessian=put(at, here.hessian, torch.stack(rows, -2).double()))
+        (at,) = places(where)
+        each = sum(v[0].numel() for v in leaves((here.x, self.data)))
+        rows = []
+        # Each problem stands there once for each row of its Hessian, so that one derivative gives them all.
+        for directions in torch.eye(self.tangent, device=at.device).split(max(1, WIDE // (each * len(at)))):
+            copies = (at.repeat_interleave(len(directions)),)
+            some, x = self.pick(copies), pick(copies, here.x)
+            first = leaves(x)[0]
+            with torch.enable_grad():
+                delta = first.new_zeros((len(first), self.tangent)).requires_grad_()
+                cost = some.cost(self.retract(x, delta)).sum()
+                (slope,) = torch.autograd.grad(cost, delta, create_graph=True, materialize_grads=True)
+                along = (slope * directions.to(slope).repeat(len(at), 1)).sum()
+                row = torch.zeros_like(delta)
+                if along.requires_grad:
+                    (row,) = torch.autograd.grad(along, delta, materialize_grads=True)
+            rows.append(row.view(len(at), len(directions), self.tangent))
+        return replace(here, hessian=put((at,), here.hessian, torch.cat(rows, 1).double()))
 
     def rounding(self, here: DenseSystem) -> Tensor:
         """What rounding of the parameters or of the data makes of the cost, whichever is less."""
