@@ -1,7 +1,6 @@
 """What the package shows: its names with their signatures, one in a line. Run as a program, it writes them anew."""
 
 import inspect
-import typing
 from enum import EnumMeta
 from pathlib import Path
 from types import ModuleType
@@ -14,11 +13,8 @@ FILE = Path(__file__).with_suffix(".txt")
 
 def public_names() -> dict[str, Any]:
     """The names at the top of the package that are no rooms."""
-    return {name: value for name, value in sorted(vars(torchsfm).items()) if name[0] != "_" and _is_ours(name, value)}
-
-
-def _is_ours(name: str, value: Any) -> bool:
-    return not isinstance(value, ModuleType) and not hasattr(typing, name)
+    values = {name: getattr(torchsfm, name) for name in torchsfm.__all__}
+    return {name: value for name, value in values.items() if not isinstance(value, ModuleType)}
 
 
 def lines() -> list[str]:

@@ -2,9 +2,6 @@
 
 import json
 import math
-import os
-import subprocess
-import sys
 import webbrowser
 from dataclasses import replace
 from pathlib import Path
@@ -126,14 +123,6 @@ def test_how_far_a_stage_is(capsys: pytest.CaptureFixture[str], tmp_path: Path, 
         "matching pairs: 1 of 4, 10 min left",
     ]
     assert [duration(seconds) for seconds in (0.4, 89.0, 600.0, 7200.0)] == ["0 s", "89 s", "10 min", "2.0 h"]
-
-
-def test_the_shell_completes_commands() -> None:
-    environment = {**os.environ, "COMP_WORDS": "torchsfm rec", "COMP_CWORD": "1"}
-    environment["_TORCHSFM_COMPLETE"] = "complete_bash"
-    code = "import sys; sys.argv[0] = 'torchsfm'; from torchsfm.cli import main; main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert done.stdout.split() == ["reconstruct"], done.stderr
 
 
 # ---- view ----------------------------------------------------------------------------------------------------------------

@@ -24,10 +24,49 @@ def test_names_of_rooms_are_reached_from_the_top() -> None:
         torchsfm.fundamental_9pt  # noqa: B018
 
 
-def test_import_leaves_the_slow_packages_out() -> None:
+def said_by(code: str) -> str:
+    """What a program of these lines prints, in a process of its own."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_all_names_are_listed_and_loaded_together() -> None:
+    """And leave slow packages out, which only those load who need them."""
     code = (
-        "import sys, torchsfm; slow = {'kornia', 'cv2', 'matplotlib', 'plotly', 'pycolmap', 'typer', 'rich', 'scipy'};"
-        "print(sorted(slow & set(sys.modules)))"
+        "from torchsfm import *; import sys, torchsfm;"
+        "slow = {'kornia', 'cv2', 'matplotlib', 'plotly', 'pycolmap', 'typer', 'rich', 'scipy'};"
+        "print(set(torchsfm.__all__) <= set(globals()) & set(dir(torchsfm)), sorted(slow & set(sys.modules)))"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
+    assert said_by(code) == "True []"
+
+
+def test_rooms_are_loaded_when_they_are_asked_for() -> None:
+    code = (
+        "import sys, torchsfm; print('torch' in sys.modules);"
+        "torchsfm.Camera; print('torchsfm.geometry' in sys.modules, 'torchsfm.motion' in sys.modules);"
+        "print(torchsfm.motion.fundamental_7pt.__name__)"
+    )
+    assert said_by(code).splitlines() == ["False", "True False", "fundamental_7pt"]
+
+
+def test_wherever_rooms_are_loaded_their_constants_are_the_same() -> None:
+    """On the CPU, and such as can take part in a derivative later."""
+    code = (
+        "import gc, torch, torchsfm\n"
+        "with torch.inference_mode(), torch.device('meta'):\n"
+        "    [getattr(torchsfm, name) for name in torchsfm.__all__]\n"
+        "tensors = [x for x in gc.get_objects() if type(x) is torch.Tensor]\n"
+        "print(len(tensors) > 0, {(x.device.type, x.is_inference()) for x in tensors})"
+    )
+    assert said_by(code) == "True {('cpu', False)}"
+
+
+def test_threads_may_be_the_first_to_ask() -> None:
+    code = (
+        "import torchsfm; from concurrent.futures import ThreadPoolExecutor\n"
+        "names = torchsfm.__all__\n"
+        "def read(start): return [getattr(torchsfm, name) for name in names[start:] + names[:start]]\n"
+        "starts = range(0, len(names), 8)\n"
+        "with ThreadPoolExecutor(len(starts)) as pool: found = list(pool.map(read, starts))\n"
+        "print(all(values == read(start) for start, values in zip(starts, found)))"
+    )
+    assert said_by(code) == "True"

@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import pkgutil
-import typing
 from collections import Counter
 from dataclasses import dataclass
 from functools import cache
@@ -30,7 +29,7 @@ class Name:
     @property
     def at_top(self) -> bool:
         """Whether `torchsfm.NAME` is listed, too."""
-        return self.name in vars(torchsfm)
+        return self.name in torchsfm.__all__
 
     @property
     def kind(self) -> str:
@@ -51,7 +50,7 @@ def rooms() -> dict[str, ModuleType]:
 def listed() -> dict[str, Name]:
     """Every public name, by every listed way to write it: "torchsfm.motion.estimate_essential", "torchsfm.Camera"."""
     ways = {f"{room}.{name}": getattr(module, name) for room, module in rooms().items() for name in module.__all__}
-    ways |= {f"torchsfm.{k}": v for k, v in vars(torchsfm).items() if k[0] != "_" and not hasattr(typing, k)}
+    ways |= {f"torchsfm.{name}": getattr(torchsfm, name) for name in torchsfm.__all__}
     ways = {way: value for way, value in ways.items() if not inspect.ismodule(value)}
     homes: dict[tuple[str, int], Name] = {}
     for way, value in sorted(ways.items(), key=_home_first):

@@ -1,43 +1,76 @@
-"""The commands and their options."""
+"""The commands by name: each is loaded from its file when it is called."""
 
+import json
 import sys
-from enum import StrEnum
+from importlib import import_module
+from importlib.metadata import version
 from io import TextIOWrapper
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import torch
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command
 
-from torchsfm.cli.align import align
-from torchsfm.cli.bundle import bundle
-from torchsfm.cli.calibrate import calibrate
-from torchsfm.cli.compare import compare, true_errors
-from torchsfm.cli.curves import curves
-from torchsfm.cli.export import check_exports, convert, export, known_targets, load, write_export
-from torchsfm.cli.inputs import (
-    FRAMES,
-    film_among,
-    photograph_folder,
-    read_film,
-    read_intrinsics,
-    read_matched,
-    warn_about_intrinsics,
-)
-from torchsfm.cli.job import Job, UserError, told
-from torchsfm.cli.known_poses import Masks, register, triangulate
-from torchsfm.cli.merge import merge
-from torchsfm.cli.output import finish_replacing, output_folder, unfinished
-from torchsfm.cli.ranks import Started
-from torchsfm.cli.results import VERSION, finish
-from torchsfm.cli.view import view
-from torchsfm.cli.voice import Commands, spoken
-from torchsfm.formats import TARGETS
-from torchsfm.formats.registry import model_files
-from torchsfm.geometry import DISTORTION_MODELS
-from torchsfm.images import MAX_PIXELS, save_image
-from torchsfm.reconstruction.report import printable
-from torchsfm.simulation import render_sequence
+from torchsfm.cli.voice import spoken
+
+COMMANDS = {
+    "reconstruct": ("reconstruct", "Turn photographs into calibrated cameras and coloured 3D points."),
+    "demo": ("demo", "Photograph a synthetic scene, reconstruct it knowing nothing, and compare with the truth."),
+    "info": ("info", "Describe saved models: cameras, points and how well each image fits."),
+    "view": ("view", "Show a model in the browser, to turn with the mouse."),
+    "compare": (
+        "compare",
+        "Compare the cameras of a model with true ones: pose AUC, position error, and the error of each image.",
+    ),
+    "triangulate": ("known_poses", "Find the 3D points of photographs whose poses are known."),
+    "register": ("known_poses", "Place new photographs in an old model, whose poses and cameras stay as they are."),
+    "align": (
+        "align",
+        "Move a model to the frame and scale of another one, of GPS, of measured points or of the ground; or scale it.",
+    ),
+    "merge": ("merge", "Join models that share images, in the world frame of the first one, and adjust them together."),
+    "bundle": ("bundle", "Adjust cameras and points of a given problem, and compare before and after."),
+    "calibrate": ("calibrate", "Calibrate a camera from photographs of a flat pattern, and say how sure the result is."),
+    "export": (
+        "export",
+        "Write a folder that another program can be pointed at: model and, where it wants them, undistorted pictures.",
+    ),
+    "convert": ("export", "Write a model in another format."),
+    "curves": ("curves", "Find the curves in space whose images are the edges of photographs with known cameras."),
+}
+"""Of each command the file in which its function stands, and the first line of that function's docstring.
+
+So the program tells what it can do before it has loaded PyTorch.
+"""
+
+
+class Commands(TyperGroup):
+    """All commands: listed as the table has them, and loaded when they are called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
+        """The command that the words name, from its file, and the words that are for it."""
+        name, _, rest = super().resolve_command(ctx, args)
+        return name, name and load(name), rest
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that the words name; wrong usage is told to programs, too, where the words ask for `--json`."""
+        wanted = "--json" in ctx.args
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            # Errors of usage, which are raised before the command begins, are of a class that has a message for people.
+            if wanted and hasattr(error, "format_message"):
+                typer.echo(json.dumps({"error": error.format_message(), "status": 2, "text": []}))
+            raise
+
+
+def load(name: str) -> Any:
+    """The command of this name with all its options."""
+    file, _ = COMMANDS[name]
+    alone = typer.Typer(add_completion=False)
+    alone.command(name)(spoken(getattr(import_module(f"torchsfm.cli.{file}"), name)))
+    return get_command(alone)
+
 
 app = typer.Typer(
     name="torchsfm",
@@ -50,35 +83,12 @@ app = typer.Typer(
 )
 
 
-class Method(StrEnum):
-    """Ways to reconstruct of `--method`."""
-
-    incremental = "incremental"
-    projective = "projective"
-    all_at_once = "global"
-
-
-Threads = Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")]
-Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
-
-
 def print_version(wanted: bool) -> bool:
     """Print the version and end, if wanted."""
     if wanted:
-        typer.echo(f"torchsfm {VERSION}")
+        typer.echo(f"torchsfm {version('torchsfm')}")
         raise typer.Exit
     return wanted
-
-
-def known_camera(name: str | None) -> str | None:
-    """See that there is a distortion model of this name.
-
-    Raises:
-        BadParameter: There is none.
-    """
-    if name is not None and name not in DISTORTION_MODELS:
-        raise typer.BadParameter(f"{name!r} is not one of {', '.join(map(repr, DISTORTION_MODELS))}.")
-    return name
 
 
 @app.callback()
@@ -94,184 +104,9 @@ def options(
             stream.reconfigure(errors="backslashreplace")
 
 
-def reconstruct(
-    images: Annotated[
-        list[Path],
-        typer.Argument(
-            help="A folder of images with its subfolders, image files, a text file that lists images, or a film; or keypoints"
-            " and matches of other programs: COLMAP's database.db, or hloc's two files, features.h5 and matches.h5.",
-            show_default=False,
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for the model, the page, the report and the finished stages.")],
-    masks: Masks = None,
-    sequence: Annotated[bool, typer.Option("--sequence", help="The images are frames of a video, in order.")] = False,
-    fps: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-3, help="Frames a second to take of a film, the sharpest of each moment; 2 if not given.", show_default=False
-        ),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            callback=known_camera,
-            metavar=f"[{'|'.join(DISTORTION_MODELS)}]",
-            help="Lens distortion; radial, or pinhole with --intrinsics.",
-            show_default=False,
-        ),
-    ] = None,
-    intrinsics: Annotated[
-        Path | None, typer.Option(help="Text file with the known 3x3 matrix K of all images, in pixels.", show_default=False)
-    ] = None,
-    shared_camera: Annotated[
-        bool | None,
-        typer.Option(
-            "--shared-camera/--own-cameras",
-            help="Whether one camera took all images of a size; by default as folders and the files' Exif data suggest.",
-            show_default=False,
-        ),
-    ] = None,
-    free_principal_point: Annotated[
-        bool,
-        typer.Option(
-            "--free-principal-point/--centred-principal-point",
-            help="Estimate the principal point too, or hold it at the middle of the image.",
-        ),
-    ] = True,
-    method: Annotated[
-        Method,
-        typer.Option(
-            help="From two images on; all together without calibration and then autocalibration; or rotations of all images, "
-            "then all places."
-        ),
-    ] = Method.incremental,
-    lines: Annotated[
-        bool, typer.Option("--lines", help="Find straight lines too, and adjust cameras by points and lines together.")
-    ] = False,
-    curves: Annotated[
-        bool, typer.Option("--curves", help="Find curves in space too, with the cameras found: from edges of the images.")
-    ] = False,
-    max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
-    max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,
-    targets: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--for",
-            callback=known_targets,
-            metavar=f"[{'|'.join(TARGETS)}]",
-            help="Also write a folder of this name for a program, as `torchsfm export` does; may be given several times.",
-            show_default=False,
-        ),
-    ] = None,
-    seed: Seed = 0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on where an earlier run into the same folder stopped.")] = False,
-    threads: Threads = None,
-) -> None:
-    """Turn photographs into calibrated cameras and coloured 3D points."""
-    started = Started.by()
-    shown = {"masks": masks, "sequence": sequence, "max_features": max_features, "max_pixels": max_pixels}
-    if started.rank > 0:
-        with told(Job(out)) as job:
-            film = film_among(images, fps)
-            if film is not None or read_matched(images) is None:
-                started.begin(out, resume)
-                source = images if film is None else [out / FRAMES]
-                job.help(source, threads, started, seed=seed, **shown | {"sequence": sequence or film is not None})
-        return
-    with told(Job(out)) as job, output_folder(out):
-        film = film_among(images, fps)
-        if film is not None:
-            read_film(job, film, fps, max_pixels)
-            images, shown["sequence"] = [out / FRAMES], True
-        matched = read_matched(images)
-        folder = photograph_folder(images) if matched is None else None
-        if targets and folder is None:
-            raise UserError("--for: wants a folder of images; torchsfm export has the option --images")
-        if lines and matched is not None:
-            raise UserError("--lines: wants images, in which line segments are found")
-        if curves and matched is not None:
-            raise UserError("--curves: wants images, in which edges are found")
-        check_exports(out, targets or [])
-        K = None if intrinsics is None else read_intrinsics(intrinsics)
-        options = {
-            "camera": camera, "K": K, "shared_camera": shared_camera, "free_principal_point": free_principal_point,
-            "method": method.value, "seed": seed,
-        }  # fmt: skip
-        if matched is not None:
-            result = job.run_matched(matched, threads, **options)
-        else:
-            result = job.run(images, threads, lines=lines, curves=curves, resume=started.begin(out, resume), **shown, **options)
-        if K is not None and result.models:
-            warn_about_intrinsics(K, result.models[0])
-        finish(job, result, folder, {}, max_pixels)
-        for target in targets or []:
-            write_export(job, result.models[0], target, out / target, folder)
+def unloaded() -> None:
+    """Stand for a command in the list of all."""
 
 
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the rendered images and all results.")] = Path("torchsfm-demo"),
-    views: Annotated[int, typer.Option(min=3, max=100, help="Number of photographs to render.")] = 12,
-    width: Annotated[int, typer.Option(min=320, max=4000, help="Their width in pixels.")] = 960,
-    seed: Seed = 0,
-    threads: Threads = None,
-) -> None:
-    """Photograph a synthetic scene, reconstruct it knowing nothing, and compare with the truth."""
-    with told(Job(out)) as job, output_folder(out):
-        folder = out / "images"
-        folder.mkdir(exist_ok=True)
-        job.set_threads(threads)
-        generator = torch.Generator().manual_seed(seed)
-        # One image at a time would show progress, but the rays are shared by all of them.
-        job.progress("render", 0, views)
-        truth = render_sequence(views=views, width=width, height=3 * width // 4, generator=generator)
-        names = [f"view{i:02d}.jpg" for i in range(views)]
-        for i, name in enumerate(names):
-            save_image(folder / name, truth.images[i])
-            job.progress("render", i + 1, views)
-        result = job.run([folder / name for name in names], threads, seed=seed, resume=False)
-        compared = {}
-        if result.models:
-            model = result.models[0]
-            K = model.cameras.K[model.camera_index]
-            compared = true_errors(model.poses, model.registered, K, truth.poses, truth.cameras.K)
-        finish(job, result, folder, compared)
-
-
-def info(
-    folder: Annotated[Path, typer.Argument(help="Folder written by `torchsfm reconstruct`, or a model of any format.")],
-) -> None:
-    """Describe saved models: cameras, points and how well each image fits."""
-    with told(Job(folder)) as job:
-        if unfinished(folder):
-            with output_folder(folder):
-                finish_replacing(folder)
-        try:
-            found = model_files(folder)
-        except ValueError as error:
-            raise UserError(" ".join(str(error).split())) from None
-        models = job.voice.record.setdefault("models", [])
-        for kind, file in found:
-            model = load(file)
-            typer.echo(f"{file}\n{model.summary()}\n")
-            counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
-            errors = model.view_errors().tolist()
-            names = [printable(name) for name in model.names]
-            width = max(map(len, ("image", *names)))
-            typer.echo(f"{'image':<{width}}  observations  mean error, px")
-            for name, registered, count, mean in zip(names, model.registered.tolist(), counts, errors, strict=True):
-                typer.echo(f"{name:<{width}}  " + (f"{count:>12}  {mean:>14.3f}" if registered else "not registered"))
-            typer.echo("")
-            rows = zip(model.names, model.registered.tolist(), counts, errors, strict=True)
-            keys = ("name", "registered", "observations", "mean_error_px")
-            models.append(
-                {"file": str(file), "format": kind.name, "points": model.num_points}
-                | {"images": [dict(zip(keys, row, strict=True)) for row in rows]}
-            )
-
-
-for command in (
-    reconstruct, demo, info, view, compare, triangulate, register, align, merge, bundle, calibrate, export, convert,
-    curves,
-):  # fmt: skip
-    app.command()(spoken(command))
+for name, (_, line) in COMMANDS.items():
+    app.command(name, help=line)(unloaded)

@@ -12,7 +12,6 @@ from functools import wraps
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
 Json = Annotated[
@@ -69,21 +68,6 @@ def spoken(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *parameters])  # type: ignore[attr-defined]
     run.__annotations__ = {**command.__annotations__, **more}
     return run
-
-
-class Commands(TyperGroup):
-    """All commands; wrong usage is told to programs, too, where the words ask for `--json`."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command that the words name."""
-        wanted = "--json" in ctx.args
-        try:
-            return super().invoke(ctx)
-        except Exception as error:
-            # Errors of usage, which are raised before the command begins, are of a class that has a message for people.
-            if wanted and hasattr(error, "format_message"):
-                typer.echo(json.dumps({"error": error.format_message(), "status": 2, "text": []}))
-            raise
 
 
 def plain(value: Any) -> Any:
