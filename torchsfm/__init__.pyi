@@ -182,9 +182,11 @@ from torchsfm.reconstruction import (
 from torchsfm.resection import (
     CameraEstimate as CameraEstimate,
     CameraRefinement as CameraRefinement,
+    ConicPoses as ConicPoses,
     PlanarPoses as PlanarPoses,
     PoseEstimate as PoseEstimate,
     ResectedCameras as ResectedCameras,
+    camera_conics as camera_conics,
     camera_planar as camera_planar,
     camera_pnp as camera_pnp,
     estimate_camera as estimate_camera,

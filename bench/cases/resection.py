@@ -17,6 +17,7 @@ from torchsfm import (
     camera_2p1l,
     camera_3l,
     camera_circle,
+    camera_conics,
     camera_dlt,
     camera_gp3p,
     camera_p3p,
@@ -26,7 +27,7 @@ from torchsfm import (
     camera_pnp,
     camera_up2p,
 )
-from torchsfm.geometry import pluecker_from_points, rotation_from_rotvec
+from torchsfm.geometry import Ellipse, conic_from_ellipse, pluecker_from_points, rotation_from_rotvec, transform_conic
 from torchsfm.resection.camera_gp3p import equations as gp3p_equations
 from torchsfm.resection.camera_p3p import equations as p3p_equations
 from torchsfm.resection.camera_p4pf import equations as p4pf_equations
@@ -230,6 +231,34 @@ def circle_error(models: Tensor, truth: Tensor) -> Tensor:
     return torch.maximum(turned, (centre - place).norm(dim=-1) / place.norm(dim=-1))
 
 
+def coplanar_conics(family: str, batch: int, generator: torch.Generator, dtype: torch.dtype) -> tuple[Sample, Tensor]:
+    """Samples of the images of two ellipses of the plane z = 0, seen from either side, and the ellipses; and the pose."""
+    tilt, spin = 1.1 * scenes.uniform(generator, batch), 6.3 * scenes.uniform(generator, batch, 2)
+    side = torch.pi * (scenes.uniform(generator, batch) < 0.5)
+    zero = torch.zeros_like(tilt)
+    turns = (
+        (tilt * spin[:, 0].cos(), tilt * spin[:, 0].sin(), zero), (side, zero, zero), (zero, zero, spin[:, 1])
+    )  # fmt: skip
+    leant, flipped, spun = (rotation_from_rotvec(torch.stack(turn, -1)) for turn in turns)
+    depth = torch.full((batch, 1), 40.0 if family == "narrow view" else 6.0, dtype=F64)
+    P = torch.cat((leant @ flipped @ spun, torch.cat((scenes.normal(generator, batch, 2), depth), -1)[..., None]), -1)
+    centre, axes = scenes.normal(generator, batch, 2, 2), 0.2 + 0.8 * scenes.uniform(generator, batch, 2, 2)
+    axes = axes[..., :1].expand_as(axes) if family == "circles" else axes
+    if family == "repeated conics":
+        centre, axes = centre[:, :1].expand_as(centre), axes[:, :1].expand_as(axes)
+    if family == "circles about one centre":
+        centre, axes = centre[:, :1].expand_as(centre), axes[..., :1].expand_as(axes)
+    angle = 3 * scenes.uniform(generator, batch, 1).expand(batch, 2)
+    drawn = conic_from_ellipse(Ellipse(centre, axes, angle))
+    return (transform_conic(P[:, None][..., [0, 1, 3]], drawn).to(dtype), drawn.to(dtype)), P
+
+
+def all_conics(C: Tensor, C_plane: Tensor) -> Solutions[Tensor]:
+    """All poses from coplanar conics."""
+    found = camera_conics(C, C_plane)
+    return Solutions(found.model, found.valid)
+
+
 CASES: tuple[Case, ...] = (
     Case(
         "camera_p3p",
@@ -339,6 +368,16 @@ CASES: tuple[Case, ...] = (
         families=("near planar", "coplanar", "narrow view", "90 degree rotation", "centre near the plane"),
         degenerate=("repeated points", "collinear", "all at infinity", "pure rotation", "zero baseline"),
         peers={"OpenCV": Peer("cv2", opencv_pnp("SOLVEPNP_SQPNP"))},
+    ),
+    Case(
+        "camera_conics",
+        size=2,
+        slots=4,
+        solve=all_conics,
+        scene=coplanar_conics,
+        error=pose_error,
+        families=("narrow view", "circles"),
+        degenerate=("repeated conics", "circles about one centre"),
     ),
     Case(
         "camera_planar",

@@ -29,6 +29,7 @@ from torchsfm.geometry import (
     project_quadric,
     rotation_from_rotvec,
     to_homogeneous,
+    transform_conic,
 )
 from torchsfm.images import Edges, Features, detect_edges, detect_segments
 from torchsfm.motion import FundamentalEstimator, HomographyEstimator
@@ -122,6 +123,17 @@ def _tilted(s: Scene) -> tuple[Tensor, Tensor]:
     dual = dual_quadric_from_ellipsoid(Ellipsoid(s.points(5), axes))
     first, second = project_quadric(s.cameras(2)[..., :, None, :, :], dual[..., None, :, :, :]).unbind(-4)
     return s.noisy_conics(first), s.noisy_conics(second)
+
+
+def _drawn(s: Scene) -> tuple[Tensor, Tensor]:
+    """Three ellipses of a plane, seen from afar with a little noise, and as they are."""
+    centre = torch.tensor([[0.0, 0.0], [2.0, 0.5], [-0.5, 1.8]], dtype=torch.float64)
+    axes = torch.tensor([[0.9, 0.5], [0.7, 0.6], [0.5, 0.5]], dtype=torch.float64)
+    drawn = conic_from_ellipse(Ellipse(centre, axes, torch.tensor([0.3, 1.0, 0.0], dtype=torch.float64)))
+    R = rotation_from_rotvec(0.2 + 0.1 * s.randn(3))
+    t = torch.tensor([0.3, -0.2, 6.0], dtype=torch.float64).expand(R[..., 0].shape)
+    seen = transform_conic(torch.cat((R[..., :2], t[..., None]), -1)[..., None, :, :], drawn)
+    return seen, drawn.expand(seen.shape)
 
 
 def _edge_points(s: Scene) -> Tensor:
@@ -440,6 +452,7 @@ FUNCTIONS: dict[str, Function] = {
             "radius": lambda s: s.rand(low=0.5, high=2.0),
         }
     ),
+    "resection.camera_conics": Function({"C": lambda s: _drawn(s)[0], "C_plane": lambda s: _drawn(s)[1]}, {"m": 3}),
     "resection.camera_dlt": Function(together=(("l", "L", "line_weights"),)),
     "resection.camera_gp3p": Function({"p": lambda s: s.points(3) - 5 * s.rays(0, 3) - 0.1, "d": lambda s: s.rays(0, 3)}),
     "resection.camera_p4pf": Function(centred=True),

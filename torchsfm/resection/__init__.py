@@ -4,6 +4,7 @@ from torchsfm.resection.camera_1p2l import camera_1p2l
 from torchsfm.resection.camera_2p1l import camera_2p1l
 from torchsfm.resection.camera_3l import camera_3l
 from torchsfm.resection.camera_circle import camera_circle
+from torchsfm.resection.camera_conics import ConicPoses, camera_conics
 from torchsfm.resection.camera_dlt import CameraEstimate, camera_dlt
 from torchsfm.resection.camera_gp3p import camera_gp3p
 from torchsfm.resection.camera_p3p import camera_p3p
@@ -40,6 +41,7 @@ __all__ = [
     "CameraEstimate",
     "CameraEstimator",
     "CameraRefinement",
+    "ConicPoses",
     "FocalCameraEstimator",
     "PlanarPoses",
     "PointLineCameraEstimator",
@@ -50,6 +52,7 @@ __all__ = [
     "camera_2p1l",
     "camera_3l",
     "camera_circle",
+    "camera_conics",
     "camera_dlt",
     "camera_gp3p",
     "camera_p3p",
