@@ -45,20 +45,20 @@ _RANK = 1e-11
 """Eigenvalues of the normal equations below this, relative to the largest, are nothing."""
 
 
-def _rotations() -> Tensor:
-    """Plenty, evenly over normals and turns about them."""
+def _tilts() -> Tensor:
+    """Rotations of the third axis to directions that are spread evenly over the sphere."""
     i = torch.arange(_NORMALS, dtype=torch.float64) + 0.5
-    z = 1 - 2 * i / _NORMALS
-    around = i * math.pi * (3 - math.sqrt(5))
-    polar = z.acos()
-    zero = torch.zeros_like(z)
-    tilt = rotation_from_rotvec(torch.stack((-polar * around.sin(), polar * around.cos(), zero), -1))
+    around, polar = i * math.pi * (3 - math.sqrt(5)), (1 - 2 * i / _NORMALS).acos()
+    return rotation_from_rotvec(torch.stack((-polar * around.sin(), polar * around.cos(), torch.zeros_like(i)), -1))
+
+
+def _spins() -> Tensor:
+    """Turns about the third axis."""
     turn = torch.arange(_SPINS, dtype=torch.float64) * (2 * math.pi / _SPINS)
-    spin = rotation_from_rotvec(torch.stack((zero.new_zeros(_SPINS), zero.new_zeros(_SPINS), turn), -1))
-    return (tilt[:, None] @ spin).flatten(0, 1)
+    return rotation_from_rotvec(torch.nn.functional.pad(turn[:, None], (2, 0)))
 
 
-_GRID = Constant(_rotations())
+_TILT, _SPIN = Constant(_tilts()), Constant(_spins())
 
 
 @dataclass(frozen=True)
@@ -301,7 +301,7 @@ def _linearize(state: _State, data: _Data) -> tuple[Tensor, Tensor]:
 
 def _starts(data: _Data, w: Tensor, middle: Tensor, size: Tensor) -> _State:
     """The best rotations that differ, with the depth that gives the images their size."""
-    grid = _GRID.on(w.device, w.dtype)
+    grid = (_TILT.on(w.device, w.dtype)[:, None] @ _SPIN.on(w.device, w.dtype)).flatten(0, 1)
     ray = torch.cat((middle, torch.ones_like(middle[..., :1])), -1)
     c0, D0, _ = shape_of_dual_conic(-data.dual)
     *_, moments = _middle(c0, D0, w)
