@@ -156,7 +156,7 @@ class DenseProblem:
         each = sum(v[0].numel() for v in leaves((here.x, self.data)))
         rows = []
         # Each problem stands there once for each row of its Hessian, so that one derivative gives them all.
-        for directions in torch.eye(self.tangent, device=at.device).split(max(1, WIDE // (each * len(at)))):
+        for directions in torch.split(torch.eye(self.tangent, device=at.device), max(1, WIDE // (each * len(at)))):
             copies = (at.repeat_interleave(len(directions)),)
             some, x = self.pick(copies), pick(copies, here.x)
             first = leaves(x)[0]
