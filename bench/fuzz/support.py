@@ -152,8 +152,14 @@ def _three_views(P: Tensor, a: Arguments) -> Tensor:
     x = [v[..., None, :, :] for v in a["x"].unbind(-3)]
     squared = TrifocalEstimator().squared_residual(signs * P[..., None, 1:, :, :], *x).amin(-2)
     if a.get("l") is not None:
-        ends = [list(v.flatten(-2).unbind(-1)) for v in a["l"].unbind(-4)]
-        squared = torch.cat((squared, squared_line_distance(P[..., 1:, :, :], ends)), -1)
+        # Where coordinates are about 1: what is rounding is told by sizes, and in pixels those of entries differ.
+        unit = a["l"].abs().flatten(-4).nanmedian(-1).values
+        unit = torch.where((unit > 0) & (unit < torch.inf), unit, 1.0)[..., None]
+        one = torch.ones_like(unit)
+        rows, columns = torch.cat((unit, unit, one), -1), torch.cat((unit, unit, one, one), -1)
+        scaled = P[..., 1:, :, :] * columns[..., None, None, :] / rows[..., None, :, None]
+        ends = [list((v / unit[..., None, None]).flatten(-2).unbind(-1)) for v in a["l"].unbind(-4)]
+        squared = torch.cat((squared, squared_line_distance(scaled, ends) * unit.square()), -1)
     return squared.sqrt()
 
 
