@@ -158,8 +158,13 @@ def _three_views(P: Tensor, a: Arguments) -> Tensor:
         one = torch.ones_like(unit)
         rows, columns = torch.cat((unit, unit, one), -1), torch.cat((unit, unit, one, one), -1)
         scaled = P[..., 1:, :, :] * columns[..., None, None, :] / rows[..., None, :, None]
-        ends = [list((v / unit[..., None, None]).flatten(-2).unbind(-1)) for v in a["l"].unbind(-4)]
-        squared = torch.cat((squared, squared_line_distance(scaled, ends) * unit.square()), -1)
+        ends = a["l"] / unit[..., None, None, None]
+        away = squared_line_distance(scaled, [list(v.flatten(-2).unbind(-1)) for v in ends.unbind(-4)]) * unit.square()
+        # Of segments that all lie on one line rounding tells which the cameras meet.
+        through = _unit(torch.linalg.cross(*to_homogeneous(ends.nan_to_num(0, 0, 0)).unbind(-2)))
+        size = torch.linalg.svdvals(through.nan_to_num(0, 0, 0))
+        apart = (size[..., 1] > _MET[torch.float64] * size[..., 0]).all(-1, keepdim=True)
+        squared = torch.cat((squared, torch.where(apart, away, 0.0)), -1)
     return squared.sqrt()
 
 
