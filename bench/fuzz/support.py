@@ -36,6 +36,8 @@ _SLACK = 1.01
 """Models in single precision have their inliers a little farther away than the threshold."""
 _ROUNDED = 1e-5
 """How far, relative to the size of a datum, rounding the entries of a model to single precision moves it."""
+_ARRIVED = 30
+"""Steps to the nearest line, also where they are short."""
 _MET = {torch.float64: 1e-5, torch.float32: 1e-2}
 """What may be left of an equation."""
 
@@ -152,19 +154,8 @@ def _three_views(P: Tensor, a: Arguments) -> Tensor:
     x = [v[..., None, :, :] for v in a["x"].unbind(-3)]
     squared = TrifocalEstimator().squared_residual(signs * P[..., None, 1:, :, :], *x).amin(-2)
     if a.get("l") is not None:
-        # Where coordinates are about 1: what is rounding is told by sizes, and in pixels those of entries differ.
-        unit = a["l"].abs().flatten(-4).nanmedian(-1).values
-        unit = torch.where((unit > 0) & (unit < torch.inf), unit, 1.0)[..., None]
-        one = torch.ones_like(unit)
-        rows, columns = torch.cat((unit, unit, one), -1), torch.cat((unit, unit, one, one), -1)
-        scaled = P[..., 1:, :, :] * columns[..., None, None, :] / rows[..., None, :, None]
-        ends = a["l"] / unit[..., None, None, None]
-        away = squared_line_distance(scaled, [list(v.flatten(-2).unbind(-1)) for v in ends.unbind(-4)]) * unit.square()
-        # Of segments that all lie on one line rounding tells which the cameras meet.
-        through = _unit(torch.linalg.cross(*to_homogeneous(ends.nan_to_num(0, 0, 0)).unbind(-2)))
-        size = torch.linalg.svdvals(through.nan_to_num(0, 0, 0))
-        apart = (size[..., 1] > _MET[torch.float64] * size[..., 0]).all(-1, keepdim=True)
-        squared = torch.cat((squared, torch.where(apart, away, 0.0)), -1)
+        ends = [list(v.flatten(-2).unbind(-1)) for v in a["l"].unbind(-4)]
+        squared = torch.cat((squared, squared_line_distance(P[..., 1:, :, :], ends, _ARRIVED)), -1)
     return squared.sqrt()
 
 

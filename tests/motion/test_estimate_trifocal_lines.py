@@ -73,6 +73,19 @@ def test_distance_is_that_from_the_images_of_the_best_line(generator: torch.Gene
     assert_share((found / optimum - 1).abs() < 1e-3, 0.99)
 
 
+def test_distances_are_in_the_unit_of_the_images(generator: torch.Generator) -> None:
+    scene = make(6, 0, 60, generator, share=0.0)
+    H = torch.linalg.inv(torch.cat((scene.P[:, 0], torch.tensor([[[0.0, 0, 0, 1]]], dtype=F64).expand(6, 1, 4)), 1))
+    model, ends, lines = (scene.P @ H[:, None])[:, 1:], scene.l.flatten(-2), torch.ones(60, 1, dtype=F64)
+    distance = PointLineTrifocalEstimator().squared_residual(model, *ends.unbind(1), lines).sqrt()
+    assert distance.isfinite().all()
+    for unit in (1e-3, 640.0):
+        T = torch.tensor([unit, unit, 1.0], dtype=F64)
+        other = model / T[:, None] * torch.cat((T, torch.ones(1, dtype=F64)))
+        found = PointLineTrifocalEstimator().squared_residual(other, *(ends / unit).unbind(1), lines).sqrt()
+        torch.testing.assert_close(unit * found, distance, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize(("n", "k", "share"), [(60, 60, 0.4), (12, 80, 0.3), (80, 12, 0.4), (0, 60, 0.1), (2, 60, 0.1)])
 def test_outliers(n: int, k: int, share: float, generator: torch.Generator) -> None:
     scene = make(4, n, k, generator, share)

@@ -22,7 +22,7 @@ _TINY = 1e-30
 _BLIND = 1e-8
 """Squared slopes, in units of what they are differences of, that are rounding."""
 _STEPS = 3
-"""Of Gauss-Newton towards ends that one line has."""
+"""Steps towards ends that one line has; for what is near it they are many."""
 
 
 class Transfer(NamedTuple):
@@ -43,14 +43,15 @@ class Transfer(NamedTuple):
     S: Rows
 
 
-def squared_line_distance(model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows]) -> Tensor:
+def squared_line_distance(model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows], steps: int = _STEPS) -> Tensor:
     """The sum of the squared distances of all six ends from the images of one line, the best to first order.
 
     Args:
         model: The second and third camera.
         x: Four rows for each of three views, the coordinates of both ends.
+        steps: Of Gauss-Newton towards ends that one line has.
     """
-    moved = _nearest(model, x)
+    moved = _nearest(model, x, steps)
     return _squared(moved, x).masked_fill(_blind(_transfer(model, moved)), torch.inf)
 
 
@@ -58,7 +59,7 @@ def line_equations(
     model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Rows]
 ) -> tuple[Tensor, Float[Tensor, "*batch 2 n"], Float[Tensor, "*batch 24 2 n"]]:
     """The squared distances; two numbers each with the same sum of squares, and their derivatives by the cameras."""
-    moved = _nearest(model, x)
+    moved = _nearest(model, x, _STEPS)
     there = _transfer(model, moved)
     f = _forms_at(there, x, moved)
     # Whitened by the Cholesky factor of S.
@@ -129,8 +130,9 @@ def _transfer(model: Tensor, x: Sequence[Rows]) -> Transfer:
 def _blind(at: Transfer) -> Tensor:
     """Where cameras would agree with any line: those that make one plane of all lines, and what is no segment."""
     (n2, w2), (n3, w3) = at.planes
-    second, third = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2] + w * w for n, w in ((n2, w2), (n3, w3)))
-    return ~(at.S[0] + at.S[2] > _BLIND * second * third)
+    # Of the first view's slopes, so that the unit of image coordinates is that of S.
+    second, third = (n[0] * n[0] + n[1] * n[1] for n in (n2, n3))
+    return ~(at.S[0] + at.S[2] > _BLIND * (second * w3 * w3 + third * w2 * w2))
 
 
 def _factor(at: Transfer) -> tuple[Tensor, Tensor, Tensor]:
@@ -144,10 +146,10 @@ def _factor(at: Transfer) -> tuple[Tensor, Tensor, Tensor]:
     return square.rsqrt(), mixed, rest.rsqrt()
 
 
-def _nearest(model: Tensor, x: Sequence[Rows]) -> Sequence[Rows]:
+def _nearest(model: Tensor, x: Sequence[Rows], steps: int) -> Sequence[Rows]:
     """The ends moved, as little as possible, to where a line is possible."""
     moved = x
-    for _ in range(_STEPS):
+    for _ in range(steps):
         at = _transfer(model, moved)
         moved = _moved(x, at, _forms_at(at, x, moved))
     return moved
