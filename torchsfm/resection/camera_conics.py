@@ -2,7 +2,7 @@
 
 What is left between a measured ellipse and the image of its conic is the distance of parallel tangents, at sixteen places
 around it. A pair of conics has ten numbers for six unknowns, but conics have symmetries, and a plane seen from afar has two
-poses: all rotations are looked at, roughly, and the best different ones refined.
+poses: all poses from which one of the conics looks right are tried, and the best different ones refined.
 """
 
 import math
@@ -16,19 +16,14 @@ from torchsfm._types import Status, check_tensors, tensor_map
 from torchsfm.geometry.conic_distance import square_root
 from torchsfm.geometry.conics import shape_of_dual_conic
 from torchsfm.geometry.poses import Pose
-from torchsfm.geometry.rotations import rotation_from_rotvec
 from torchsfm.linalg import adjugate_3x3, eigh, unit_scale, usable
-from torchsfm.linalg.constants import Constant
 from torchsfm.optim import levenberg_marquardt, rotation_exponential
 from torchsfm.optim.pytree import cut, flatten, join
+from torchsfm.resection.ellipse_poses import ellipse_poses
 
 _SLOTS = 4
 """As many symmetries has the most symmetric pair of conics that determines a pose: coaxial ellipses about one centre."""
 _TANGENTS = 16
-_NORMALS, _SPINS = 60, 12
-"""Rotations to start from: normals of the plane, all over the sphere, and turns about each."""
-_APART = math.radians(40)
-"""Of starts from each other."""
 _KEPT, _REFINED = 20, 8
 """Starts that are refined a little, and to the end."""
 _FIRST, _LAST = 6, 60
@@ -43,22 +38,6 @@ _PIECE = 400
 """Conics whose poses are looked for together: all starts of more would not fit the memory."""
 _RANK = 1e-11
 """Eigenvalues of the normal equations below this, relative to the largest, are nothing."""
-
-
-def _tilts() -> Tensor:
-    """Rotations of the third axis to directions that are spread evenly over the sphere."""
-    i = torch.arange(_NORMALS, dtype=torch.float64) + 0.5
-    around, polar = i * math.pi * (3 - math.sqrt(5)), (1 - 2 * i / _NORMALS).acos()
-    return rotation_from_rotvec(torch.stack((-polar * around.sin(), polar * around.cos(), torch.zeros_like(i)), -1))
-
-
-def _spins() -> Tensor:
-    """Turns about the third axis."""
-    turn = torch.arange(_SPINS, dtype=torch.float64) * (2 * math.pi / _SPINS)
-    return rotation_from_rotvec(torch.nn.functional.pad(turn[:, None], (2, 0)))
-
-
-_TILT, _SPIN = Constant(_tilts()), Constant(_spins())
 
 
 @dataclass(frozen=True)
@@ -158,7 +137,7 @@ def camera_conics(
     counts = counts & ellipses[..., None]
     w = torch.where(counts, w, 0.0)
     with torch.no_grad():
-        origin, scale, _ = _middle(c0, D0, w)
+        origin, scale = _middle(c0, D0, w)
     data = _measured(
         c, D, (c0 - origin[..., None, :]) / scale[..., None, None], D0 / scale.square()[..., None, None, None], counts
     )
@@ -190,11 +169,11 @@ def _solve(data: _Data, w: Tensor, c: Tensor, D: Tensor) -> tuple[_State, Tensor
     """The minima of a flat batch, which of them are answers, their errors; where the best is determined and a minimum."""
     weights = _by_tangent(w)[:, None]
     with torch.no_grad():
-        middle, size, _ = _middle(c, D, w)
+        _, size = _middle(c, D, w)
         fixed = tensor_map(torch.Tensor.detach, data)
         each = _beside(fixed)
         first = levenberg_marquardt(
-            _residual, _starts(fixed, w, middle, size), each, retract=_State.moved, size=6, weights=weights,
+            _residual, _starts(fixed, w, c, D), each, retract=_State.moved, size=6, weights=weights,
             linearize=_linearize, max_iterations=_FIRST,
         )  # fmt: skip
         start, _ = _distinct(first.x, first.cost, _REFINED, _NEAR)
@@ -217,14 +196,13 @@ def _solve(data: _Data, w: Tensor, c: Tensor, D: Tensor) -> tuple[_State, Tensor
     return _pick(found.x, order), valid & valid[:, :1], error, regular[:, 0], done[:, 0]
 
 
-def _middle(c: Tensor, D: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The middle of ellipses, their size and second moments about it."""
+def _middle(c: Tensor, D: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """The middle of ellipses and their size about it."""
     share = w / w.sum(-1, keepdim=True).clamp_min(1e-300)
     middle = (share[..., None] * c).sum(-2)
-    off = c - middle[..., None, :]
-    moments = (share[..., None, None] * (off[..., :, None] * off[..., None, :] + D)).sum(-3)
-    size = moments.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-    return middle, torch.where((size > 0) & torch.isfinite(size), size, 1.0), moments
+    square = (c - middle[..., None, :]).square().sum(-1) + D.diagonal(dim1=-2, dim2=-1).sum(-1)
+    size = (share * square).sum(-1).sqrt()
+    return middle, torch.where((size > 0) & torch.isfinite(size), size, 1.0)
 
 
 def _measured(c: Tensor, D: Tensor, c0: Tensor, D0: Tensor, counts: Tensor) -> _Data:
@@ -299,27 +277,20 @@ def _linearize(state: _State, data: _Data) -> tuple[Tensor, Tensor]:
     return r.flatten(-2)[..., None], J.flatten(-3, -2)[..., None, :]
 
 
-def _starts(data: _Data, w: Tensor, middle: Tensor, size: Tensor) -> _State:
-    """The best rotations that differ, with the depth that gives the images their size."""
-    grid = (_TILT.on(w.device, w.dtype)[:, None] @ _SPIN.on(w.device, w.dtype)).flatten(0, 1)
-    ray = torch.cat((middle, torch.ones_like(middle[..., :1])), -1)
+def _starts(data: _Data, w: Tensor, c: Tensor, D: Tensor) -> _State:
+    """Poses from which the conic that counts most looks right, where the others look better than from its neighbours."""
     c0, D0, _ = shape_of_dual_conic(-data.dual)
-    *_, moments = _middle(c0, D0, w)
-    slope = grid[:, :2, :2] - middle[..., None, :, None] * grid[:, 2:, :2]
-    spread = ((slope @ moments[..., None, :, :]) * slope).sum((-2, -1))
-    depth = spread.sqrt() / size[..., None]
-    state = _State(grid.expand(len(w), -1, 3, 3), depth[..., None] * ray[..., None, :])
+    size = D.diagonal(dim1=-2, dim2=-1).sum(-1)
+    first = torch.where(data.counts, w * size, -1.0).argmax(-1)[:, None]
+    R, t = ellipse_poses(*(v.take_along_dim(first[(...,) + (None,) * (v.ndim - 2)], 1)[:, 0] for v in (c, D, c0, D0)))
+    state = _State(R.flatten(1, 3), t.flatten(1, 3))
     rough = _Data(data.dual, data.n[..., ::2, :], data.support[..., ::2], data.counts)
     r = _residual(state, _beside(rough))[..., 0]
     some = w.repeat_interleave(_TANGENTS // 2, -1)[..., None, :]
-    cost = (r.square() * some).sum(-1).nan_to_num(torch.inf, torch.inf)
-    near = (grid.flatten(1) @ grid.flatten(1).mT) > 1 + 2 * math.cos(_APART)
-    kept = []
-    for _ in range(_KEPT):
-        index = cost.argmin(-1)
-        kept.append(index)
-        cost = torch.where(near[index], torch.inf, cost)
-    return _pick(state, torch.stack(kept, -1))
+    cost = (r.square() * some).sum(-1).nan_to_num(torch.inf, torch.inf).reshape(R.shape[:-2])
+    beside = torch.nn.functional.pad(cost, (0, 0, 1, 1), value=torch.inf)
+    cost = torch.where(cost <= torch.minimum(beside[:, :, :-2], beside[:, :, 2:]), cost, torch.inf)
+    return _pick(state, cost.flatten(1).topk(_KEPT, largest=False).indices)
 
 
 def _pick(state: _State, index: Tensor) -> _State:
