@@ -41,11 +41,18 @@ def make(model: str = "radial") -> Reconstruction:
     return replace(empty, x=empty.projections() + noise)
 
 
-def with_curves(model: Reconstruction) -> Reconstruction:
-    """The model with a circle, a part of a helix and a straight curve of two samples, as its registered images show them."""
+def with_curves(model: Reconstruction, *, finer: int = 1, shift: float = 0.0) -> Reconstruction:
+    """The model with a circle, a part of a helix and a straight curve of two samples, as its registered images show them.
+
+    The first two have so many times the samples, each further on by a part of the way to the next.
+    """
     g = seeded(7)
-    t = [torch.arange(16) * (2 * math.pi / 16), torch.linspace(0, 3, 12), torch.tensor([0.0, 1.0])]
-    place, curve = torch.cat(t).double(), torch.arange(3).repeat_interleave(torch.tensor([16, 12, 2]))
+    t = [
+        (torch.arange(16 * finer) + shift) * (2 * math.pi / (16 * finer)),
+        (torch.arange(12 * finer) + shift) * (3 / (12 * finer - 1)),
+        torch.tensor([0.0, 1.0]),
+    ]
+    place, curve = torch.cat(t).double(), torch.arange(3).repeat_interleave(torch.tensor([len(part) for part in t]))
     bent, rise = torch.tensor([0.6, 0.5, 0.0]).double()[curve], torch.tensor([0.0, 0.3, 0.4]).double()[curve]
 
     def at(t: Tensor, of: Tensor) -> Tensor:
@@ -59,7 +66,7 @@ def with_curves(model: Reconstruction) -> Reconstruction:
     known = model.registered.nonzero()[:, 0]
     sample, view = torch.arange(n).repeat_interleave(len(known)), known.repeat(n)
     # The edge points are up to a pixel or two along their curves.
-    on = place[sample] + 0.005 * torch.rand(len(sample), generator=g, dtype=torch.float64)
+    on = place[sample] + 0.005 * torch.rand(len(sample), generator=g, dtype=torch.float64) / finer
     h = 1e-3
     before, x, after = (seen(on + step, sample, view) for step in (-h, 0, h))
     first, second = (after - before) / (2 * h), (after - 2 * x + before) / h**2

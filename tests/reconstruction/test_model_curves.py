@@ -183,3 +183,25 @@ def test_what_is_taken_out_of_a_chain_leaves_two() -> None:
     edges = ImageEdges(x, x, n, n, torch.stack((n, n, n), -1), torch.tensor([0] * 6 + [1] * 4))
     some = edges.where(torch.tensor([1, 1, 0, 1, 1, 1, 1, 1, 1, 0], dtype=torch.bool))
     assert some.chain.tolist() == [0, 0, 1, 1, 1, 2, 2, 2]
+
+
+def test_runs_of_samples(generator: torch.Generator) -> None:
+    """By hand, curve by curve: neighbours that are kept stay neighbours, around the end of a closed curve, too."""
+    curves = of(small_model.with_curves(small_model.make()))
+    for _ in range(20):
+        keep = torch.rand(len(curves.X), generator=generator) < torch.rand((), generator=generator) ** 0.3
+        found = curves.runs_where(keep)
+        links = [(a, b) for a, b in curves.links().tolist() if bool(keep[a]) and bool(keep[b])]
+        assert len(found.X) == int(keep.sum())
+        name = {tuple(x): i for i, x in enumerate(curves.X.tolist())}
+        old = torch.tensor([name[tuple(x)] for x in found.X.tolist()], dtype=torch.long)
+        assert sorted(map(tuple, old[found.links()].tolist())) == sorted(links)
+        assert torch.equal(found.color, curves.color[old])
+        assert torch.equal(found.sigma, curves.sigma[old])
+        shown = keep[curves.sample]
+        assert torch.equal(old[found.sample], curves.sample[shown])
+        assert torch.equal(found.x, curves.x[shown])
+    whole = curves.runs_where(torch.ones(len(curves.X), dtype=torch.bool))
+    assert torch.equal(whole.X, curves.X)
+    assert torch.equal(whole.closed, curves.closed)
+    assert len(curves.runs_where(torch.zeros(len(curves.X), dtype=torch.bool))) == 0

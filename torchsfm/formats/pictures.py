@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import Camera
 from torchsfm.images import ImageError, Photograph, parse_exif, read_image, save_image, undistort_images, undistorted_cameras
-from torchsfm.reconstruction.lines import Lines
+from torchsfm.reconstruction.parts import with_images
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 KEPT = frozenset((".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm"))
@@ -25,31 +25,7 @@ BATCH_VALUES = 2**26
 
 def registered_only(model: Reconstruction) -> Reconstruction:
     """The model without the images that have no pose."""
-    keep = model.registered
-    number = keep.cumsum(0) - 1
-    seen = keep[model.view]
-    lines = None if model.lines is None else segments_where(model.lines, keep[model.lines.view])
-    conics = None if model.conics is None else model.conics.seen_where(keep[model.conics.view])
-    curves = None if model.curves is None else model.curves.seen_where(keep[model.curves.view])
-    return replace(
-        model,
-        names=tuple(name for name, kept in zip(model.names, keep.tolist(), strict=True) if kept),
-        image_size=model.image_size[keep],
-        camera_index=model.camera_index[keep],
-        poses=Pose(model.poses.R[keep], model.poses.t[keep]),
-        registered=keep[keep],
-        x=model.x[seen],
-        view=number[model.view[seen]],
-        point=model.point[seen],
-        lines=None if lines is None else replace(lines, view=number[lines.view]),
-        conics=None if conics is None else replace(conics, view=number[conics.view]),
-        curves=None if curves is None else replace(curves, view=number[curves.view]),
-    )
-
-
-def segments_where(lines: Lines, keep: Bool[Tensor, "k"]) -> Lines:
-    """All lines, with some of their segments."""
-    return replace(lines, **{name: getattr(lines, name)[keep] for name in ("x", "weight", "view", "line")})
+    return with_images(model, model.registered)
 
 
 def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: bool = False) -> Reconstruction:
@@ -85,7 +61,7 @@ def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: boo
     lines = model.lines
     if lines is not None:
         ends, there = _moved(lines.x, lenses[index[lines.view]], pinholes[index[lines.view]])
-        lines = segments_where(replace(lines, x=ends), there)
+        lines = replace(lines, x=ends).seen_where(there)
     conics = None if model.conics is None else model.conics.seen_where(torch.zeros_like(model.conics.view, dtype=torch.bool))
     curves = model.curves
     if curves is not None:

@@ -10,9 +10,10 @@ from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.localise import register_photographs
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
-from torchsfm.reconstruction.merge import MergedModel, merge_models, part_of_model
+from torchsfm.reconstruction.merge import MergedModel, merge_models
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.models import reconstruct_tracks
+from torchsfm.reconstruction.parts import part_of_model
 from torchsfm.reconstruction.photographs import reconstruct
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, ReconstructionError, Report, SfmResult

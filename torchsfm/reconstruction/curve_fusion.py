@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.reconstruction.curve_pieces import Pieces
+from torchsfm.reconstruction.mapping import first_of_each
 
 _NEAR = 2.0
 """Samples of different images, that many pixels apart across the curve, are of the same curve."""
@@ -43,19 +44,15 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
         least_images: Images that must have found a sample.
         shortest: Samples of the shortest curve.
     """
-    X, tangent = pieces.X, piece_tangents(pieces.X, pieces.piece)
-    n = len(X)
-    scale = float(pieces.pixel.median()) if n else 1.0
-    a, b = near_pairs(X, _BESIDE * scale)
-    size = pieces.pixel[a].clamp(max=2 * scale)
+    n = len(pieces.X)
+    scale = _scale(pieces)
+    tangent = piece_tangents(pieces.X, pieces.piece)
+    a, b = _same(pieces, tangent)
+    X = pieces.X
 
     def across(X: Tensor) -> Tensor:
-        d = X[b] - X[a]
-        return d - (d * tangent[a]).sum(-1, keepdim=True) * tangent[a]
+        return _across(X[b] - X[a], tangent[a])
 
-    offset = across(X)
-    same = (torch.linalg.vector_norm(offset, dim=-1) < _NEAR * size) & ((tangent[a] * tangent[b]).sum(-1).abs() > _ALONG)
-    a, b = a[same], b[same]
     weight = 1 / pieces.sigma[b].square().clamp_min(1e-12 * scale**2)
     own = 1 / pieces.sigma.square().clamp_min(1e-12 * scale**2)
     total = own.index_add(0, a, weight)
@@ -84,6 +81,43 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
         pieces.sigma[index],
         torch.tensor(closed, dtype=torch.bool, device=X.device),
     )
+
+
+def nearest_fused(pieces: Pieces, fused: FusedCurves) -> Int[Tensor, "n"]:
+    """The sample of the curves that each sample of their pieces is of: the nearest one, -1 where none is near.
+
+    Args:
+        pieces: From all images.
+        fused: What `fuse_pieces` made of them.
+    """
+    own = torch.arange(len(pieces.X), device=pieces.X.device)
+    found = torch.full_like(own, -1).index_copy(0, fused.source, torch.arange(len(fused.X), device=own.device))
+    a, b = _same(pieces, piece_tangents(pieces.X, pieces.piece))
+    left = (found[a] < 0) & (found[b] >= 0)
+    a, b = a[left], b[left]
+    order = torch.linalg.vector_norm(pieces.X[b] - pieces.X[a], dim=-1).argsort(stable=True)
+    order = order[first_of_each(a[order])]
+    return found.index_copy(0, a[order], found[b[order]])
+
+
+def _scale(pieces: Pieces) -> float:
+    """The usual size of a pixel."""
+    return float(pieces.pixel.median()) if len(pieces.X) else 1.0
+
+
+def _same(pieces: Pieces, tangent: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
+    """Ordered pairs of samples that are near to each other on one curve."""
+    scale = _scale(pieces)
+    a, b = near_pairs(pieces.X, _BESIDE * scale)
+    far = torch.linalg.vector_norm(_across(pieces.X[b] - pieces.X[a], tangent[a]), dim=-1)
+    near = far < _NEAR * pieces.pixel[a].clamp(max=2 * scale)
+    same = near & ((tangent[a] * tangent[b]).sum(-1).abs() > _ALONG)
+    return a[same], b[same]
+
+
+def _across(d: Float[Tensor, "k 3"], tangent: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
+    """What of steps leads across a curve."""
+    return d - (d * tangent).sum(-1, keepdim=True) * tangent
 
 
 def piece_tangents(X: Float[Tensor, "n d"], piece: Int[Tensor, "n"]) -> Float[Tensor, "n d"]:

@@ -64,9 +64,13 @@ class Lines:
 
     def select(self, keep: Bool[Tensor, "l"]) -> "Lines":
         """Some of the lines, with their segments."""
-        number, rows = keep.cumsum(0) - 1, keep[self.line]
-        x, weight, view, line = (t[rows] for t in (self.x, self.weight, self.view, self.line))
-        return Lines(self.ends[keep], self.color[keep], x, weight, view, number[line])
+        seen, number = self.seen_where(keep[self.line]), keep.cumsum(0) - 1
+        return replace(seen, ends=self.ends[keep], color=self.color[keep], line=number[seen.line])
+
+    def seen_where(self, keep: Bool[Tensor, "k"]) -> "Lines":
+        """All lines, with some of their segments."""
+        x, weight, view, line = (t[keep] for t in (self.x, self.weight, self.view, self.line))
+        return Lines(self.ends, self.color, x, weight, view, line)
 
     def detached(self) -> "Lines":
         """The same as plain numbers on the CPU."""

@@ -100,12 +100,12 @@ class Mapping:
         node, point, error = node[free], point[free], error[free]
         order = torch.argsort(error, stable=True)
         node, point = node[order], point[order]
-        node, point = (t[_first_of_each(node)] for t in (node, point))
+        node, point = (t[first_of_each(node)] for t in (node, point))
         # An image is taken for a point when an observation already has it, or a better candidate does.
         view, v = self.graph.view, len(self.graph.names)
         taken = self.observations()
         key = torch.cat([self.point[taken] * v + view[taken], point * v + view[node]])
-        first = _first_of_each(key)
+        first = first_of_each(key)
         first = first[first >= len(taken)] - len(taken)
         new = self.point.clone()
         new[node[first]] = point[first]
@@ -148,7 +148,7 @@ class Mapping:
         )
 
 
-def _first_of_each(key: Int[Tensor, "k"]) -> Int[Tensor, "u"]:
+def first_of_each(key: Int[Tensor, "k"]) -> Int[Tensor, "u"]:
     """Positions at which each value occurs for the first time, in order."""
     order = torch.argsort(key, stable=True)
     ordered = key[order]

@@ -111,6 +111,30 @@ class Curves:
             color=self.color[own], sigma=self.sigma[own], sample=(own.cumsum(0) - 1)[seen.sample],
         )  # fmt: skip
 
+    def runs_where(self, keep: Bool[Tensor, "n"]) -> "Curves":
+        """Some of the samples: each run of neighbours is a curve, which closes only where a closed curve is there whole."""
+        number = self.number
+        first = number.cumsum(0) - number
+        own = torch.arange(len(self.X), device=self.X.device)
+        whole = torch.ones_like(self.closed).index_fill(0, self.curve[~keep], value=False)
+        # A closed curve is cut where it lacks a sample, so that no run goes on around its end.
+        cut = (first + number).scatter_reduce(0, self.curve[~keep], own[~keep], "amin")
+        cut = torch.where(self.closed & ~whole, cut, first)
+        order = torch.argsort(first[self.curve] + (own - cut[self.curve]) % number[self.curve])
+        order = order[keep[order]]
+        linked = torch.zeros_like(order, dtype=torch.bool)
+        if len(order) > 1:
+            before, after, of = order[:-1], order[1:], self.curve[order]
+            last = (first + number - 1)[of[:-1]]
+            linked[1:] = (of[1:] == of[:-1]) & (torch.where(before == last, first[of[:-1]], before + 1) == after)
+        run = (~linked).cumsum(0) - 1
+        place = torch.empty_like(own).index_copy(0, order, torch.arange(len(order), device=own.device))
+        seen = self.seen_where(keep[self.sample])
+        return replace(
+            seen, X=self.X[order], curve=run, closed=(self.closed & whole)[self.curve[order[~linked]]],
+            color=self.color[order], sigma=self.sigma[order], sample=place[seen.sample],
+        )  # fmt: skip
+
     def seen_where(self, keep: Bool[Tensor, "k"]) -> "Curves":
         """All curves, with some of the edge points."""
         return replace(self, **{name: getattr(self, name)[keep] for name in TRACKS})
