@@ -62,12 +62,14 @@ def test_every_command_speaks_json(saved: Path, tmp_path: Path) -> None:
     model = small_model.make()
     for words, keys in (
         (("info", saved), {"models"}),
-        (("convert", saved, tmp_path / "sparse"), {"out", "format", "images", "points"}),
+        (("convert", saved, tmp_path / "sparse"), {"out", "format", "images", "points", "observations"}),
         (("export", saved, "--for", "colmap", "--out", tmp_path / "colmap"), {"exports"}),
         (("bundle", saved, "--out", tmp_path / "b.npz"), {"cost_before", "cost", "iterations", "ending", "out"}),
         (("compare", saved, saved), {"auc", "position_rmse", "images"}),
         (("view", saved, "--no-browser", "--out", tmp_path / "a.html"), {"page"}),
-        (("align", saved, "--scale", 2.0, "--out", tmp_path / "c.npz"), set()),
+        (("align", saved, "--scale", 2.0, "--out", tmp_path / "c.npz"), {"similarity", "out", "format", "images", "points"}),
+        (("align", saved, "--to", saved, "--out", tmp_path / "c.npz"), {"similarity", "aligned", "out"}),
+        (("merge", saved, saved, "--out", tmp_path / "d.npz"), {"merged", "out", "format", "images", "points"}),
     ):
         status, found, _ = spoken(*words)
         assert status == 0
@@ -78,6 +80,32 @@ def test_every_command_speaks_json(saved: Path, tmp_path: Path) -> None:
     assert [image["name"] for image in found["images"]] == list(model.names)
     assert [image["observations"] for image in found["images"]] == torch.bincount(model.view, minlength=4).tolist()
     assert found["images"][3]["mean_error_px"] is None or not found["images"][3]["registered"]
+
+
+def test_what_align_and_merge_tell_to_programs(saved: Path, tmp_path: Path) -> None:
+    model = small_model.make()
+    moved(model).save(tmp_path / "moved.npz")
+    found = spoken("align", saved, "--to", tmp_path / "moved.npz", "--out", tmp_path / "a.npz")[1]
+    similarity = found["similarity"]
+    assert similarity["scale"] == pytest.approx(3.0)
+    assert torch.tensor(similarity["translation"]).allclose(torch.tensor([1.0, -2.0, 5.0]), atol=1e-6)
+    R = torch.tensor(similarity["rotation"], dtype=torch.float64)
+    torch.testing.assert_close(
+        model.transform(Similarity(torch.tensor(3.0).double(), R, torch.tensor([1.0, -2.0, 5.0]).double())).X,
+        Reconstruction.load(tmp_path / "a.npz").X,
+    )
+    assert [(row["name"], row["used"]) for row in found["aligned"]] == [(name, True) for name in model.names[:3]]
+    assert max(row["apart"] for row in found["aligned"]) < 1e-9
+    assert (found["images"], found["points"], found["format"]) == (3, 30, "torchsfm")
+    small_model.with_curves(model).save(tmp_path / "curves.npz")
+    found = spoken("merge", saved, saved, tmp_path / "curves.npz", "--out", tmp_path / "b.npz")[1]
+    assert [part["shared_images"] for part in found["merged"]] == 2 * [list(model.names[:3])]
+    assert [part["model"] for part in found["merged"]] == [str(saved), str(tmp_path / "curves.npz")]
+    assert found["merged"][0]["shared_points"] == 30
+    merged = Reconstruction.load(tmp_path / "b.npz")
+    assert merged.curves is not None
+    assert (found["points"], found["observations"]) == (merged.num_points, merged.num_observations)
+    assert found["curves"] == len(merged.curves)
 
 
 def test_faults_are_told_to_programs(tmp_path: Path) -> None:

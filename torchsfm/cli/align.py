@@ -1,19 +1,21 @@
 """`torchsfm align`: a saved model in another world frame, or at another scale."""
 
+import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
 
-from torchsfm.cli.export import find_photographs, load
+from torchsfm.cli.export import find_photographs, load, model_record
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.formats import write_model
 from torchsfm.formats.registry import format_for
 from torchsfm.geometry import Similarity
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.alignment import ControlPoints, align_models, align_to_points
+from torchsfm.reconstruction.alignment import Alignment, ControlPoints, align_models, align_to_points
 from torchsfm.reconstruction.control import adjust_to_points
 from torchsfm.reconstruction.gps import align_to_gps
 from torchsfm.reconstruction.report import printable
@@ -73,26 +75,50 @@ def align(
                 raise UserError(f"--scale: wanted a positive number, got {scale:g}")
             one = torch.ones((), dtype=torch.float64)
             similarity = Similarity(scale * one, torch.eye(3, dtype=one.dtype), torch.zeros(3, dtype=one.dtype))
-            moved, words = source.to(torch.float64).transform(similarity), f"scale {scale:g}"
+            found = _Found(similarity, f"scale {scale:g}")
         elif bend is not None and points is not None:
-            control = read_points(points)
             job.progress("bundle", 0, 1)
-            bent = adjust_to_points(source, control, sigma=bend)
-            moved, words = bent.model, _good(points, bent.fault(), bent.summary)
+            found = _bent(source, points, bend)
         else:
-            similarity, words = _similarity(source, model, to, points, images, gps=gps, ground=ground)
-            moved = source.to(torch.float64).transform(similarity)
+            found = _aligned(source, model, to, points, images, gps=gps, ground=ground)
+        moved = found.model or source.to(torch.float64).transform(found.similarity)
         job.close()
         try:
             write_model(moved, out, kind.name)
         except ValueError as error:
             raise UserError(f"{out}: {' '.join(str(error).split())}") from None
-        typer.echo(f"{out}: {words}")
+        typer.echo(f"{out}: {found.words}")
+        s = found.similarity
+        parts = {"scale": float(s.scale), "rotation": s.R.tolist(), "translation": s.t.tolist()}
+        job.voice.record.update(model_record(moved, out, kind.name), similarity=parts, **found.record)
 
 
-def _similarity(
+@dataclass(frozen=True)
+class _Found:
+    """Where a model goes: in numbers, in words and, with what is known of it, for programs; the model itself, if it was bent."""
+
+    similarity: Similarity
+    words: str
+    record: dict[str, Any] = field(default_factory=dict)
+    model: Reconstruction | None = None
+
+
+def _bent(source: Reconstruction, points: Path, sigma: float) -> _Found:
+    """The model adjusted to measured points.
+
+    Raises:
+        UserError: They do not determine it, or contradict it.
+    """
+    bent = adjust_to_points(source, read_points(points), sigma=sigma)
+    words = _good(points, bent.fault(), bent.summary)
+    rows = zip(bent.control.names, bent.apart.norm(dim=-1).tolist(), bent.deviation.tolist(), strict=True)
+    record = {"aligned": [{"name": name, "apart": apart, "deviation": deviation} for name, apart, deviation in rows]}
+    return _Found(bent.alignment.similarity, words, record, bent.model)
+
+
+def _aligned(
     source: Reconstruction, model: Path, to: Path | None, points: Path | None, images: Path | None, *, gps: bool, ground: bool
-) -> tuple[Similarity, str]:
+) -> _Found:
     """Where the model goes, and how well that is known.
 
     Raises:
@@ -103,15 +129,27 @@ def _similarity(
         if folder is None:
             raise UserError(f"{model}: the photographs were not found; say with --images where they lie")
         placed = align_to_gps(source, folder)
-        return placed.alignment.similarity, _good(folder, placed.fault(), placed.summary)
+        words = _good(folder, placed.fault(), placed.summary)
+        return _Found(placed.alignment.similarity, words, {"origin": placed.origin.tolist()} | _record(placed.alignment))
     if to is not None or points is not None:
         found = align_models(source, load(to)) if to is not None else align_to_points(source, read_points(points or model))
         words = _good(to or points or model, found.fault(), lambda: found.summary("images" if to is not None else "points"))
         aside = [f"{name} ({d:.3g} off)" for name, d, used in
                  zip(found.names, found.distance.tolist(), found.used.tolist(), strict=True) if not used]  # fmt: skip
-        return found.similarity, words + (f"; left aside: {', '.join(map(printable, aside[:5]))}" if aside else "")
+        words += f"; left aside: {', '.join(map(printable, aside[:5]))}" if aside else ""
+        return _Found(found.similarity, words, _record(found))
     level = align_to_ground(source) if ground else align_upright(source)
-    return level.similarity, _good(model, level.fault(), level.summary)
+    words = _good(model, level.fault(), level.summary)
+    record = {"sigma_deg": math.degrees(level.sigma), "level_cameras": int(level.held.sum())}
+    return _Found(
+        level.similarity, words, record | ({} if level.ground is None else {"ground_points": int(level.ground.sum())})
+    )
+
+
+def _record(found: Alignment) -> dict[str, Any]:
+    """For programs: how far off each image or point is that both worlds have."""
+    rows = zip(found.names, found.distance.tolist(), found.used.tolist(), strict=True)
+    return {"aligned": [{"name": name, "apart": apart, "used": used} for name, apart, used in rows]}
 
 
 def _good(source: Path, fault: str, summary: Callable[[], str]) -> str:

@@ -120,7 +120,7 @@ def convert(
         job.progress("write", 1, 1)
         job.close()
         typer.echo(f"{target}: {kind.what}, {model.num_registered} images, {model.num_points} points")
-        job.voice.record.update(out=str(target), format=kind.name, images=model.num_registered, points=model.num_points)
+        job.voice.record.update(model_record(model, target, kind.name))
 
 
 def load(path: Path) -> Reconstruction:
@@ -133,6 +133,13 @@ def load(path: Path) -> Reconstruction:
         return read_model(path)
     except ValueError as error:
         raise UserError(" ".join(str(error).split())) from None
+
+
+def model_record(model: Reconstruction, out: Path, kind: str) -> dict[str, Any]:
+    """What programs are told of a model that was written: where, in which format, and how much it has of what."""
+    more = {"lines": model.lines, "ellipses": model.conics, "curves": model.curves}
+    counts = {"images": model.num_registered, "points": model.num_points, "observations": model.num_observations}
+    return {"out": str(out), "format": kind} | counts | {key: len(some) for key, some in more.items() if some is not None}
 
 
 def find_photographs(path: Path, model: Reconstruction) -> Path | None:

@@ -1,11 +1,11 @@
 """`torchsfm merge`: models that share images as one."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from torchsfm.cli.export import load
+from torchsfm.cli.export import load, model_record
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.formats import write_model
 from torchsfm.formats.registry import format_for
@@ -32,6 +32,7 @@ def merge(
             raise UserError(str(error)) from None
         first, *others = [load(path) for path in models]
         words: list[str] = []
+        parts: list[dict[str, Any]] = []
         for path, other in zip(models[1:], others, strict=True):
             job.progress("merge", len(words), len(others))
             found = merge_models(first, other, fixed_cameras=fixed_cameras)
@@ -39,6 +40,8 @@ def merge(
                 raise UserError(f"{path}: {fault}")
             first = found.model
             words.append(f"{path}: {found.summary()}")
+            shared = {"shared_images": list(found.shared_images), "shared_points": found.shared_points}
+            parts.append({"model": str(path), "adjustment": found.status.name} | shared)
         job.progress("merge", len(words), len(others))
         job.close()
         try:
@@ -46,3 +49,4 @@ def merge(
         except ValueError as error:
             raise UserError(f"{out}: {' '.join(str(error).split())}") from None
         typer.echo("\n".join([*words, f"written: {out}"]))
+        job.voice.record.update(model_record(first, out, kind.name), merged=parts)

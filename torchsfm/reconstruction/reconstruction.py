@@ -153,24 +153,19 @@ class Reconstruction:
         """A few lines for people: what was registered, how many points, how well they fit, the cameras found."""
         lines = [f"{self.num_registered} of {len(self.names)} images registered"]
         if self.num_points:
-            lines += [
-                f"{self.num_points} points, {self.num_observations} observations, "
-                f"mean track length {self.num_observations / self.num_points:.2f}",
-                f"mean reprojection error {float(self.residuals().mean()):.3f} px",
-            ]
+            length = self.num_observations / self.num_points
+            known = f"{self.num_observations} observations, mean track length {length:.2f}"
+            lines.append(f"{self.num_points} points, {known if self.num_observations else 'no observations'}")
+        if self.num_observations:
+            lines.append(f"mean reprojection error {float(self.residuals().mean()):.3f} px")
         if self.lines is not None and len(self.lines):
-            views, error = self.lines.support().double().mean(), self.line_residuals().mean()
-            lines.append(
-                f"{len(self.lines)} lines, {len(self.lines.x)} segments, in {views:.2f} images each, {error:.3f} px off"
-            )
+            shown = _shown(self.lines.support(), self.line_residuals())
+            lines.append(f"{len(self.lines)} lines, {len(self.lines.x)} segments{shown}")
         if self.conics is not None and len(self.conics):
-            views, error = self.conics.support().double().mean(), self.conic_residuals().mean()
-            lines.append(f"{len(self.conics)} ellipses, in {views:.2f} images each, {error:.3f} px off")
+            lines.append(f"{len(self.conics)} ellipses{_shown(self.conics.support(), self.conic_residuals())}")
         if self.curves is not None and len(self.curves):
-            views, error = self.curves.support().double().mean(), self.curve_residuals().mean()
-            lines.append(
-                f"{len(self.curves)} curves, {len(self.curves.X)} samples, in {views:.2f} images each, {error:.3f} px off"
-            )
+            shown = _shown(self.curves.support(), self.curve_residuals())
+            lines.append(f"{len(self.curves)} curves, {len(self.curves.X)} samples{shown}")
         used = torch.unique(self.camera_index[self.registered]).tolist()
         for index in used:
             camera = self.cameras[index]
@@ -235,6 +230,11 @@ class Reconstruction:
             curves=Curves(**curves) if curves else None,
             **tensors,
         )
+
+
+def _shown(support: Int[Tensor, "n"], apart: Tensor) -> str:
+    """In how many images things are seen and how well they fit, in words; nothing where none is seen."""
+    return f", in {support.double().mean():.2f} images each, {apart.mean():.3f} px off" if apart.numel() else ""
 
 
 LAYOUT = {
