@@ -1,14 +1,15 @@
 """The `Reconstruction` object: saving, moving, transforming, measuring."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from chance import seeded
-from small_model import make
+from small_model import make, with_curves
 
 from torchsfm.geometry import DISTORTION_MODELS, Similarity, random_rotation
-from torchsfm.reconstruction import Reconstruction
+from torchsfm.reconstruction import Lines, Reconstruction
 
 
 @pytest.mark.parametrize("model", list(DISTORTION_MODELS))
@@ -63,6 +64,18 @@ def test_errors_agree_with_a_loop() -> None:
     for j in (0, 17, 29):
         assert torch.isclose(model.point_errors()[j], residuals[model.point == j].mean())
     assert model.track_lengths().tolist() == [3] * 30
+
+
+def test_the_summary_of_what_no_image_shows_has_no_numbers_that_are_none() -> None:
+    model = with_curves(make())
+    assert model.curves is not None
+    none, empty = model.view[:0], model.x.new_zeros(0)
+    lines = Lines(model.X[:4].reshape(2, 2, 3), model.color[:2], empty.reshape(0, 2, 2), empty, none, none)
+    curves = model.curves.seen_where(torch.zeros_like(model.curves.view, dtype=torch.bool))
+    bare = replace(model, x=model.x[:0], view=none, point=none, lines=lines, curves=curves)
+    text = bare.summary()
+    assert "nan" not in text
+    assert "30 points, no observations\n2 lines, 0 segments\n3 curves, 30 samples\n" in text
 
 
 def test_summary_names_the_numbers() -> None:

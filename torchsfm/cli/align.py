@@ -95,7 +95,7 @@ def align(
 
 @dataclass(frozen=True)
 class _Found:
-    """Where a model goes: in numbers, in words and, with what is known of it, for programs; the model itself, if it was bent."""
+    """Where a model goes, in words and, with what is known of that, for programs; the model itself where it was bent."""
 
     similarity: Similarity
     words: str
