@@ -105,6 +105,18 @@ def test_every_field_is_explained() -> None:
     assert not bare
 
 
+def test_every_parameter_of_a_function_is_explained() -> None:
+    functions = {name: value for name, value in PUBLIC.items() if name not in CLASSES}
+    bare = {name: set(inspect.signature(value).parameters) - _arguments(value) for name, value in functions.items()}
+    assert not {name: parameters for name, parameters in bare.items() if parameters}
+
+
+def _arguments(value: Any) -> set[str]:
+    """The parameters with a line in the docstring's list of arguments."""
+    listed = re.search(r"^Args:\n((?: +.*\n)+)", (inspect.getdoc(value) or "") + "\n", re.MULTILINE)
+    return set(re.findall(r"^    \**(\w+): ", listed[1], re.MULTILINE)) if listed else set()
+
+
 def _fields(value: type) -> list[str]:
     names = [f.name for f in fields(value)] if is_dataclass(value) else getattr(value, "_fields", ())
     return [name for name in names if not name.startswith("_")]

@@ -9,9 +9,11 @@ from torchsfm.bundle.rig import Rig
 from torchsfm.geometry import Pose, Similarity
 
 Gauge = Literal["free", "first"]
-"""What is done about it: "free", nothing (damping takes the shortest step, so the world stays about where it was); "first", the
-first pose that moved comes back to where it was, and the pose farthest from it at the start to its distance from it. Which is
-chosen changes no residual: the adjustment itself is free, which converges best, and the world is moved afterwards."""
+"""What is done about the place, turn and size of the world, which no residual tells.
+
+"free": nothing (damping takes the shortest step, so the world stays about where it was). "first": the first pose that moved
+comes back to where it was, and the pose farthest from it at the start to its distance from it. Which is chosen changes no
+residual: the adjustment itself is free, which converges best, and the world is moved afterwards."""
 
 
 def restore_gauge(

@@ -25,6 +25,14 @@ def intrinsics_covariance(
     Poses and points are free, and no gauge matters. It costs about a step of the adjustment, where `bundle_covariance` costs
     many.
 
+    Args:
+        problem: The result of the adjustment with its observations.
+        free: The intrinsics that were free, by name.
+        fixed_intrinsics: By names as in `free`, cameras in which these were held.
+        loss: The robust loss, squares if not given.
+        intrinsics_sigma: Standard deviations of the priors on intrinsics, by names as in `free`.
+        intrinsics_mean: Where these were centred; the cameras of the problem if not given.
+
     Returns:
         Covariances in the order focal (pixels along x), aspect, skew, principal point, distortion, for noise of one pixel in
         each image coordinate; zero where a number is held, very large or NaN where nothing determines it.

@@ -61,13 +61,33 @@ class Structure(Protocol):
         """
 
     def variables(self, sight: Sight) -> Block:
-        """The variables where they start."""
+        """The variables where they start.
+
+        Args:
+            sight: What is between the world and the images.
+        """
 
     def term(self, sight: Sight, start: Block) -> Term:
-        """The residuals, in units in which those of points are pixels, one row an observation."""
+        """The residuals, in units in which those of points are pixels, one row an observation.
+
+        Args:
+            sight: What is between the world and the images.
+            start: The variables as `variables` gave them.
+        """
 
     def covariance(self, x: Tensor, C: Tensor) -> Tensor:
-        """Covariances of the variables in coordinates that mean something outside, from those of their steps."""
+        """Covariances of the variables in coordinates that mean something outside, from those of their steps.
+
+        Args:
+            x: The variables, as the block holds them.
+            C: The covariances of steps along the block's manifold.
+        """
 
     def moved(self, start: Tensor, end: Tensor, world: Similarity | None) -> "Structure":
-        """The same with the variables moved, and then the world of those that did; others keep every bit."""
+        """The same with the variables moved, and then the world of those that did; others keep every bit.
+
+        Args:
+            start: The variables before, as the block holds them.
+            end: The same after the adjustment.
+            world: How the gauge then moved the world; None where it did not.
+        """

@@ -138,6 +138,10 @@ def kornia_from_camera(pose: Pose, camera: Camera, image_size: Int[Tensor, "*bat
 def camera_from_kornia(intrinsics: Float[Tensor, "*batch 4 4"], extrinsics: Float[Tensor, "*batch 4 4"]) -> tuple[Pose, Camera]:
     """Pose and camera from the matrices of a `PinholeCamera` of kornia.
 
+    Args:
+        intrinsics: K in pixels in the upper left 3x3.
+        extrinsics: The motion from world to camera.
+
     See the example of `kornia_from_camera`.
     """
     check_tensors(intrinsics=(intrinsics, "4 4"), extrinsics=(extrinsics, "4 4"))
@@ -190,6 +194,12 @@ def camera_from_pytorch3d(
     principal_point: Float[Tensor, "*batch 2"],
 ) -> tuple[Pose, Camera]:
     """Pose and camera from the arguments of PyTorch3D's `PerspectiveCameras(in_ndc=False)`.
+
+    Args:
+        R: Rotations as PyTorch3D holds them: rows times R, axes left, up, forward.
+        T: Translations along the same axes.
+        focal_length: Along x and y, in pixels.
+        principal_point: In pixels, the corner of the image at (0, 0).
 
     See the example of `pytorch3d_from_camera`.
     """
@@ -269,6 +279,9 @@ def camera_from_nerfstudio(
 def pycolmap_from_model(model: Reconstruction) -> Any:
     """The model as a `pycolmap.Reconstruction`.
 
+    Args:
+        model: Cameras, poses, points and tracks.
+
     Raises:
         ImportError: pycolmap is not installed.
         ValueError: COLMAP has no such cameras.
@@ -287,6 +300,9 @@ def pycolmap_from_model(model: Reconstruction) -> Any:
 
 def model_from_pycolmap(reconstruction: Any) -> Reconstruction:
     """The model that a `pycolmap.Reconstruction` holds.
+
+    Args:
+        reconstruction: The `pycolmap.Reconstruction`.
 
     Raises:
         ValueError: It has cameras that have no equal here.

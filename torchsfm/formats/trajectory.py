@@ -16,6 +16,10 @@ from torchsfm.reconstruction.reconstruction import Reconstruction
 def write_tum(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write the poses in the form of TUM, with the number of the image as its time; images without a pose have no line.
 
+    Args:
+        reconstruction: The model with the poses.
+        path: The file to write.
+
     Raises:
         OSError: The file cannot be written.
 
@@ -37,6 +41,10 @@ def write_tum(reconstruction: Reconstruction, path: str | Path) -> None:
 
 def write_kitti(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write the poses in the form of KITTI, a line for each image that has one; the lines tell no names and no times.
+
+    Args:
+        reconstruction: The model with the poses.
+        path: The file to write.
 
     Raises:
         OSError: The file cannot be written.

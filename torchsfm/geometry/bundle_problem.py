@@ -66,6 +66,15 @@ class BundleProblem:
     ) -> "BundleProblem":
         """The problem of views that one camera took, or each one of its own, unless `camera_index` says which.
 
+        Args:
+            poses: Of the views, world to camera.
+            cameras: One for all views, one for each, or those that `camera_index` chooses from.
+            X: Points in space.
+            x: Observations in pixels.
+            view: The view of each observation.
+            point: The point of each observation.
+            camera_index: The camera of each view.
+
         Raises:
             ValueError: `camera_index` is missing where there are several cameras, but not one for each view.
         """

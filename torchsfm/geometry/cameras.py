@@ -160,6 +160,11 @@ def camera_from_krt(
 ) -> Float[Tensor, "*batch 3 4"]:
     """Multiply out `P = K [R | t]`.
 
+    Args:
+        K: Intrinsics in pixels.
+        R: Rotations from world to camera.
+        t: The world's origin in the camera's frame.
+
     Example:
         >>> import torch, torchsfm
         >>> K = torchsfm.intrinsics(torch.tensor(500.0), torch.tensor([320.0, 240.0]))

@@ -43,18 +43,36 @@ class Distortion(ABC):
     @staticmethod
     @abstractmethod
     def project_rows(X: Tensor, Y: Tensor, Z: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Project rays given as separate coordinates; everything broadcasts."""
+        """Project rays given as separate coordinates; everything broadcasts.
+
+        Args:
+            X: To the right, in the camera's frame.
+            Y: Downwards.
+            Z: Along the optical axis.
+            *parameters: Those of the model, in the order of `parameter_names`.
+        """
 
     @classmethod
     def image(cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "p *#n"]) -> Float[Tensor, "2 *n"]:
-        """Project rays with the coordinates first, as optimisers do (float64); finite for all finite rays."""
+        """Project rays with the coordinates first, as optimisers do (float64); finite for all finite rays.
+
+        Args:
+            ray: Rays or points in camera coordinates, of any length.
+            k: The parameters, in the order of `parameter_names`.
+        """
         return torch.stack(cls.project_rows(*ray.unbind(0), *k.unbind(0)))
 
     @classmethod
     def linearize(
         cls, ray: Float[Tensor, "3 *n"], k: Float[Tensor, "p *#n"], out: Float[Tensor, "2 3 *n"]
     ) -> tuple[Float[Tensor, "2 *n"], list[Float[Tensor, "2 *n"]]]:
-        """Compute `image` and its derivatives by each parameter; `out` gets those by the ray. Here by two reverse sweeps."""
+        """Compute `image` and its derivatives by each parameter. Here by two reverse sweeps.
+
+        Args:
+            ray: Rays or points in camera coordinates, of any length.
+            k: The parameters, in the order of `parameter_names`.
+            out: What the derivatives by the ray are written to.
+        """
         leaves = [row.detach().expand(ray.shape[1:]).clone().requires_grad_() for row in (*ray, *k)]
         with torch.enable_grad():
             both = cls.project_rows(*leaves)
@@ -77,7 +95,11 @@ class Distortion(ABC):
         """
 
     def in_domain(self, d: Float[Tensor, "*#batch n 3"]) -> Bool[Tensor, "*#batch n"]:
-        """Tell which rays point forwards and lie within the valid radius, so that `unproject` finds them again."""
+        """Tell which rays point forwards and lie within the valid radius, so that `unproject` finds them again.
+
+        Args:
+            d: Rays or points in camera coordinates, of any length.
+        """
         check_tensors(d=(d, "n 3"))
         X, Y, Z = d.detach().unbind(-1)
         return (Z > 0) & ((X * X + Y * Y).sqrt() < self.valid_radius()[..., None] * Z)
@@ -117,7 +139,14 @@ class Distortion(ABC):
 
     @classmethod
     def from_parameters(cls: type[D], p: Float[Tensor, "*batch p"]) -> D:
-        """Make the model from its parameters in the order of `parameter_names`."""
+        """Make the model from its parameters.
+
+        Args:
+            p: The parameters, in the order of `parameter_names`.
+
+        Raises:
+            ValueError: There are more or fewer.
+        """
         if p.shape[-1] != cls.num_parameters:
             raise ValueError(f"p: wanted shape (*batch, {cls.num_parameters}) for {cls.__name__}, got {tuple(p.shape)}")
         return cls(*p.unbind(-1))

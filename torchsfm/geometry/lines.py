@@ -20,6 +20,10 @@ def line_from_points(x1: Float[Tensor, "*#batch 2"], x2: Float[Tensor, "*#batch 
     The normal is a quarter turn from y to x ahead of the direction from the first point to the second: seen on the screen,
     distances are positive to the left. Points that coincide give zero.
 
+    Args:
+        x1: The first point.
+        x2: The second, in the same unit; so are the distances.
+
     Example:
         >>> import torch, torchsfm
         >>> l = torchsfm.geometry.line_from_points(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]))
@@ -38,6 +42,10 @@ def point_line_distance(x: Float[Tensor, "*#batch 2"], l: Float[Tensor, "*#batch
 
     Zero where the line is none: the line at infinity, and zero.
 
+    Args:
+        x: Points in an image, or any plane.
+        l: Homogeneous lines: `l'x = 0` for points on them.
+
     Example:
         >>> import torch, torchsfm
         >>> torchsfm.geometry.point_line_distance(torch.tensor([3.0, 7.0]), torch.tensor([0.0, 2.0, -4.0]))  # y = 2
@@ -49,6 +57,10 @@ def point_line_distance(x: Float[Tensor, "*#batch 2"], l: Float[Tensor, "*#batch
 
 def pluecker_from_points(X1: Float[Tensor, "*#batch 3"], X2: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 6"]:
     """The line through two points, its direction `X2 - X1`. Points that coincide give zero.
+
+    Args:
+        X1: The point that the line comes from.
+        X2: The point that it goes to.
 
     Example:
         >>> import torch, torchsfm
@@ -65,6 +77,10 @@ def pluecker_from_planes(plane1: Float[Tensor, "*#batch 4"], plane2: Float[Tenso
 
     Planes that coincide give zero, parallel ones a line at infinity (d = 0).
 
+    Args:
+        plane1: Homogeneous planes: `plane' X = 0` for homogeneous points X on it.
+        plane2: Others.
+
     Example:
         >>> import torch, torchsfm
         >>> floor, wall = torch.tensor([0.0, 0.0, 1.0, 0.0]), torch.tensor([1.0, 0.0, 0.0, -2.0])  # z = 0 and x = 2
@@ -78,6 +94,9 @@ def pluecker_from_planes(plane1: Float[Tensor, "*#batch 4"], plane2: Float[Tenso
 
 def nearest_pluecker(L: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
     """The line nearest to a 6-vector that need not be one: the nearest point with `d'm = 0` (the Klein quadric).
+
+    Args:
+        L: Six numbers (d, m), as an estimate without constraint gives them.
 
     Example:
         >>> import torch, torchsfm
@@ -104,6 +123,10 @@ def nearest_pluecker(L: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 6"]:
 def transform_lines(H: Float[Tensor, "*#batch 4 4"], L: Float[Tensor, "*#batch n 6"]) -> Float[Tensor, "*batch n 6"]:
     """Lines whose points a projective map of space moves: that through `H X1` and `H X2` of the line through X1 and X2.
 
+    Args:
+        H: Maps of homogeneous points of space.
+        L: Lines in space (d, m), Pluecker coordinates.
+
     Example:
         >>> import torch, torchsfm
         >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 2.0]]))
@@ -127,6 +150,10 @@ def project_lines(P: Float[Tensor, "*#batch 3 4"], L: Float[Tensor, "*#batch n 6
 
     A line through the camera's centre gives zero.
 
+    Args:
+        P: Cameras.
+        L: Lines in space (d, m), Pluecker coordinates.
+
     Example:
         >>> import torch, torchsfm
         >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([[0.0, 2.0, 4.0]]), torch.tensor([[1.0, 2.0, 4.0]]))
@@ -144,6 +171,10 @@ def project_lines(P: Float[Tensor, "*#batch 3 4"], L: Float[Tensor, "*#batch n 6
 def viewing_planes(P: Float[Tensor, "*#batch 3 4"], l: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*batch n 4"]:  # noqa: E741
     """The planes of all points that a camera sees on image lines, `P'l`.
 
+    Args:
+        P: Cameras.
+        l: Homogeneous image lines in pixels.
+
     Example:
         >>> import torch, torchsfm
         >>> l = torch.tensor([[0.0, 1.0, -0.5]])  # the image line y = 1 / 2
@@ -156,6 +187,10 @@ def viewing_planes(P: Float[Tensor, "*#batch 3 4"], l: Float[Tensor, "*#batch n 
 
 def intersect_line_plane(L: Float[Tensor, "*#batch 6"], plane: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch 4"]:
     """The homogeneous point where a line meets a plane; zero where it lies in the plane.
+
+    Args:
+        L: A line in space (d, m), Pluecker coordinates of any scale.
+        plane: Homogeneous planes: `plane' X = 0` for homogeneous points X on it.
 
     Example:
         >>> import torch, torchsfm
@@ -171,6 +206,10 @@ def intersect_line_plane(L: Float[Tensor, "*#batch 6"], plane: Float[Tensor, "*#
 
 def nearest_on_line(X: Float[Tensor, "*#batch 3"], L: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 3"]:
     """The foot of the perpendicular from a point to a line; the point itself where the line is at infinity.
+
+    Args:
+        X: Points in space.
+        L: A line in space (d, m), Pluecker coordinates of any scale.
 
     Example:
         >>> import torch, torchsfm
@@ -188,6 +227,10 @@ def nearest_on_line(X: Float[Tensor, "*#batch 3"], L: Float[Tensor, "*#batch 6"]
 def point_to_line_distance(X: Float[Tensor, "*#batch 3"], L: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch"]:
     """The distance in space between a point and a line; zero where the line is at infinity.
 
+    Args:
+        X: Points in space.
+        L: A line in space (d, m), Pluecker coordinates of any scale.
+
     Example:
         >>> import torch, torchsfm
         >>> L = torchsfm.geometry.pluecker_from_points(torch.tensor([0.0, 0.0, 2.0]), torch.tensor([1.0, 0.0, 2.0]))
@@ -200,6 +243,10 @@ def point_to_line_distance(X: Float[Tensor, "*#batch 3"], L: Float[Tensor, "*#ba
 
 def line_to_line_distance(L1: Float[Tensor, "*#batch 6"], L2: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch"]:
     """The distance in space between two lines, parallel ones too; zero where one is at infinity.
+
+    Args:
+        L1: A line in space (d, m), Pluecker coordinates of any scale.
+        L2: Another one.
 
     Example:
         >>> import torch, torchsfm
@@ -229,6 +276,11 @@ def unproject_onto_lines(
 
     That is where the plane through the image point and across the image line meets the line. Zero where the camera's centre
     lies on the line.
+
+    Args:
+        x: Image points in pixels.
+        P: Cameras.
+        L: Lines in space (d, m), Pluecker coordinates, one for each point.
 
     Example:
         >>> import torch, torchsfm

@@ -13,6 +13,9 @@ SERIES = 1e-3
 def cross_matrix(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Write the cross product with v as a matrix: `cross_matrix(v) @ a = v x a`.
 
+    Args:
+        v: The left factor of the product.
+
     Example:
         >>> import torch, torchsfm
         >>> torchsfm.geometry.cross_matrix(torch.tensor([1.0, 0.0, 0.0])) @ torch.tensor([0.0, 1.0, 0.0])
@@ -211,6 +214,9 @@ def rotation_angle(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     """Measure the angle of rotations, 0 to pi radians, accurate over the whole range.
 
     The angle between two rotations is `rotation_angle(R1.mT @ R2)`. The derivative at angle 0, where there is none, is 0.
+
+    Args:
+        R: Rotation matrices.
 
     Example:
         >>> import torch, torchsfm

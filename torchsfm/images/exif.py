@@ -100,6 +100,9 @@ def parse_exif(data: bytes) -> Exif:
 
     A HEIC file tells its decoder how to turn the image, which then stands upright, whatever the tag says: its orientation is 1.
 
+    Args:
+        data: The whole file, or as much of its head as holds the tags.
+
     Example:
         >>> import torchsfm
         >>> torchsfm.images.parse_exif(b"no picture").focal_mm is None

@@ -11,6 +11,10 @@ def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"])
     The damping is relative to the diagonal, so that the unknowns may be of different units. An unknown that nothing depends on
     is 0.
 
+    Args:
+        A: Symmetric matrices, positive semidefinite but for rounding.
+        b: Right-hand sides as columns.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> A, b = torch.diag(torch.tensor([4.0, 0.0])).double(), torch.tensor([[8.0], [0.0]]).double()  # nothing says y

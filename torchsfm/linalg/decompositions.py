@@ -22,6 +22,9 @@ def eigh(
 ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
     """Eigenvalues, ascending, and eigenvectors, as columns, of symmetric matrices; the lower triangle counts.
 
+    Args:
+        A: Symmetric matrices.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> values, vectors, ok = torchsfm.linalg.eigh(torch.tensor([[2.0, 1.0], [1.0, 2.0]]))
@@ -36,6 +39,9 @@ def eigh(
 
 def eigvalsh(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
     """Eigenvalues, ascending, of symmetric matrices; the lower triangle counts.
+
+    Args:
+        A: Symmetric matrices.
 
     Example:
         >>> import torch, torchsfm.linalg
@@ -52,6 +58,9 @@ def eigvalsh(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n"],
 
 def eigvals(A: Float[Tensor, "*batch n n"]) -> tuple[Complex[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
     """Eigenvalues, in no order, of square matrices.
+
+    Args:
+        A: Any square matrices.
 
     Example:
         >>> import torch, torchsfm.linalg
@@ -70,6 +79,10 @@ def svd(
 ) -> tuple[Float[Tensor, "*batch m p"], Float[Tensor, "*batch k"], Float[Tensor, "*batch q n"], Bool[Tensor, "*batch"]]:
     """`U`, the k = min(m, n) singular values, descending, and `V'`; all of the axes or the first k of them.
 
+    Args:
+        A: Any matrices.
+        full_matrices: All of the axes, so that U and V are square.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> U, S, Vh, ok = torchsfm.linalg.svd(torch.diag(torch.tensor([1.0, 3.0, 2.0])))
@@ -84,6 +97,9 @@ def svd(
 
 def svdvals(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch k"], Bool[Tensor, "*batch"]]:
     """The k = min(m, n) singular values, descending.
+
+    Args:
+        A: Any matrices.
 
     Example:
         >>> import torch, torchsfm.linalg
@@ -101,6 +117,10 @@ def qr(
 ) -> tuple[Float[Tensor, "*batch m p"], Float[Tensor, "*batch p n"], Bool[Tensor, "*batch"]]:
     """`Q`, all m columns or the first min(m, n), and the upper triangle `R`; `ok` says nothing of the rank.
 
+    Args:
+        A: Any matrices.
+        complete: All m columns of Q, which then is square.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> A = torch.tensor([[3.0, 0.0], [4.0, 5.0]])
@@ -115,6 +135,9 @@ def qr(
 
 def triangular_factor(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch k n"], Bool[Tensor, "*batch"]]:
     """The upper triangle `R` of the QR decomposition alone, k = min(m, n).
+
+    Args:
+        A: Any matrices.
 
     Example:
         >>> import torch, torchsfm.linalg
@@ -153,6 +176,9 @@ def solve(
 
 def inverse(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"], Bool[Tensor, "*batch"]]:
     """The inverse; `ok` is False where LU finds the matrix singular, or it or its inverse is not finite.
+
+    Args:
+        A: Any square matrices.
 
     Example:
         >>> import torch, torchsfm.linalg

@@ -10,6 +10,10 @@ from torchsfm.linalg.rows import combine_rows
 def cross(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
     """The cross product along the last dimension, with broadcasting.
 
+    Args:
+        a: The left factors.
+        b: The right ones.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> torchsfm.linalg.cross(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
@@ -24,6 +28,9 @@ def cross(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float
 def determinant_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
     """The determinant as a triple product, whose derivatives of every order exist where it is zero.
 
+    Args:
+        A: Any matrices.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> torchsfm.linalg.determinant_3x3(torch.diag(torch.tensor([1.0, 2.0, 3.0])))
@@ -34,6 +41,9 @@ def determinant_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
 
 def adjugate_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not.
+
+    Args:
+        A: Any matrices.
 
     Example:
         >>> import torch, torchsfm.linalg
@@ -46,6 +56,9 @@ def adjugate_3x3(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 def adjugate_4x4(A: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """The adjugate, `A adj(A) = det(A) I`; it exists where the inverse does not.
+
+    Args:
+        A: Any matrices.
 
     Example:
         >>> import torch, torchsfm.linalg

@@ -11,6 +11,9 @@ LARGEST = 1e60
 def usable(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
     """Which numbers are finite and of a size that products of several can be computed with.
 
+    Args:
+        x: Any numbers.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> torchsfm.linalg.usable(torch.tensor([1.0, torch.inf, torch.nan]))
@@ -21,6 +24,9 @@ def usable(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
 
 def unit_scale(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch 1 1"]:
     """A power of two by which the largest number of a finite matrix, unless it is 0, comes to between 1/2 and 1.
+
+    Args:
+        A: Any matrices.
 
     Example:
         >>> import torch, torchsfm.linalg

@@ -12,6 +12,9 @@ from torchsfm.linalg.rows import combine_rows
 def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
     """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose.
 
+    Args:
+        A: Matrices with fewer rows than columns, the rows independent.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> torchsfm.linalg.orthonormal_nullspace(torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])).abs()

@@ -17,6 +17,10 @@ Roots = tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]
 def evaluate(c: Float[Tensor, "*#batch m"], x: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
     """The values of polynomials at k points each, by Horner's rule.
 
+    Args:
+        c: Coefficients, that of the constant first.
+        x: Where to evaluate.
+
     Example:
         >>> import torch, torchsfm.linalg
         >>> torchsfm.linalg.evaluate(torch.tensor([1.0, 0.0, 2.0]), torch.tensor([0.0, 1.0, 3.0]))  # 1 + 2 x^2

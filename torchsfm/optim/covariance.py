@@ -110,6 +110,12 @@ def marginal_covariance(
     held in a coordinate; infinite where the terms do not determine the block; residuals in units of their standard deviation,
     as in `sparse_covariance`.
 
+    Args:
+        blocks: The variables by name, at the optimum.
+        terms: The residuals of which it is the optimum.
+        name: The block whose covariance is wanted.
+        eliminate: Blocks that are eliminated first, as points are.
+
     Example:
         >>> import torch, torchsfm
         >>> from torchsfm.optim import Block, Term

@@ -19,6 +19,9 @@ from torchsfm.linalg import qr
 def wants_derivative(*inputs: Tensor) -> bool:
     """Whether any of the tensors is followed by reverse- or forward-mode differentiation right now.
 
+    Args:
+        *inputs: Tensors, any number of them.
+
     Example:
         >>> import torch, torchsfm
         >>> x, y = torch.zeros(2), torch.zeros(2, requires_grad=True)

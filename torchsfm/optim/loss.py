@@ -148,6 +148,10 @@ class Truncated:
 def loss_slope(loss: Loss, s: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """`rho'(s)`, by the loss's own `slope` or by automatic differentiation; negative and non-finite slopes become 0.
 
+    Args:
+        loss: The loss `rho(s)`.
+        s: Squared residuals, in the loss's unit squared.
+
     Example:
         >>> import torch, torchsfm
         >>> torchsfm.optim.loss_slope(torch.sqrt, torch.tensor([1.0, 4.0]))  # any function of squared residuals

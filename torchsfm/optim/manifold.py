@@ -247,6 +247,9 @@ class Product:
 def rotation_exponential(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """The rotation `exp([w]x)`, smooth at zero (Rodrigues).
 
+    Args:
+        w: Axes times angles, in radians.
+
     Example:
         >>> import torch, torchsfm
         >>> torchsfm.optim.rotation_exponential(torch.tensor([0.0, 0.0, torch.pi])).diagonal()  # half a turn about z

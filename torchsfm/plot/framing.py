@@ -32,6 +32,9 @@ def up_direction(reconstruction: Reconstruction) -> Float[Tensor, "3"]:
     an aeroplane, up is against the view. Where the horizontal axes are all parallel and the up directions are not, the images
     lie on their side, and up is the end of that axis from which the cameras look down.
 
+    Args:
+        reconstruction: The model, of whose images only the poses are looked at.
+
     Example:
         >>> import torch, torchsfm
         >>> g = torch.Generator().manual_seed(0)

@@ -26,6 +26,9 @@ the gradient takes the one, the Hessian the other. A step that takes the weights
 def constant_weights(weights: Float[Tensor, "*#batch n"]) -> Weigh:
     """The weights of a step of least squares: they do not depend on the distances; 0 for data to leave out.
 
+    Args:
+        weights: Of each datum.
+
     Example:
         >>> import torch, torchsfm
         >>> weigh = torchsfm.robust.constant_weights(torch.tensor([1.0, 0.0, 2.0]))

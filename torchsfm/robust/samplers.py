@@ -42,7 +42,13 @@ class Sampler(Protocol):
         ...
 
     def needed(self, problems: Problems, near: Bool[Tensor, "p width"], confidence: float) -> Float[Tensor, "p"]:
-        """How many samples it takes to have drawn, with the given confidence, one of `near` data alone."""
+        """How many samples it takes to have drawn one of inliers alone.
+
+        Args:
+            problems: All problems, with their data.
+            near: The inliers of each problem's best model.
+            confidence: The probability wanted, below 1.
+        """
         ...
 
 

@@ -34,11 +34,23 @@ class Scoring(Protocol):
     def cost(
         self, squared: Float[Tensor, "g s n"], limit: Float[Tensor, "g"], weight: Tensor | None, codimension: int
     ) -> Float[Tensor, "g s"]:
-        """The cost of models with such squared distances; weight (g, n) counts the data, None for all alike."""
+        """The cost of models; the lower, the better.
+
+        Args:
+            squared: Squared distances of n data to s models each of g problems.
+            limit: The squared threshold of each problem.
+            weight: How much each datum counts, (g, n); None for all alike.
+            codimension: How many independent numbers make a distance, see `Estimator`.
+        """
         ...
 
     def weigh(self, ratio: Float[Tensor, "*batch n"], codimension: int) -> Float[Tensor, "*batch n"]:
-        """The weight of data in local optimisation, by their squared distance over the squared threshold."""
+        """The weight of data in local optimisation.
+
+        Args:
+            ratio: Squared distances over the squared threshold.
+            codimension: How many independent numbers make a distance, see `Estimator`.
+        """
         ...
 
 

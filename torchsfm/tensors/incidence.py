@@ -23,6 +23,12 @@ def trifocal_ppp(
 ) -> Float[Tensor, "*batch n 3 3"]:
     """Point, point, point: [x2]x (x1^i T_i) [x3]x = 0, nine equations of which four are independent as equations for T.
 
+    Args:
+        T: The trifocal tensor of the views.
+        x1: Image points in the first view.
+        x2: Image points in the second view.
+        x3: Image points in the third view.
+
     Example:
         >>> import torch, torchsfm
         >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
@@ -42,6 +48,12 @@ def trifocal_ppl(
     l3: Float[Tensor, "*#batch n 3"],
 ) -> Float[Tensor, "*batch n 3"]:
     """Point, point, line: [x2]x (x1^i T_i) l3 = 0.
+
+    Args:
+        T: The trifocal tensor of the views.
+        x1: Image points in the first view.
+        x2: Image points in the second view.
+        l3: Homogeneous image lines in the third view.
 
     Example:
         >>> import torch, torchsfm
@@ -65,6 +77,12 @@ def trifocal_plp(
 ) -> Float[Tensor, "*batch n 3"]:
     """Point, line, point: l2' (x1^i T_i) [x3]x = 0.
 
+    Args:
+        T: The trifocal tensor of the views.
+        x1: Image points in the first view.
+        l2: Homogeneous image lines in the second view.
+        x3: Image points in the third view.
+
     Example:
         >>> import torch, torchsfm
         >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
@@ -87,6 +105,12 @@ def trifocal_pll(
 ) -> Float[Tensor, "*batch n"]:
     """Point, line, line: l2' (x1^i T_i) l3 = 0. Also for a point x1 on the first image of a line with images l2 and l3.
 
+    Args:
+        T: The trifocal tensor of the views.
+        x1: Image points in the first view.
+        l2: Homogeneous image lines in the second view.
+        l3: Homogeneous image lines in the third view.
+
     Example:
         >>> import torch, torchsfm
         >>> P = torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
@@ -107,6 +131,12 @@ def trifocal_lll(
     l3: Float[Tensor, "*#batch n 3"],
 ) -> Float[Tensor, "*batch n 3"]:
     """Line, line, line: (l2_j l3_k T_i^jk) x l1 = 0, three equations of which two are independent.
+
+    Args:
+        T: The trifocal tensor of the views.
+        l1: Homogeneous image lines in the first view.
+        l2: Homogeneous image lines in the second view.
+        l3: Homogeneous image lines in the third view.
 
     Example:
         >>> import torch, torchsfm
@@ -129,6 +159,13 @@ def quadrifocal_pppp(
     x4: Float[Tensor, "*#batch n 2"],
 ) -> Float[Tensor, "*batch n 3 3 3 3"]:
     """Four points: [x1]x [x2]x [x3]x [x4]x applied to the indices of Q is 0; 81 equations, 16 of them independent for Q.
+
+    Args:
+        Q: The quadrifocal tensor of the views.
+        x1: Image points in the first view.
+        x2: Image points in the second view.
+        x3: Image points in the third view.
+        x4: Image points in the fourth view.
 
     Example:
         >>> import torch, torchsfm
@@ -153,6 +190,13 @@ def quadrifocal_pppl(
 ) -> Float[Tensor, "*batch n 3 3 3"]:
     """Three points and a line through the fourth.
 
+    Args:
+        Q: The quadrifocal tensor of the views.
+        x1: Image points in the first view.
+        x2: Image points in the second view.
+        x3: Image points in the third view.
+        l4: Homogeneous image lines in the fourth view.
+
     Example:
         >>> import torch, torchsfm
         >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
@@ -175,6 +219,13 @@ def quadrifocal_ppll(
     l4: Float[Tensor, "*#batch n 3"],
 ) -> Float[Tensor, "*batch n 3 3"]:
     """Two points and lines through the other two.
+
+    Args:
+        Q: The quadrifocal tensor of the views.
+        x1: Image points in the first view.
+        x2: Image points in the second view.
+        l3: Homogeneous image lines in the third view.
+        l4: Homogeneous image lines in the fourth view.
 
     Example:
         >>> import torch, torchsfm
@@ -199,6 +250,13 @@ def quadrifocal_plll(
 ) -> Float[Tensor, "*batch n 3"]:
     """A point and lines through its other three images.
 
+    Args:
+        Q: The quadrifocal tensor of the views.
+        x1: Image points in the first view.
+        l2: Homogeneous image lines in the second view.
+        l3: Homogeneous image lines in the third view.
+        l4: Homogeneous image lines in the fourth view.
+
     Example:
         >>> import torch, torchsfm
         >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
@@ -221,6 +279,13 @@ def quadrifocal_llll(
 ) -> Float[Tensor, "*batch n"]:
     """Four lines through the images of one point, one in each view: l1_p l2_q l3_r l4_s Q^pqrs = 0.
 
+    Args:
+        Q: The quadrifocal tensor of the views.
+        l1: Homogeneous image lines in the first view.
+        l2: Homogeneous image lines in the second view.
+        l3: Homogeneous image lines in the third view.
+        l4: Homogeneous image lines in the fourth view.
+
     Example:
         >>> import torch, torchsfm
         >>> P = torchsfm.random_poses(4, generator=torch.Generator().manual_seed(0)).matrix()
@@ -241,6 +306,12 @@ def quadrifocal_lll(
     l3: Float[Tensor, "*#batch n 3"],
 ) -> Float[Tensor, "*batch n 3"]:
     """The images of one line in the first three views: l1_p l2_q l3_r Q^pqrs = 0 for each s.
+
+    Args:
+        Q: The quadrifocal tensor of the views.
+        l1: Homogeneous image lines in the first view.
+        l2: Homogeneous image lines in the second view.
+        l3: Homogeneous image lines in the third view.
 
     Example:
         >>> import torch, torchsfm
