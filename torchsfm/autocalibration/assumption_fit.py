@@ -89,7 +89,8 @@ def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumptio
             held[:, k] = 1 - present[:, view]
     precision = (precision + held)[:, None]
     mean = torch.zeros_like(precision)
-    rough = fit_upgrade(problem, starts, plane, mean, precision, coupled=False, max_iterations=30)
+    # Near enough to tell minima apart and to rank them; those that are kept go on to their own.
+    rough = fit_upgrade(problem, starts, plane, mean, precision, coupled=False, max_iterations=30, tolerance=1e-4)
     ranked = (rough.objective + _impossible(problem, ready, rough.unknowns, rough.plane)).argsort(-1)
     finalists = _distinct(ranked, rough.unknowns[..., is_focal].mean(-1), rough.plane)
     rows = torch.arange(b, device=ready.P.device)[:, None]

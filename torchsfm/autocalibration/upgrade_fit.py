@@ -6,14 +6,13 @@ and plane have, so that many starts of many problems fit in one batch; its singu
 of their noise.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.autocalibration.upgrade_residual import departure_derivatives
+from torchsfm.autocalibration.upgrade_residual import Departures, departures
 from torchsfm.geometry.intrinsic_parameters import intrinsics_from_relative
 from torchsfm.optim import levenberg_marquardt
 
@@ -64,6 +63,7 @@ def fit_upgrade(
     *,
     coupled: bool,
     max_iterations: int,
+    tolerance: float = 1e-9,
 ) -> UpgradeFit:
     """Minimise from k starts each.
 
@@ -75,6 +75,7 @@ def fit_upgrade(
         precision: One over the standard deviation of that.
         coupled: Weigh with the covariance of all views together; else view by view, which is cheaper and less exact.
         max_iterations: Most steps.
+        tolerance: A fit is done when no more than this fraction of its objective is left to gain.
     """
     b, k, q = unknowns.shape
     v = problem.P.shape[1]
@@ -87,20 +88,20 @@ def fit_upgrade(
         t[:, None].expand(*size, *t.shape[1:]).flatten(0, 1) for t in (problem.P, covariance, problem.base, problem.present)
     ]
     expected = [t.expand(b, k, q).flatten(0, 1) for t in (mean, precision)]
-    linearize = _linearization(problem.spread, coupled)
+    weighed = _WeighedDepartures(problem.spread, coupled)
     start = torch.cat((unknowns, plane), -1).flatten(0, 1)
     result = levenberg_marquardt(
-        lambda x, *data: linearize(x, *data)[0],
+        weighed.residual,
         start,
         *shared,
         *expected,
-        linearize=linearize,
+        linearize=weighed.linearize,
         max_iterations=max_iterations,
-        function_tolerance=1e-9,
+        function_tolerance=tolerance,
         step_tolerance=1e-9,
         initial_damping=1e-3,
     )
-    residual = linearize(result.x, *shared, *expected)[0]
+    residual = weighed.residual(result.x, *shared, *expected)
     cost = residual[:, : 5 * v, 0].square().sum(-1)
     bad = torch.finfo(cost.dtype).max / 4
     cost = torch.nan_to_num(cost, bad, bad, bad)
@@ -120,34 +121,60 @@ def fit_information(
     zero = torch.zeros_like(unknowns)
     x = torch.cat((unknowns, plane), -1)
     data = (problem.P, problem.covariance, problem.base, problem.present, zero, zero)
-    _, J = _linearization(problem.spread, problem.covariance.ndim == 5)(x, *data)
+    _, J = _WeighedDepartures(problem.spread, problem.covariance.ndim == 5).linearize(x, *data)
     J = torch.nan_to_num(J[:, :, 0], 0.0, 0.0, 0.0)
     return J.mT @ J
 
 
-def _linearization(spread: Tensor, coupled: bool) -> Callable[..., tuple[Tensor, Tensor]]:
-    v, _, q = spread.shape
+@dataclass(frozen=True)
+class _WeighedDepartures:
+    """The departures of present views over their noise, and what is expected of the unknowns: residuals of one number each."""
+
+    spread: Float[Tensor, "v 5 q"]
+    coupled: bool
+
+    def residual(
+        self, x: Tensor, P: Tensor, covariance: Tensor, base: Tensor, present: Tensor, mean: Tensor, precision: Tensor
+    ) -> Tensor:
+        """The residuals (b, 5 v + q, 1)."""
+        found, counts = self._departures(x, P, base, present)
+        weighed = self._weigh(found.by_camera, covariance, counts, (found.g * counts[..., None])[..., None])
+        expected = (x[:, : self.spread.shape[-1]] - mean) * precision
+        return torch.cat((weighed[..., 0], expected), -1)[..., None]
 
     def linearize(
-        x: Tensor, P: Tensor, covariance: Tensor, base: Tensor, present: Tensor, mean: Tensor, precision: Tensor
+        self, x: Tensor, P: Tensor, covariance: Tensor, base: Tensor, present: Tensor, mean: Tensor, precision: Tensor
     ) -> tuple[Tensor, Tensor]:
-        unknowns, p = x[:, :q], x[:, q:]
-        b = len(x)
-        K = intrinsics_from_relative(base + torch.einsum("vmq,bq->bvm", spread, unknowns))
-        g, by_camera, own, reference, by_plane = departure_derivatives(P, K, K[:, 0], p)
-        J = torch.cat((own @ spread + reference @ spread[0], by_plane), -1)
-        # The first view is metric by the choice of frame; absent ones say nothing.
+        """The residuals, and their derivatives (b, 5 v + q, 1, q + 3), those of the weights left out."""
+        found, counts = self._departures(x, P, base, present)
+        own, reference, by_plane = found.by_parameters()
+        J = torch.cat((own @ self.spread + reference @ self.spread[0], by_plane), -1)
+        whole = torch.cat((found.g[..., None], J), -1) * counts[..., None, None]
+        whole = self._weigh(found.by_camera, covariance, counts, whole)
+        q = self.spread.shape[-1]
+        expected = (x[:, :q] - mean) * precision
+        tail = torch.cat((torch.diag_embed(precision), precision.new_zeros(len(x), q, 3)), -1)
+        r = torch.cat((whole[..., 0], expected), -1)
+        return r[..., None], torch.cat((whole[..., 1:], tail), -2)[..., None, :]
+
+    def _departures(self, x: Tensor, P: Tensor, base: Tensor, present: Tensor) -> tuple[Departures, Tensor]:
+        """Those of all views, and which count: the first is metric by the choice of frame, absent ones say nothing."""
+        q = self.spread.shape[-1]
+        K = intrinsics_from_relative(base + torch.einsum("vmq,bq->bvm", self.spread, x[:, :q]))
         counts = present.clone()
         counts[:, 0] = 0
-        g, J = g * counts[..., None], J * counts[..., None, None]
+        return departures(P, K, K[:, 0], x[:, q:]), counts
+
+    def _weigh(self, by_camera: Tensor, covariance: Tensor, counts: Tensor, columns: Tensor) -> Tensor:
+        """Columns (b, v, 5, k) times the inverse root of the covariance of the departures, (b, 5 v, k)."""
+        b, v = counts.shape
         by_camera = by_camera * counts[..., None, None]
         idle = (1 - counts)[..., None].expand(b, v, 5)
-        if coupled:
+        if self.coupled:
             half = (by_camera @ covariance.reshape(b, v, 12, 12 * v)).reshape(b, 5 * v, v, 12)
             C = torch.einsum("brvi,bvmi->brvm", half, by_camera).reshape(b, 5 * v, 5 * v)
             C = 0.5 * (C + C.mT)
-            idle = idle.reshape(b, 5 * v)
-            g, J = g.reshape(b, 5 * v), J.reshape(b, 5 * v, -1)
+            idle, columns = idle.reshape(b, 5 * v), columns.flatten(1, 2)
         else:
             C = by_camera @ covariance @ by_camera.mT
         diagonal = C.diagonal(dim1=-2, dim2=-1)
@@ -157,11 +184,5 @@ def _linearization(spread: Tensor, coupled: bool) -> Callable[..., tuple[Tensor,
         L, info = torch.linalg.cholesky_ex(scale[..., :, None] * C * scale[..., None, :])
         # A covariance that is none makes the residual infinite, and the step is not taken.
         wrong = torch.where(info == 0, 0.0, torch.nan)[..., None, None]
-        whole = torch.cat((g[..., None], J), -1) * scale[..., None] + wrong
-        whole = torch.linalg.solve_triangular(L, whole, upper=False).reshape(b, 5 * v, -1)
-        expected = (unknowns - mean) * precision
-        tail = torch.cat((torch.diag_embed(precision), precision.new_zeros(b, q, 3)), -1)
-        r = torch.cat((whole[..., 0], expected), -1)
-        return r[..., None], torch.cat((whole[..., 1:], tail), -2)[..., None, :]
-
-    return linearize
+        weighed: Tensor = torch.linalg.solve_triangular(L, columns * scale[..., None] + wrong, upper=False)
+        return weighed.reshape(b, 5 * v, -1)

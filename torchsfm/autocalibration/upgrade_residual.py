@@ -6,6 +6,7 @@ In the frame where the reference camera is [I | 0] and the plane at infinity is 
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -45,18 +46,41 @@ def departure(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 5"]:
     return g
 
 
-def departure_derivatives(
+@dataclass(frozen=True)
+class Departures:
+    """The departures of all views, and what their derivatives are made of."""
+
+    g: Float[Tensor, "*batch v 5"]
+    by_camera: Float[Tensor, "*batch v 5 12"]
+    """Their derivatives with respect to the entries of each camera."""
+    P: Float[Tensor, "*batch v 3 4"]
+    K: Float[Tensor, "*batch v 3 3"]
+    K_ref: Float[Tensor, "*batch 3 3"]
+    M: Float[Tensor, "*batch v 3 3"]
+    left: Float[Tensor, "*batch v 3 3"]
+    """`M = left K_ref`."""
+    Q: Float[Tensor, "*batch v 5 3 3"]
+    """`dg = <Q, dM>`."""
+    pulled: Float[Tensor, "*batch v 5 3 3"]
+    """`K^-T Q`."""
+    R: Float[Tensor, "*batch v 5 3 3"]
+    """`K^-T Q K_ref'`."""
+
+    def by_parameters(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Derivatives with respect to the view's own parameters (5, 5), those of the reference view (5, 5), and p (5, 3)."""
+        own = -torch.einsum("...mij,...kij->...mk", self.pulled @ self.M.mT[..., None, :, :], intrinsics_slopes(self.K))
+        slopes = intrinsics_slopes(self.K_ref)[..., None, :, :, :]
+        reference = torch.einsum("...mij,...kij->...mk", self.left.mT[..., None, :, :] @ self.Q, slopes)
+        return own, reference, -(self.R.mT @ self.P[..., None, :, 3:])[..., 0]
+
+
+def departures(
     P: Float[Tensor, "*batch v 3 4"],
     K: Float[Tensor, "*batch v 3 3"],
     K_ref: Float[Tensor, "*batch 3 3"],
     p: Float[Tensor, "*batch 3"],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The departures (*batch, v, 5) and their derivatives.
-
-    Returns:
-        g, and its derivatives with respect to the camera (5, 12), the view's own parameters (5, 5), those of the reference
-        view (5, 5), and p (5, 3).
-    """
+) -> Departures:
+    """The departures of cameras with intrinsics K, in the frame where the plane at infinity is (p, 1)."""
     inverse = inverse_intrinsics(K)
     left = inverse @ (P[..., :3] - P[..., 3:] * p[..., None, None, :])
     Kr = K_ref[..., None, :, :]
@@ -64,16 +88,11 @@ def departure_derivatives(
     S = M @ M.mT
     size = S.flatten(-2).norm(dim=-1).clamp_min(torch.finfo(M.dtype).tiny)
     g = departure(M)
-    E = traceless_basis(M)
-    # dg = <Q, dM>
     Q = 2 * (
-        E @ M[..., None, :, :] / size[..., None, None, None]
+        traceless_basis(M) @ M[..., None, :, :] / size[..., None, None, None]
         - g[..., None, None] * (S @ M / size[..., None, None] ** 2)[..., None, :, :]
     )
     pulled = inverse.mT[..., None, :, :] @ Q
     R = pulled @ Kr[..., None, :, :].mT
     by_camera = torch.cat((R, -(R @ p[..., None, None, :, None])), -1).flatten(-2)
-    own = -torch.einsum("...mij,...kij->...mk", pulled @ M.mT[..., None, :, :], intrinsics_slopes(K))
-    reference = torch.einsum("...mij,...kij->...mk", left.mT[..., None, :, :] @ Q, intrinsics_slopes(K_ref)[..., None, :, :, :])
-    by_plane = -(R.mT @ P[..., None, :, 3:])[..., 0]
-    return g, by_camera, own, reference, by_plane
+    return Departures(g, by_camera, P, K, K_ref, M, left, Q, pulled, R)
