@@ -131,6 +131,11 @@ def test_the_tags_of_a_position(generator: torch.Generator) -> None:
         assert (exif.latitude, exif.longitude) == (pytest.approx(latitude, abs=1e-9), pytest.approx(longitude, abs=1e-9))
         assert exif.altitude == pytest.approx(height, abs=1e-3)
     assert parse_exif(with_position(55.0, 13.0, None)).altitude is None
+    # XMP beside it counts where it alone has a height.
+    xmp = b"<rdf:RDF><a drone-dji:GpsLatitude='1' drone-dji:GpsLongitude='2' drone-dji:AbsoluteAltitude='3'/></rdf:RDF>"
+    for height, wanted in ((7.0, (55.0, 13.0, 7.0)), (None, (1.0, 2.0, 3.0))):
+        exif = parse_exif(with_position(55.0, 13.0, height) + xmp)
+        assert (exif.latitude, exif.longitude, exif.altitude) == wanted
     # A receiver without a position writes zeros.
     assert parse_exif(with_position(0.0, 0.0, 0.0)).latitude is None
     beyond = with_position(89.0, 13.0, 5.0).replace(struct.pack("<2I", 89, 1), struct.pack("<2I", 95, 1))

@@ -42,7 +42,7 @@ def align(
     ] = None,
     scale: Annotated[float | None, typer.Option(help="Multiply all lengths.", show_default=False)] = None,
     gps: Annotated[
-        bool, typer.Option("--gps", help="To metres east, north and up, by the positions in the photographs' Exif tags.")
+        bool, typer.Option("--gps", help="To metres east, north and up, by the positions in the photographs' Exif tags or XMP.")
     ] = False,
     up: Annotated[bool, typer.Option("--up", help="So that z points up, by how the cameras were held.")] = False,
     ground: Annotated[bool, typer.Option("--ground", help="So that z points up and z = 0 is the ground.")] = False,

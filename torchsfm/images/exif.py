@@ -1,8 +1,8 @@
 """What a camera wrote beside the pixels: orientation, maker, model, the numbers that give a focal length, and where it was.
 
 The few tags needed are read straight from the bytes (TIFF 6.0; Exif 2.32, JEITA CP-3451; CIPA DC-008), in JPEG, PNG, TIFF and
-WebP files; those of HEIC come from what decodes it. Metadata is often damaged, so nothing here raises: what cannot be read is
-absent.
+WebP files; those of HEIC come from what decodes it. Positions also stand in XMP packets. Metadata is often damaged, so nothing
+here raises: what cannot be read is absent.
 """
 
 import math
@@ -10,6 +10,7 @@ import struct
 from dataclasses import dataclass
 
 from torchsfm.images.heif import heif_exif, is_heif
+from torchsfm.images.xmp import Position, xmp_position
 
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8}
 _INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i"}
@@ -98,6 +99,8 @@ class Exif:
 def parse_exif(data: bytes) -> Exif:
     """The Exif tags in the bytes of an image file (JPEG, PNG, TIFF, WebP, HEIC); an empty `Exif` where there are none.
 
+    The position may also come from an XMP packet, as drones write it.
+
     A HEIC file tells its decoder how to turn the image, which then stands upright, whatever the tag says: its orientation is 1.
 
     Args:
@@ -123,11 +126,9 @@ def parse_exif(data: bytes) -> Exif:
         value = tags.get(name)
         return value if isinstance(value, str) else ""
 
-    latitude, longitude = _degrees(tags, "latitude", "north", "S", 90.0), _degrees(tags, "longitude", "east", "W", 180.0)
-    # A receiver that does not know writes zeros.
-    placed = latitude is not None and longitude is not None and (latitude, longitude) != (0, 0)
-    height = tags.get("altitude")
-    up = height if isinstance(height, int | float) and math.isfinite(height) else None
+    # A position with a height is worth more than one without, whoever wrote it.
+    places = [place for place in (_position(tags), xmp_position(data)) if place is not None]
+    latitude, longitude, altitude = max(places, key=lambda place: place[2] is not None, default=(None, None, None))
     orientation = 1 if is_heif(data) else integer("orientation") or 1
     per_unit = _MILLIMETRES.get(integer("plane_unit") or 2)
     x_resolution, y_resolution = number("plane_x_resolution"), number("plane_y_resolution")
@@ -141,10 +142,21 @@ def parse_exif(data: bytes) -> Exif:
         height=integer("height"),
         plane_x_resolution=x_resolution / per_unit if x_resolution and per_unit else None,
         plane_y_resolution=y_resolution / per_unit if y_resolution and per_unit else None,
-        latitude=latitude if placed else None,
-        longitude=longitude if placed else None,
-        altitude=None if up is None or not placed else -up if tags.get("below") == 1 else up,
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
     )
+
+
+def _position(tags: dict[str, Value]) -> Position | None:
+    """Where the photograph was taken, as the tags say."""
+    latitude, longitude = _degrees(tags, "latitude", "north", "S", 90.0), _degrees(tags, "longitude", "east", "W", 180.0)
+    # A receiver that does not know writes zeros.
+    if latitude is None or longitude is None or (latitude, longitude) == (0, 0):
+        return None
+    height = tags.get("altitude")
+    up = height if isinstance(height, int | float) and math.isfinite(height) else None
+    return latitude, longitude, -up if up is not None and tags.get("below") == 1 else up
 
 
 def _degrees(tags: dict[str, Value], name: str, side: str, negative: str, limit: float) -> float | None:

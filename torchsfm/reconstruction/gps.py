@@ -1,4 +1,4 @@
-"""Where photographs say that they were taken: the positions in their Exif tags, as a local frame in metres."""
+"""Where photographs say that they were taken: the positions in their Exif tags or XMP, as a local frame in metres."""
 
 import math
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ class GpsAlignment:
 
 
 def align_to_gps(model: Reconstruction, images: str | Path) -> GpsAlignment:
-    """The similarity that carries a model to metres east, north and up, by the positions in its photographs' Exif tags.
+    """The similarity that carries a model to metres east, north and up, by the positions in its photographs' Exif or XMP.
 
     The origin is in the middle of the positions. Receivers are off by metres, more in height: see `align_to_positions` for what
     is left aside, and for when nothing is determined. Positions without a height do not count.
@@ -80,7 +80,7 @@ def align_to_gps(model: Reconstruction, images: str | Path) -> GpsAlignment:
 
 
 def gps_places(files: Sequence[str | Path]) -> Float[Tensor, "n 3"]:
-    """Latitude, longitude (degrees) and height (metres) in the Exif tags of image files; NaN where there is none.
+    """Latitude, longitude (degrees) and height (metres) in the Exif tags or XMP of image files; NaN where there is none.
 
     Raises:
         OSError: A file cannot be read.
