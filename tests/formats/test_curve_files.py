@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import small_model
 import torch
 
 from torchsfm.formats import read_ply, write_curves
+from torchsfm.geometry import Curve
 from torchsfm.reconstruction import Curves
 
 
@@ -76,9 +78,85 @@ def test_no_curves_and_broken_ones(curves: Curves, tmp_path: Path) -> None:
         assert len(json.loads((tmp_path / "a.json").read_text())["curves"]) == (2 if count else 0)
 
 
+def drawn(path: Path) -> tuple[list[float], list[tuple[torch.Tensor, bool, str]]]:
+    """The page and the paths of a drawing, in the pixels of its image."""
+    svg = ElementTree.parse(path).getroot()
+    group = svg.find("{*}g")
+    assert group is not None
+    assert group.get("transform") == "translate(0.5 0.5)"
+    paths = []
+    for one in group:
+        words = (one.get("d") or "").replace(",", " ").split()
+        closed = words[-1] == "Z"
+        values = [float(word) for word in words[1 : len(words) - closed]]
+        paths.append((torch.tensor(values, dtype=torch.float64).reshape(-1, 2), closed, one.get("stroke") or ""))
+    return [float(word) for word in (svg.get("viewBox") or "").split()], paths
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "opencv", "fisheye"])
+def test_a_drawing_of_a_model_is_what_its_camera_sees(lens: str, tmp_path: Path) -> None:
+    model = small_model.with_curves(small_model.make(lens))
+    assert model.curves is not None
+    model = replace(model, names=("a.jpg", "<b>&\udcff\x01.jpg", "c.jpg", "d.jpg"))
+    for image in (1, model.names[1]):
+        write_curves(model, tmp_path / "a.svg", image=image)
+        page, paths = drawn(tmp_path / "a.svg")
+        assert page == [0, 0, 800, 600]
+        assert [closed for _, closed, _ in paths] == model.curves.closed.tolist()
+        wanted = model.cameras[0].project(model.poses[1].transform(model.curves.X))
+        torch.testing.assert_close(torch.cat([x for x, _, _ in paths]), wanted, rtol=0, atol=6e-4)
+        assert paths[0][2] == "#" + "".join(f"{v:02x}" for v in (model.curves.color[:16].mean(0) * 255).round().int().tolist())
+
+
+def test_a_drawing_ends_where_the_image_does(tmp_path: Path) -> None:
+    """Curves are cut at the border, and where they go behind the camera."""
+    model = small_model.with_curves(small_model.make("pinhole"), finer=4)
+    centre = model.poses.centre[0]
+    assert model.curves is not None
+    around = replace(model, curves=replace(model.curves, X=centre + model.curves.X))
+    for some in (around, replace(model, image_size=torch.tensor([[430, 600]] * 4))):
+        write_curves(some, tmp_path / "a.svg", image=0)
+        (_, _, width, height), paths = drawn(tmp_path / "a.svg")
+        x = torch.cat([x for x, _, _ in paths])
+        assert bool(((x >= -0.5) & (x <= torch.tensor([width, height]) - 0.5)).all())
+        assert some.curves is not None
+        d = some.poses[0].transform(some.curves.X)
+        y = some.cameras[0].project(d)
+        inside = ((y >= -0.5) & (y <= some.image_size[0] - 0.5)).all(-1) & (d[:, 2] > 0)
+        assert 0 < len(x) == int(inside.sum()) < len(inside)
+        assert not all(closed for _, closed, _ in paths)
+
+
+def test_a_drawing_of_curves_of_an_image(tmp_path: Path, generator: torch.Generator) -> None:
+    x = 100 * torch.rand(2, 3, 7, 2, generator=generator) - 20
+    valid = torch.arange(7) < torch.tensor([[7, 0, 3], [5, 1, 2]])[..., None]
+    closed = torch.tensor([[True, False, False], [True, False, False]])
+    write_curves(Curve(x, valid, closed), tmp_path / "a.svg")
+    (left, top, width, height), paths = drawn(tmp_path / "a.svg")
+    assert [len(own) for own, _, _ in paths] == [7, 3, 5, 1, 2]
+    assert [around for _, around, _ in paths] == [True, False, True, False, False]
+    torch.testing.assert_close(torch.cat([own for own, _, _ in paths]).float(), x[valid], rtol=0, atol=6e-4)
+    corner = torch.tensor([left, top]) - 0.5
+    assert bool(((x[valid] >= corner) & (x[valid] <= corner + torch.tensor([width, height]))).all())
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_wrong_names_and_models(curves: Curves, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"path: wanted a name that ends with one of \.ply, \.obj, \.json"):
+    with pytest.raises(ValueError, match=r"path: wanted a name that ends with one of \.ply, \.obj, \.json, \.svg"):
         write_curves(curves, tmp_path / "curves.stl")
     with pytest.raises(ValueError, match="a model in which none were looked for"):
         write_curves(small_model.make(), tmp_path / "curves.ply")
+    model = replace(small_model.make(), curves=curves)
+    rows = Curve(torch.zeros(3, 2), torch.ones(3, dtype=torch.bool), torch.tensor(False))
+    for some, name, image, words in (
+        (model, "a.svg", None, "image: wanted one for a drawing"),
+        (model, "a.svg", 3, "image: wanted one of the model that has a pose, got 3"),
+        (model, "a.svg", "gone.jpg", "image: wanted one of the model that has a pose, got 'gone.jpg'"),
+        (model, "a.ply", 0, "image: wanted one for a drawing"),
+        (curves, "a.svg", None, "curves: wanted a model with cameras"),
+        (rows, "a.ply", None, "path: wanted a name that ends with .svg for curves of an image"),
+        (curves.rows(), "a.svg", None, "curves: wanted ones of an image"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            write_curves(some, tmp_path / name, image=image)
+    assert not list(tmp_path.iterdir())

@@ -1,32 +1,38 @@
-"""Curves in space for other programs: PLY and OBJ with edges between samples, JSON with splines."""
+"""Curves for other programs: PLY and OBJ with edges between samples, JSON with splines, SVG drawings of images."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from torchsfm._types import check_options
+from torchsfm.formats.drawing import draw_curves, draw_model_curves
+from torchsfm.geometry import Curve
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 
-def write_curves(curves: Curves | Reconstruction, path: str | Path) -> None:
-    """Write curves in space, in the format that the name ends with.
+def write_curves(curves: Curves | Reconstruction | Curve, path: str | Path, *, image: str | int | None = None) -> None:
+    """Write curves in space, or those of an image, in the format that the name ends with.
 
     `.ply` (binary) has the samples as coloured vertices, in order, and edges from each to the next: MeshLab, Blender and Open3D
     show them as lines, programs that know only points show the samples. A property `curve` of the vertices says which curve it
     is. `.obj` has coloured vertices and a line element `l` for each curve. `.json` has cubic B-splines, of each its degree,
     knots and control points, as NURBS programs and SciPy take them; samples are no farther from them than half of the samples
     are known to be, where they are dense enough to tell. The control points of a closed spline end with its first three once
-    more: its ends then meet smoothly.
+    more: its ends then meet smoothly. `.svg` is a drawing, in the pixels of an image: of curves of an image, or of those in
+    space where an image of the model would show them, whatever may hide them.
 
     Args:
-        curves: The curves, or a model with some.
+        curves: Curves in space or a model with some; for a drawing a model with some, or curves of an image.
         path: File to write; its folder must be there.
+        image: The image of the model, by its name or number, that a drawing is of.
 
     Raises:
-        ValueError: The model has no curves, or the name ends otherwise.
+        ValueError: The model has no curves, or the name ends otherwise, or there is no such image.
         OSError: The file cannot be written.
 
     Example:
@@ -38,17 +44,33 @@ def write_curves(curves: Curves | Reconstruction, path: str | Path) -> None:
         True
     """
     path = Path(path)
+    check_options(curves=(curves, Curves | Reconstruction | Curve))
     some = curves.curves if isinstance(curves, Reconstruction) else curves
     if some is None:
         raise ValueError("curves: wanted curves or a model with some, got a model in which none were looked for")
     writers = {".ply": _ply, ".obj": _obj, ".json": _json}
-    if path.suffix not in writers:
-        raise ValueError(f"path: wanted a name that ends with one of {', '.join(writers)}, got {path.name!r}")
-    some = some.detached()
-    sound = torch.ones_like(some.closed).index_fill(0, some.curve[~some.X.isfinite().all(-1)], value=False)
-    content = writers[path.suffix](some.select(sound))
+    if path.suffix not in (*writers, ".svg"):
+        raise ValueError(f"path: wanted a name that ends with one of {', '.join(writers)}, .svg, got {path.name!r}")
+    if (image is not None) != (path.suffix == ".svg" and isinstance(curves, Reconstruction)):
+        raise ValueError(f"image: wanted one for a drawing of a model's curves, and for nothing else, got {image!r}")
+    if isinstance(some, Curve):
+        if path.suffix != ".svg":
+            raise ValueError(f"path: wanted a name that ends with .svg for curves of an image, got {path.name!r}")
+        content = draw_curves(some).encode()
+    elif path.suffix == ".svg":
+        if not isinstance(curves, Reconstruction) or image is None:
+            raise ValueError("curves: wanted a model with cameras, or curves of an image, for a drawing")
+        content = draw_model_curves(replace(curves, curves=_sound(some)), image).encode()
+    else:
+        content = writers[path.suffix](_sound(some))
     with whole_file(path) as file:
         file.write(content)
+
+
+def _sound(curves: Curves) -> Curves:
+    """The curves of which every sample is a point."""
+    some = curves.detached()
+    return some.select(torch.ones_like(some.closed).index_fill(0, some.curve[~some.X.isfinite().all(-1)], value=False))
 
 
 def _ply(curves: Curves) -> bytes:
