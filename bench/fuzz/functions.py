@@ -551,7 +551,7 @@ EXCEPTIONS: dict[str, str] = {
     "optim.wants_derivative": "a question about tensors, not their values",
     **{f"reconstruction.{name}": "takes a whole model; tests of models spoil it" for name in (
         "adjust_to_points", "align_models", "align_to_gps", "align_to_ground", "align_to_points", "align_to_positions",
-        "align_upright", "merge_models", "part_of_model")},
+        "align_upright", "merge_models", "part_of_model", "up_direction")},
     "reconstruction.reconstruct_curves": "photographs one after another, and seconds",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.register_photographs": "photographs; tests/test_register.py spoils them",
@@ -564,7 +564,7 @@ EXCEPTIONS: dict[str, str] = {
     "simulation.render_sequence": "takes no data, and seconds",
     **{f"plot.plot_{name}": "draws" for name in (
         "cameras", "epipolar_lines", "lines_3d", "matches", "points_2d", "points_3d", "residuals", "tracks")},
-    **{f"plot.{name}": "draws" for name in ("show_image", "show_scaled", "up_direction", "write_page")},
+    **{f"plot.{name}": "draws" for name in ("show_image", "show_scaled", "write_page")},
 }  # fmt: skip
 """Public functions that are not tried, and why."""
 

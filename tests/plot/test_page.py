@@ -14,18 +14,14 @@ import pytest
 import small_model
 import torch
 from chance import seeded
-from torch import Tensor
 
 from torchsfm.geometry import Pose
-from torchsfm.geometry.rotations import random_rotation
-from torchsfm.geometry.similarity import Similarity
 from torchsfm.images import read_image, save_image
-from torchsfm.plot import up_direction, write_page
+from torchsfm.plot import write_page
 from torchsfm.plot.framing import frame
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, Report
-from torchsfm.simulation import look_at, orbit_poses
 
 
 def content(path: Path) -> dict[str, Any]:
@@ -248,52 +244,6 @@ def test_wrong_arguments(model: Reconstruction, tmp_path: Path) -> None:
     (tmp_path / "page").write_text("a file, not a folder")
     with pytest.raises(OSError, match="page"):
         write_page(model, tmp_path / "page" / "page.html")
-
-
-def turned(model: Reconstruction, R: Tensor) -> Reconstruction:
-    return model.transform(Similarity(torch.ones((), dtype=torch.float64), R, torch.zeros(3, dtype=torch.float64)))
-
-
-def with_poses(model: Reconstruction, poses: Pose) -> Reconstruction:
-    count = len(poses.t)
-    return replace(
-        model, names=tuple(map(str, range(count))), poses=poses, registered=torch.ones(count, dtype=torch.bool),
-        image_size=model.image_size[:1].repeat(count, 1), camera_index=torch.zeros(count, dtype=torch.long),
-    )  # fmt: skip
-
-
-def test_up_is_up_whatever_the_frame(model: Reconstruction, generator: torch.Generator) -> None:
-    R = random_rotation(generator=generator, dtype=torch.float64)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    assert torch.allclose(up_direction(model), up, atol=1e-6)
-    assert torch.allclose(up_direction(turned(model, R)), R @ up, atol=1e-6)
-    # All the way round, looking steeply down, the mean of the cameras' up directions still finds it.
-    orbit = with_poses(model, orbit_poses(9, radius=2.0, height=(2.0, 5.0), sweep=2 * math.pi))
-    assert torch.allclose(up_direction(orbit), up, atol=1e-6)
-
-
-def test_up_of_aerial_images_is_against_the_view(model: Reconstruction) -> None:
-    angle = torch.arange(6, dtype=torch.float64) * math.pi / 3
-    centre = torch.stack((angle.cos(), angle.sin(), torch.full_like(angle, 5.0)), -1)
-    held = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)
-    aerial = with_poses(model, look_at(centre, centre - torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), held))
-    assert torch.allclose(up_direction(aerial), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=1e-6)
-
-
-def test_up_of_images_lying_on_their_side(model: Reconstruction) -> None:
-    poses = orbit_poses(12, radius=4.0, height=(0.5, 1.0), sweep=2 * math.pi)
-    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    half = torch.arange(12)[:, None, None] < 7
-    for turn in (quarter, quarter.mT, torch.where(half, quarter, quarter.mT)):
-        lying = with_poses(model, Pose(turn @ poses.R, (turn @ poses.t[..., None])[..., 0]))
-        assert torch.allclose(up_direction(lying), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=0.02)
-
-
-def test_one_camera_and_none_have_an_up(model: Reconstruction) -> None:
-    one = with_poses(model, orbit_poses(1, radius=4.0, height=(0.0, 0.0)))
-    assert torch.allclose(up_direction(one), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), atol=1e-6)
-    none = replace(model, registered=torch.zeros(5, dtype=torch.bool))
-    assert torch.allclose(up_direction(none), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
 
 
 def test_framing_ignores_wild_points(model: Reconstruction) -> None:

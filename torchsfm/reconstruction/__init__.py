@@ -18,7 +18,7 @@ from torchsfm.reconstruction.photographs import reconstruct
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, ReconstructionError, Report, SfmResult
 from torchsfm.reconstruction.similarities import Certainty
-from torchsfm.reconstruction.upright import Levelling, align_to_ground, align_upright
+from torchsfm.reconstruction.upright import Levelling, align_to_ground, align_upright, up_direction
 from torchsfm.reconstruction.view_graph import Verdict
 
 __all__ = [
@@ -57,4 +57,5 @@ __all__ = [
     "register_photographs",
     "saved_features",
     "triangulate_photographs",
+    "up_direction",
 ]

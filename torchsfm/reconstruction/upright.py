@@ -20,6 +20,8 @@ MOST_OPEN = math.radians(6)
 """Standard deviation beyond which the direction is not known."""
 AGREEING = 2 / 3
 """The least share of the cameras that must be held level."""
+PARALLEL, STEADY, CANCELLED = 0.9, 0.7, 0.3
+"""For guesses: shares of their squares that directions have in common or not, and length of a mean that says nothing."""
 MOST_PAIRS = 2000
 SAMPLES, SETTLING = 500, 10
 TOLERANCE = 0.01
@@ -119,6 +121,44 @@ def align_upright(model: Reconstruction) -> Levelling:
     if count < AGREEING * v:
         return _unknown(v, Status.DEGENERATE, f"only {count} of {v} cameras agree on which way is up")
     return Levelling(_upright(up, centre.mean(0)), roll, held, sigma)
+
+
+def up_direction(model: Reconstruction) -> Float[Tensor, "3"]:
+    """Which way is up, for showing a model: as `align_upright` has it or, where that is not known, by the best guess.
+
+    Photographs that lie on their side, all x axes parallel and the other ones not, have up along these, at the end from which
+    they look down. Else up is the mean of the cameras' up directions; where these cancel but all look the same way, as from an
+    aeroplane, it is against the view. Without registered images it is the world's z axis.
+
+    Args:
+        model: The model, of whose images only the poses are looked at.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.reconstruction.up_direction(torchsfm.read_model("model.npz")).norm()
+        tensor(1., dtype=torch.float64)
+    """
+    level = align_upright(model)
+    if not level.fault():
+        return level.similarity.R[2]
+    rows = model.poses.R[model.registered].to("cpu", torch.float64)
+    if not len(rows):
+        return rows.new_tensor([0.0, 0.0, 1.0])
+    right, up, forward = rows[:, 0], -rows[:, 1], rows[:, 2]
+    mean, view = up.mean(0), forward.mean(0)
+    values, vectors = eigh(right.mT @ right / len(right))[:2]
+    steadiness = float(eigh(up.mT @ up / len(up))[0][2])
+    if float(values[2]) > PARALLEL and steadiness < STEADY:
+        found = vectors[:, 2] * -torch.sign(vectors[:, 2] @ view - 1e-12)
+    elif float(mean.norm()) >= CANCELLED:
+        found = mean
+    elif float(view.norm()) > STEADY:
+        found = -view
+    else:
+        found = vectors[:, 0] * torch.sign(vectors[:, 0] @ mean + 1e-12)
+    return torch.nn.functional.normalize(found, dim=0)
 
 
 def align_to_ground(model: Reconstruction, *, generator: torch.Generator | None = None) -> Levelling:
