@@ -70,13 +70,13 @@ def test_clusters_are_what_occurs_together(chain: tuple[dict[str, Block], list[T
     blocks, terms = chain
     x = {name: b.x for name, b in blocks.items()}
     shared = schur.Elimination(blocks, layout.lay_out(blocks, terms, "mark"), "pcg")
-    assert [tuple(g.shape) for g in shared.clusters.groups] == [(12, 1), (24, 2)]
+    assert [tuple(g.shape) for g in shared.plan.groups] == [(12, 1), (24, 2)]
     own = blocks | {"scale": Block(torch.ones(24, 1, dtype=F64))}
     i, _, j = terms[0].index
     terms = [dataclasses.replace(terms[0], index=(i, i, j)), terms[1]]
     single = schur.Elimination(own, layout.lay_out(own, terms, "mark"), "pcg")
-    assert [tuple(g.shape) for g in single.clusters.groups] == [(24, 3)]
-    assert sorted(single.clusters.groups[0].flatten().tolist()) == list(range(72))
+    assert [tuple(g.shape) for g in single.plan.groups] == [(24, 3)]
+    assert sorted(single.plan.groups[0].flatten().tolist()) == list(range(72))
     assert x.keys() == own.keys()
 
 

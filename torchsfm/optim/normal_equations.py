@@ -14,7 +14,7 @@ from torchsfm.optim.descent import Step
 from torchsfm.optim.layout import Family, Layout
 from torchsfm.optim.retained_blocks import RetainedBlocks
 from torchsfm.optim.schur_grouped import GroupCoupling
-from torchsfm.optim.schur_matrix_free import Clusters, RowCoupling, solve_reduced
+from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, solve_reduced
 from torchsfm.optim.schur_pairwise import PairCoupling
 
 NULL = 1e-11
@@ -65,8 +65,8 @@ class NormalEquations:
     layout: Layout
     eliminated: list[Eliminated]
     squares: RetainedBlocks
-    clusters: Clusters | None
-    """The preconditioner's blocks where the reduced system is not formed."""
+    plan: Plan | None
+    """How to precondition where the reduced system is not formed."""
     diagonal: Tensor
     """Of the Gauss-Newton U."""
     slope: Tensor
@@ -102,13 +102,13 @@ class NormalEquations:
     def _reduced(self, weight: Tensor, triangles: list[Triangle], right: list[Tensor]) -> tuple[Tensor, Tensor, bool]:
         """The step of the retained variables, whether there is one, and whether the cost bends down along some."""
         size = self.layout.size
-        if self.clusters is not None:
+        if self.plan is not None:
             rows = [
                 (part.coupling, L, z)
                 for part, L, z in zip(self.eliminated, triangles, right, strict=True)
                 if isinstance(part.coupling, RowCoupling)
             ]
-            kept, positive = solve_reduced(self.squares, rows, self.clusters, weight)
+            kept, positive = solve_reduced(self.squares, rows, self.plan, weight)
             return kept, kept.isfinite().all() & (positive or not self.curved), False
         if not size:
             return weight, torch.ones_like(weight, dtype=torch.bool).all(), False

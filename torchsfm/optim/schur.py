@@ -20,10 +20,11 @@ from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import backward, factor, forward, hold, measure, place
 from torchsfm.optim.layout import CHUNK, Layout, Piece
+from torchsfm.optim.multigrid import PairGraph
 from torchsfm.optim.normal_equations import Eliminated, NormalEquations
 from torchsfm.optim.retained_blocks import RetainedBlocks, Runs, find_runs
 from torchsfm.optim.schur_grouped import GroupCoupling, plan_groups
-from torchsfm.optim.schur_matrix_free import Clusters, RowCoupling, find_clusters
+from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, find_clusters
 from torchsfm.optim.schur_pairwise import PairCoupling, estimate_pairs
 from torchsfm.optim.terms import (
     Block,
@@ -93,7 +94,7 @@ class Elimination:
         some = next(iter(blocks.values())).x
         self.squares = RetainedBlocks(layout, some)
         self.work = Workspace(some)
-        self.clusters: Clusters | None = None
+        self.plan: Plan | None = None
         self.eliminated: list[Eliminated] = []
         self.current: NormalEquations | None = None
         """What the memory holds."""
@@ -114,7 +115,7 @@ class Elimination:
             self.eliminated.append(Eliminated(family, coupling, V, V))
         if iterative:
             rows = [part.coupling for part in self.eliminated if isinstance(part.coupling, RowCoupling)]
-            self.clusters = find_clusters(layout, rows)
+            self.plan = PairGraph.of(layout) or find_clusters(layout, rows)
 
     def curve(self, x: dict[str, Tensor], system: NormalEquations, *, minimum: bool = False) -> NormalEquations:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
@@ -123,7 +124,7 @@ class Elimination:
         At a `minimum` it is held where the cost is flat along it. The system holds until the next call.
         """
         if self._exact is None:
-            self._exact = Elimination(self.blocks, self.layout, "dense" if self.clusters is None else "pcg")
+            self._exact = Elimination(self.blocks, self.layout, "dense" if self.plan is None else "pcg")
         exact = self._exact
         exact._clear()
         for part in exact.parts:
@@ -200,7 +201,7 @@ class Elimination:
         for part in self.parts:
             self._add(part, x, lifts, None if part.family is None else self.eliminated[part.family].V)
         diagonal, slope = self.ranks.sum(torch.stack((self.squares.diagonal(), self.squares.gradient())))
-        self.current = NormalEquations(self.layout, self.eliminated, self.squares, self.clusters, diagonal, slope)
+        self.current = NormalEquations(self.layout, self.eliminated, self.squares, self.plan, diagonal, slope)
         return self.current
 
     def settle(self, x: dict[str, Tensor]) -> dict[str, Tensor]:

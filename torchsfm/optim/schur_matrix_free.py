@@ -10,6 +10,7 @@ such as the pose and the intrinsics of one photograph.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -139,6 +140,22 @@ class Clusters:
     total: int
     ranks: Ranks
 
+    def preconditioner(self, squares: RetainedBlocks, coupled: list[Tensor], weight: Tensor) -> Apply:
+        """The inverse of the system's blocks, given the squares of each coupling."""
+        return _SchurJacobi(self, squares, coupled, weight)
+
+
+@runtime_checkable
+class Plan(Protocol):
+    """How the reduced system is divided."""
+
+    @property
+    def ranks(self) -> Ranks:
+        """The processes that share it."""
+
+    def preconditioner(self, squares: RetainedBlocks, coupled: list[Tensor], weight: Tensor) -> Apply:
+        """An approximate inverse: of U, less the squares of each coupling, damped."""
+
 
 def find_clusters(layout: Layout, couplings: Sequence[RowCoupling]) -> Clusters:
     """Put variables that occur in the same slots together, on whichever rank."""
@@ -241,14 +258,14 @@ class _SchurJacobi:
 
 
 def solve_reduced(
-    squares: RetainedBlocks, eliminated: Sequence[tuple[RowCoupling, Triangle, Tensor]], clusters: Clusters, weight: Tensor
+    squares: RetainedBlocks, eliminated: Sequence[tuple[RowCoupling, Triangle, Tensor]], plan: Plan, weight: Tensor
 ) -> tuple[Tensor, bool]:
     """The step of the retained variables for a damping `weight`, to the accuracy of `FORCING`, and whether there is one.
 
     Args:
         squares: U and the gradient.
         eliminated: W, the factors L of V, and `L^-1 h` of each eliminated family that meets retained variables.
-        clusters: The preconditioner's blocks, and the ranks over which all of this is divided.
+        plan: How to precondition, and the ranks over which all of this is divided.
         weight: Added to the diagonal, (size).
     """
     size = squares.size
@@ -256,15 +273,15 @@ def solve_reduced(
     coupled = [coupling.squares(L, z) for coupling, L, z in eliminated]
     for (coupling, _, _), values in zip(eliminated, coupled, strict=True):
         right.index_add_(0, coupling.columns.flatten(), values[:, :-1, -1].flatten(), alpha=-1)
-    right = clusters.ranks.sum(right[:size])
-    precondition = _SchurJacobi(clusters, squares, coupled, weight)
+    right = plan.ranks.sum(right[:size])
+    precondition = plan.preconditioner(squares, coupled, weight)
 
     def apply(x: Tensor) -> Tensor:
         out = squares.product(x)
         for coupling, L, _ in eliminated:
             inner = coupling.product(torch.nn.functional.pad(x, (0, 2)))
             out -= coupling.lift(backward(L, forward(L, inner)))[:size]
-        return clusters.ranks.sum(out) + weight * x
+        return plan.ranks.sum(out) + weight * x
 
     return conjugate_gradients(apply, precondition, -right, FORCING)
 

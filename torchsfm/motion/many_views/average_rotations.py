@@ -4,7 +4,8 @@ The residual of an edge is the rotation vector of `R_j R_i' R_ij'`, in units of 
 tree of the edges that close best around triangles; from there a minimum of the sum of lengths, which outliers bend little
 (Hartley, Aftab & Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011), whose scatter then sets the scale
 of a loss under which they have no pull at all (Chatterjee & Govindu, "Robust relative rotation averaging", PAMI 2018). Each is
-a sparse problem of three unknowns a camera.
+a sparse problem of three unknowns a camera, turns of the world seen by it: equal ones of all cameras change nothing, which is
+what `optim.multigrid` makes use of.
 """
 
 from dataclasses import dataclass
@@ -228,7 +229,7 @@ class _Graph:
 
     def minimise(self, start: Float[Tensor, "v 3 3"], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
         """The minimum nearest to a start."""
-        blocks = {"R": Block(start.flatten(1), Rotation())}
+        blocks = {"R": Block(start.mT.flatten(1), Rotation())}
         return minimise(blocks, self.terms(loss), max_iterations=max_iterations, function_tolerance=tolerance)
 
     def covariance(self, model: Tensor, component: Tensor, status: Tensor, loss: Loss, scale: float) -> Float[Tensor, "v 3 3"]:
@@ -236,7 +237,8 @@ class _Graph:
         held = (component == torch.arange(self.views, device=component.device)) | (status != int(Status.OK))
         within = (component[self.edges[:, 0]] == component[self.edges[:, 1]]).nonzero()[:, 0]
         terms = [term.select(within) for term in self.terms(loss)]
-        spread = scale**2 * marginal_covariance({"R": Block(model.flatten(1), Rotation(), held)}, terms, "R")
+        spread = scale**2 * marginal_covariance({"R": Block(model.mT.flatten(1), Rotation(), held)}, terms, "R")
+        spread = model @ spread @ model.mT
         unknown = torch.diag(spread.new_full((3,), torch.inf))
         known = (status == int(Status.OK))[:, None, None]
         return torch.where(known, spread, unknown)
@@ -252,27 +254,29 @@ class _Graph:
 
 
 def _rotations(found: SparseResult) -> Float[Tensor, "v 3 3"]:
-    return found.x["R"].view(-1, 3, 3)
+    return found.x["R"].view(-1, 3, 3).mT
 
 
 def _residual(a: Tensor, b: Tensor, R: Tensor, W: Tensor) -> Tensor:
-    """The whitened rotation vector of `b a' R'`."""
-    e = rotvec_from_rotation(b.reshape(-1, 3, 3) @ a.reshape(-1, 3, 3).mT @ R.mT)
+    """The whitened rotation vector of `b' a R'`, of rotations a and b from the cameras to the world."""
+    e = rotvec_from_rotation(b.reshape(-1, 3, 3).mT @ a.reshape(-1, 3, 3) @ R.mT)
     return (W @ e[..., None])[..., 0]
 
 
 def _linearize(a: Tensor, b: Tensor, R: Tensor, W: Tensor, *, out: list[Tensor | None]) -> Tensor:
-    """The same, and its derivatives by turns of both cameras: `log(exp(w) exp(e)) = e + J w`, on the other side `J' w`."""
-    e = rotvec_from_rotation(b.reshape(-1, 3, 3) @ a.reshape(-1, 3, 3).mT @ R.mT)
+    """The same, and its derivatives by turns of both cameras: `log(exp(w) exp(e)) = e + J w` for a turn w in b's frame."""
+    back = b.reshape(-1, 3, 3).mT
+    e = rotvec_from_rotation(back @ a.reshape(-1, 3, 3) @ R.mT)
     square = (e * e).sum(-1)
     half = 0.5 * square.clamp(min=1e-6).sqrt()
     factor = torch.where(square < 1e-6, 1 / 12 + square / 720, (1 - half * half.cos() / half.sin()) / square.clamp(min=1e-6))
     cross = cross_matrix(e)
     J = torch.eye(3, dtype=e.dtype, device=e.device) - 0.5 * cross + factor[:, None, None] * (cross @ cross)
+    turned = W @ J @ back
     if out[0] is not None:
-        out[0].copy_(-W @ J.mT @ R)
+        out[0].copy_(turned)
     if out[1] is not None:
-        out[1].copy_(W @ J)
+        out[1].copy_(-turned)
     return (W @ e[..., None])[..., 0]
 
 

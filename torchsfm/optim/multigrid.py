@@ -1,0 +1,200 @@
+"""A preconditioner for variables of one kind that meet in pairs, such as the cameras of a view graph.
+
+Steps that vary slowly over a graph are what conjugate gradients find last: along a chain they need as many iterations as it has
+links. On a coarser graph they are found at once. Variables join to stars of partners that hold each other strongly; the stars
+are the variables of the next graph, all of whose members move alike, and so on until few are left, which are solved for
+(aggregation: Notay, "An aggregation-based algebraic multigrid method", ETNA 2010). As members do not quite move alike the
+coarse steps are too short, and are taken longer (Braess, "Towards algebraic multigrid for elliptic problems of second order",
+Computing 1995).
+
+It is good where what hardly costs anything are motions of all variables by the same tangent vector, so a problem with a gauge
+freedom should have coordinates of the world; in others it is a preconditioner like any other.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsfm.optim.layout import Layout
+from torchsfm.optim.ranks import Ranks
+from torchsfm.optim.retained_blocks import RetainedBlocks
+
+FEW = 200
+"""Variables of a graph that is solved for by a dense factor."""
+SMOOTH = 2 / 3
+"""Of a Jacobi step: what meets in pairs has no eigenvalue beyond 2 in its units."""
+LONGER = 1.5
+"""By how much coarse steps are taken longer than they come out."""
+VISITS = 2
+"""Cycles on each coarser graph."""
+STRONG = 0.25
+"""Of the strongest edge of a variable, what is strong."""
+RIDGE = 1e-13
+"""Of the diagonal, added where sums of blocks cancel down to rounding."""
+
+
+@dataclass(frozen=True)
+class PairGraph:
+    """Which variables meet, in a problem whose retained variables are of one block and meet in pairs and nothing else."""
+
+    columns: int
+    """Tangent coordinates of a variable."""
+    count: int
+    """Number of variables."""
+    ends: list[tuple[Tensor, ...]]
+    """For each piece the one or two variables of its slots, `count` for one that is fixed."""
+    ranks: Ranks
+
+    @classmethod
+    def of(cls, layout: Layout) -> "PairGraph | None":
+        """The graph of a problem; None if it is none."""
+        if len(layout.first) != 1 or layout.families:
+            return None
+        (name,) = layout.first
+        count = layout.free[name].numel()
+        width = layout.size // count
+        fits = torch.tensor([piece.columns.shape[1] <= 2 * width for piece in layout.pieces], device=layout.device)
+        if not bool(layout.ranks.all(fits.all())):
+            return None
+        ends = []
+        for piece in layout.pieces:
+            ends.append(tuple((piece.columns[:, ::width] // width).clamp(max=count).unbind(1)))
+        return cls(width, count, ends, layout.ranks)
+
+    def preconditioner(self, squares: RetainedBlocks, coupled: list[Tensor], weight: Tensor) -> "_Cycle":
+        """An approximate inverse of the system; nothing is coupled."""
+        w, n = self.columns, self.count
+        D = weight.new_zeros((n + 1, w, w))
+        found = []
+        for ends, values in zip(self.ends, squares.values, strict=True):
+            for k, end in enumerate(ends):
+                D.index_add_(0, end, values[:, w * k : w * k + w, w * k : w * k + w])
+            if len(ends) == 2:
+                i, j = ends
+                both = (i < n) & (j < n) & (i != j)
+                found.append((i[both], j[both], values[both, :w, w : 2 * w]))
+                # A variable that meets itself.
+                D.index_add_(0, i, torch.where((i == j)[:, None, None], (v := values[:, :w, w : 2 * w]) + v.mT, 0.0))
+        D = self.ranks.sum(D[:n]) + torch.diag_embed(weight.view(n, w))
+        none = torch.zeros(0, dtype=torch.long, device=D.device)
+        i, j, B = (
+            self.ranks.gather(torch.cat(parts)) for parts in zip((none, none, D.new_zeros((0, w, w))), *found, strict=True)
+        )
+        return _Cycle(_summed(i, j, B, D, D.diagonal(dim1=1, dim2=2)))
+
+
+@dataclass(frozen=True)
+class _Level:
+    """A symmetric matrix of blocks over the variables of a graph."""
+
+    i: Tensor
+    j: Tensor
+    """The ends of each edge, i < j, each pair once."""
+    B: Tensor
+    """The block of each edge, with the rows of i."""
+    D: Tensor
+    """The diagonal blocks."""
+    scale: Tensor
+    """What the diagonal would be if nothing cancelled."""
+
+    def product(self, x: Tensor) -> Tensor:
+        """The matrix times a vector (variables, coordinates)."""
+        out = (self.D @ x[:, :, None])[:, :, 0]
+        out.index_add_(0, self.i, (self.B @ x[self.j][:, :, None])[:, :, 0])
+        return out.index_add_(0, self.j, (self.B.mT @ x[self.i][:, :, None])[:, :, 0])
+
+    def stars(self) -> Tensor:
+        """The number of the star of each variable: centres drawn at random, and those that are held strongly to one.
+
+        No two centres are partners (Luby, "A simple parallel algorithm for the maximal independent set problem", 1986), so
+        stars are small whatever the strengths are.
+        """
+        n, device = len(self.D), self.B.device
+        strength = torch.linalg.matrix_norm(self.B)
+        best = strength.new_zeros(n)
+        best.scatter_reduce_(0, self.i, strength, "amax").scatter_reduce_(0, self.j, strength, "amax")
+        strong = strength >= STRONG * torch.minimum(best[self.i], best[self.j])
+        i, j = self.i[strong], self.j[strong]
+        own = torch.arange(n, device=device)
+        rank = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(device)
+        member = torch.empty_like(rank).index_copy_(0, rank, own)
+        centre = torch.full_like(own, -1)
+        while True:
+            left = centre < 0
+            both = left[i] & left[j]
+            i, j = i[both], j[both]
+            above = torch.where(left, rank, n)
+            above.scatter_reduce_(0, i, rank[j], "amax").scatter_reduce_(0, j, rank[i], "amax")
+            chosen = left & (above == rank)
+            centre = torch.where(chosen, own, centre)
+            if not len(i):
+                star: Tensor = torch.unique(centre, return_inverse=True)[1]
+                return star
+            # The others go to the neighbouring centre that was drawn highest.
+            found = torch.full_like(own, -1)
+            for a, b in ((i, j), (j, i)):
+                found.scatter_reduce_(0, a, torch.where(chosen[b], rank[b], -1), "amax")
+            centre = torch.where((centre < 0) & (found >= 0), member[found.clamp(min=0)], centre)
+
+    def coarser(self, star: Tensor) -> "_Level":
+        """The matrix over stars whose members move alike."""
+        n = int(star.max()) + 1
+        D = self.D.new_zeros((n, *self.D.shape[1:])).index_add_(0, star, self.D)
+        scale = self.scale.new_zeros((n, self.scale.shape[1])).index_add_(0, star, self.scale)
+        i, j = star[self.i], star[self.j]
+        inside = i == j
+        D.index_add_(0, i[inside], self.B[inside] + self.B[inside].mT)
+        return _summed(i[~inside], j[~inside], self.B[~inside], D, scale)
+
+
+def _summed(i: Tensor, j: Tensor, B: Tensor, D: Tensor, scale: Tensor) -> _Level:
+    """A level, given edges that may come several times and in any direction."""
+    n = len(D)
+    key, place = torch.unique(torch.minimum(i, j) * n + torch.maximum(i, j), return_inverse=True)
+    B = torch.where((i > j)[:, None, None], B.mT, B)
+    B = B.new_zeros((len(key), *B.shape[1:])).index_add_(0, place, B)
+    return _Level(torch.div(key, n, rounding_mode="floor"), key % n, B, D + torch.diag_embed(RIDGE * scale), scale)
+
+
+class _Cycle:
+    """The approximate inverse that one cycle over all graphs is."""
+
+    def __init__(self, finest: _Level) -> None:
+        self._levels, self._stars = [finest], list[Tensor]()
+        while len(self._levels[-1].D) > FEW and len(self._levels[-1].i):
+            self._stars.append(self._levels[-1].stars())
+            self._levels.append(self._levels[-1].coarser(self._stars[-1]))
+        self._inverse = [_inverse(level.D) for level in self._levels]
+        last = self._levels[-1]
+        self._last: Tensor | None = None
+        if len(last.i):
+            n, w = last.scale.shape
+            own = torch.arange(n, device=last.i.device)
+            A = last.D.new_zeros((n, n, w, w))
+            A[own, own], A[last.i, last.j], A[last.j, last.i] = last.D, last.B, last.B.mT
+            (self._last,) = _inverse(A.transpose(1, 2).reshape(1, n * w, n * w))
+
+    def __call__(self, r: Tensor) -> Tensor:
+        return self._solve(0, r.view(len(self._levels[0].D), -1)).flatten()
+
+    def _solve(self, k: int, r: Tensor) -> Tensor:
+        level, inverse = self._levels[k], self._inverse[k]
+        if k == len(self._levels) - 1:
+            rows = r[:, :, None]
+            return (inverse @ rows)[:, :, 0] if self._last is None else (self._last @ r.flatten()).view_as(r)
+        x = SMOOTH * (inverse @ r[:, :, None])[:, :, 0]
+        star, coarse = self._stars[k], self._levels[k + 1]
+        right = r.new_zeros(coarse.scale.shape).index_add_(0, star, r - level.product(x))
+        step = self._solve(k + 1, right)
+        for _ in range(VISITS - 1 if k + 2 < len(self._levels) else 0):
+            step = step + self._solve(k + 1, right - coarse.product(step))
+        x = x + LONGER * step[star]
+        return x + SMOOTH * (inverse @ (r - level.product(x))[:, :, None])[:, :, 0]
+
+
+def _inverse(A: Tensor) -> Tensor:
+    """The inverses of positive matrices; of their diagonals where rounding spoils one."""
+    lower, info = torch.linalg.cholesky_ex(A)
+    plain = torch.diag_embed(A.diagonal(dim1=1, dim2=2).abs().clamp_min(1e-300).sqrt())
+    return torch.cholesky_inverse(torch.where((info == 0)[:, None, None], lower, plain))
