@@ -7,6 +7,7 @@ import torch
 from test_reconstruct_tracks import Scene, make_scene, run, turning
 
 from torchsfm.geometry import Pose
+from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses
 
@@ -51,3 +52,40 @@ def test_what_has_no_depth_is_refused() -> None:
     scene = make_scene()
     few = replace(scene, x=scene.x[:9], view=scene.view[:9], track=scene.track[:9])
     assert not run(few, method="global").models
+
+
+def ring_of_pairs(views: int, reach: int) -> torch.Tensor:
+    start = torch.arange(views)
+    return torch.cat([torch.stack((start, (start + k) % views), 1) for k in range(1, reach + 1)])
+
+
+@pytest.mark.parametrize(
+    ("views", "reach", "sigma", "wanted"),
+    [
+        (400, 4, 0.05, "global"),
+        (100, 4, 0.05, "incremental"),  # few
+        (400, 1, 0.05, "incremental"),  # a chain
+        (400, 4, 0.5, "incremental"),  # unknown focal lengths
+        (0, 1, 0.05, "incremental"),
+    ],
+)
+def test_mapper_for_a_view_graph(views: int, reach: int, sigma: float, wanted: str, generator: torch.Generator) -> None:
+    pairs = ring_of_pairs(views, reach)
+    inliers = torch.full((len(pairs),), 60)
+    focal = torch.full((views,), sigma, dtype=torch.float64)
+    assert choose_mapper(pairs, inliers, focal) == wanted
+    # The order of images, and pairs that are not related, say nothing.
+    order = torch.randperm(views, generator=generator)
+    more = torch.cat((order[pairs], torch.randint(max(views, 1), (views, 2), generator=generator)))
+    assert choose_mapper(more, torch.cat((inliers, torch.zeros(views).long())), focal) == wanted
+    # Halves that nothing connects are looked at each by itself.
+    if views == 400:
+        apart = pairs[((pairs < 150) == (pairs[:, :1] < 150)).all(1) & ((pairs < 300) == (pairs[:, :1] < 300)).all(1)]
+        assert choose_mapper(apart, inliers[: len(apart)], focal) == "incremental"
+
+
+def test_auto_says_which_mapper_it_took() -> None:
+    scene = make_scene(points=150)
+    result = run(scene, method="auto", focal=1100.0)
+    assert result.report.method == "incremental"
+    assert torch.equal(result.model.X, run(scene, focal=1100.0).model.X)

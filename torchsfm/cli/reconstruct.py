@@ -32,6 +32,7 @@ class Method(StrEnum):
     incremental = "incremental"
     projective = "projective"
     all_at_once = "global"
+    auto = "auto"
 
 
 def known_camera(name: str | None) -> str | None:
@@ -93,8 +94,10 @@ def reconstruct(
     method: Annotated[
         Method,
         typer.Option(
-            help="From two images on; all together without calibration and then autocalibration; or rotations of all images, "
-            "then all places."
+            "--method",
+            "--mapper",
+            help="From two images on; all together without calibration and then autocalibration; rotations of all images, "
+            "then all places; or the first or last of these, by the number of images and what holds them together.",
         ),
     ] = Method.incremental,
     lines: Annotated[

@@ -14,6 +14,7 @@ from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.adjust import LOSS
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
+from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
@@ -29,7 +30,7 @@ from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import unfold
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
 
-METHODS = ("incremental", "projective", "global")
+METHODS = ("incremental", "projective", "global", "auto")
 MIN_IMAGES = 2
 """Smallest number of images of a model."""
 FEW_IMAGES = 60
@@ -70,7 +71,7 @@ def build_models(
         shared_camera: See `reconstruct`.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
-        method: "incremental", "projective" or "global".
+        method: "incremental", "projective", "global", or "auto" for what `choose_mapper` says.
         generator: Source of randomness.
         stages: Timing and saving.
         progress: Called as images are registered.
@@ -95,6 +96,8 @@ def build_models(
         free += DISTORTION_MODELS[camera].parameter_names
         free += ("principal_point",) if free_principal_point and K is None else ()
         options = MappingOptions(free=free, expected=cameras, focal_sigma=focal_uncertainty(source), generator=generator)
+        if method == "auto":
+            method = choose_mapper(graph.pairs, graph.fundamental_inliers, options.focal_sigma[camera_index])
         empty = Mapping.start(graph, track, cameras, camera_index)
         found: list[tuple[Reconstruction, Standing, Calibration]] = []
         reasons: dict[int, str] = {}
@@ -160,7 +163,9 @@ def build_models(
     pairs = pair_report(graph.pairs, graph.num_matches, graph.fundamental_inliers, graph.homography_inliers, verdict)
     images = image_reports(graph, [(model, standing) for model, standing, _ in found], reasons, failures, order)
     calibrations = tuple(calibration for _, _, calibration in found)
-    course = Report(images, pairs, dict(stages.seconds), source, tuple(autocalibration), calibrations=calibrations)
+    course = Report(
+        images, pairs, dict(stages.seconds), source, tuple(autocalibration), calibrations=calibrations, method=method
+    )
     return SfmResult(tuple(model for model, _, _ in found), course)
 
 
@@ -242,7 +247,7 @@ def reconstruct_tracks(
         K: Known intrinsics of all images.
         focal: First guess of the focal length in pixels, which is then adjusted.
         free_principal_point: Estimate the principal point too.
-        method: "incremental", "projective" or "global", see `reconstruct`.
+        method: "incremental", "projective", "global" or "auto", see `reconstruct`.
         seed: The same seed gives the same model.
         progress: Called as images are registered.
 

@@ -97,6 +97,7 @@ class Report:
         autocalibration: For each set of images that was autocalibrated what was assumed, found and determined, or why not.
         skipped: Files and folders in the input folder that may hold photographs but were passed over, each with the reason.
         calibrations: For each model how its cameras were found, and how well they are known.
+        method: How the models were made: "incremental", "projective" or "global"; empty where the cameras were given.
 
     See the example of `reconstruct_tracks`.
     """
@@ -108,6 +109,7 @@ class Report:
     autocalibration: tuple[str, ...] = ()
     skipped: tuple[tuple[str, str], ...] = ()
     calibrations: tuple[Calibration, ...] = ()
+    method: str = ""
 
     def compared_names(self) -> list[str]:
         """Names of the images that could be read, by the numbers that `pairs` has for them."""
@@ -124,6 +126,8 @@ class Report:
             names = {Verdict.GENERAL: "general", Verdict.PLANAR: "planar", Verdict.ROTATION: "pure rotation"}
             kinds = ", ".join(f"{self.pairs.count(kind)} {name}" for kind, name in names.items())
             lines.append(f"{len(self.pairs.pairs)} pairs compared: {kinds}, {self.pairs.count(Verdict.UNRELATED)} unrelated")
+        if self.method:
+            lines.append(f"method: {self.method}")
         if self.focal_source:
             lines.append("focal length first from: " + ", ".join(sorted(set(self.focal_source))))
         lines += [f"autocalibration: {text}" for text in self.autocalibration]

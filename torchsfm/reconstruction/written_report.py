@@ -33,7 +33,8 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         **more: Further entries, such as the options of the run; `truth` is a dict that `report_markdown` shows as a table.
 
     Returns:
-        `models`, `images`, `pairs`, `seconds`, `focal_source`, `autocalibration`, `skipped` and the further entries.
+        `models`, `images`, `pairs`, `seconds`, `method`, `focal_source`, `autocalibration`, `skipped` and the further
+        entries.
     """
     report = result.report
     observed: dict[str, tuple[int, float]] = {}
@@ -66,6 +67,7 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         "images": images,
         "pairs": pairs,
         "seconds": {stage: round(value, 3) for stage, value in report.seconds.items()},
+        "method": report.method,
         "focal_source": list(report.focal_source),
         "autocalibration": list(report.autocalibration),
         "skipped": [{"name": name, "reason": reason} for name, reason in report.skipped],
