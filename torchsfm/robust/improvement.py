@@ -31,8 +31,9 @@ EXPLORED_DATA = 512
 """How many data that looks at."""
 _PER_START, _AMBIGUOUS = 128, 0.5
 """One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers."""
-_SUPPORT = 0.6
-"""How much of its support within the threshold a model may lose by refinement."""
+_SUPPORT, _CHANCE = 0.6, 2.5
+"""How much of what is within the threshold a model may lose by refinement, and how many standard deviations of its support: the
+one before was chosen for it."""
 _SAMPLES, _NUMBERS = 1 << 13, 1 << 15
 """Samples to solve at a time, and numbers in one row of all data of several models, on a CPU: what fits its cache."""
 
@@ -218,37 +219,50 @@ def try_alternatives(fine: Problems, coarse: Problems, best: Best, options: Opti
 def refine_finally(fine: Problems, coarse: Problems, best: Best) -> tuple[Best, Float[Tensor, "p width"]]:
     """Refine the best models on all data, to the end in float64, and keep what does not lose support; and their distances.
 
-    The loss is that of the noise found in the data, whatever the scoring.
+    The loss is that of the noise found in the data, whatever the scoring; where the data within the threshold contradict such
+    noise, that of the threshold.
     """
-    parts, distances, score, k = [], [], Msac(), fine.estimator.codimension
+    parts = []
     for part in _portions(_all(fine), fine.width, _NUMBERS):
         some, rough, old = fine.take(part), coarse.take(part), best.take(part)
         near = [d[:, :SCALE_DATA] for d in rough.data]
         model, reach = scale_of_noise(rough.estimator, old.model, near, old.limit, rough.counts[:, :SCALE_DATA])
         model, _ = step_within(rough.estimator, model, rough.data, reach * old.limit, rough.counts)
-        old, reach = cast(old, torch.float64), reach.double() * old.limit
-        model, settled = optimise_fully(some.estimator, cast(model, torch.float64), some.data, reach, some.counts)
-        # In double precision too: in single precision what is far may look near by a threshold below rounding.
-        squared, before = (squared_residual(some.estimator, m, *some.data) for m in (model, old.model))
-        # A threshold smaller than the noise would blame the better model.
-        judged = torch.maximum(old.limit, reach)
-        both, counts = torch.stack((squared, before), 1), some.counts
-        loss, before_loss = score.cost(both, judged, counts, k).unbind(1)
-        # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
-        won = (loss <= 1.02 * before_loss + 1) & (loss < torch.inf)
-        # Noise that leaves the threshold so much less support is none: the model is not quite that of the data.
-        within, within_before = ((both < old.limit[:, None, None]) * counts[:, None]).sum(-1).unbind(1)
-        won &= within >= _SUPPORT * within_before
-        distances.append(torch.where(won[:, None], squared, before))
-        parts.append(
-            replace(
-                old,
-                model=select(won, model, old.model),
-                loss=torch.where(won, loss, before_loss),
-                reach=torch.where(won & settled, reach, 0),
-            )
-        )
-    return join(parts), torch.cat(distances)
+        old = cast(old, torch.float64)
+        found, squared, won = _refined(some, old, cast(model, torch.float64), reach.double() * old.limit)
+        lost = (~won & old.solved).nonzero()[:, 0]
+        if len(lost):
+            start = old.take(lost)
+            again = _refined(some.take(lost), start, start.model, start.limit)
+            found, squared = put(found, lost, again[0]), squared.index_copy(0, lost, again[1])
+        parts.append((found, squared))
+    return join([one[0] for one in parts]), torch.cat([one[1] for one in parts])
+
+
+def _refined(some: Problems, old: Best, model: Any, reach: Float[Tensor, "g"]) -> tuple[Best, Tensor, Bool[Tensor, "g"]]:
+    """The optima of losses near some models where they are better than the old ones, the distances, and where that is."""
+    model, settled = optimise_fully(some.estimator, model, some.data, reach, some.counts)
+    # In double precision too: in single precision what is far may look near by a threshold below rounding.
+    squared, before = (squared_residual(some.estimator, m, *some.data) for m in (model, old.model))
+    # A threshold smaller than the noise would blame the better model.
+    judged = torch.maximum(old.limit, reach)
+    score, k, both, counts = Msac(), some.estimator.codimension, torch.stack((squared, before), 1), some.counts
+    loss, before_loss = score.cost(both, judged, counts, k).unbind(1)
+    # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
+    won = (loss <= 1.02 * before_loss + 1) & (loss < torch.inf)
+    # Noise that leaves the threshold so much less support is none: the model is not quite that of the data.
+    ratio = both / old.limit[:, None, None]
+    within, within_before = ((ratio < 1) * counts[:, None]).sum(-1).unbind(1)
+    support, support_before = ((1 - ratio).clamp(min=0) * counts[:, None]).nan_to_num(0).sum(-1).unbind(1)
+    chance = some.estimator.sample_size + _CHANCE * support_before.sqrt()
+    won &= (within >= _SUPPORT * within_before) & (support >= support_before - chance)
+    found = replace(
+        old,
+        model=select(won, model, old.model),
+        loss=torch.where(won, loss, before_loss),
+        reach=torch.where(won & settled, reach, 0),
+    )
+    return found, torch.where(won[:, None], squared, before), won
 
 
 def _portions(index: Int[Tensor, "g"], each: int, budget: int) -> Iterator[Int[Tensor, "_"]]:
