@@ -420,6 +420,42 @@ def test_fingers_turn_pinch_and_tap(browser: Browser, page: Path) -> None:
     assert browser.run("details.hidden")
 
 
+MIDDLE = (
+    "(e => { e.scrollIntoView({ block: 'nearest' });"
+    " const box = e.getBoundingClientRect(); return [box.x + box.width / 2, box.y + box.height / 2]; })"
+)
+
+
+def test_details_close_on_phones(browser: Browser, page: Path) -> None:
+    """By a tap on their button or by opening the panel over them: the picture is whole again and can be touched."""
+    browser.open(page, PHONE, touch=True)
+    places = "model.images.filter(c => c.pose).map(c => projector()(...c.centre))"
+    before = browser.run(places)
+    rows = "document.querySelectorAll('#list tbody tr')"
+    for close in ("$('closedetails')", "$('bare')"):
+        browser.run("showPanel(true)")
+        browser.touch([tuple(browser.run(f"{MIDDLE}({rows}[0])"))])
+        browser.wait("!details.hidden")
+        assert browser.run("$('subject').textContent") == "view_0.png"
+        assert not browser.run("$('panel').checkVisibility()"), "one of the two at a time"
+        assert np.abs(np.array(browser.run(places)) - before).max() > 20, "the model makes room"
+        browser.touch([tuple(browser.run(f"{MIDDLE}({close})"))])
+        browser.wait("details.hidden")
+        assert browser.run("$('panel').checkVisibility()") == (close == "$('bare')")
+        assert browser.run("chosen.camera") == -1
+        browser.run("showPanel(false)")
+        assert np.allclose(browser.run(places), before, atol=1e-6)
+        x, y = browser.run(f"{MIDDLE}(canvas)")
+        assert browser.run(f"document.elementFromPoint({x}, {y + 250}) == canvas")
+    # With keys, from the table, which is hidden meanwhile.
+    browser.run(f"showPanel(true), {rows}[1].focus()")
+    browser.key("Enter")
+    assert browser.run("$('subject').textContent") == "view_1.png"
+    browser.key("Escape")
+    assert browser.run("details.hidden && document.activeElement == canvas")
+    assert browser.complaints == []
+
+
 def test_names_stay_text_in_every_panel(browser: Browser, model: Reconstruction, tmp_path: Path) -> None:
     wild = replace(model, names=EVIL)
     title = "<script>alert(2)</script>"

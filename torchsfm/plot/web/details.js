@@ -19,7 +19,8 @@ function closeDetails() {
   choose(-1, -1);
   details.hidden = true;
   document.body.classList.remove("detailed");
-  if (opener?.isConnected) opener.focus({ preventScroll: true });
+  const there = e => e && e != document.body && e.checkVisibility();
+  if (!there(document.activeElement)) (there(opener) ? opener : canvas).focus({ preventScroll: true });
   draw();
 }
 $("closedetails").onclick = closeDetails;
