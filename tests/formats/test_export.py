@@ -13,7 +13,7 @@ from command_line import assert_one_line, torchsfm
 from full_disk import full_disk
 
 from torchsfm.formats import TARGETS, export_model, read_colmap, read_model, read_nerfstudio, undistorted_model
-from torchsfm.geometry import NoDistortion
+from torchsfm.geometry import Camera, NoDistortion
 from torchsfm.images import read_image, save_image
 from torchsfm.reconstruction import Lines, Reconstruction
 
@@ -113,6 +113,38 @@ def test_pictures_as_taken_are_the_same_files(photographs: Path, tmp_path: Path)
     for name in model.names[:3]:
         assert (out / "images" / name).read_bytes() == (photographs / name).read_bytes()
     torch.testing.assert_close(read_model(out).residuals(), model.residuals(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("lens", ["pinhole", "simple_radial", "radial", "opencv", "fisheye"])
+def test_gsplat_gets_lenses_as_opencv_has_them(lens: str, photographs: Path, tmp_path: Path) -> None:
+    """Its parser takes k1, k2 and p1, p2 or k3, k4 from pycolmap, and projects as OpenCV does; pixel centres are at halves."""
+    pycolmap, cv2 = pytest.importorskip("pycolmap"), pytest.importorskip("cv2")
+    model = model_of(lens)
+    if lens == "opencv":
+        k = model.cameras.distortion.parameters().clone()
+        k[:, model.cameras.distortion.parameter_names.index("k3")] = 0
+        model = replace(model, cameras=Camera(model.cameras.K, type(model.cameras.distortion).from_parameters(k)))
+    scene = pycolmap.Reconstruction(
+        export_model(model, "gsplat", tmp_path / "scene", images=photographs, undistort=False) / "sparse" / "0"
+    )
+    where = {"SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": (3,), "RADIAL": (3, 4)}
+    where |= dict.fromkeys(("OPENCV", "OPENCV_FISHEYE"), (4, 5, 6, 7))
+    projections, count = model.projections().numpy(), 0
+    for image in scene.images.values():
+        camera = scene.cameras[image.camera_id]
+        K = camera.calibration_matrix()
+        numbers = np.zeros(4)
+        for place, index in enumerate(where[camera.model.name]):
+            numbers[place] = camera.params[index]
+        pose = image.cam_from_world().matrix()
+        rows = (model.view == model.names.index(image.name)).nonzero()[:, 0].numpy()
+        X = model.X[model.point[rows]].numpy().reshape(-1, 1, 3)
+        project = cv2.fisheye.projectPoints if camera.model.name == "OPENCV_FISHEYE" else cv2.projectPoints
+        x = project(X, cv2.Rodrigues(pose[:, :3])[0], pose[:, 3], K, numbers)[0]
+        assert np.abs(x.reshape(-1, 2) - 0.5 - projections[rows]).max() < 1e-6
+        count += len(rows)
+    assert count == len(model.x)
 
 
 def test_cameras_that_gsplat_refuses_are_not_written(photographs: Path, tmp_path: Path) -> None:
