@@ -21,10 +21,10 @@ import torchsfm
 
 # The program, which is run and not called.
 NOT_CALLED = {"cli"}
-# Their examples are shown and not run: they want files that nothing here writes, or photographs and seconds.
+# Their examples are shown and not run: they want files that nothing here writes, photographs and seconds, or viser.
 NOT_RUN = {
     "formats.pycolmap_from_model", "formats.read_features", "formats.read_hloc", "formats.read_libmv", "formats.read_vgg",
-    "images.extract_frames", "images.load_detector", "images.load_matcher", "reconstruction.align_to_gps",
+    "images.extract_frames", "images.load_detector", "images.load_matcher", "plot.LiveViewer", "reconstruction.align_to_gps",
     "reconstruction.reconstruct", "reconstruction.register_photographs", "reconstruction.triangulate_photographs",
 }  # fmt: skip
 

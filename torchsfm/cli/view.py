@@ -3,6 +3,7 @@
 import tempfile
 import webbrowser
 from pathlib import Path
+from threading import Event
 from typing import Annotated
 
 import typer
@@ -10,7 +11,7 @@ import typer
 from torchsfm.cli.export import find_photographs, load
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.formats.registry import model_files
-from torchsfm.plot import write_page
+from torchsfm.plot import LiveViewer, write_page
 
 PAGE = "page.html"
 
@@ -30,6 +31,10 @@ def view(
     unit: Annotated[
         str, typer.Option(help="Name of the unit that the model is in, such as m; without it lengths are in units.")
     ] = "",
+    live: Annotated[
+        bool, typer.Option("--live", help="Serve the model to the browser until Ctrl-C, with viser (the extra `viser`).")
+    ] = False,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="For --live: the port, or the next free one.")] = 8080,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page, or only say where it is.")] = True,
 ) -> None:
     """Show a model in the browser, to turn with the mouse."""
@@ -37,6 +42,9 @@ def view(
         page = model / PAGE
         if images is not None and not images.is_dir():
             raise UserError(f"{images}: no such folder")
+        if live:
+            serve(job, model, images, port, browser)
+            return
         if images is not None or out is not None or unit or not page.is_file():
             page = write(model, images, out, unit)
         job.close()
@@ -45,6 +53,31 @@ def view(
             typer.echo(f"{page}  no browser was found here: open it in one")
         else:
             typer.echo(f"{page}  open it in a browser and turn the model with the mouse" if not browser else str(page))
+
+
+def serve(job: Job, path: Path, images: Path | None, port: int, browser: bool) -> None:
+    """Show the model of a path by the live viewer until the user ends that.
+
+    Raises:
+        UserError: It holds no model, or there is no viewer.
+    """
+    model = load(path)
+    try:
+        viewer = LiveViewer(port=port)
+    except ImportError as error:
+        raise UserError(str(error)) from None
+    try:
+        viewer.show(model, images=images or find_photographs(path, model))
+        job.voice.record["address"] = viewer.address
+        if not job.voice.quiet:
+            typer.echo(f"{viewer.address}  Ctrl-C ends it", err=True)
+        if browser:
+            webbrowser.open(viewer.address)
+        Event().wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer.close()
 
 
 def write(model: Path, images: Path | None, out: Path | None, unit: str) -> Path:

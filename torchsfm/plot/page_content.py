@@ -2,16 +2,16 @@
 
 import base64
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.plot.framing import Framing, frame
+from torchsfm.plot.strokes import model_strokes
 from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Report
@@ -76,7 +76,7 @@ def model_content(model: Reconstruction, number: int, report: Report | None, cou
         track = model.num_observations / max(model.num_points, 1)
         summary.append(f"{model.num_observations:,} observations, mean track {track:.1f}")
         summary.append(f"residuals: mean {float(residuals.mean()):.3g}, median {_quantile(residuals, 0.5):.3g} px")
-    strokes = _strokes(model)
+    strokes = model_strokes(model)
     summary += [stroke.summary for stroke in strokes.values()]
     ends = torch.cat([model.X.new_zeros(0, 2, 3), *(stroke.ends for stroke in strokes.values())])
     shades = torch.cat([model.X.new_zeros(0, 3), *(stroke.color for stroke in strokes.values())])
@@ -124,46 +124,6 @@ def pairs_content(report: Report) -> dict[str, Any]:
         "inliers": _pack(inliers, np.uint32),
         "verdict": _pack(table.verdict, np.uint8),
     }
-
-
-@dataclass(frozen=True)
-class _Stroke:
-    """Straight pieces that are drawn and hidden together."""
-
-    ends: Float[Tensor, "s 2 3"]
-    color: Float[Tensor, "s 3"]
-    summary: str
-
-
-def _strokes(model: Reconstruction) -> dict[str, _Stroke]:
-    """Lines, ellipses and curves, those kinds that there are."""
-    strokes: dict[str, _Stroke] = {}
-    if model.lines is not None:
-        drawn = model.lines.ends.isfinite().flatten(1).all(-1)
-        text = f"{int(drawn.sum()):,} lines"
-        if drawn.any():
-            support = float(model.lines.support().double().mean())
-            text += f", in {support:.1f} images, mean error {float(model.line_residuals().nan_to_num().mean()):.3g} px"
-        strokes["lines"] = _Stroke(model.lines.ends[drawn], model.lines.color[drawn], text)
-    if model.conics is not None:
-        conics = model.conics.select(model.conics.axes.isfinite().flatten(1).all(-1) & model.conics.centre.isfinite().all(-1))
-        chords = conics.chords()
-        text = f"{len(conics):,} ellipses"
-        if len(conics):
-            text += f", in {float(conics.support().double().mean()):.1f} images"
-        if len(model.conics.x):
-            text += f", mean error {float(model.conic_residuals().nan_to_num().mean()):.3g} px"
-        shades = conics.color.repeat_interleave(len(chords) // max(len(conics), 1), 0)
-        strokes["ellipses"] = _Stroke(chords, shades, text)
-    if model.curves is not None:
-        links = model.curves.links()
-        links = links[model.curves.X.isfinite().all(-1)[links].all(-1)]
-        text = f"{len(model.curves):,} curves"
-        if len(model.curves.x):
-            support = float(model.curves.support().double().mean())
-            text += f", in {support:.1f} images, mean error {float(model.curve_residuals().nan_to_num().mean()):.3g} px"
-        strokes["curves"] = _Stroke(model.curves.X[links], model.curves.color[links[:, 0]], text)
-    return strokes
 
 
 def _frustum_size(model: Reconstruction, radius: float) -> float:
