@@ -50,6 +50,7 @@ def examine(
     prior: CameraPrior,
     threshold: float,
     uncertain: Bool[Tensor, "v"] | None = None,
+    apart: int = 0,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
@@ -59,6 +60,7 @@ def examine(
         prior: What was expected of the cameras before any image point was seen.
         threshold: Largest reprojection error of an observation, in pixels.
         uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
+        apart: Verified matches of its images with those of other models, which this model cannot explain.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -69,7 +71,7 @@ def examine(
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
     matches, agreeing = (agreement.per_view(one > 0, n, v) for n in (agreement.matches, agreement.agreeing))
-    explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
+    explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum()) + apart
     outvoted = agreement.balance(v) < 0
     conflicts = missing_correspondences(mapping)
     refuted = conflicts.refuted
@@ -90,7 +92,8 @@ def examine(
         if int(agreeing[i]) < EXPLAINED * int(matches[i]):
             return f"{int(agreeing[i])} of the {int(matches[i])} matches of its pairs agree with its place, the others do not"
         if explained < EXPLAINED * verified:
-            return f"{explained} of the {verified} matches of all pairs agree with the model, the others do not"
+            others = f"{apart} are with images of other models" if apart else "the others do not"
+            return f"{explained} of the {verified} matches of all pairs agree with the model, {others}"
         if count >= 3 and int(supporting[i]) < 2:
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
         if count < 3 and bool(guessed[i]):
@@ -101,7 +104,12 @@ def examine(
             return f"its place is known to {100 * position[i]:.1f} % of its distance from the points only"
         return ""
 
-    return Standing(rotation, position, tuple(doubt(i) if mapping.registered[i] else "" for i in range(v)))
+    doubts = [doubt(i) if mapping.registered[i] else "" for i in range(v)]
+    if 2 * sum(map(bool, doubts)) > count:
+        # Which images are right is then not known: the others agree with too few.
+        few = "most images of its model are doubtful"
+        doubts = [known or few if mapping.registered[i] else "" for i, known in enumerate(doubts)]
+    return Standing(rotation, position, tuple(doubts))
 
 
 def pose_deviations(

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
@@ -99,7 +99,7 @@ def build_models(
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, options.focal_sigma[camera_index])
         empty = Mapping.start(graph, track, cameras, camera_index)
-        found: list[tuple[Reconstruction, Standing, Calibration]] = []
+        made: list[tuple[Reconstruction, Mapping, MappingOptions, Bool[Tensor, "v"] | None]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
         taken = empty.registered
@@ -146,16 +146,20 @@ def build_models(
             if edges is not None:
                 with stages.timed("curves"):
                     curves = find_curves(model, edges(), progress)
-            if not found:
+            if not made:
                 reasons |= failed
             taken = taken | model.registered
-            standing = examine(
-                model, open_numbers=free, prior=known.prior(model), threshold=options.reprojection, uncertain=uncertain
-            )
-            finished = replace(model.reconstruction(), lines=lines, curves=curves)
-            found.append((finished, standing, calibration_of(model, known.prior(model), loss=LOSS)))
+            made.append((replace(model.reconstruction(), lines=lines, curves=curves), model, known, uncertain))
             if stages.folder is not None:
-                _save_model(found[-1][0], stages.folder, len(found) - 1)
+                _save_model(made[-1][0], stages.folder, len(made) - 1)
+        found: list[tuple[Reconstruction, Standing, Calibration]] = []
+        for finished, model, known, uncertain in made:
+            prior = known.prior(model)
+            standing = examine(
+                model, open_numbers=free, prior=prior, threshold=options.reprojection, uncertain=uncertain,
+                apart=graph.matches_between(model.registered, taken & ~model.registered),
+            )  # fmt: skip
+            found.append((finished, standing, calibration_of(model, prior, loss=LOSS)))
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", len(graph.names), len(graph.names))
     unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[camera_index]
