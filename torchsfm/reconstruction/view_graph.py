@@ -13,6 +13,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.linalg import svdvals
 from torchsfm.motion import estimate_fundamental, estimate_homography
+from torchsfm.robust.sampling import draw_seed
 
 MIN_INLIERS = 15
 """Fewer epipolar inliers than this also occur between unrelated images."""
@@ -20,6 +21,8 @@ MIN_INLIERS = 15
 CONFIDENCE = 0.999
 MAX_ITERATIONS = 3000
 """Pairs of unrelated images, the most of many, never reach the confidence; this is what they may cost."""
+FEW = 2 * MIN_INLIERS
+"""So few matches are unrelated unless half of them are right, which takes fewer samples."""
 
 _ROWS_PER_CALL = 4_000_000
 """Padded correspondences verified at once; bounds memory, changes no result."""
@@ -186,7 +189,8 @@ def verify_pairs(
         generator: Source of randomness.
 
     Returns:
-        What was found; a pair with fewer than `MIN_INLIERS` inliers keeps its counts but none of its matches.
+        What was found; a pair with fewer than `MIN_INLIERS` inliers keeps its counts but none of its matches. What is found of
+        a pair is a function of its matches and the randomness, up to rounding, whatever other pairs there are.
     """
     counts = torch.tensor([len(m) for m in matches], dtype=torch.long)
     q = len(pairs)
@@ -195,6 +199,7 @@ def verify_pairs(
     num_F, num_H = torch.zeros(q, dtype=torch.long), torch.zeros(q, dtype=torch.long)
     kept: dict[int, Tensor] = {}
     scale = image_size.amax(dim=-1).to(dtype).div(1600).clamp(min=1)
+    seed = draw_seed(generator)
     for block in _blocks(counts):
         slots = int(counts[block].max())
         x1, x2 = torch.zeros(len(block), slots, 2, dtype=dtype), torch.zeros(len(block), slots, 2, dtype=dtype)
@@ -203,18 +208,21 @@ def verify_pairs(
             x1[row, : len(m)], x2[row, : len(m)] = x[i][m[:, 0]], x[j][m[:, 1]]
         mask = torch.arange(slots) < counts[block, None]
         limit = threshold * scale[pairs[block]].amax(dim=-1)
-        options: dict[str, Any] = {"generator": generator, "confidence": CONFIDENCE, "max_iterations": _trials(slots)}
+        options: dict[str, Any] = {"confidence": CONFIDENCE, "max_iterations": _trials(slots)}
         if quality is not None:
             trusted = [quality[index].to(dtype) for index in block.tolist()]
             options["quality"] = torch.nn.utils.rnn.pad_sequence(trusted, batch_first=True)
-        epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, **options)
+        again = torch.Generator().manual_seed(seed)
+        epipolar = estimate_fundamental(x1, x2, threshold=limit, mask=mask, generator=again, **options)
         F[block] = epipolar.model
         num_F[block] = epipolar.inliers.sum(-1) * (epipolar.status == Status.OK)
         # Images that do not differ, or differ by a homography, may leave F undetermined and yet have all in common.
         related = (num_F[block] >= MIN_INLIERS) | (epipolar.status == Status.DEGENERATE)
         if bool(related.any()):
             options |= {"quality": options["quality"][related]} if quality is not None else {}
-            planar = estimate_homography(x1[related], x2[related], threshold=limit[related], mask=mask[related], **options)
+            planar = estimate_homography(
+                x1[related], x2[related], threshold=limit[related], mask=mask[related], generator=again, **options
+            )
             H[block[related]] = planar.model
             num_H[block[related]] = planar.inliers.sum(-1) * (planar.status == Status.OK)
             planar_inliers = torch.zeros_like(mask)
@@ -241,7 +249,7 @@ def _blocks(counts: Int[Tensor, "q"]) -> list[Int[Tensor, "_"]]:
     """Pairs with enough matches, like sizes together, cut so that a padded block stays within memory."""
     order = torch.argsort(counts, descending=True, stable=True)
     order = order[counts[order] >= MIN_INLIERS]
-    few = counts[order] <= 2 * MIN_INLIERS
+    few = counts[order] <= FEW
     blocks = []
     for rest in (order[~few], order[few]):
         while len(rest):
@@ -251,10 +259,12 @@ def _blocks(counts: Int[Tensor, "q"]) -> list[Int[Tensor, "_"]]:
     return blocks
 
 
-def _trials(most: int) -> int:
-    """Samples of seven that find `MIN_INLIERS` inliers, or a quarter, among the matches of a pair with confidence."""
-    share = max(MIN_INLIERS / most, 0.25)
-    return min(MAX_ITERATIONS, math.ceil(math.log(1 - CONFIDENCE) / math.log1p(-(share**7)))) if share < 1 else 1
+def _trials(matches: int) -> int:
+    """Most samples of a pair, by whether it has few matches alone, so that no other pair matters."""
+    if matches > FEW:
+        return MAX_ITERATIONS
+    # They find `MIN_INLIERS` inliers with confidence.
+    return math.ceil(math.log(1 - CONFIDENCE) / math.log1p(-((MIN_INLIERS / FEW) ** 7)))
 
 
 def graph_from_tracks(
