@@ -5,12 +5,15 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
+from torchsfm.geometry import project_points
 from torchsfm.reconstruction import match_all
 from torchsfm.reconstruction.image_points import SavedFeatures
 from torchsfm.reconstruction.match_all import NEAR_IMAGES, VERIFIED_AT_ONCE, PairShards
 from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.view_graph import ViewGraph, verify_pairs
+from torchsfm.simulation import random_points, random_poses
 
 
 def matched(folder: Path, out: Path | None = None, **options: Any) -> MatchedPhotographs:
@@ -84,3 +87,28 @@ def test_verification_in_parts_is_that_of_the_whole(
         assert torch.equal(getattr(parts.graph, name), getattr(whole.graph, name)), name
     other = matched(courtyard, tmp_path, sequence=sequence, seed=4)
     assert not torch.equal(other.graph.F, parts.graph.F)
+
+
+def test_a_pair_is_verified_by_its_own_matches(generator: torch.Generator) -> None:
+    sizes = [16, 25, 33, 40, 60, 300]
+    pose = random_poses(2, generator=generator)
+    x: list[Tensor] = []
+    for n in sizes:
+        X = random_points(n, generator=generator)
+        for P in pose.matrix():
+            image = 500 + 800 * project_points(P, X)
+            wrong = torch.rand(n, generator=generator) < 0.5
+            noise = torch.randn(n, 2, generator=generator, dtype=torch.float64)
+            x.append(
+                torch.where(wrong[:, None], 1000 * torch.rand(n, 2, generator=generator, dtype=torch.float64), image + noise)
+            )
+    pairs = torch.arange(2 * len(sizes)).reshape(-1, 2)
+    same = [torch.arange(n)[:, None].expand(-1, 2) for n in sizes]
+    size = torch.full((2 * len(sizes), 2), 1000)
+    together = verify_pairs(size, x, pairs, same, generator=torch.Generator().manual_seed(5))
+    for q in range(len(sizes)):
+        alone = verify_pairs(size, x, pairs[q : q + 1], same[q : q + 1], generator=torch.Generator().manual_seed(5))
+        assert alone.fundamental_inliers[0] == together.fundamental_inliers[q]
+        assert alone.homography_inliers[0] == together.homography_inliers[q]
+        torch.testing.assert_close(alone.F[0], together.F[q], rtol=1e-6, atol=1e-12)
+        assert torch.equal(alone.match, together.match[together.match_pair == q])
