@@ -11,7 +11,7 @@ from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.calibration import CameraPrior
-from torchsfm.reconstruction.distinctive import Backbone, distinctiveness
+from torchsfm.reconstruction.distinctive import Backbone, Distinctiveness
 from torchsfm.reconstruction.doubt import examine
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions, grow_model
@@ -19,7 +19,7 @@ from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.tracks import build_tracks
-from torchsfm.reconstruction.unfold import unfold
+from torchsfm.reconstruction.unfold import hanging_on_copies, imitated, unfold
 from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at
 
@@ -118,7 +118,7 @@ def test_the_backbone_passes_by_copies(generator: torch.Generator) -> None:
         empty, _, true = street(generator, apart=8.0)
         graph = empty.graph
         assert not true.all()
-        assert true[Backbone.of(graph.pairs, distinctiveness(graph), VIEWS).chosen].all()
+        assert true[Backbone.of(graph.pairs, Distinctiveness.of(graph).weight, VIEWS).chosen].all()
         fooled += int(not true[Backbone.of(graph.pairs, graph.fundamental_inliers.double(), VIEWS).chosen].all())
     # The scenes are not so easy that numbers of matches would do.
     assert fooled > 0
@@ -170,9 +170,47 @@ def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) 
     half = replace(empty, graph=graph, track=build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair]))
     folded = mapped(half)
     unfolded = unfold(half, folded, half.registered, options(half), quiet)
-    sides = unfolded.model.registered.reshape(2, -1)
-    assert sides.any(1).tolist().count(True) == 1
+    own = unfolded.model.registered
+    assert own.reshape(2, -1).any(1).tolist().count(True) == 1
     assert wrong_cameras(unfolded.model, truth) == 0
+    # Had relations been given up that are as distinctive as those of the half, which are wrong?
+    uncertain = hanging_on_copies(empty.graph, unfolded.model, ~own, threshold=4.0)
+    assert uncertain.any()
+    assert not uncertain[~own].any()
+
+
+@pytest.mark.parametrize("rival", [0.5, 0.95, 1.05])
+def test_what_is_hardly_more_distinctive_than_its_rival_is_uncertain(rival: float, generator: torch.Generator) -> None:
+    """A chain of three images, and a pair of its first with one elsewhere that has a share of the weakest link's matches."""
+    n = 400
+    # Images 0 to 3, the last of another model; what each pair shows is its own.
+    numbers = {(0, 1): n, (1, 2): 2 * n, (0, 3): int(rival * n)}
+    pairs = torch.tensor(list(numbers))
+    count = torch.tensor(list(numbers.values()))
+    ends = pairs.repeat_interleave(count, 0)
+    match = torch.arange(2 * len(ends)).reshape(-1, 2)
+    view, order = ends.flatten().sort(stable=True)
+    graph = ViewGraph(
+        names=("a", "b", "c", "d"),
+        image_size=torch.tensor([SIZE] * 4),
+        x=torch.rand(len(view), 2, generator=generator, dtype=torch.float64),
+        view=view,
+        color=torch.zeros(len(view), 3, dtype=torch.float64),
+        pairs=pairs,
+        num_matches=count,
+        F=torch.eye(3, dtype=torch.float64).repeat(3, 1, 1),
+        H=torch.eye(3, dtype=torch.float64).repeat(3, 1, 1),
+        fundamental_inliers=count,
+        homography_inliers=torch.zeros_like(count),
+        match=order.argsort()[match],
+        match_pair=torch.arange(3).repeat_interleave(count),
+    )
+    distinct = Distinctiveness.of(graph)
+    assert distinct.weight.tolist() == count.tolist() == distinct.variance.tolist()
+    backbone = Backbone.of(pairs, torch.tensor([1.0, 1.0, 0.0]), 4)
+    false = torch.tensor([False, False, True])
+    found = imitated(distinct, backbone, false, torch.tensor([True, True, True, False]))
+    assert found.tolist() == [rival > 0.9, False, False]
 
 
 def test_uncertain_images_are_doubted(generator: torch.Generator) -> None:
@@ -251,5 +289,5 @@ def test_matches_that_return_to_an_image_do_not_count() -> None:
         match=match,
         match_pair=torch.zeros(3, dtype=torch.long),
     )
-    assert distinctiveness(graph).tolist() == [1.0]
-    assert distinctiveness(graph.only(torch.tensor([False]))).tolist() == [0.0]
+    assert Distinctiveness.of(graph).weight.tolist() == [1.0]
+    assert Distinctiveness.of(graph.only(torch.tensor([False]))).weight.tolist() == [0.0]

@@ -18,20 +18,33 @@ from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.view_graph import ViewGraph
 
 
-def distinctiveness(graph: ViewGraph) -> Float[Tensor, "q"]:
-    """The matches of each pair, each counted by how much it tells the pair from others.
+@dataclass(frozen=True)
+class Distinctiveness:
+    """The matches of each pair of images, each counted by how much it tells the pair from others.
 
     A match counts as one over the number of images in which its image points are matched, the geometric mean of both, and not
     at all where matches connect its points with two in one image.
+
+    Attributes:
+        weight: What the matches count together.
+        variance: By chance, as matches come and go: the sum of the squares of what they count.
     """
-    n, v = len(graph.x), len(graph.names)
-    a, b = graph.match.unbind(1)
-    degree = torch.bincount(graph.match.flatten(), minlength=n).double()
-    component = components(graph.match, n)
-    images = torch.unique(component * v + graph.view) // v
-    once = torch.bincount(component, minlength=n) == torch.bincount(images, minlength=n)
-    weight = once[component[a]] / (degree[a] * degree[b]).sqrt()
-    return degree.new_zeros(len(graph.pairs)).index_add_(0, graph.match_pair, weight)
+
+    weight: Float[Tensor, "q"]
+    variance: Float[Tensor, "q"]
+
+    @classmethod
+    def of(cls, graph: ViewGraph) -> "Distinctiveness":
+        """That of the pairs of a view graph."""
+        n, v = len(graph.x), len(graph.names)
+        a, b = graph.match.unbind(1)
+        degree = torch.bincount(graph.match.flatten(), minlength=n).double()
+        component = components(graph.match, n)
+        images = torch.unique(component * v + graph.view) // v
+        once = torch.bincount(component, minlength=n) == torch.bincount(images, minlength=n)
+        one = once[component[a]] / (degree[a] * degree[b]).sqrt()
+        total = degree.new_zeros(2, len(graph.pairs)).index_add_(1, graph.match_pair, torch.stack([one, one * one]))
+        return cls(total[0], total[1])
 
 
 @dataclass(frozen=True)
@@ -87,3 +100,7 @@ class Backbone:
         group = components(self.pairs[rest], views)
         first, second = self.pairs[pair]
         return group == group[first], group == group[second]
+
+    def smaller_side(self, pair: int, among: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
+        """The images, among some, that a pair of the backbone connects with more others."""
+        return min((side & among for side in self.sides(pair, len(among))), key=lambda side: int(side.sum()))

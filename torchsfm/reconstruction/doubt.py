@@ -50,7 +50,6 @@ def examine(
     prior: CameraPrior,
     threshold: float,
     uncertain: Bool[Tensor, "v"] | None = None,
-    apart: int = 0,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
@@ -60,7 +59,6 @@ def examine(
         prior: What was expected of the cameras before any image point was seen.
         threshold: Largest reprojection error of an observation, in pixels.
         uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
-        apart: Verified matches of its images with those of other models, which this model cannot explain.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -71,7 +69,7 @@ def examine(
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
     matches, agreeing = (agreement.per_view(one > 0, n, v) for n in (agreement.matches, agreement.agreeing))
-    explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum()) + apart
+    explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
     outvoted = agreement.balance(v) < 0
     conflicts = missing_correspondences(mapping)
     refuted = conflicts.refuted
@@ -92,8 +90,7 @@ def examine(
         if int(agreeing[i]) < EXPLAINED * int(matches[i]):
             return f"{int(agreeing[i])} of the {int(matches[i])} matches of its pairs agree with its place, the others do not"
         if explained < EXPLAINED * verified:
-            others = f"{apart} are with images of other models" if apart else "the others do not"
-            return f"{explained} of the {verified} matches of all pairs agree with the model, {others}"
+            return f"{explained} of the {verified} matches of all pairs agree with the model, the others do not"
         if count >= 3 and int(supporting[i]) < 2:
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
         if count < 3 and bool(guessed[i]):

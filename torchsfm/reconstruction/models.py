@@ -27,7 +27,7 @@ from torchsfm.reconstruction.report import ImageReport, Progress, Reconstruction
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.tracks import build_tracks
-from torchsfm.reconstruction.unfold import unfold
+from torchsfm.reconstruction.unfold import hanging_on_copies, unfold
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
 
 METHODS = ("incremental", "projective", "global", "auto")
@@ -102,7 +102,7 @@ def build_models(
         made: list[tuple[Reconstruction, Mapping, MappingOptions, Bool[Tensor, "v"] | None]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
-        taken = empty.registered
+        taken = given_up = empty.registered
         while int((~taken).sum()) >= MIN_IMAGES:
             report = lambda n, v: progress("map", n, v)  # noqa: E731
             if method == "projective":
@@ -135,6 +135,7 @@ def build_models(
             uncertain = None
             if matched and method != "projective":
                 unfolded = unfold(empty, model, taken, known, report)
+                given_up = given_up | (model.registered & ~unfolded.model.registered)
                 model, uncertain = unfolded.model, unfolded.uncertain
                 # What is left is mapped without the relations that were given up.
                 empty = replace(empty, graph=model.graph, track=model.track)
@@ -154,11 +155,10 @@ def build_models(
                 _save_model(made[-1][0], stages.folder, len(made) - 1)
         found: list[tuple[Reconstruction, Standing, Calibration]] = []
         for finished, model, known, uncertain in made:
-            prior = known.prior(model)
-            standing = examine(
-                model, open_numbers=free, prior=prior, threshold=options.reprojection, uncertain=uncertain,
-                apart=graph.matches_between(model.registered, taken & ~model.registered),
-            )  # fmt: skip
+            prior, threshold = known.prior(model), options.reprojection
+            if uncertain is not None and bool(given_up.any()):
+                uncertain = uncertain | hanging_on_copies(graph, model, taken & ~model.registered, threshold=threshold)
+            standing = examine(model, open_numbers=free, prior=prior, threshold=threshold, uncertain=uncertain)
             found.append((finished, standing, calibration_of(model, prior, loss=LOSS)))
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", len(graph.names), len(graph.names))

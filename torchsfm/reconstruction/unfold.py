@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.reconstruction.consistency import PairAgreement, pair_agreement
-from torchsfm.reconstruction.distinctive import Backbone, distinctiveness
+from torchsfm.reconstruction.distinctive import Backbone, Distinctiveness
 from torchsfm.reconstruction.incremental import MappingOptions, extend_model, grow_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
@@ -60,15 +60,15 @@ def unfold(
         The best of the given model and the new ones: that which is refuted least and which the most distinctive pairs support.
     """
     graph, v = empty.graph, len(empty.graph.names)
-    weight = distinctiveness(graph)
-    backbone = Backbone.of(graph.pairs, torch.where(elsewhere[graph.pairs].any(1), 0.0, weight), v)
+    distinct = Distinctiveness.of(graph)
+    backbone = Backbone.of(graph.pairs, torch.where(elsewhere[graph.pairs].any(1), 0.0, distinct.weight), v)
     agreement = pair_agreement(replace(model, graph=graph), threshold=options.reprojection)
     contradicted = agreement.index[agreement.contradicts & backbone.chosen[agreement.index]]
     uncertain = _hanging_on(backbone, contradicted, model.registered)
-    first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, weight))
+    first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, distinct.weight))
     if not len(contradicted) and not first.conflicts.folded:
         return first
-    for trial in _trials(empty, weight, elsewhere, options, progress):
+    for trial in _trials(empty, distinct, elsewhere, options, progress):
         # Less than a fold is no reason to give images up.
         complete = int(trial.model.registered.sum()) >= int(model.registered.sum())
         better = (trial.conflicts.strength, -trial.support) < (best.conflicts.strength, -best.support)
@@ -81,23 +81,60 @@ def _support(agreement: PairAgreement, weight: Float[Tensor, "q"]) -> float:
     return float(weight[agreement.index[agreement.supports]].sum())
 
 
+def hanging_on_copies(graph: ViewGraph, model: Mapping, others: Bool[Tensor, "v"], *, threshold: float) -> Bool[Tensor, "v"]:
+    """The images of a model that hang on relations no more distinctive than those which were given up to part it from others.
+
+    Args:
+        graph: All pairs of images, those that were given up among them.
+        model: The model.
+        others: Images of other models.
+        threshold: Largest reprojection error of an observation, in pixels.
+    """
+    distinct = Distinctiveness.of(graph)
+    agreement = pair_agreement(replace(model, graph=graph), threshold=threshold)
+    supports = torch.zeros(len(graph.pairs), dtype=torch.bool)
+    supports[agreement.index] = agreement.supports
+    backbone = Backbone.of(graph.pairs, torch.where(supports, distinct.weight, 0.0), len(graph.names))
+    given_up = model.registered[graph.pairs].any(1) & others[graph.pairs].any(1)
+    doubtful = backbone.chosen & imitated(distinct, backbone, given_up, model.registered)
+    return _hanging_on(backbone, doubtful.nonzero()[:, 0], model.registered)
+
+
+def imitated(
+    distinct: Distinctiveness, backbone: Backbone, false: Bool[Tensor, "q"], registered: Bool[Tensor, "v"]
+) -> Bool[Tensor, "q"]:
+    """Pairs of a backbone that false ones equal in distinctiveness, so that they may be false themselves.
+
+    A pair that no false one anywhere exceeds still has rivals: those that would put the images which hang on it elsewhere. It
+    must exceed them by more than both vary by chance.
+    """
+    weight = torch.where(false, distinct.weight, 0.0)
+    alike = backbone.chosen & (distinct.weight < weight.amax())
+    for q in (backbone.chosen & ~alike).nonzero()[:, 0].tolist():
+        side = backbone.smaller_side(q, registered)
+        leads_away = side[backbone.pairs].sum(1) == 1
+        rival = int(torch.where(leads_away, weight, 0.0).argmax())
+        scatter = float(distinct.variance[[q, rival]].sum()) ** 0.5
+        alike[q] = bool(leads_away[rival]) and float(distinct.weight[q] - weight[rival]) < scatter
+    return alike
+
+
 def _hanging_on(backbone: Backbone, pairs: Int[Tensor, "k"], registered: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
     """The registered images that pairs of the backbone connect with more others."""
     hanging = torch.zeros_like(registered)
     for q in pairs.tolist():
-        sides = [side & registered for side in backbone.sides(q, len(registered))]
-        hanging |= min(sides, key=lambda side: int(side.sum()))
+        hanging |= backbone.smaller_side(q, registered)
     return hanging
 
 
 def _trials(
     empty: Mapping,
-    weight: Float[Tensor, "q"],
+    distinct: Distinctiveness,
     elsewhere: Bool[Tensor, "v"],
     options: MappingOptions,
     progress: Callable[[int, int], None],
 ) -> Iterator[Unfolded]:
-    graph, v = empty.graph, len(empty.graph.names)
+    graph, weight, v = empty.graph, distinct.weight, len(empty.graph.names)
     refuted, suspected = (torch.zeros(len(graph.pairs), dtype=torch.bool) for _ in range(2))
     for _ in range(ROUNDS):
         usable = ~refuted & ~elsewhere[graph.pairs].any(1)
@@ -109,11 +146,10 @@ def _trials(
         agreement = pair_agreement(replace(grown, graph=graph), threshold=options.reprojection)
         ways = [backbone.way(i, j) for i, j in conflicts.refuted.tolist()]
         suspected[[q for way in ways for q in way]] = True
-        # A relation no more distinctive than those that are false may be one of them.
         false = refuted.clone()
         false[agreement.index[agreement.contradicts]] = True
-        alike = weight < torch.where(false, weight, 0.0).amax()
-        uncertain = _hanging_on(backbone, (backbone.chosen & (suspected | alike)).nonzero()[:, 0], grown.registered)
+        doubtful = suspected | imitated(distinct, backbone, false, grown.registered)
+        uncertain = _hanging_on(backbone, (backbone.chosen & doubtful).nonzero()[:, 0], grown.registered)
         model = _with_pairs(grown, graph, _agreeing(agreement, ~refuted))
         yield Unfolded(model, uncertain, conflicts, _support(agreement, weight))
         if not any(ways):

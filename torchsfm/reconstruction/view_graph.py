@@ -91,12 +91,6 @@ class ViewGraph:
             homography_inliers=torch.where(kept, self.homography_inliers, 0),
         )
 
-    def matches_between(self, some: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> int:
-        """Number of verified matches between two groups of images."""
-        first, second = self.pairs.unbind(1)
-        between = (some[first] & others[second]) | (others[first] & some[second])
-        return int(between[self.match_pair].sum())
-
     def verdicts(self, K: Float[Tensor, "v 3 3"], unknown_focal: Bool[Tensor, "v"]) -> Int[Tensor, "q"]:
         """The `Verdict` on each pair, given intrinsics of each image, and where their focal length is only a guess.
 
