@@ -173,8 +173,11 @@ def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) 
     own = unfolded.model.registered
     assert own.reshape(2, -1).any(1).tolist().count(True) == 1
     assert wrong_cameras(unfolded.model, truth) == 0
-    # Had relations been given up that are as distinctive as those of the half, which are wrong?
-    uncertain = hanging_on_copies(empty.graph, unfolded.model, ~own, threshold=4.0)
+    # Had relations been given up that are more distinctive than those of the half, which are wrong?
+    inside = own[graph.pairs].all(1)[graph.match_pair]
+    few = ~inside | (torch.rand(len(inside), generator=generator) < 0.2)
+    thin = replace(graph, match=graph.match[few], match_pair=graph.match_pair[few])
+    uncertain = hanging_on_copies(thin, unfolded.model, ~own, threshold=4.0)
     assert uncertain.any()
     assert not uncertain[~own].any()
 
