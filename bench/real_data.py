@@ -117,6 +117,7 @@ def model_house(data: Path) -> PhotographSet:
 SETS: dict[str, Callable[[Path], PhotographSet]] = {
     "fountain": lambda data: strecha(data, "fountain-P11"),
     "castle": lambda data: strecha(data, "castle-P19"),
+    "entry": lambda data: strecha(data, "entry-P10"),
     "sceaux": sceaux,
     "temple": temple,
     "temple-K": lambda data: temple(data, known_K=True),
