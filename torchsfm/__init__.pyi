@@ -129,11 +129,13 @@ from torchsfm.images import (
 from torchsfm.motion import (
     AffineFactorization as AffineFactorization,
     AveragedRotations as AveragedRotations,
+    AveragedSimilarities as AveragedSimilarities,
     CurveFactorization as CurveFactorization,
     ConicEpipolarFit as ConicEpipolarFit,
     Factorization as Factorization,
     GlobalPositions as GlobalPositions,
     average_rotations as average_rotations,
+    average_similarities as average_similarities,
     estimate_essential as estimate_essential,
     estimate_fundamental as estimate_fundamental,
     estimate_fundamentals as estimate_fundamentals,

@@ -20,6 +20,7 @@ from torchsfm.geometry import (
     Ellipsoid,
     Pose,
     Radial,
+    Similarity,
     camera_from_krt,
     conic_from_ellipse,
     curve_from_samples,
@@ -276,6 +277,17 @@ def _relative_rotations(s: Scene) -> Tensor:
     return rotation_from_rotvec(0.01 * s.randn(6, 3)) @ R[second] @ R[first].mT
 
 
+def _between(s: Scene) -> Similarity:
+    """Similarities that agree but for a little."""
+    R, t = _relative_rotations(s), s.randn(4, 3)
+    first, second = PAIRS.unbind(-1)
+    scale = s.rand(4, low=0.5, high=2.0)
+    ratio = scale[first] / scale[second]
+    # The world of the second model seen from the first.
+    way = t[second] - ratio[:, None] * (R @ t[first][..., None])[..., 0]
+    return Similarity(ratio, R, way)
+
+
 def _fit(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
     return torch.stack((x[..., 0, None] * a - b, x[..., 1, None] * a.exp() - 1), -1)
 
@@ -383,6 +395,12 @@ FUNCTIONS: dict[str, Function] = {
     "linalg.orthonormal_nullspace": Function({"A": lambda s: s.randn(3, 5)}),
     "motion.average_rotations": Function(
         {"R": _relative_rotations, "edges": PAIRS, "views": 4, "deviation": None, "weights": lambda s: s.rand(6, low=0.5)},
+        {"e": 6},
+        batched=False,
+    ),
+    "motion.average_similarities": Function(
+        {"between": _between, "edges": PAIRS, "models": 4, "places": lambda s: s.randn(6, 4, 3),
+         "deviation": lambda s: s.rand(6, low=0.5)},
         {"e": 6},
         batched=False,
     ),

@@ -1,6 +1,7 @@
 """From images alone: how did the camera move?"""
 
 from torchsfm.motion.many_views.average_rotations import AveragedRotations, average_rotations
+from torchsfm.motion.many_views.average_similarities import AveragedSimilarities, average_similarities
 from torchsfm.motion.many_views.factorization_affine import AffineFactorization, factorize_affine
 from torchsfm.motion.many_views.factorization_curves import CurveFactorization, factorize_curves
 from torchsfm.motion.many_views.factorization_points import Factorization, factorize_points
@@ -63,6 +64,7 @@ __all__ = [
     "SOLVERS",
     "AffineFactorization",
     "AveragedRotations",
+    "AveragedSimilarities",
     "ConicEpipolarFit",
     "CurveFactorization",
     "Factorization",
@@ -79,6 +81,7 @@ __all__ = [
     "TrifocalFit",
     "UprightPoseEstimator",
     "average_rotations",
+    "average_similarities",
     "essential_5pt",
     "essential_6pt",
     "estimate_essential",

@@ -20,8 +20,8 @@ from torchsfm.optim.layout import Layout
 from torchsfm.optim.ranks import Ranks
 from torchsfm.optim.retained_blocks import RetainedBlocks
 
-FEW = 200
-"""Variables of a graph that is solved for by a dense factor."""
+FEW = 600
+"""Columns of a system that is solved by a dense inverse."""
 SMOOTH = 2 / 3
 """Of a Jacobi step: what meets in pairs has no eigenvalue beyond 2 in its units."""
 LONGER = 1.5
@@ -162,7 +162,7 @@ class _Cycle:
 
     def __init__(self, finest: _Level) -> None:
         self._levels, self._stars = [finest], list[Tensor]()
-        while len(self._levels[-1].D) > FEW and len(self._levels[-1].i):
+        while self._levels[-1].scale.numel() > FEW and len(self._levels[-1].i):
             self._stars.append(self._levels[-1].stars())
             self._levels.append(self._levels[-1].coarser(self._stars[-1]))
         self._inverse = [_inverse(level.D) for level in self._levels]
