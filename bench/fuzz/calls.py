@@ -22,8 +22,10 @@ from bench.fuzz.scene import Scene
 from bench.fuzz.support import JUDGES
 from torchsfm._types import tensor_map
 
-BATCHES = ((4,), (2, 3), (64,), (64,), (64,), (64,), (64,), (64,))
-"""Shapes of batches: most are large, for one call then judges many problems."""
+SMALL: tuple[tuple[int, ...], ...] = ((4,), (2, 3))
+"""Shapes of batches of what is slow."""
+BATCHES = (*SMALL, *[(64,)] * 6)
+"""Shapes of batches of all else: most are large, for one call then judges many problems."""
 BAD = 0.75
 """Share of the problems of a batch that are made bad."""
 OPTIONAL = 0.3
@@ -139,7 +141,8 @@ def _is_data(t: Tensor, how: Function) -> bool:
 def _bad_values(name: str, call: Call, seed: int) -> Trial:
     how = FUNCTIONS.get(name, Function())
     generator = torch.Generator().manual_seed(seed)
-    scene = _scene(how, generator, BATCHES[seed % len(BATCHES)])
+    batches = SMALL if how.slow else BATCHES
+    scene = _scene(how, generator, batches[seed % len(batches)])
     arguments = good_arguments(call, how, scene)
     if how.half and torch.rand((), generator=generator) < 0.3:
         arguments = _cast(arguments, torch.float32)

@@ -60,6 +60,8 @@ class Function:
     """What it says of data that are good for nothing."""
     half: bool = True
     """Whether single precision is tried too."""
+    slow: bool = False
+    """Whether a problem takes a good part of a second, so that batches are to be small."""
 
 
 def _generator(_: Scene) -> torch.Generator:
@@ -317,9 +319,10 @@ TWO_VIEWS = {"estimator": FundamentalEstimator(), "data": lambda s: tuple(s.imag
 
 FUNCTIONS: dict[str, Function] = {
     "autocalibration.autocalibrate_curves": Function(
-        SIZED | {"X": lambda s: to_homogeneous(_rings(s)[..., ::3, :]), "curves": _images_of_curves}, {"v": 4, "c": 3, "m": 16}
+        SIZED | {"X": lambda s: to_homogeneous(_rings(s)[..., ::3, :]), "curves": _images_of_curves}, {"v": 4, "c": 3, "m": 16},
+        slow=True,
     ),
-    "autocalibration.autocalibrate_points": Function(SIZED, {"n": 20}),
+    "autocalibration.autocalibrate_points": Function(SIZED, {"n": 20}, slow=True),
     "autocalibration.calibrate_planes": Function({"X": lambda s: _board(s)[0], "x": lambda s: _board(s)[1]}),
     "autocalibration.calibrate_view_graph": Function(
         {
@@ -418,7 +421,9 @@ FUNCTIONS: dict[str, Function] = {
     ),
     "motion.estimate_upright": Function(RAYS, {"n": 30}),
     "motion.factorize_affine": Function({"max_iterations": 20}),
-    "motion.factorize_curves": Function({"curves": _images_of_curves, "samples": 16, "oriented": True, "aligned": True}),
+    "motion.factorize_curves": Function(
+        {"curves": _images_of_curves, "samples": 16, "oriented": True, "aligned": True}, slow=True
+    ),
     "motion.factorize_points": Function({"max_iterations": 20}),
     "motion.fundamental_from_conics": Function(
         {f"C{i + 1}": lambda s, i=i: _tilted(s)[i] for i in range(2)}
