@@ -13,6 +13,7 @@ import type_checks
 from chance import seeded, set_seed, stream_seed
 from hypothesis import settings
 
+pytest_plugins = ["scripts"]
 torch.set_num_threads(1)
 type_checks.install()
 # No run remembers another.
