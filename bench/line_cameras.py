@@ -100,8 +100,10 @@ def errors(pose: Tensor, view: View) -> tuple[float, float]:
 
 
 def sequences(folder: Path, repeats: int, generator: torch.Generator) -> None:
-    """Medians over views and repetitions, and the share of lost poses."""
-    print("Oxford lines    wrong  with    program   rotation deg  centre/distance  lost    ms")
+    """Median and 95 % quantile over views and repetitions, and the share of lost poses."""
+    print(
+        "\nOxford lines    wrong  with    program   rotation deg: median   95 %  centre/distance: median     95 %  lost    ms"
+    )
     for name in ("model_house", "corridor", "merton1", "library"):
         views = list(oxford(folder, name))
         for share in (0.3, 0.5, 0.7):
@@ -114,8 +116,9 @@ def sequences(folder: Path, repeats: int, generator: torch.Generator) -> None:
                     turn, shift = np.array([errors(P, view) for P, view in zip(found, tried, strict=True)]).T
                     lost = ((turn > BAD[0]) | (shift > BAD[1])).mean()
                     what = "both" if points else "lines"
+                    (a, c), (b, d) = (np.quantile(v, (0.5, 0.95)) for v in (turn, shift))
                     print(
-                        f"{name:14}  {share:5.0%}  {what:6}  {program:8}  {np.median(turn):12.4f}  {np.median(shift):15.5f}  "
+                        f"{name:14}  {share:5.0%}  {what:6}  {program:8}  {a:20.4f}  {c:6.3f}  {b:23.5f}  {d:7.4f}  "
                         f"{lost:5.1%}  {1e3 * seconds:5.1f}"
                     )
 

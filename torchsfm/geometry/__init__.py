@@ -11,15 +11,13 @@ from torchsfm.geometry.cameras import (
     project_points,
 )
 from torchsfm.geometry.conic_distance import conic_distance, ellipse_distance
+from torchsfm.geometry.conic_intersections import intersect_conics, intersect_line_conic, tangent_lines
 from torchsfm.geometry.conics import (
     Ellipse,
     conic_from_ellipse,
     dual_conic,
     ellipse_from_conic,
-    intersect_conics,
-    intersect_line_conic,
     polar_lines,
-    tangent_lines,
     transform_conic,
 )
 from torchsfm.geometry.curves import Crossings, Curve, FootPoints, curve_crossings, curve_from_samples, foot_points
