@@ -31,7 +31,7 @@ EXPLORED_DATA = 512
 """How many data that looks at."""
 _PER_START, _AMBIGUOUS = 128, 0.5
 """One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers."""
-_SUPPORT, _CHANCE = 0.6, 2.5
+_SUPPORT, _CHANCE = 0.6, 1.5
 """How much of what is within the threshold a model may lose by refinement, and how many standard deviations of its support: the
 one before was chosen for it."""
 _SAMPLES, _NUMBERS = 1 << 13, 1 << 15
