@@ -18,8 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -52,18 +52,31 @@ def memory() -> float:
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
+@dataclass
+class StageClock:
+    """Takes the seconds of this process that stages take, where it is told of the progress of a reconstruction."""
+
+    last: float = field(default_factory=time.process_time)
+    stage: str = "features"
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """What came since the last call belongs to this stage; before matching, pairs are chosen."""
+        now = time.process_time()
+        name = "pairs" if (self.stage, stage) == ("features", "match") else stage
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.last
+        self.last, self.stage = now, stage
+
+
 def photographs(views: int) -> Row:
     """The whole job."""
-    from torchsfm.reconstruction import reconstruct, stages
+    from torchsfm.reconstruction import reconstruct
 
-    # The report's seconds, of this process alone.
-    stages.time = SimpleNamespace(perf_counter=time.process_time, sleep=time.sleep)  # type: ignore[assignment]
     with tempfile.TemporaryDirectory() as folder:
         files = render(Path(folder), views)
-        before = memory()
-        result = reconstruct(files, max_features=FEATURES, neighbours=NEIGHBOURS, out=Path(folder) / "out")
-        spent = result.report.seconds
-    names = ("features", "pairs", "match", "verify", "map")
+        before, clock = memory(), StageClock()
+        result = reconstruct(files, max_features=FEATURES, neighbours=NEIGHBOURS, out=Path(folder) / "out", progress=clock)
+    names, spent = ("features", "pairs", "match", "verify", "map"), clock.seconds
     return {
         "pairs compared": len(result.report.pairs.pairs),
         "registered": result.models[0].num_registered if result.models else 0,

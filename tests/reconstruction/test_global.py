@@ -62,10 +62,10 @@ def ring_of_pairs(views: int, reach: int) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("views", "reach", "sigma", "wanted"),
     [
-        (400, 4, 0.05, "global"),
+        (800, 4, 0.05, "global"),
         (100, 4, 0.05, "incremental"),  # few
-        (400, 1, 0.05, "incremental"),  # a chain
-        (400, 4, 0.5, "incremental"),  # unknown focal lengths
+        (800, 1, 0.05, "incremental"),  # a chain
+        (800, 4, 0.5, "incremental"),  # unknown focal lengths
         (0, 1, 0.05, "incremental"),
     ],
 )
@@ -78,10 +78,13 @@ def test_mapper_for_a_view_graph(views: int, reach: int, sigma: float, wanted: s
     order = torch.randperm(views, generator=generator)
     more = torch.cat((order[pairs], torch.randint(max(views, 1), (views, 2), generator=generator)))
     assert choose_mapper(more, torch.cat((inliers, torch.zeros(views).long())), focal) == wanted
-    # Halves that nothing connects are looked at each by itself.
-    if views == 400:
-        apart = pairs[((pairs < 150) == (pairs[:, :1] < 150)).all(1) & ((pairs < 300) == (pairs[:, :1] < 300)).all(1)]
-        assert choose_mapper(apart, inliers[: len(apart)], focal) == "incremental"
+
+
+def test_parts_that_nothing_connects_are_looked_at_each_by_itself() -> None:
+    pairs, focal = ring_of_pairs(800, 4), torch.full((800,), 0.05, dtype=torch.float64)
+    apart = pairs[(pairs // 300 == pairs[:, :1] // 300).all(1)]
+    assert choose_mapper(pairs, torch.full((len(pairs),), 60), focal) == "global"
+    assert choose_mapper(apart, torch.full((len(apart),), 60), focal) == "incremental"
 
 
 def test_auto_says_which_mapper_it_took() -> None:

@@ -8,8 +8,8 @@ from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL
 from torchsfm.reconstruction.view_graph import MIN_INLIERS
 
-MANY = 200
-"""Images that hang together, from which on they are mapped at once: fewer are mapped as exactly, and as fast, one by one."""
+MANY = 500
+"""Images that hang together, from which on they are mapped at once: up to 200 at least, one by one is as exact and as fast."""
 HELD, MOST = 3, 0.9
 """Pairs by which an image must be held to be placed without its points (one of two may be wrong), and how many must be so."""
 

@@ -70,7 +70,7 @@ def reconstruct(
             without calibration, by factorisation of the longest tracks, and finds the camera by autocalibration. It refuses
             rather than guesses where the images do not determine the focal length (`report.autocalibration` says why);
             "global" finds the rotations of all images from those of pairs, then all centres and points at once, with a first
-            focal length; "auto" is "global" for 200 images or more that many pairs hold together and whose focal lengths are
+            focal length; "auto" is "global" for 500 images or more that many pairs hold together and whose focal lengths are
             roughly known, else "incremental".
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
