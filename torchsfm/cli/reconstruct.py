@@ -33,6 +33,7 @@ class Method(StrEnum):
     projective = "projective"
     all_at_once = "global"
     auto = "auto"
+    curves = "curves"
 
 
 def known_camera(name: str | None) -> str | None:
@@ -97,7 +98,8 @@ def reconstruct(
             "--method",
             "--mapper",
             help="From two images on; all together without calibration and then autocalibration; rotations of all images, "
-            "then all places; or the first or last of these, by the number of images and what holds them together.",
+            "then all places; the first or last of these, by the number of images and what holds them together; or a sequence "
+            "by its edges alone, where there is little else to see.",
         ),
     ] = Method.incremental,
     lines: Annotated[

@@ -132,7 +132,7 @@ def curves_of_edges(
             )
     progress("follow", v, v)
     if not sum(len(p.piece) for p in pieces):
-        return _no_curves(poses.R)
+        return no_curves(poses.R)
     offset, shifted = 0, []
     for p in pieces:
         shifted.append(p._replace(piece=p.piece + offset))
@@ -149,14 +149,15 @@ def curves_of_edges(
     edge = together.edge[source] + (count.cumsum(0) - count)[together.image[source]]
     color = torch.cat([own.color for own in kept])[edge]
     curves = replace(
-        _no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
+        no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
     tracked = track_samples(curves, kept, lines, P, size, threshold)
     return measured_weights(tracked, edge_distances(poses, cameras, tracked.bundle()))
 
 
-def _no_curves(like: Tensor) -> Curves:
+def no_curves(like: Tensor) -> Curves:
+    """None, in the dtype of a tensor."""
     none = like.new_zeros(0)
     x, index = none.reshape(0, 2), none.long()
     return Curves(none.reshape(0, 3), index, none.bool(), none.reshape(0, 3), none, x, x, none, none, index, index)

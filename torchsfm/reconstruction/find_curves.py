@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,38 +36,57 @@ class FoundEdges:
     """Width and height of that size."""
     zoom: Float[Tensor, "v 2"]
     """Pixels of the image for one of these, along x and y."""
+    focal: Float[Tensor, "v"]
+    """Focal length in pixels of the image that each file states, or 0."""
 
     @classmethod
     def of(cls, arrays: Arrays) -> "FoundEdges":
         """From saved tensors."""
         counts = arrays["count"].tolist()
         parts = zip(*(torch.split(arrays[field.name], counts) for field in fields(ImageEdges)), strict=True)
-        return cls(tuple(ImageEdges(*part) for part in parts), arrays["size"], arrays["zoom"])
+        return cls(tuple(ImageEdges(*part) for part in parts), *(arrays[name] for name in ("size", "zoom", "focal")))
 
 
-def detect_all_edges(files: Sequence[Path], max_pixels: int, progress: Progress, masks: Masks | None = None) -> Arrays:
+class _Photograph(NamedTuple):
+    """What one file gives."""
+
+    edges: ImageEdges
+    size: tuple[int, int]
+    zoom: tuple[float, float]
+    focal: float
+
+
+def detect_all_edges(
+    files: Sequence[Path], max_pixels: int, progress: Progress, masks: Masks | None = None, *, longest: int = EDGE_SIZE
+) -> Arrays:
     """Edges of all files as tensors to save, those of a file after those of the one before; none of what cannot be read."""
 
-    def work(path: Path) -> tuple[ImageEdges, tuple[int, int], tuple[float, float]]:
+    def work(path: Path) -> _Photograph:
         try:
-            photo = read_image(path, max_size=EDGE_SIZE, max_pixels=max_pixels)
+            photo = read_image(path, max_size=longest, max_pixels=max_pixels)
         except ImageError:
-            return ImageEdges.none(), (1, 1), (1.0, 1.0)
+            return _Photograph(ImageEdges.none(), (1, 1), (1.0, 1.0), 0.0)
         found = ImageEdges.of(photo.pixels, min_edgels=SHORTEST)
         zoom = photo.size[0] / photo.width, photo.size[1] / photo.height
         if masks is not None:
             found = found.where(masks.admit(path, (found.x + 0.5) * torch.tensor(zoom) - 0.5, photo.size))
-        return found, (photo.width, photo.height), zoom
+        # The focal length is that of the image as it was read.
+        focal = (photo.focal or 0.0) * max(photo.size) / max(photo.width, photo.height)
+        return _Photograph(found, (photo.width, photo.height), zoom, focal)
 
-    found: list[tuple[ImageEdges, tuple[int, int], tuple[float, float]]] = []
+    found: list[_Photograph] = []
     with ThreadPoolExecutor(max(1, torch.get_num_threads())) as pool:
         for result in pool.map(work, files):
             found.append(result)
             progress("edges", len(found), len(files))
-    edges = [e for e, _, _ in found]
-    joined = {field.name: torch.cat([getattr(e, field.name) for e in edges]) for field in fields(ImageEdges)}
-    size, zoom = torch.tensor([s for _, s, _ in found]), torch.tensor([z for _, _, z in found], dtype=torch.float64)
-    return joined | {"count": torch.tensor([len(e) for e in edges]), "size": size, "zoom": zoom}
+    joined = {field.name: torch.cat([getattr(f.edges, field.name) for f in found]) for field in fields(ImageEdges)}
+    numbers = {
+        "count": torch.tensor([len(f.edges) for f in found]),
+        "size": torch.tensor([f.size for f in found]),
+        "zoom": torch.tensor([f.zoom for f in found], dtype=torch.float64),
+        "focal": torch.tensor([f.focal for f in found], dtype=torch.float64),
+    }
+    return joined | numbers
 
 
 def find_curves(mapping: Mapping, found: FoundEdges, progress: Progress) -> Curves:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS
+from torchsfm.reconstruction.curve_models import reconstruct_from_curves
 from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges
 from torchsfm.reconstruction.find_lines import FoundSegments
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all
@@ -23,6 +24,8 @@ from torchsfm.reconstruction.sources import Source, Sources
 from torchsfm.reconstruction.stages import Stages, fingerprint
 from torchsfm.reconstruction.view_graph import ViewGraph
 
+FROM_CURVES = "curves"
+"""The method that goes by edges alone."""
 NEIGHBOURS = 20
 """Images each one is matched with when there are many."""
 
@@ -71,7 +74,11 @@ def reconstruct(
             rather than guesses where the images do not determine the focal length (`report.autocalibration` says why);
             "global" finds the rotations of all images from those of pairs, then all centres and points at once, with a first
             focal length; "auto" is "global" for 500 images or more that many pairs hold together and whose focal lengths are
-            roughly known, else "incremental".
+            roughly known, else "incremental"; "curves" goes by edges alone, where points do not suffice: smooth things with
+            painted curves. The images are consecutive frames of one camera that is a little elsewhere each time; its principal
+            point is held centred. Curves are followed through a few frames, which tells their cameras, then one frame after the
+            other is placed by the curves in space, and all are adjusted together. There are no points then: the curves are in
+            `Reconstruction.curves`. `report.refusal` says why where there is no model.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
         curves: Find curves in space, too, with the cameras that have been found: edges of the photographs, scaled down to a
@@ -103,11 +110,22 @@ def reconstruct(
     """
     if camera is not None and camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
-    if method not in METHODS:
-        raise ReconstructionError(f"no method '{method}'; there are {', '.join(METHODS)}")
+    if method not in (*METHODS, FROM_CURVES):
+        raise ReconstructionError(f"no method '{method}'; there are {', '.join((*METHODS, FROM_CURVES))}")
+    if method == FROM_CURVES and lines:
+        raise ReconstructionError("the method from curves finds no lines")
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
     report = progress or (lambda stage, done, total: None)
+    model = camera or ("pinhole" if K is not None else "radial")
+    if method == FROM_CURVES:
+        sources = Sources.of(images, without=[folder for folder in (out, masks) if folder is not None])
+        admitted = None if masks is None else Masks.of(masks, sources)
+        stages = _stages(sources, admitted, {"method": method, "pixels": max_pixels}, out, resume)
+        found = reconstruct_from_curves(
+            sources, stages, camera=model, K=K, max_pixels=max_pixels, masks=admitted, progress=report
+        )
+        return replace(found, report=replace(found.report, skipped=sources.skipped))
     seen = match_photographs(
         images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
         resume=resume, seed=seed, progress=report, masks=masks,
@@ -129,7 +147,7 @@ def reconstruct(
         exif_focal=seen.points.focal,
         failures=seen.points.failures,
         order=seen.names,
-        camera=camera or ("pinhole" if K is not None else "radial"),
+        camera=model,
         shared_camera=shared_camera,
         K=K,
         free_principal_point=free_principal_point,
@@ -141,6 +159,16 @@ def reconstruct(
         edges=cache(edges) if curves else None,
     )
     return replace(result, report=replace(result.report, skipped=seen.skipped))
+
+
+def _stages(
+    sources: Sources, masks: Masks | None, options: dict[str, Any], out: str | Path | None, resume: bool, first: float = 0.0
+) -> Stages:
+    """Stages of work on photographs with options on which all that is saved depends."""
+    options = options | {"names": sources.names}
+    if masks is not None:
+        options["masks"] = fingerprint([path for file in sources.files if (path := masks.path(file))], {})
+    return Stages(None if out is None else Path(out), resume, fingerprint(sources.files, options), first)
 
 
 @dataclass(frozen=True)
@@ -190,11 +218,8 @@ def match_photographs(
     files, names = sources.files, sources.names
     # What is saved depends on these alone; cameras and models are made from it each time.
     options: dict[str, Any] = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
-    options["names"] = names
     found = None if masks is None else Masks.of(masks, sources)
-    if found is not None:
-        options["masks"] = fingerprint([path for file in files if (path := found.path(file))], {})
-    stages = Stages(None if out is None else Path(out), resume, fingerprint(files, options), first)
+    stages = _stages(sources, found, options, out, resume, first)
     points = detect_all(files, names, stages, max_features, max_pixels, progress, found)
     graph = match_all(
         points, stages, progress, seed, sequence=sequence, neighbours=neighbours, max_pixels=max_pixels, masks=found

@@ -97,7 +97,8 @@ class Report:
         autocalibration: For each set of images that was autocalibrated what was assumed, found and determined, or why not.
         skipped: Files and folders in the input folder that may hold photographs but were passed over, each with the reason.
         calibrations: For each model how its cameras were found, and how well they are known.
-        method: How the models were made: "incremental", "projective" or "global"; empty where the cameras were given.
+        method: How the models were made: "incremental", "projective", "global" or "curves"; empty where the cameras were given.
+        refusal: Why there is no model, where the method can tell; empty else.
 
     See the example of `reconstruct_tracks`.
     """
@@ -110,6 +111,7 @@ class Report:
     skipped: tuple[tuple[str, str], ...] = ()
     calibrations: tuple[Calibration, ...] = ()
     method: str = ""
+    refusal: str = ""
 
     def compared_names(self) -> list[str]:
         """Names of the images that could be read, by the numbers that `pairs` has for them."""
@@ -178,6 +180,8 @@ class SfmResult:
 
     def failure(self) -> str:
         """Why there is no model, in one line."""
+        if self.report.refusal:
+            return self.report.refusal
         pairs = self.report.pairs
         readable = sum(1 for image in self.report.images if image.features)
         if readable < 2:

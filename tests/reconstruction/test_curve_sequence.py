@@ -1,0 +1,112 @@
+"""Sequences by their edges alone: what is refused, and why; and a rendered one from images to cameras."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from command_line import torchsfm
+from painted_box import photograph
+from torch import Tensor
+
+from torchsfm.geometry import Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
+from torchsfm.images import detect_edges, save_image
+from torchsfm.linalg import nearest_rotation
+from torchsfm.reconstruction import ReconstructionError, reconstruct
+from torchsfm.reconstruction.curve_sequence import as_edges
+from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.simulation import orbit_poses, paint_shapes
+
+F64 = torch.float64
+FOCAL = 360.0
+
+
+def test_edges_of_frames_are_those_that_are_followed() -> None:
+    images = photograph(orbit_poses(3, radius=5.5, sweep=0.1))
+    straight = detect_edges(images)
+    again = as_edges([ImageEdges.of(image) for image in images])
+    for i in range(len(images)):
+        good = straight.valid[i]
+        n = int(good.sum())
+        assert again.valid[i].sum() == n
+        assert torch.equal(again.x[i, :n], straight.x[i, good])
+        assert torch.equal(again.chain[i, :n], straight.chain[i, good])
+        cosine = torch.nn.functional.cosine_similarity(again.gradient[i, :n], straight.gradient[i, good], dim=-1)
+        assert (cosine > 0.7).float().mean() > 0.95
+        assert (again.closed[i, :n] == straight.closed[i, good]).float().mean() > 0.9
+
+
+def painted(folder: Path, frames: int, generator: torch.Generator) -> Pose:
+    """Photographs of flat shapes without a corner, each in a plane of its own, the camera on an arc around them."""
+
+    def rand(*shape: int) -> Tensor:
+        return 2 * torch.rand(*shape, dtype=F64, generator=generator) - 1
+
+    t = torch.arange(72, dtype=F64) * (2 * math.pi / 72)
+    r = 0.5 * (1 + 0.12 * (2 * t + 3 * rand(9, 1)).cos() + 0.05 * (3 * t + 3 * rand(9, 1)).cos())
+    flat = torch.stack((r * t.cos(), r * t.sin(), 0 * r), -1)
+    place = torch.tensor([[x, y] for y in (-1.25, 0.0, 1.25) for x in (-1.5, 0.0, 1.5)], dtype=F64)
+    depth = 0.8 * torch.tensor([1, -1, 0.3, -0.5, 0.8, -1, 0.5, -0.2, 1], dtype=F64)[:, None]
+    shapes = flat @ rotation_from_rotvec(0.5 * rand(9, 3)).mT + torch.cat((place, depth), -1)[:, None]
+    turn = math.radians(4.0) * (torch.arange(frames, dtype=F64)[:, None] - frames // 2)
+    R = rotation_from_rotvec(turn * torch.tensor([0.3, 1.0, 0.0], dtype=F64) + 0.005 * rand(frames, 3))
+    poses = Pose(R, torch.tensor([0.0, 0.0, 6.0], dtype=F64) + 0.05 * rand(frames, 3))
+    K = intrinsics(torch.tensor(FOCAL, dtype=F64), torch.tensor([159.5, 119.5], dtype=F64))
+    outlines = project_points(K @ poses.matrix(), shapes.flatten(0, 1)).unflatten(1, (9, -1))
+    grey = torch.tensor([0.5, 0.9, 0.1, 0.8, 0.2, 0.95, 0.15, 0.85, 0.1, 0.9], dtype=F64)
+    for i, x in enumerate(outlines):
+        image = paint_shapes(list(x), grey, width=320, height=240, fine=4)
+        save_image(folder / f"{i}.png", image + 0.005 * torch.randn(image.shape, dtype=F64, generator=generator))
+    return poses
+
+
+@pytest.mark.slow
+def test_cameras_and_curves_without_points(tmp_path: Path, generator: torch.Generator) -> None:
+    poses = painted(tmp_path, 8, generator)
+    found = reconstruct(tmp_path, method="curves", camera="pinhole")
+    model = found.model
+    assert bool(model.registered.all())
+    turn = nearest_rotation((poses.R.mT @ model.poses.R).mean(0))
+    assert rotation_angle(model.poses.R @ (poses.R @ turn).mT).rad2deg().max() < 1.0
+    assert abs(float(model.cameras.K[0, 0, 0]) / FOCAL - 1) < 0.05
+    assert {image.doubt for image in found.report.images} == {""}
+    assert model.curves is not None
+    assert len(model.curves) >= 6
+    assert model.curve_residuals().median() < 0.3
+
+
+@pytest.fixture
+def blank(tmp_path: Path, generator: torch.Generator) -> Path:
+    for i in range(5):
+        save_image(tmp_path / f"{i}.png", 0.5 + 0.01 * torch.randn(1, 60, 80, generator=generator))
+    return tmp_path
+
+
+def test_frames_without_curves_are_refused(blank: Path) -> None:
+    found = reconstruct(blank, method="curves")
+    assert found.models == ()
+    assert "curves could be followed" in found.report.refusal
+    assert {image.reason for image in found.report.images} == {found.report.refusal}
+    with pytest.raises(ReconstructionError, match="curves could be followed"):
+        _ = found.model
+
+
+def test_few_frames_are_refused(blank: Path) -> None:
+    found = reconstruct([blank / f"{i}.png" for i in range(3)], method="curves")
+    assert found.report.refusal.startswith("3 frames")
+
+
+def test_frames_of_two_sizes_and_files_that_are_no_images(blank: Path) -> None:
+    (blank / "a.png").write_bytes(b"no image")
+    assert reconstruct(blank, method="curves").report.images[-1].reason == "cannot be read as an image"
+    save_image(blank / "b.png", torch.zeros(1, 50, 80))
+    with pytest.raises(ReconstructionError, match="one size"):
+        reconstruct(blank, method="curves")
+    with pytest.raises(ReconstructionError, match="finds no lines"):
+        reconstruct(blank, method="curves", lines=True)
+
+
+def test_command_line_says_why(blank: Path, tmp_path: Path) -> None:
+    status, _, stderr = torchsfm("reconstruct", blank, "--method", "curves", "--out", tmp_path / "out")
+    assert status != 0
+    assert "curves could be followed" in stderr

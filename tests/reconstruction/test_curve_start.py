@@ -1,0 +1,106 @@
+"""Cameras of a few frames from curves that were followed through them, and of one more from curves in space."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Curve, Pose, curve_from_samples, intrinsics, project_points, rotation_angle, rotation_from_rotvec
+from torchsfm.images.edge_field import edge_field
+from torchsfm.reconstruction.curve_resection import pose_from_edges
+from torchsfm.reconstruction.curve_start import first_cameras
+
+F64 = torch.float64
+WIDTH, HEIGHT, FOCAL, FRAMES = 480, 360, 500.0, 5
+CENTRE = torch.tensor([(WIDTH - 1) / 2, (HEIGHT - 1) / 2], dtype=F64)
+K = intrinsics(torch.tensor(FOCAL, dtype=F64), CENTRE)
+
+
+def rings(number: int, generator: torch.Generator) -> Tensor:
+    """Closed curves in space, each bent in its own way, within one or two units of the origin, (number, 80, 3)."""
+    t = torch.arange(80, dtype=F64) * (2 * math.pi / 80)
+    phase = 6.3 * torch.rand(number, 3, 1, dtype=F64, generator=generator)
+    r = 0.5 + 0.08 * (2 * t + phase[:, 0]).cos() + 0.04 * (3 * t + phase[:, 1]).cos()
+    flat = torch.stack((r * t.cos(), r * t.sin(), 0.15 * (2 * t + phase[:, 2]).cos()), -1)
+    turn = rotation_from_rotvec(1.2 * (torch.rand(number, 3, dtype=F64, generator=generator) - 0.5))
+    place = 2.4 * (torch.rand(number, 1, 3, dtype=F64, generator=generator) - 0.5)
+    return flat @ turn.mT + place
+
+
+def arc(frames: int, generator: torch.Generator, step: float = 3.0) -> Pose:
+    """Cameras around the origin, six units away, a little shaken."""
+    at = torch.arange(frames, dtype=F64) - frames // 2
+    axis = torch.tensor([0.2, 1.0, 0.1], dtype=F64)
+    shaken = 0.005 * torch.randn(frames, 3, dtype=F64, generator=generator)
+    R = rotation_from_rotvec(math.radians(step) * at[:, None] * axis + shaken)
+    t = torch.tensor([0.0, 0.0, 6.0], dtype=F64) + 0.03 * torch.randn(frames, 3, dtype=F64, generator=generator)
+    return Pose(R, t)
+
+
+def images(X: Tensor, poses: Pose, generator: torch.Generator, noise: float = 0.03) -> Curve:
+    x = project_points((K @ poses.matrix())[:, None], X)
+    return curve_from_samples(x + noise * torch.randn(x.shape, dtype=F64, generator=generator), closed=True)
+
+
+def turned(found: Pose, poses: Pose) -> Tensor:
+    """Degrees by which rotations from the middle frame are wrong."""
+    k = len(poses.R) // 2
+    return rotation_angle(found.R @ found.R[k].mT @ (poses.R @ poses.R[k].mT).mT).rad2deg()
+
+
+@pytest.mark.parametrize("expected", [0.8, 1.25])
+def test_first_cameras(expected: float, generator: torch.Generator) -> None:
+    poses = arc(FRAMES, generator)
+    curves = images(rings(10, generator), poses, generator)
+    found = first_cameras(curves, FRAMES // 2, torch.tensor(expected * FOCAL, dtype=F64), CENTRE, 0.5)
+    assert found.refusal == ""
+    assert turned(found.poses, poses).max() < 1.0
+    assert abs(math.log(float(found.focal) / FOCAL)) < 0.15
+
+
+def test_curves_that_move_each_by_itself_are_not_followed(generator: torch.Generator) -> None:
+    curves = images(rings(10, generator), arc(FRAMES, generator), generator)
+    shift = torch.randn(FRAMES, 10, 1, 2, dtype=F64, generator=generator) * 12
+    found = first_cameras(Curve(curves.x + shift, curves.valid, curves.closed), 2, K[0, 0], CENTRE, 0.5)
+    assert found.refusal
+
+
+def test_a_camera_that_turns_tells_nothing(generator: torch.Generator) -> None:
+    poses = arc(FRAMES, generator)
+    middle = torch.tensor([0.0, 0.0, -6.0], dtype=F64)
+    still = Pose(poses.R, -(poses.R @ middle))
+    found = first_cameras(images(rings(10, generator), still, generator), 2, K[0, 0], CENTRE, 0.01)
+    assert found.refusal
+
+
+def test_too_few_curves(generator: torch.Generator) -> None:
+    poses = arc(FRAMES, generator)
+    for number in (0, 1, 2):
+        curves = images(rings(10, generator), poses, generator)
+        few = Curve(curves.x[:, :number], curves.valid[:, :number], curves.closed[:, :number])
+        found = first_cameras(few, 2, K[0, 0], CENTRE, 0.5)
+        assert found.refusal
+        assert found.poses.R.isfinite().all()
+
+
+def test_a_pose_from_edges(generator: torch.Generator) -> None:
+    X, pose = rings(12, generator), arc(3, generator)[2]
+    x = project_points(K @ pose.matrix(), X.flatten(0, 1)).unflatten(0, (12, -1))
+    along = X.roll(-1, 1) - X.roll(1, 1)
+    ahead = x.roll(-1, 1) - x.roll(1, 1)
+    # What is bright is to the left.
+    bright = torch.stack((ahead[..., 1], -ahead[..., 0]), -1).flatten(0, 1)
+    chain = torch.arange(12).repeat_interleave(80)
+    field = edge_field(x.flatten(0, 1), bright, chain, torch.ones_like(chain, dtype=torch.bool), (HEIGHT, WIDTH))
+    away = torch.cat((0.02 * torch.randn(6, 3, dtype=F64, generator=generator), 0.1 * torch.ones(6, 3, dtype=F64)), -1)
+    starts = Pose(pose.R.expand(6, 3, 3), pose.t.expand(6, 3)).retract(away)
+    tangent = torch.nn.functional.normalize(along.flatten(0, 1), dim=-1)
+    found = pose_from_edges(X.flatten(0, 1), tangent, field, (HEIGHT, WIDTH), K, starts)
+    best = int(found.near.argmax())
+    assert found.near[best] > 0.95 * found.inside[best]
+    assert rotation_angle(found.pose.R[best] @ pose.R.mT).rad2deg() < 0.05
+    assert (found.pose.t[best] - pose.t).norm() < 0.01
+    # Edges whose bright side is on the other hand are others.
+    none = pose_from_edges(X.flatten(0, 1), -tangent, field, (HEIGHT, WIDTH), K, starts)
+    assert none.near.max() < 0.5 * found.near[best]

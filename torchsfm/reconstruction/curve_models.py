@@ -1,0 +1,172 @@
+"""From the frames of a sequence to a model of cameras and curves, where points do not suffice."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm.bundle import bundle_covariance
+from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
+from torchsfm.reconstruction.cameras import DEFAULT_FOCAL, FOCAL_SIGMA
+from torchsfm.reconstruction.curve_mapping import CurveMapping, terms
+from torchsfm.reconstruction.curve_sequence import Expected, Settled, all_curves, map_sequence
+from torchsfm.reconstruction.doubt import DEVIATIONS, GUESSED_FOCAL, WRONG_ANGLE, Standing
+from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges, scaled
+from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
+from torchsfm.reconstruction.sources import Sources
+from torchsfm.reconstruction.stages import Stages, one_thread
+
+FRAME_SIZE = 640
+"""Longer side, in pixels, to which larger frames are scaled down."""
+_BENT = 0.05
+"""Standard deviation of the first number of a lens' distortion, and"""
+_MORE_BENT = 0.02
+"""of others."""
+_RESTLESS = 0.5
+"""Degrees by which cameras may still turn as more samples are given up."""
+_CONTRADICTED = 1.0
+"""Degrees between cameras of the model and those of a few frames by themselves, beyond which the model has drifted."""
+_FEWEST = 30
+"""Samples that a frame must show in the end."""
+
+
+def reconstruct_from_curves(
+    sources: Sources,
+    stages: Stages,
+    *,
+    camera: str,
+    K: Float[Tensor, "3 3"] | None,
+    max_pixels: int,
+    masks: Masks | None,
+    progress: Progress,
+) -> SfmResult:
+    """Reconstruct consecutive frames of one camera from their edges alone.
+
+    Args:
+        sources: The frames, in order.
+        stages: Timing and saving.
+        camera: Name of the distortion model.
+        K: Known intrinsics.
+        max_pixels: Larger frames are left out.
+        masks: Where frames show nothing that counts.
+        progress: Called as the work goes on.
+
+    Raises:
+        ReconstructionError: Fewer than two frames can be read, or they differ in size.
+    """
+    found = FoundEdges.of(
+        stages.run("edges", lambda: detect_all_edges(sources.files, max_pixels, progress, masks, longest=FRAME_SIZE))
+    )
+    readable = (found.size > 1).all(-1).nonzero()[:, 0]
+    if len(readable) < 2:
+        raise ReconstructionError(f"{len(readable)} of {len(sources.files)} files can be read as images")
+    size = (found.size * found.zoom).round().long()[readable]
+    if len(torch.unique(size, dim=0)) > 1:
+        raise ReconstructionError("the frames of a sequence must have one size")
+    zoom = found.zoom[readable[0]]
+    focal = [f for f in found.focal[readable].tolist() if f > 0]
+    expected, source = _expected(camera, K, focal, size[0], zoom)
+    width, height = found.size[readable[0]].tolist()
+    with stages.timed("map"), one_thread():
+        settled, reason = map_sequence([found.edges[i] for i in readable.tolist()], (height, width), expected, progress)
+    names = [sources.names[i] for i in readable.tolist()]
+    models: tuple[Reconstruction, ...] = ()
+    standing = None
+    if settled is not None:
+        with stages.timed("curves"):
+            model = _model(settled.mapping, names, size, zoom, progress)
+        models, standing = (model,), _standing(settled, expected)
+    images = _reports(sources.names, readable, found, settled, standing, reason)
+    none = torch.zeros(0, dtype=torch.long)
+    pairs = pair_report(none.reshape(0, 2), none, none, none, none)
+    return SfmResult(models, Report(images, pairs, dict(stages.seconds), (source,), method="curves", refusal=reason))
+
+
+def _expected(
+    camera: str, K: Tensor | None, focal: Sequence[float], size: Int[Tensor, "2"], zoom: Float[Tensor, "2"]
+) -> tuple[Expected, str]:
+    """What is known of the camera, in pixels of the edges, and where its focal length comes from."""
+    distortion = DISTORTION_MODELS[camera]
+    whole = size.double()
+    source = "given" if K is not None else "exif" if focal else "default"
+    f = torch.tensor(focal, dtype=torch.float64).median() if focal else DEFAULT_FOCAL * whole.max()
+    matrix = K.double() if K is not None else intrinsics(f, (whole - 1) / 2)
+    none = distortion.from_parameters(torch.zeros(distortion.num_parameters, dtype=torch.float64))
+    seen = scaled(Camera(matrix, none)[(None,)], 1 / zoom[None])[0]
+    names = distortion.parameter_names
+    sigma = dict.fromkeys(names, _MORE_BENT) | dict.fromkeys(names[:1], _BENT) | {"focal": FOCAL_SIGMA[source]}
+    return Expected(seen, (() if K is not None else ("focal",)) + tuple(names), sigma), source
+
+
+def _model(
+    mapping: CurveMapping, names: Sequence[str], size: Int[Tensor, "v 2"], zoom: Float[Tensor, "2"], progress: Progress
+) -> Reconstruction:
+    """The model in pixels of the whole frames."""
+    v = len(names)
+    x, none = mapping.poses.t.new_zeros(0, 2), torch.zeros(0, dtype=torch.long)
+    curves = all_curves(mapping, progress).in_images(torch.arange(v), zoom.expand(v, 2)).detached()
+    X = mapping.poses.t[:0]
+    return Reconstruction(
+        tuple(names), size, scaled(mapping.camera[(None,)], zoom[None]), torch.zeros(v, dtype=torch.long), mapping.poses,
+        mapping.registered, X, X, x, none, none, curves=curves,
+    )  # fmt: skip
+
+
+def _standing(settled: Settled, expected: Expected) -> Standing:
+    """How well the cameras are known, by the curves."""
+    mapping = settled.mapping
+    curves = mapping.curves
+    covariance = bundle_covariance(mapping.problem(), **terms(mapping), **expected.terms(lens=True))
+    variance = covariance.poses.diagonal(dim1=-2, dim2=-1)
+    seen = torch.bincount(curves.view, minlength=len(mapping.edges))
+    depth = (mapping.poses.transform(curves.X)[..., 2]).median(-1).values
+    there = mapping.registered
+    rotation = torch.where(there, variance[:, :3].sum(-1).sqrt().rad2deg(), torch.inf)
+    position = torch.where(there, variance[:, 3:].sum(-1).sqrt() / depth.abs(), torch.inf)
+    told = settled.apart[settled.apart.isfinite()]
+    contradicted = float(told.amax()) if len(told) else 0.0
+    focal = 0.0
+    if "focal" in expected.free:
+        focal = float(covariance.cameras[0, 0, 0].sqrt() / mapping.camera.K[0, 0])
+
+    def doubt(i: int) -> str:
+        if int(seen[i]) < _FEWEST:
+            return f"it shows {int(seen[i])} samples of curves only"
+        if not focal < GUESSED_FOCAL:
+            return f"curves tell the focal length to {100 * focal:.0f} % only"
+        if not settled.apart[i] < torch.inf:
+            return "curves followed through the frames around do not tell its camera by themselves"
+        if contradicted > _CONTRADICTED:
+            return f"cameras turn by {contradicted:.1f} degrees less or more than a few frames by themselves say"
+        if settled.moved > _RESTLESS:
+            return f"cameras still turn by {settled.moved:.1f} degrees as more of the edges are left out"
+        if not DEVIATIONS * rotation[i] < WRONG_ANGLE:
+            return f"its rotation is known to {rotation[i]:.1f} degrees only"
+        if not DEVIATIONS * torch.atan(position[i]).rad2deg() < WRONG_ANGLE:
+            return f"its place is known to {100 * position[i]:.1f} % of its distance from the curves only"
+        return ""
+
+    return Standing(rotation, position, tuple(doubt(i) if there[i] else "" for i in range(len(there))))
+
+
+def _reports(
+    names: Sequence[str], readable: Tensor, found: FoundEdges, settled: Settled | None, standing: Standing | None, reason: str
+) -> tuple[ImageReport, ...]:
+    """What became of each file."""
+    place = {file: i for i, file in enumerate(readable.tolist())}
+    reports = []
+    for k, name in enumerate(names):
+        i, features = place.get(k), len(found.edges[k])
+        if i is None:
+            reports.append(ImageReport(name, None, "cannot be read as an image"))
+        elif settled is None or standing is None:
+            reports.append(ImageReport(name, None, reason, features))
+        elif not settled.mapping.registered[i]:
+            reports.append(ImageReport(name, None, "its edges do not fit the curves of the frames around", features))
+        else:
+            sigma = {"rotation_sigma": float(standing.rotation_sigma[i]), "position_sigma": float(standing.position_sigma[i])}
+            reports.append(ImageReport(name, 0, "", features, doubt=standing.doubt[i], **sigma))
+    return tuple(reports)

@@ -1,0 +1,326 @@
+"""Cameras of a few neighbouring frames from curves that were followed through them, when nothing is known of any camera.
+
+A sample of a curve of the first frame is somewhere on its ray: one number, its inverse depth, against a distance from the image
+curve in each further frame. So few unknowns are found by descents from many guesses of the motion at once, all samples at one
+depth: ways around what is seen in several directions and of several speeds, and sideways.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm.geometry.curve_places import CurvePlaces, curve_places
+from torchsfm.geometry.curves import Curve
+from torchsfm.geometry.poses import Pose
+from torchsfm.geometry.rotations import rotation_angle, rotation_from_rotvec
+from torchsfm.linalg import damped_solve
+from torchsfm.optim import GemanMcClure
+from torchsfm.optim.descent import Options, Problem, Step, descend
+from torchsfm.optim.pytree import Places, pick
+
+_DIRECTIONS = 8
+"""Axes of rotation that are tried, parallel to the first image."""
+_TURNS = (1.5, 5.0)
+"""Degrees from a frame to the next that are tried."""
+_STEPS = 8
+"""Of each descent, after which it is seen anew which samples a frame shows."""
+_FLAT = 0.05
+"""Weight of inverse depths' departure from their mean, so that those that nothing tells stay there."""
+_SCALES = (8.0, 4.0, 2.0, 1.0)
+"""Where the loss lets go, in pixels, in one descent after the other, from all guesses."""
+_BEST = 5
+"""Guesses that are followed to the end,"""
+_LAST = 3
+"""in so many descents, where the loss lets go at"""
+_TRUSTED = 4.5
+"""medians of the distances, and no less than"""
+_FINEST = 0.05
+"""pixels."""
+_SAMPLES = 16
+"""Of each curve."""
+_FEWEST = 60
+"""Samples in each frame, on average, that must agree, and"""
+_AGREE = 0.7
+"""what share of all."""
+_PARALLAX = 2.0
+"""Pixels, at least, by which near samples move more than far ones."""
+_RIVAL = 1.5
+"""A motion is not told from another whose cost is no more than so many times as large,"""
+_APART = 4.0
+"""when these differ by so many degrees."""
+
+
+class Motion(NamedTuple):
+    """Cameras, depths, and where on the image curves samples are seen, for each guess."""
+
+    R: Float[Tensor, "h v 3 3"]
+    t: Float[Tensor, "h v 3"]
+    """Of the frames but the first one, from the first one's camera."""
+    rho: Float[Tensor, "h n"]
+    """Inverse depths of samples in the first frame, about 1."""
+    zoom: Float[Tensor, "h"]
+    """Logarithm of the focal length over the expected one."""
+    place: Float[Tensor, "h v n"]
+
+
+class Seen(NamedTuple):
+    """Samples in the frames."""
+
+    r: Float[Tensor, "h v n"]
+    """Distances from the image curves."""
+    slope: Float[Tensor, "h v n 3"]
+    """The derivative of `r` by the point in the camera's frame."""
+    turned: Float[Tensor, "h v n 3"]
+    """The ray in the camera's frame."""
+    by_zoom: Float[Tensor, "h v n"]
+    place: Float[Tensor, "h v n"]
+
+
+@dataclass(frozen=True)
+class MotionSystem:
+    """Robust squared distances linearised."""
+
+    x: Motion
+    cost: Tensor
+    J: Float[Tensor, "h v n 6"]
+    by_zoom: Float[Tensor, "h v n"]
+    by_depth: Float[Tensor, "h v n"]
+    r: Float[Tensor, "h v n"]
+    w: Float[Tensor, "h v n"]
+    total: Tensor
+    sigma: float
+
+    def gradient(self) -> tuple[Tensor, Tensor]:
+        """Of half the cost's sum by cameras (with the focal length last) and by depths."""
+        wr = self.w * self.r
+        cameras = (wr[..., None] * self.J).sum(2).flatten(1)
+        zoom = (wr * self.by_zoom).sum((1, 2)) + self.x.zoom / self.sigma**2
+        return torch.cat((cameras, zoom[:, None]), 1), (wr * self.by_depth).sum(1) + _FLAT * (self.x.rho - 1)
+
+    def steepest(self) -> Tensor:
+        """The largest derivative."""
+        return torch.cat(self.gradient(), 1).abs().amax(-1)
+
+    def along(self, delta: tuple[Tensor, Tensor]) -> Tensor:
+        """The derivative of the cost along a step."""
+        return sum((2 * (g * d).sum(-1) for g, d in zip(self.gradient(), delta, strict=True)), torch.zeros(())) / self.total
+
+    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
+        """The step of cameras and depths; depths are eliminated."""
+        h, v, n = self.r.shape
+        wJ = self.w[..., None] * self.J
+        A = wJ.new_zeros(h, 6 * v + 1, 6 * v + 1)
+        own = wJ.mT @ self.J
+        for i in range(v):
+            A[:, 6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = own[:, i]
+        A[:, :-1, -1] = A[:, -1, :-1] = (wJ * self.by_zoom[..., None]).sum(2).flatten(1)
+        A[:, -1, -1] = (self.w * self.by_zoom.square()).sum((1, 2)) + 1 / self.sigma**2
+        E = torch.cat(((wJ * self.by_depth[..., None]).transpose(1, 2).flatten(2), A.new_zeros(h, n, 1)), -1)
+        E[..., -1] = (self.w * self.by_depth * self.by_zoom).sum(1)
+        C = (self.w * self.by_depth.square()).sum(1) + _FLAT
+        a, b = self.gradient()
+        more = (1 + damping)[:, None]
+        A.diagonal(dim1=1, dim2=2).mul_(more)
+        C = C * more
+        S = A - E.mT @ (E / C[..., None])
+        move = damped_solve(S, -(a - (E * (b / C)[..., None]).sum(1))[..., None])[..., 0]
+        depth = -(b + (E @ move[..., None])[..., 0]) / C
+        promise = -(a * move).sum(-1) - (b * depth).sum(-1)
+        solved = torch.isfinite(move).all(-1) & torch.isfinite(depth).all(-1) & (move != 0).any(-1)
+        promise = torch.where(solved, promise / self.total, torch.inf)
+        return Step((move, depth), promise, solved, torch.zeros_like(solved))
+
+
+@dataclass(frozen=True)
+class MotionDistances(Problem[MotionSystem]):
+    """The robust mean of squared normal distances over cameras, depths and the focal length."""
+
+    images: CurvePlaces
+    """Of the frames but the first, (v, c)."""
+    x: Float[Tensor, "n 2"]
+    """Samples in the first frame, from the principal point."""
+    centre: Float[Tensor, "2"]
+    focal: Float[Tensor, "h"]
+    weight: Float[Tensor, "h v n"]
+    sigma: float
+    scale: float
+
+    def pick(self, at: Places) -> "MotionDistances":
+        """Some of the guesses."""
+        return replace(self, focal=pick(at, self.focal), weight=pick(at, self.weight))
+
+    def linearize(self, x: Motion) -> MotionSystem:
+        """The system of cameras and depths."""
+        seen = self.sights(x)
+        s = seen.r.square()
+        loss = GemanMcClure(self.scale)
+        total = self.weight.sum((1, 2)).clamp_min(1)
+        prior = _FLAT * (x.rho - 1).square().sum(-1) + x.zoom.square() / self.sigma**2
+        cost = ((self.weight * loss(s)).sum((1, 2)) + prior) / total
+        cost = torch.where(cost.isfinite(), cost, torch.inf)
+        J = torch.cat((torch.linalg.cross(seen.turned, seen.slope), x.rho[:, None, :, None] * seen.slope), -1)
+        by_depth = (seen.slope * x.t[:, :, None]).sum(-1)
+        w = self.weight * loss.slope(s)
+        return MotionSystem(x._replace(place=seen.place), cost, J, seen.by_zoom, by_depth, seen.r, w, total, self.sigma)
+
+    def advance(self, here: MotionSystem, step: Step) -> MotionSystem:
+        """The system where a step leads."""
+        move, depth = step.delta
+        moves = move[:, :-1].unflatten(1, (-1, 6))
+        R = rotation_from_rotvec(moves[..., :3]) @ here.x.R
+        x = Motion(R, here.x.t + moves[..., 3:], here.x.rho + depth, here.x.zoom + move[:, -1], here.x.place)
+        return self.linearize(x)
+
+    def rounding(self, here: MotionSystem) -> Tensor:
+        """Nothing finer than a hundredth of a pixel matters here."""
+        return torch.full_like(here.cost, 1e-6)
+
+    def sights(self, x: Motion) -> Seen:
+        """Where samples are seen, and how far from the image curves."""
+        f = self.focal * x.zoom.exp()
+        d = self.x / f[:, None, None]
+        ray = torch.cat((d, torch.ones_like(d[..., :1])), -1)
+        turned = ray[:, None] @ x.R.mT
+        y = turned + x.rho[:, None, :, None] * x.t[:, :, None]
+        z = torch.where(y[..., 2] > 0.05, y[..., 2], torch.nan)
+        u = y[..., :2] / z[..., None]
+        points = u * f[:, None, None, None] + self.centre
+        place, foot, first = self._feet(x.place, points)
+        tangent = torch.nn.functional.normalize(first, dim=-1)
+        normal = torch.stack((-tangent[..., 1], tangent[..., 0]), -1)
+        r = ((points - foot) * normal).sum(-1)
+        g = normal * (f[:, None, None] / z)[..., None]
+        slope = torch.cat((g, -(g * u).sum(-1, keepdim=True)), -1)
+        flat = torch.cat((-d, torch.zeros_like(d[..., :1])), -1)[:, None] @ x.R.mT
+        by_zoom = (slope * flat).sum(-1) + (normal * (points - self.centre)).sum(-1)
+        shown = self.weight > 0
+        r, by_zoom = (torch.where(shown, number, 0) for number in (r, by_zoom))
+        slope, turned = (torch.where(shown[..., None], vector, 0) for vector in (slope, turned))
+        return Seen(r, slope, turned, by_zoom, torch.where(shown, place, x.place))
+
+    def _feet(self, place: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The image curves' points nearest to given ones; all guesses look at the same curves."""
+        where = self.images.nearest(self._by_curves(place), self._by_curves(points))
+        foot, first, _ = self.images.at(where)
+        return self._by_guesses(where), self._by_guesses(foot), self._by_guesses(first)
+
+    def _by_curves(self, t: Tensor) -> Tensor:
+        """(h, v, n, ...) as (v, c, ..., ...), the guesses' samples of each curve one after the other."""
+        h, v, n = t.shape[:3]
+        c = self.images.number.shape[1]
+        return t.reshape(h, v, c, n // c, *t.shape[3:]).movedim(0, 2).flatten(2, 3)
+
+    def _by_guesses(self, t: Tensor) -> Tensor:
+        """Back."""
+        v, c, m = t.shape[:3]
+        h = len(self.focal)
+        return t.reshape(v, c, h, m // h, *t.shape[3:]).movedim(2, 0).flatten(2, 3)
+
+    def beyond(self, place: Float[Tensor, "h v n"]) -> Bool[Tensor, "h v n"]:
+        """Samples beyond the ends of what a frame shows of their curves."""
+        return self._by_guesses(self.images.beyond(self._by_curves(place)) > 0)
+
+
+@dataclass(frozen=True)
+class FirstCameras:
+    """What was found."""
+
+    poses: Pose
+    """Of all frames; the world is the reference frame's camera, and samples are about 1 away."""
+    focal: Float[Tensor, ""]
+    refusal: str
+    """Why these are not to be used; empty where they are."""
+
+
+def first_cameras(
+    curves: Curve, reference: int, focal: Float[Tensor, ""], centre: Float[Tensor, "2"], sigma: float
+) -> FirstCameras:
+    """Cameras from curves that were followed through a few frames.
+
+    Args:
+        curves: Of each frame, all running alike: fields of shape (v, c, n, 2), (v, c, n), (v, c), float64.
+        reference: Which frame's samples are placed in space; best one in the middle.
+        focal: The focal length to expect, in pixels,
+        centre: and the principal point.
+        sigma: Standard deviation of the logarithm of the focal length.
+    """
+    v = len(curves.x)
+    curves = Curve(*(t[:, curve_places(curves).number[reference] >= 3] for t in (curves.x, curves.valid, curves.closed)))
+    others = torch.tensor([k for k in range(v) if k != reference])
+    places = curve_places(curves)
+    c = places.number.shape[1]
+    if c < 2:
+        return _refused(v, focal, f"{c} curves could be followed")
+    spread = places.spread(_SAMPLES)
+    samples = places.at(spread)[0].flatten(1, 2) - centre
+    images = curve_places(Curve(curves.x[others], curves.valid[others], curves.closed[others]))
+    shown = (places.number[others] >= 3).repeat_interleave(_SAMPLES, 1).to(samples)
+    turns = _turns(samples)
+    h = len(turns)
+    R = rotation_from_rotvec(turns[:, None] * (others - reference)[:, None])
+    f = focal.expand(h)
+    t = _translations(R, samples[reference], samples[others], shown, f)
+    motion = Motion(R, t, t.new_ones(h, c * _SAMPLES), torch.zeros_like(f), spread[others].flatten(1, 2).expand(h, -1, -1))
+    problem = MotionDistances(images, samples[reference], centre, f, shown.expand(h, -1, -1), sigma, 1.0)
+
+    def descent(scale: float, steps: int) -> tuple[Motion, Tensor]:
+        inside = problem.weight * ~problem.beyond(motion.place)
+        found = descend(replace(problem, weight=inside, scale=scale), motion, Options(steps, 1e-4))
+        return found.x, found.cost
+
+    for scale in _SCALES:
+        motion, cost = descent(scale, _STEPS)
+    best = (cost.argsort()[:_BEST],)
+    motion, problem = pick(best, motion), problem.pick(best)
+    for _ in range(_LAST):
+        r = problem.sights(motion).r[0][problem.weight[0] > 0].abs()
+        scale = max(_FINEST, _TRUSTED * float(r.median()))
+        motion, cost = descent(scale, 2 * _STEPS)
+    k = int(cost.argmin())
+    counts = (problem.weight[k] > 0) & ~problem.beyond(motion.place)[k]
+    good = (problem.sights(motion).r[k].abs() < scale) & counts
+    apart = rotation_angle(motion.R @ motion.R[k].mT).rad2deg().amax(-1)
+    depths = motion.rho[k].quantile(motion.rho.new_tensor([0.1, 0.9]))
+    refusal = ""
+    if int(good.sum()) < _FEWEST * (v - 1):
+        refusal = f"{int(good.sum())} samples of curves followed through {v} frames agree with one motion, too few"
+    elif int(good.sum()) < _AGREE * int(counts.sum()):
+        refusal = f"only {int(good.sum())} of {int(counts.sum())} samples of curves agree with one motion"
+    elif float((depths[1] - depths[0]) * motion.t[k].norm(dim=-1).amax() * focal) < _PARALLAX:
+        refusal = "the camera hardly moved, or only turned, which gives no depth"
+    elif bool(((cost < _RIVAL * cost[k]) & (apart > _APART)).any()):
+        refusal = "several motions explain the curves as well"
+    elif not bool(torch.isfinite(cost[k]) & (motion.rho[k].median() > 0)):
+        refusal = "no motion explains the curves"
+    own = torch.eye(3, dtype=t.dtype, device=t.device).repeat(v, 1, 1)
+    own[others] = motion.R[k]
+    return FirstCameras(Pose(own, t.new_zeros(v, 3).index_copy(0, others, motion.t[k])), focal * motion.zoom[k].exp(), refusal)
+
+
+def _refused(v: int, focal: Tensor, why: str) -> FirstCameras:
+    return FirstCameras(Pose.identity(v, dtype=focal.dtype, device=focal.device), focal, why)
+
+
+def _turns(like: Tensor) -> Float[Tensor, "h 3"]:
+    """Rotations from a frame to the next that are tried."""
+    angle = torch.arange(_DIRECTIONS, dtype=like.dtype, device=like.device) * (2 * math.pi / _DIRECTIONS)
+    axis = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)
+    return torch.cat((torch.zeros_like(axis[:1]), *(math.radians(size) * axis for size in _TURNS)))
+
+
+def _translations(R: Tensor, x: Tensor, other: Tensor, shown: Tensor, f: Tensor) -> Tensor:
+    """Where the frames' cameras are so that samples at one depth are seen where curves' samples are, (h, v, 3)."""
+    d = torch.cat((x / f[:, None, None], torch.ones(len(f), len(x), 1, dtype=x.dtype)), -1)
+    turned = d[:, None] @ R.mT
+    u = other / f[:, None, None, None]
+    # u z = x along both axes: t_x - u t_z = u z0 - x0.
+    eye = torch.eye(2, dtype=x.dtype).expand(*u.shape, 2)
+    rows = torch.cat((eye, -u[..., None]), -1).flatten(2, 3)
+    right = (u * turned[..., 2:] - turned[..., :2]).flatten(2)
+    w = shown.repeat_interleave(2, -1)
+    A = rows.mT @ (w[..., None] * rows)
+    return damped_solve(A, rows.mT @ (w * right)[..., None])[..., 0]
