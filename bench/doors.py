@@ -4,17 +4,21 @@
 
 reconstructs castle-P19 whole, in two halves that share three images, and without one image, and prints how good the merged
 halves are beside the whole, where the image left out is placed beside where the whole model has it, and for fountain-P11 what
-points the true poses give beside free ones. With `--out`, what was finished there is not computed again.
+points the true poses give beside free ones; then temple_ring as a film, and fountain-P11 by COLMAP's features and matches in
+its database, where pycolmap is installed. With `--out`, what was finished there is not computed again.
 """
 
 import argparse
+import subprocess
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import torch
 
-from bench.real_data import PhotographSet, data_folder, strecha
+from bench.real_data import PhotographSet, data_folder, strecha, temple
 from torchsfm.geometry import Camera, Pose, rotation_angle
 from torchsfm.reconstruction import (
     Reconstruction,
@@ -27,6 +31,9 @@ from torchsfm.reconstruction import (
 )
 from torchsfm.reconstruction.evaluation import align_poses, pose_auc, pose_errors, position_rmse
 
+HEAD = """
+| model | images | points | error, px | AUC at 1 / 2 / 5 deg | position, RMS mm | rotation, mean deg |
+|---|---|---|---|---|---|---|"""
 SHARED = 3
 LEFT_OUT = 9
 
@@ -67,8 +74,7 @@ def merging(castle: PhotographSet, out: Path) -> None:
     whole = model_of(castle.paths, out / "whole")
     first, second = model_of(castle.paths[:middle], out / "first"), model_of(castle.paths[middle - SHARED :], out / "second")
     merged = merge_models(first, second)
-    print("\n| model | images | points | error, px | AUC at 1 / 2 / 5 deg | position, RMS mm | rotation, mean deg |")
-    print("|---|---|---|---|---|---|---|")
+    print(HEAD)
     for name, model in (("whole", whole), ("first", first), ("second", second), ("merged", merged.model)):
         print(describe(name, model, true_poses(castle, model.names)))
     print(merged.fault() or merged.summary())
@@ -115,6 +121,42 @@ def pointing(fountain: PhotographSet, out: Path) -> None:
               f"{float(model.residuals().mean()):.3f} px mean, {float(model.residuals().median()):.3f} px median")  # fmt: skip
 
 
+def filming(ring: PhotographSet, out: Path) -> None:
+    """The views around an object as frames of a film, compressed as one, and the model that the film gives."""
+    if not (out / "model.npz").exists():
+        out.mkdir(parents=True, exist_ok=True)
+        height, width = cv2.imread(str(ring.paths[0])).shape[:2]
+        writer = cv2.VideoWriter(str(out / "film.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (width, height))
+        for path in ring.paths:
+            writer.write(cv2.imread(str(path)))
+        writer.release()
+        command(out / "film.avi", "--fps", "10", "--out", out)
+    model = Reconstruction.load(out / "model.npz")
+    names = tuple(ring.paths[number].name for number in range(len(model.names)))
+    print(describe("temple_ring, a film", model, true_poses(ring, names)))
+
+
+def by_colmap(fountain: PhotographSet, out: Path) -> None:
+    """The model that COLMAP's own features and matches give, read from its database."""
+    try:
+        import pycolmap
+    except ImportError:
+        print("pycolmap is not installed")
+        return
+    if not (out / "model.npz").exists():
+        out.mkdir(parents=True, exist_ok=True)
+        pycolmap.extract_features(out / "database.db", fountain.paths[0].parent, camera_mode=pycolmap.CameraMode.SINGLE)
+        pycolmap.match_exhaustive(out / "database.db")
+        command(out / "database.db", "--out", out)
+    model = Reconstruction.load(out / "model.npz")
+    print(describe("fountain-P11, COLMAP's database", model, true_poses(fountain, model.names)))
+
+
+def command(*words: object) -> None:
+    """Run `torchsfm reconstruct`."""
+    subprocess.run([sys.executable, "-m", "torchsfm", "reconstruct", *map(str, words)], check=True, stdout=subprocess.DEVNULL)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser()
@@ -129,6 +171,9 @@ def main() -> None:
         merging(castle, out / "castle")
         placing(castle, out / "castle")
         pointing(fountain, out / "fountain")
+        print(HEAD)
+        filming(temple(data), out / "film")
+        by_colmap(fountain, out / "database")
 
 
 if __name__ == "__main__":

@@ -25,6 +25,8 @@ def test_the_list_says_what_each_command_says_of_itself(name: str) -> None:
     command = load(name)
     assert command.name == name
     assert command.help.splitlines()[0] == COMMANDS[name][1]
+    options = {word for parameter in command.params for word in parameter.opts}
+    assert {"--quiet", "-q", "--json"} <= options, "each speaks to programs and to nobody"
 
 
 @pytest.mark.parametrize("program", [PROGRAM, ("-m", "torchsfm")], ids=["script", "module"])
