@@ -205,8 +205,8 @@ def make_view_graph(
         family: One of `FAMILIES`.
         views: Number of cameras.
         outliers: The part of edges whose rotation is random.
-        symmetric: The part of edges between views from directions more than 60 degrees apart, and as many of others again,
-            that see a scene of fourfold symmetry and are taken for neighbours.
+        symmetric: The part of edges from the first half of the cameras to the second that say the same wrong thing: that the
+            second half is turned by a quarter, as a scene of fourfold symmetry lets it look.
         seed: Of everything.
         nearest: Partners of each camera that are nearest to it.
     """
@@ -233,7 +233,6 @@ def make_view_graph(
     if symmetric:
         alike = torch.rand(len(edges), generator=g) < symmetric
         quarter = rotation_from_rotvec(torch.tensor([0.0, 0.0, math.pi / 2], dtype=torch.float64))
-        # A camera of the second half of the ring is seen where the symmetry puts it, by those of the first.
         across = (i < views // 2) & (j >= views // 2) & alike & ~wrong
         measured = torch.where(across[:, None, None], rotation_from_rotvec(noise) @ R[j] @ quarter @ R[i].mT, measured)
         wrong = wrong | across
