@@ -6,23 +6,27 @@ import math
 import pytest
 import torch
 from chance import assert_unit_variance
+from structure_scenes import (
+    adjusted,
+    first_two,
+    moved,
+    views_on_an_arc,
+    whitened,
+    with_a_rig_of_one,
+    with_points,
+    with_the_first_camera_where_it_was,
+    without_points,
+)
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import BundleConics, BundleResult, Rig, bundle_adjust, bundle_covariance
+from torchsfm.bundle import BundleConics, bundle_adjust, bundle_covariance
 from torchsfm.bundle.blocks import Bundle
 from torchsfm.geometry import (
     BundleProblem,
-    Camera,
-    Distortion,
     Ellipse,
     Ellipsoid,
-    KannalaBrandt,
-    NoDistortion,
-    Pose,
-    Radial,
     conic_from_ellipse,
-    intrinsics,
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
@@ -32,11 +36,7 @@ from torchsfm.optim.terms import term_residual
 from torchsfm.triangulation import triangulate_conics
 
 F64 = torch.float64
-LENSES = {
-    "none": NoDistortion,
-    "radial": lambda: Radial(*torch.tensor([-0.25, 0.08], dtype=F64)),
-    "fisheye": lambda: KannalaBrandt(*torch.tensor([-0.05, 0.01, 0.0, 0.0], dtype=F64)),
-}
+LENSES = ("none", "radial", "fisheye")
 EDGE = 40
 """Edge points of an image."""
 
@@ -63,14 +63,7 @@ def make_scene(
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=F64)
 
-    angle = torch.linspace(-0.5, 0.5, views, dtype=F64)
-    turn = torch.stack((0.15 * torch.cos(4 * angle), angle, 0.1 * torch.sin(5 * angle)), -1)
-    poses = Pose(rotation_from_rotvec(turn), torch.tensor([[0.1, -0.1, 4.0]], dtype=F64).repeat(views, 1))
-    poses = poses.retract(0.05 * torch.randn(views, 6, generator=generator, dtype=F64))
-    distortion: Distortion = LENSES[lens]()
-    K = intrinsics(torch.tensor(700.0, dtype=F64), torch.tensor([320.0, 240.0], dtype=F64), 1.02)
-    one = Camera(K, distortion)
-    cameras = Camera(K[None], type(distortion).from_parameters(distortion.parameters()[None]))
+    poses, camera = views_on_an_arc(generator, lens, views, 0.05)
     tilt = torch.cat((rand(conics, 2) - 0.5, 6 * rand(conics, 1)), -1)
     lengths = torch.stack((0.2 + 0.3 * rand(conics), torch.zeros(conics, dtype=F64)), -1)
     lengths[:, 1] = lengths[:, 0] * (1.0 if circle else 0.4 + 0.5 * rand(conics))
@@ -79,16 +72,9 @@ def make_scene(
     view, conic = torch.cartesian_prod(torch.arange(views), torch.arange(conics)).unbind(1)
     t = torch.arange(EDGE, dtype=F64) * (2 * math.pi / EDGE)
     on = model.centre[:, None] + torch.stack((t.cos(), t.sin(), 0 * t), -1) @ model.axes
-    edges = one.project(poses[view].transform(on[conic]))
-    X = 2 * rand(points, 3) - 1
-    seen, point = torch.cartesian_prod(torch.arange(views), torch.arange(points)).unbind(1)
-    x = one.project(poses[seen].transform(X[point, None]))[:, 0]
-    problem = BundleProblem(poses, cameras, torch.zeros(views, dtype=torch.long), X, x, seen, point)
+    edges = camera.project(poses[view].transform(on[conic]))
+    problem = with_points(poses, camera, 2 * rand(points, 3) - 1)
     return Scene(problem, model, edges, view, conic)
-
-
-def without_points(problem: BundleProblem) -> BundleProblem:
-    return dataclasses.replace(problem, X=problem.X[:0], x=problem.x[:0], view=problem.view[:0], point=problem.point[:0])
 
 
 def disturbed(
@@ -99,22 +85,10 @@ def disturbed(
     def randn(*shape: int) -> Tensor:
         return size * torch.randn(*shape, generator=generator, dtype=F64)
 
-    step = randn(len(problem.poses.t), 6)
-    step[:2] = 0
-    problem = dataclasses.replace(problem, poses=problem.poses.retract(step), X=problem.X + randn(*problem.X.shape))
+    problem = moved(problem, generator, size)
     model = conics.model
     axes = (1 + randn(len(model.centre), 1, 1)) * model.axes @ rotation_from_rotvec(3 * randn(len(model.centre), 3))
     return problem, dataclasses.replace(conics, model=Ellipsoid(model.centre + randn(*model.centre.shape), axes))
-
-
-def first_two(problem: BundleProblem) -> Tensor:
-    return torch.arange(len(problem.poses.t)) < 2
-
-
-def adjusted_conics(result: BundleResult) -> BundleConics:
-    (conics,) = result.structure
-    assert isinstance(conics, BundleConics)
-    return conics
 
 
 def dual(model: Ellipsoid) -> Tensor:
@@ -130,7 +104,7 @@ def test_exact_data_are_recovered(generator: torch.Generator, lens: str, circle:
     assert result.status == Status.OK
     # The image of an ellipse through a lens is none, but what an ellipse fitted to it has of that is in both to first order.
     limit = 1e-7 if lens == "none" else 1e-4
-    assert (dual(adjusted_conics(result).model) - dual(scene.model)).abs().max() < limit
+    assert (dual(adjusted(result, BundleConics).model) - dual(scene.model)).abs().max() < limit
     assert result.structure_residuals[0].shape == (len(scene.view), 5)
 
 
@@ -141,7 +115,7 @@ def test_ellipses_alone_determine_poses(generator: torch.Generator) -> None:
         without_points(problem), free=(), fixed_poses=first_two(problem), structure=[conics], tolerance=1e-14
     )
     assert (result.poses.t - scene.problem.poses.t).abs().max() < 1e-6
-    assert (dual(adjusted_conics(result).model) - dual(scene.model)).abs().max() < 1e-6
+    assert (dual(adjusted(result, BundleConics).model) - dual(scene.model)).abs().max() < 1e-6
 
 
 def test_cameras_held_it_is_triangulation(generator: torch.Generator) -> None:
@@ -160,7 +134,7 @@ def test_cameras_held_it_is_triangulation(generator: torch.Generator) -> None:
         conic_from_ellipse(ellipse).reshape(*shape, 3, 3), P, covariance=covariance.reshape(*shape, 5, 5)
     )
     sigma = C.diagonal(dim1=-2, dim2=-1)[:, :3].sqrt()
-    assert ((adjusted_conics(found).model.centre - apart.model.centre).abs() < 0.05 * sigma).all()
+    assert ((adjusted(found, BundleConics).model.centre - apart.model.centre).abs() < 0.05 * sigma).all()
     torch.testing.assert_close(C[:, :3, :3], apart.covariance[:, :3, :3], rtol=0.05, atol=0.02 * float(C[:, :3, :3].max()))
 
 
@@ -183,27 +157,20 @@ def test_errors_are_those_of_the_covariance(generator: torch.Generator, lens: st
         result = bundle_adjust(noisy, structure=[seen], tolerance=1e-9, fixed_poses=held, weights=weights)
         turn = result.poses @ scene.problem.poses.inverse()
         poses.append(whitened(torch.cat((rotvec_from_rotation(turn.R), turn.t), -1)[~held], C.poses[~held]))
-        centres.append(whitened(adjusted_conics(result).model.centre - scene.model.centre, C.structure[0][:, :3, :3]))
+        centres.append(whitened(adjusted(result, BundleConics).model.centre - scene.model.centre, C.structure[0][:, :3, :3]))
     # Errors within a trial depend on each other, those of one pose or ellipse in several do not.
     for scores in (poses, centres):
         assert_unit_variance(torch.stack(scores).movedim(1, -1).flatten(0, 1), dim=0)
-
-
-def whitened(step: Tensor, C: Tensor) -> Tensor:
-    return torch.linalg.solve_triangular(torch.linalg.cholesky(C), step[..., None], upper=False)[..., 0]
 
 
 def test_a_rig_of_one_changes_nothing(generator: torch.Generator) -> None:
     scene = make_scene(generator)
     noisy = scene.edges + 0.3 * torch.randn(scene.edges.shape, generator=generator, dtype=F64)
     problem, conics = disturbed(scene.problem, scene.measured(noisy, 0.3), generator)
-    views = len(problem.poses.t)
-    rig = Rig(Pose.identity(1, dtype=F64), torch.zeros(views, dtype=torch.long), torch.arange(views))
-    options = {"fixed_poses": first_two(problem), "structure": [conics], "tolerance": 1e-13}
-    plain = bundle_adjust(problem, **options)
-    rigged = bundle_adjust(problem, rig=rig, fixed_sensors=torch.tensor([True]), **options)
-    assert rigged.cost == pytest.approx(plain.cost, rel=1e-9)
-    torch.testing.assert_close(dual(adjusted_conics(rigged).model), dual(adjusted_conics(plain).model), rtol=0, atol=1e-6)
+    plain, rigged = with_a_rig_of_one(problem, conics)
+    torch.testing.assert_close(
+        dual(adjusted(rigged, BundleConics).model), dual(adjusted(plain, BundleConics).model), rtol=0, atol=1e-6
+    )
 
 
 def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> None:
@@ -223,7 +190,7 @@ def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> N
     )  # fmt: skip
     result = bundle_adjust(problem, structure=[changed])
     assert result.status == Status.OK
-    after = adjusted_conics(result).model
+    after = adjusted(result, BundleConics).model
     same = ((after.centre == changed.model.centre).all(1)) & (after.axes == changed.model.axes).flatten(1).all(1)
     assert same.nonzero()[:, 0].tolist() == [3, 5, 7, 8]
     assert after.centre.isfinite().all()
@@ -257,7 +224,7 @@ def test_a_loss_resists_wrong_ellipses(generator: torch.Generator) -> None:
         # Twenty steps show where it goes; against wrong ellipses the last digits take long.
         robust = dataclasses.replace(conics, loss=loss)
         result = bundle_adjust(problem, fixed_poses=held, structure=[robust], max_iterations=20)
-        gaps.append((adjusted_conics(result).model.centre - scene.model.centre).norm(dim=-1).median())
+        gaps.append((adjusted(result, BundleConics).model.centre - scene.model.centre).norm(dim=-1).median())
     assert gaps[1] < 0.5 * gaps[0]
 
 
@@ -265,16 +232,7 @@ def test_the_world_comes_back_with_its_ellipses(generator: torch.Generator) -> N
     scene = make_scene(generator)
     noisy = scene.edges + 0.3 * torch.randn(scene.edges.shape, generator=generator, dtype=F64)
     problem, conics = disturbed(scene.problem, scene.measured(noisy, 0.3), generator)
-    free = bundle_adjust(problem, structure=[conics], tolerance=1e-12)
-    first = bundle_adjust(problem, structure=[conics], tolerance=1e-12, gauge="first")
-    assert torch.equal(first.poses.R[0], problem.poses.R[0])
-    assert not torch.allclose(first.poses.t[1:], free.poses.t[1:], rtol=0, atol=1e-6)
-    held = {"free": (), "fixed_poses": torch.ones(len(problem.poses.t), dtype=torch.bool)}
-    again = bundle_adjust(
-        dataclasses.replace(problem, poses=first.poses, cameras=first.cameras, X=first.X),
-        structure=[adjusted_conics(first)], max_iterations=0, **held,
-    )  # fmt: skip
-    assert again.initial_cost == pytest.approx(free.cost, rel=1e-9)
+    with_the_first_camera_where_it_was(problem, conics)
 
 
 def test_derivatives_by_measured_ellipses(generator: torch.Generator) -> None:
@@ -289,7 +247,7 @@ def test_derivatives_by_measured_ellipses(generator: torch.Generator) -> None:
         some = dataclasses.replace(conics, ellipse=ellipse)
         held = torch.ones(3, dtype=torch.bool)
         result = bundle_adjust(problem, free=(), fixed_poses=held, structure=[some], tolerance=1e-16, max_iterations=100)
-        return (dual(adjusted_conics(result).model) * probe).sum()
+        return (dual(adjusted(result, BundleConics).model) * probe).sum()
 
     at = torch.cat((conics.ellipse.centre, conics.ellipse.semi_axes, conics.ellipse.angle[:, None]), -1)
     place = at.clone().requires_grad_()

@@ -5,35 +5,34 @@ import dataclasses
 import pytest
 import torch
 from chance import assert_unit_variance
+from structure_scenes import (
+    LENSES,
+    adjusted,
+    assert_written_derivatives,
+    first_two,
+    moved,
+    views_on_an_arc,
+    whitened,
+    with_a_rig_of_one,
+    with_all_free,
+    with_points,
+    with_the_first_camera_where_it_was,
+    without_points,
+)
 from torch import Tensor
 
-from torchsfm.bundle import BundleCurves, BundleLines, BundleResult, Rig, bundle_adjust, bundle_covariance
+from torchsfm.bundle import BundleCurves, BundleLines, bundle_adjust, bundle_covariance
 from torchsfm.bundle.blocks import Bundle
 from torchsfm.geometry import (
-    BrownConrady,
     BundleProblem,
-    Camera,
-    Distortion,
-    KannalaBrandt,
-    NoDistortion,
-    Pose,
-    Radial,
-    intrinsics,
     pluecker_from_points,
     random_rotation,
-    rotation_from_rotvec,
     rotvec_from_rotation,
 )
 from torchsfm.optim import Huber
-from torchsfm.optim.terms import Workspace, lift_of, linearize, prepare, term_residual
+from torchsfm.optim.terms import prepare, term_residual
 
 F64 = torch.float64
-LENSES = {
-    "none": NoDistortion,
-    "radial": lambda: Radial(*torch.tensor([-0.25, 0.08], dtype=F64)),
-    "brown": lambda: BrownConrady(*torch.tensor([-0.2, 0.05, 0.01, 0.004, -0.003], dtype=F64)),
-    "fisheye": lambda: KannalaBrandt(*torch.tensor([-0.05, 0.01, 0.0, 0.0], dtype=F64)),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,14 +67,7 @@ def make_scene(
     bend: float = 1.0,
 ) -> Scene:
     """Views on an arc; of each sample an edge point some pixels along the image curve, noise across it."""
-    angle = torch.linspace(-0.5, 0.5, views, dtype=F64)
-    turn = torch.stack((0.15 * torch.cos(4 * angle), angle, 0.1 * torch.sin(5 * angle)), -1)
-    poses = Pose(rotation_from_rotvec(turn), torch.tensor([[0.1, -0.1, 4.0]], dtype=F64).repeat(views, 1))
-    poses = poses.retract(0.1 * torch.randn(views, 6, generator=generator, dtype=F64))
-    distortion: Distortion = LENSES[lens]()
-    K = intrinsics(torch.tensor(700.0, dtype=F64), torch.tensor([320.0, 240.0], dtype=F64), 1.02)
-    cameras = Camera(K[None], type(distortion).from_parameters(distortion.parameters()[None]))
-    index = torch.zeros(views, dtype=torch.long)
+    poses, camera = views_on_an_arc(generator, lens, views)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=F64)
@@ -84,13 +76,13 @@ def make_scene(
         return torch.randn(*shape, generator=generator, dtype=F64)
 
     X = 2 * rand(points, 3) - 1
-    view, point = torch.cartesian_prod(torch.arange(views), torch.arange(points)).unbind(1)
-    x = cameras[index[view]].project(poses[view].transform(X[point, None]))[:, 0]
-    problem = BundleProblem(poses, cameras, index, X, x + noise * randn(*x.shape), view, point)
+    problem = with_points(poses, camera, X)
+    problem = dataclasses.replace(problem, x=problem.x + noise * randn(*problem.x.shape))
     # Curves that run towards a camera have images with cusps: of many, those that do so the least.
     many = 8 * samples
     axes = random_rotation(many, generator=generator, dtype=F64) * torch.tensor([0.5 * bend, 0.5 * bend, 0.8])[:, None]
-    empty = BundleCurves(X[:0], X[:0], x[:0], x[:0], view[:0], view[:0])
+    x, view = problem.x[:0], problem.view[:0]
+    empty = BundleCurves(X[:0], X[:0], x, x, view, view)
     scene = Scene(problem, empty, 2 * rand(many, 3) - 1, axes, 0.5 * randn(many))
     seen, sample = torch.cartesian_prod(torch.arange(views), torch.arange(many)).unbind(1)
     h = 1e-4
@@ -111,30 +103,13 @@ def make_scene(
     return dataclasses.replace(scene, curves=curves)
 
 
-def without_points(problem: BundleProblem) -> BundleProblem:
-    return dataclasses.replace(problem, X=problem.X[:0], x=problem.x[:0], view=problem.view[:0], point=problem.point[:0])
-
-
 def disturbed(scene: Scene, generator: torch.Generator, size: float = 0.003) -> tuple[BundleProblem, BundleCurves]:
     """All but the first two poses moved, points, and samples across their curves."""
-    step = size * torch.randn(len(scene.problem.poses.t), 6, generator=generator, dtype=F64)
-    step[:2] = 0
-    X = scene.problem.X + size * torch.randn(scene.problem.X.shape, generator=generator, dtype=F64)
+    problem = moved(scene.problem, generator, size)
     along = scene.curves.tangent / scene.curves.tangent.norm(dim=-1, keepdim=True)
     move = size * torch.randn(along.shape, generator=generator, dtype=F64)
     samples = scene.curves.X + move - (move * along).sum(-1, keepdim=True) * along
-    problem = dataclasses.replace(scene.problem, poses=scene.problem.poses.retract(step), X=X)
     return problem, dataclasses.replace(scene.curves, X=samples)
-
-
-def first_two(problem: BundleProblem) -> Tensor:
-    return torch.arange(len(problem.poses.t)) < 2
-
-
-def adjusted(result: BundleResult) -> BundleCurves:
-    (curves,) = result.structure
-    assert isinstance(curves, BundleCurves)
-    return curves
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -164,7 +139,7 @@ def test_exact_data_are_recovered(generator: torch.Generator, lens: str) -> None
     problem, curves = disturbed(scene, generator)
     result = bundle_adjust(problem, fixed_poses=first_two(problem), structure=[curves], tolerance=1e-14)
     assert result.cost < 1e-6
-    assert (adjusted(result).X - scene.curves.X).abs().max() < 1e-4
+    assert (adjusted(result, BundleCurves).X - scene.curves.X).abs().max() < 1e-4
     assert (result.poses.t - scene.problem.poses.t).abs().max() < 1e-6
     assert result.structure_residuals[0].shape == (len(curves.x), 1)
     assert result.structure_residuals[0].abs().max() < 1e-3
@@ -235,9 +210,8 @@ def test_errors_are_those_of_the_covariance(generator: torch.Generator, lens: st
         result = bundle_adjust(noisy, structure=[seen], tolerance=1e-9, fixed_poses=held)
         turn = result.poses @ scene.problem.poses.inverse()
         step = torch.cat((rotvec_from_rotation(turn.R), turn.t), -1)[~held]
-        factor = torch.linalg.cholesky(C.poses[~held])
-        poses.append(torch.linalg.solve_triangular(factor, step[..., None], upper=False)[..., 0])
-        samples.append((to_unit @ (adjusted(result).X - scene.curves.X)[..., None])[..., 0])
+        poses.append(whitened(step, C.poses[~held]))
+        samples.append((to_unit @ (adjusted(result, BundleCurves).X - scene.curves.X)[..., None])[..., 0])
     # Errors within a trial depend on each other, those of one pose or sample in several do not.
     for scores in (poses, samples):
         assert_unit_variance(torch.stack(scores).movedim(1, -1).flatten(0, 1), dim=0)
@@ -246,13 +220,8 @@ def test_errors_are_those_of_the_covariance(generator: torch.Generator, lens: st
 def test_a_rig_of_one_changes_nothing(generator: torch.Generator) -> None:
     scene = make_scene(generator, noise=0.5)
     problem, curves = disturbed(scene, generator)
-    views = len(problem.poses.t)
-    rig = Rig(Pose.identity(1, dtype=F64), torch.zeros(views, dtype=torch.long), torch.arange(views))
-    options = {"fixed_poses": first_two(problem), "structure": [curves], "tolerance": 1e-13}
-    plain = bundle_adjust(problem, **options)
-    rigged = bundle_adjust(problem, rig=rig, fixed_sensors=torch.tensor([True]), **options)
-    assert rigged.cost == pytest.approx(plain.cost, rel=1e-9)
-    assert (adjusted(rigged).X - adjusted(plain).X).abs().max() < 1e-6
+    plain, rigged = with_a_rig_of_one(problem, curves)
+    assert (adjusted(rigged, BundleCurves).X - adjusted(plain, BundleCurves).X).abs().max() < 1e-6
 
 
 def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> None:
@@ -265,7 +234,7 @@ def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> N
     x[curves.sample == 7], normal[curves.sample == 9], tangent[11] = torch.nan, 0.0, 0.0
     changed = dataclasses.replace(curves, fixed=fixed, weights=weights, x=x, normal=normal, tangent=tangent)
     result = bundle_adjust(problem, structure=[changed], tolerance=1e-13)
-    after = adjusted(result).X
+    after = adjusted(result, BundleCurves).X
     assert (after == curves.X).all(1).nonzero()[:, 0].tolist() == [3, 5, 7, 9, 11]
     assert after.isfinite().all()
     dead = torch.isin(curves.sample, torch.tensor([5, 7, 9, 11]))
@@ -286,7 +255,7 @@ def test_a_loss_resists_wrong_edges(generator: torch.Generator) -> None:
     wrong = torch.rand(len(curves.x), generator=generator) < 0.1
     x = torch.where(wrong[:, None], curves.x + 20 * torch.randn(curves.x.shape, generator=generator, dtype=F64), curves.x)
     off = [
-        (adjusted(bundle_adjust(problem, fixed_poses=first_two(problem), structure=[some])).X - scene.curves.X)
+        (adjusted(bundle_adjust(problem, fixed_poses=first_two(problem), structure=[some]), BundleCurves).X - scene.curves.X)
         .norm(dim=-1)
         .median()
         for loss in (None, Huber(0.5))
@@ -298,17 +267,10 @@ def test_a_loss_resists_wrong_edges(generator: torch.Generator) -> None:
 def test_the_world_comes_back_with_its_curves(generator: torch.Generator) -> None:
     scene = make_scene(generator, noise=0.5)
     problem, curves = disturbed(scene, generator)
-    free = bundle_adjust(problem, structure=[curves], tolerance=1e-12)
-    first = bundle_adjust(problem, structure=[curves], tolerance=1e-12, gauge="first")
-    assert torch.equal(first.poses.R[0], problem.poses.R[0])
-    assert not torch.allclose(first.poses.t[1:], free.poses.t[1:], rtol=0, atol=1e-6)
-    moved = dataclasses.replace(problem, poses=first.poses, cameras=first.cameras, X=first.X)
-    held = {"free": (), "fixed_poses": torch.ones(len(problem.poses.t), dtype=torch.bool)}
-    again = bundle_adjust(moved, structure=[adjusted(first)], max_iterations=0, **held)
-    assert again.initial_cost == pytest.approx(free.cost, rel=1e-9)
+    free, first = with_the_first_camera_where_it_was(problem, curves)
     # Directions turn with the world: across the curve is where it was.
     turn = first.poses.R[0].mT @ free.poses.R[0]
-    torch.testing.assert_close(adjusted(first).tangent, curves.tangent @ turn.mT, rtol=0, atol=1e-9)
+    torch.testing.assert_close(adjusted(first, BundleCurves).tangent, curves.tangent @ turn.mT, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["x", "normal", "curvature"])
@@ -321,7 +283,7 @@ def test_derivatives_by_image_curves(generator: torch.Generator, name: str) -> N
         some = dataclasses.replace(curves, **{name: values})
         held = torch.arange(4) != 2
         result = bundle_adjust(problem, free=(), fixed_poses=held, structure=[some], tolerance=1e-16, max_iterations=100)
-        return (adjusted(result).X * probe).sum() + result.poses.t[2].sum()
+        return (adjusted(result, BundleCurves).X * probe).sum() + result.poses.t[2].sum()
 
     values = getattr(curves, name)
     leaf = values.clone().requires_grad_()
@@ -338,22 +300,9 @@ def test_the_written_derivatives_are_those_of_the_residuals(generator: torch.Gen
     """By every variable, with skew and numbers held in some cameras."""
     scene = make_scene(generator, lens=lens, noise=1.0, apart=3.0)
     problem, curves = disturbed(scene, generator)
-    names = ("focal", "aspect", "skew", "principal_point", *problem.cameras.distortion.parameter_names)
-    views = len(problem.poses.t)
-    sensors = Pose.identity(2, dtype=F64).retract(0.1 * torch.randn(2, 6, generator=generator, dtype=F64))
-    rig = Rig(sensors, torch.arange(views) % 2, torch.arange(views)) if rigged else None
-    held = {"skew": torch.tensor([not rigged])}
-    blocks, terms = Bundle(problem, free=names, fixed_intrinsics=held, rig=rig, structure=(curves,)).problem()
+    blocks, terms = with_all_free(problem, curves, rigged, generator)
     blocks, terms, _ = prepare(blocks, terms[1:2])
-    x = {name: block.x for name, block in blocks.items()}
-    found, wanted = [], []
-    for term, slopes in ((terms[0], found), (dataclasses.replace(terms[0], linearize=None), wanted)):
-        sizes = [blocks[name].tangent for name in term.blocks]
-        slopes += [curves.x.new_empty(1, size, len(term.index[0])).permute(2, 0, 1) for size in sizes]
-        lifts = {name: lift_of(block, x[name]) for name, block in blocks.items()}
-        slopes.append(linearize(term, x, lifts, slopes[:], Workspace(curves.x))[0])
-    for mine, other in zip(found, wanted, strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-9 * float(other.abs().max()))
+    assert_written_derivatives(blocks, terms[0], 1, curves.x)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -5,38 +5,39 @@ import dataclasses
 import pytest
 import torch
 from chance import assert_unit_variance
+from structure_scenes import (
+    LENSES,
+    adjusted,
+    assert_written_derivatives,
+    first_two,
+    moved,
+    views_on_an_arc,
+    whitened,
+    with_a_rig_of_one,
+    with_all_free,
+    with_points,
+    with_the_first_camera_where_it_was,
+    without_points,
+)
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import BundleLines, BundleResult, Rig, bundle_adjust, bundle_covariance
+from torchsfm.bundle import BundleLines, bundle_adjust, bundle_covariance
 from torchsfm.bundle.blocks import Bundle
 from torchsfm.geometry import (
-    BrownConrady,
     BundleProblem,
     Camera,
-    Distortion,
-    KannalaBrandt,
-    NoDistortion,
-    Pose,
-    Radial,
     intrinsics,
     line_to_line_distance,
     pluecker_from_points,
     point_to_line_distance,
-    rotation_from_rotvec,
     rotvec_from_rotation,
 )
 from torchsfm.geometry.line_manifold import line_tangents
 from torchsfm.optim import Block, Cauchy, Huber, Loss, RigidMotion, Term, sparse_levenberg_marquardt
-from torchsfm.optim.terms import Workspace, curvature, lift_of, linearize, prepare, term_residual
+from torchsfm.optim.terms import Workspace, curvature, linearize, prepare, term_residual
 
 F64 = torch.float64
-LENSES = {
-    "none": NoDistortion,
-    "radial": lambda: Radial(*torch.tensor([-0.25, 0.08], dtype=F64)),
-    "brown": lambda: BrownConrady(*torch.tensor([-0.2, 0.05, 0.01, 0.004, -0.003], dtype=F64)),
-    "fisheye": lambda: KannalaBrandt(*torch.tensor([-0.05, 0.01, 0.0, 0.0], dtype=F64)),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,14 +52,7 @@ def make_scene(
     generator: torch.Generator, *, lens: str = "none", views: int = 5, points: int = 30, lines: int = 12, noise: float = 0.0
 ) -> Scene:
     """Views on an arc; segments whose ends do not correspond, noise across them."""
-    angle = torch.linspace(-0.5, 0.5, views, dtype=F64)
-    turn = torch.stack((0.15 * torch.cos(4 * angle), angle, 0.1 * torch.sin(5 * angle)), -1)
-    poses = Pose(rotation_from_rotvec(turn), torch.tensor([[0.1, -0.1, 4.0]], dtype=F64).repeat(views, 1))
-    poses = poses.retract(0.1 * torch.randn(views, 6, generator=generator, dtype=F64))
-    distortion: Distortion = LENSES[lens]()
-    K = intrinsics(torch.tensor(700.0, dtype=F64), torch.tensor([320.0, 240.0], dtype=F64), 1.02)
-    one = Camera(K, distortion)
-    cameras = Camera(K[None], type(distortion).from_parameters(distortion.parameters()[None]))
+    poses, camera = views_on_an_arc(generator, lens, views)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator, dtype=F64)
@@ -68,40 +62,21 @@ def make_scene(
 
     X, ends = 2 * rand(points, 3) - 1, 2 * rand(lines, 2, 3) - 1
     ends[:, 1] = ends[:, 0] + (ends[:, 1] - ends[:, 0]) * 1.2 / (ends[:, 1] - ends[:, 0]).norm(dim=-1, keepdim=True)
-    view, point = torch.cartesian_prod(torch.arange(views), torch.arange(points)).unbind(1)
     seen, line = torch.cartesian_prod(torch.arange(views), torch.arange(lines)).unbind(1)
     share = torch.stack((0.3 * rand(len(line)), 0.7 + 0.3 * rand(len(line))), -1)[..., None]
     on = ends[line, None, 0] * (1 - share) + ends[line, None, 1] * share
-    x = one.project(poses[view].transform(X[point, None]))[:, 0]
-    image = one.project(poses[seen].transform(on))
-    index = torch.zeros(views, dtype=torch.long)
-    problem = BundleProblem(poses, cameras, index, X, x + noise * randn(*x.shape), view, point)
+    image = camera.project(poses[seen].transform(on))
+    problem = with_points(poses, camera, X)
+    problem = dataclasses.replace(problem, x=problem.x + noise * randn(*problem.x.shape))
     L = pluecker_from_points(ends[:, 0], ends[:, 1])
     return Scene(problem, BundleLines(L, image + noise * randn(*image.shape), seen, line), ends)
 
 
-def without_points(problem: BundleProblem) -> BundleProblem:
-    return dataclasses.replace(problem, X=problem.X[:0], x=problem.x[:0], view=problem.view[:0], point=problem.point[:0])
-
-
 def disturbed(scene: Scene, generator: torch.Generator, size: float = 0.02) -> tuple[BundleProblem, BundleLines]:
     """All but the first two poses, points and lines moved."""
-    step = size * torch.randn(len(scene.problem.poses.t), 6, generator=generator, dtype=F64)
-    step[:2] = 0
-    X = scene.problem.X + size * torch.randn(scene.problem.X.shape, generator=generator, dtype=F64)
+    problem = moved(scene.problem, generator, size)
     ends = scene.ends + size * torch.randn(scene.ends.shape, generator=generator, dtype=F64)
-    problem = dataclasses.replace(scene.problem, poses=scene.problem.poses.retract(step), X=X)
     return problem, dataclasses.replace(scene.lines, L=pluecker_from_points(ends[:, 0], ends[:, 1]))
-
-
-def first_two(problem: BundleProblem) -> Tensor:
-    return torch.arange(len(problem.poses.t)) < 2
-
-
-def adjusted_lines(result: BundleResult) -> BundleLines:
-    (lines,) = result.structure
-    assert isinstance(lines, BundleLines)
-    return lines
 
 
 def gap(lines: BundleLines, ends: Tensor) -> Tensor:
@@ -138,7 +113,7 @@ def test_exact_data_are_recovered(generator: torch.Generator, lens: str) -> None
     result = bundle_adjust(problem, fixed_poses=first_two(problem), structure=[lines], tolerance=1e-14)
     assert result.status == Status.OK
     assert result.cost < 1e-12
-    assert (gap(adjusted_lines(result), scene.ends) < 1e-8).all()
+    assert (gap(adjusted(result, BundleLines), scene.ends) < 1e-8).all()
     assert (result.X - scene.problem.X).abs().max() < 1e-8
     assert result.structure_residuals[0].shape == lines.x.shape[:2]
     assert result.structure_residuals[0].abs().max() < 1e-6
@@ -149,7 +124,7 @@ def test_lines_alone_determine_poses(generator: torch.Generator) -> None:
     problem, lines = disturbed(scene, generator)
     result = bundle_adjust(without_points(problem), free=(), fixed_poses=first_two(problem), structure=[lines], tolerance=1e-14)
     assert (result.poses.t - scene.problem.poses.t).abs().max() < 1e-7
-    assert (gap(adjusted_lines(result), scene.ends) < 1e-7).all()
+    assert (gap(adjusted(result, BundleLines), scene.ends) < 1e-7).all()
 
 
 def test_held_lines_are_points_that_slide_along_them(generator: torch.Generator) -> None:
@@ -158,7 +133,7 @@ def test_held_lines_are_points_that_slide_along_them(generator: torch.Generator)
     problem, lines = disturbed(scene, generator)
     held = dataclasses.replace(scene.lines, fixed=torch.ones(len(lines.L), dtype=torch.bool))
     result = bundle_adjust(without_points(problem), free=(), structure=[held], tolerance=1e-15)
-    assert torch.equal(adjusted_lines(result).L, held.L)
+    assert torch.equal(adjusted(result, BundleLines).L, held.L)
     blocks, _ = Bundle(problem, free=()).problem()
     bundle = Bundle(problem, free=(), structure=(held,))
     projection = bundle.problem()[1][0].residual
@@ -198,14 +173,10 @@ def test_errors_are_those_of_the_covariance(generator: torch.Generator, lens: st
         result = bundle_adjust(noisy, structure=[seen], tolerance=1e-9, fixed_poses=held)
         turn = result.poses @ scene.problem.poses.inverse()
         poses.append(whitened(torch.cat((rotvec_from_rotation(turn.R), turn.t), -1)[~held], C.poses[~held]))
-        lines.append(whitened(line_steps(scene.lines.L, adjusted_lines(result).L), C.structure[0]))
+        lines.append(whitened(line_steps(scene.lines.L, adjusted(result, BundleLines).L), C.structure[0]))
     # Errors within a trial depend on each other, those of one pose or line in several do not.
     for scores in (poses, lines):
         assert_unit_variance(torch.stack(scores).movedim(1, -1).flatten(0, 1), dim=0)
-
-
-def whitened(step: Tensor, C: Tensor) -> Tensor:
-    return torch.linalg.solve_triangular(torch.linalg.cholesky(C), step[..., None], upper=False)[..., 0]
 
 
 def line_steps(L: Tensor, M: Tensor) -> Tensor:
@@ -220,13 +191,8 @@ def line_steps(L: Tensor, M: Tensor) -> Tensor:
 def test_a_rig_of_one_changes_nothing(generator: torch.Generator) -> None:
     scene = make_scene(generator, noise=0.5)
     problem, lines = disturbed(scene, generator)
-    views = len(problem.poses.t)
-    rig = Rig(Pose.identity(1, dtype=F64), torch.zeros(views, dtype=torch.long), torch.arange(views))
-    options = {"fixed_poses": first_two(problem), "structure": [lines], "tolerance": 1e-13}
-    plain = bundle_adjust(problem, **options)
-    rigged = bundle_adjust(problem, rig=rig, fixed_sensors=torch.tensor([True]), **options)
-    assert rigged.cost == pytest.approx(plain.cost, rel=1e-9)
-    assert (line_to_line_distance(adjusted_lines(rigged).L, adjusted_lines(plain).L) < 1e-6).all()
+    plain, rigged = with_a_rig_of_one(problem, lines)
+    assert (line_to_line_distance(adjusted(rigged, BundleLines).L, adjusted(plain, BundleLines).L) < 1e-6).all()
 
 
 def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> None:
@@ -239,7 +205,7 @@ def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> N
     x[lines.line == 7] = torch.nan
     changed = dataclasses.replace(lines, fixed=fixed, weights=weights, x=x)
     result = bundle_adjust(problem, structure=[changed])
-    after = adjusted_lines(result).L
+    after = adjusted(result, BundleLines).L
     same = (after == lines.L).all(1)
     assert same.nonzero()[:, 0].tolist() == [3, 5, 7]
     assert after.isfinite().all()
@@ -261,7 +227,9 @@ def test_a_loss_resists_wrong_segments(generator: torch.Generator) -> None:
     wrong = torch.rand(len(lines.x), generator=generator) < 0.1
     x = torch.where(wrong[:, None, None], lines.x + 40 * torch.randn(lines.x.shape, generator=generator, dtype=F64), lines.x)
     gaps = [
-        gap(adjusted_lines(bundle_adjust(problem, fixed_poses=first_two(problem), structure=[some])), scene.ends).median()
+        gap(
+            adjusted(bundle_adjust(problem, fixed_poses=first_two(problem), structure=[some]), BundleLines), scene.ends
+        ).median()
         for loss in (None, Huber(0.5))
         for some in [dataclasses.replace(lines, x=x, loss=loss)]
     ]
@@ -271,16 +239,7 @@ def test_a_loss_resists_wrong_segments(generator: torch.Generator) -> None:
 def test_the_world_comes_back_with_its_lines(generator: torch.Generator) -> None:
     scene = make_scene(generator, noise=0.5)
     problem, lines = disturbed(scene, generator)
-    free = bundle_adjust(problem, structure=[lines], tolerance=1e-12)
-    first = bundle_adjust(problem, structure=[lines], tolerance=1e-12, gauge="first")
-    assert torch.equal(first.poses.R[0], problem.poses.R[0])
-    assert not torch.allclose(first.poses.t[1:], free.poses.t[1:], rtol=0, atol=1e-6)
-    held = {"free": (), "fixed_poses": torch.ones(len(problem.poses.t), dtype=torch.bool)}
-    again = bundle_adjust(
-        dataclasses.replace(problem, poses=first.poses, cameras=first.cameras, X=first.X),
-        structure=[adjusted_lines(first)], max_iterations=0, **held,
-    )  # fmt: skip
-    assert again.initial_cost == pytest.approx(free.cost, rel=1e-9)
+    with_the_first_camera_where_it_was(problem, lines)
 
 
 def test_derivatives_by_segments(generator: torch.Generator) -> None:
@@ -292,7 +251,7 @@ def test_derivatives_by_segments(generator: torch.Generator) -> None:
     def found(x: Tensor) -> Tensor:
         some = dataclasses.replace(lines, x=x)
         result = bundle_adjust(problem, free=(), fixed_poses=held, structure=[some], tolerance=1e-16, max_iterations=100)
-        return (adjusted_lines(result).L * probe).sum()
+        return (adjusted(result, BundleLines).L * probe).sum()
 
     x = lines.x.clone().requires_grad_()
     (slope,) = torch.autograd.grad(found(x), x)
@@ -325,26 +284,13 @@ def test_the_written_derivatives_are_those_of_the_residuals(generator: torch.Gen
     """By every variable, where cameras have moved since the rays were taken, with skew and numbers held in some cameras."""
     scene = make_scene(generator, lens=lens, noise=1.0)
     problem, lines = disturbed(scene, generator, 0.002)
-    names = ("focal", "aspect", "skew", "principal_point", *problem.cameras.distortion.parameter_names)
-    views = len(problem.poses.t)
-    sensors = Pose.identity(2, dtype=F64).retract(0.1 * torch.randn(2, 6, generator=generator, dtype=F64))
-    rig = Rig(sensors, torch.arange(views) % 2, torch.arange(views)) if rigged else None
-    held = {"skew": torch.tensor([not rigged])}
-    blocks, terms = Bundle(problem, free=names, fixed_intrinsics=held, rig=rig, structure=(lines,)).problem()
+    blocks, terms = with_all_free(problem, lines, rigged, generator)
     blocks["camera"] = dataclasses.replace(blocks["camera"], x=blocks["camera"].x * 1.003)
     blocks, terms, _ = prepare(blocks, terms[1:2])
-    x = {name: block.x for name, block in blocks.items()}
-    found, wanted = [], []
-    for term, slopes in ((terms[0], found), (dataclasses.replace(terms[0], linearize=None), wanted)):
-        sizes = [blocks[name].tangent for name in term.blocks]
-        slopes += [lines.x.new_empty(2, size, len(term.index[0])).permute(2, 0, 1) for size in sizes]
-        lifts = {name: lift_of(block, x[name]) for name, block in blocks.items()}
-        slopes.append(linearize(term, x, lifts, slopes[:], Workspace(lines.x))[0])
-    for mine, other in zip(found, wanted, strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-8, atol=1e-9 * float(other.abs().max()))
+    found = assert_written_derivatives(blocks, terms[0], 2, lines.x)
     # Those of eliminated variables alone.
     only = [None] * (len(found) - 2) + [torch.empty_like(found[-2])]
-    linearize(terms[0], x, {}, only, Workspace(lines.x))
+    linearize(terms[0], {name: block.x for name, block in blocks.items()}, {}, only, Workspace(lines.x))
     torch.testing.assert_close(only[-1], found[-2])
 
 
@@ -357,12 +303,7 @@ def test_the_written_second_derivatives_are_those_of_the_cost(
     scene = make_scene(generator, lens=lens, noise=1.0, views=4, lines=5)
     problem, lines = disturbed(scene, generator, 0.002)
     lines = dataclasses.replace(lines, loss=loss, weights=0.5 + torch.rand(len(lines.x), generator=generator, dtype=F64))
-    names = ("focal", "aspect", "skew", "principal_point", *problem.cameras.distortion.parameter_names)
-    views = len(problem.poses.t)
-    sensors = Pose.identity(2, dtype=F64).retract(0.1 * torch.randn(2, 6, generator=generator, dtype=F64))
-    rig = Rig(sensors, torch.arange(views) % 2, torch.arange(views)) if rigged else None
-    held = {"skew": torch.tensor([not rigged])}
-    blocks, terms = Bundle(problem, free=names, fixed_intrinsics=held, rig=rig, structure=(lines,)).problem()
+    blocks, terms = with_all_free(problem, lines, rigged, generator)
     blocks["camera"] = dataclasses.replace(blocks["camera"], x=blocks["camera"].x * 1.003)
     blocks, (term,), _ = prepare(blocks, terms[1:2])
     assert term.reduction is not None
