@@ -44,8 +44,8 @@ def test_sides_of_squares_are_found_in_place() -> None:
     assert bool((segments.valid.sum(-1) == 4).all())
     angle, offset, missing, side = errors(segments, corners)
     assert bool((side.sort(-1).values == torch.arange(4)).all())
-    assert float(angle.max()) < 0.05
-    assert float(offset.max()) < 0.05
+    assert float(angle.max()) < 0.015
+    assert float(offset.max()) < 0.005
     assert float(missing.max()) < 6.5
     assert float(missing.min()) > 0
     line = line_from_points(segments.ends[..., 0, :], segments.ends[..., 1, :])

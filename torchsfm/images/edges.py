@@ -63,6 +63,7 @@ def detect_edges(
     noise: float | None = None,
     min_edgels: int = 8,
     mask: Bool[Tensor, "*#batch h w"] | None = None,
+    straight: bool = False,
 ) -> Edges:
     """Edges as ordered chains of points with sub-pixel positions.
 
@@ -82,6 +83,7 @@ def detect_edges(
             given, and never less than the rounding of eight bits.
         min_edgels: Chains of fewer points are left out.
         mask: Where edges may be.
+        straight: Leave edge points where they are, for what is straight: what is measured of its curvature is error.
 
     Returns:
         The edges. An image without any, or where everything is NaN, has none valid; around a NaN there are none. Within two
@@ -102,6 +104,7 @@ def detect_edges(
     check_options(
         max_edgels=(max_edgels, "int >= 1"), blur=(blur, "0.5 <= float <= 20"), low=(low, "float >= 0"),
         high=(high, "float >= 0"), noise=(noise, "?float >= 0"), min_edgels=(min_edgels, "int >= 1"),
+        straight=(straight, bool),
     )  # fmt: skip
     channels, height, width = image.shape[-3:]
     if channels not in (1, 3):
@@ -132,8 +135,9 @@ def detect_edges(
     curvature, drawn = chain_curvature(x, chains), 0.5 * _drawn_in(spread, cosine)
     # The radius comes out smaller by the shift.
     curvature = curvature / (1 + drawn * curvature.square())
-    shift = (curvature * drawn).clamp(-_MOST_BENT, _MOST_BENT)
-    x = x + (shift / top)[:, None] * gradient
+    if not straight:
+        shift = (curvature * drawn).clamp(-_MOST_BENT, _MOST_BENT)
+        x = x + (shift / top)[:, None] * gradient
     strong = top >= (6 * level * filters.noise).clamp_min(high)[image_of]
     strong = torch.zeros_like(chains.chain).index_add(0, chains.chain, strong.long())[chains.chain] > 0
     keep = strong & (chains.length >= min_edgels)

@@ -86,7 +86,7 @@ def hough_lines(
         (tensor(1), tensor([ 0.0000,  1.0000, 29.5000]))
     """
     check_options(max_lines=(max_lines, "int >= 1"), min_count=(min_count, "int >= 3"), max_gap=(max_gap, "float > 0"))
-    edges = detect_edges(image, blur=blur, low=low, high=high, noise=noise, mask=mask)
+    edges = detect_edges(image, blur=blur, low=low, high=high, noise=noise, mask=mask, straight=True)
     batch, n = edges.valid.shape[:-1], edges.valid.shape[-1]
     height, width = image.shape[-2:]
     flat = Edges(*(getattr(edges, name).reshape(batch.numel(), *getattr(edges, name).shape[len(batch) :]) for name in _FIELDS))

@@ -103,7 +103,7 @@ def detect_segments(
     check_options(
         max_segments=(max_segments, "int >= 1"), min_length=(min_length, "float > 0"), tolerance=(tolerance, "float > 0")
     )
-    edges = detect_edges(image, blur=blur, low=low, high=high, noise=noise, mask=mask)
+    edges = detect_edges(image, blur=blur, low=low, high=high, noise=noise, mask=mask, straight=True)
     batch, slots = edges.valid.shape[:-1], edges.valid.shape[-1]
     pixels = image.shape[-1] * image.shape[-2]
     place = edges.valid.flatten().nonzero()[:, 0]

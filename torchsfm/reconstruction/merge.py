@@ -128,9 +128,11 @@ def merge_models(a: Reconstruction, b: Reconstruction, *, fixed_cameras: bool = 
     mapping = _adjusted(mapping, fixed_cameras)
     # Of the model of which less is left: one that is wrong in itself fits nothing, however large the other is.
     of_first = torch.arange(len(start)) < len(a.x)
+    of_second = ~of_first
+    of_second[pairs[agree, 0]] = True
     kept = mapping.point >= 0
-    left = min(float((kept & start & of).sum()) / max(int((start & of).sum()), 1) for of in (of_first, ~of_first))
-    if left < AGREEING and bool((start & ~of_first).any()):
+    left = min(float((kept & start & of).sum()) / max(int((start & of).sum()), 1) for of in (of_first, of_second))
+    if left < AGREEING and bool((start & of_second).any()):
         why = f"the models contradict each other: of one only {100 * left:.0f} % of the observations fit the other"
         return refused(why, similarity, fused)
     model = with_structure(mapping.reconstruction(), a, moved, joined_views(a, b), threshold=ERROR, loss=LOSS)

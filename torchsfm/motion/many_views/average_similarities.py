@@ -112,6 +112,7 @@ def average_similarities(
         >>> bool(found.model.scale.allclose(size)), int(found.inliers.sum())
         (True, 10)
     """
+    check_options(between=(between, Similarity))
     check_one_problem(
         scale=(between.scale, "e"), R=(between.R, "e 3 3"), t=(between.t, "e 3"), edges=(edges, "e 2: int"),
         places=(places, "?e p>=3 3"), deviation=(deviation, "?e"),
