@@ -59,8 +59,9 @@ def describe_segments(image: Float[Tensor, "c h w"], ends: Float[Tensor, "n 2 2"
     parts = [v for g in (over, ahead) for v in (g.mean(1) * weight, (g.var(1, correction=0) + 1e-20).sqrt() * weight)]
     means, spreads = torch.cat(parts[::2], -1), torch.cat(parts[1::2], -1)
     both = torch.cat([v / v.square().sum(-1, keepdim=True).sqrt().clamp_min(1e-6) for v in (means, spreads)], -1)
-    sound = both.isfinite().all(-1, keepdim=True)
-    return torch.where(sound, both, 0.0) / 2**0.5
+    # Of an exact image the one or the other may be rounding alone.
+    size = both.square().sum(-1, keepdim=True).sqrt()
+    return torch.where(both.isfinite().all(-1, keepdim=True) & (size > 0.5), both / size, 0.0)
 
 
 def match_segments(
