@@ -256,6 +256,11 @@ def test_what_cannot_be_merged(generator: torch.Generator) -> None:
     assert merge_models(a, strangers).model is not None
     other_size = replace(b, image_size=2 * b.image_size)
     assert "another size" in merge_models(a, other_size).fault()
+    # The photographs are the same, but one model of them is wrong.
+    wrong = halves(model, 4, generator)[1]
+    turned = Pose(random_rotation(len(wrong.names), generator=generator, dtype=F64), wrong.poses.t)
+    wrong = replace(wrong, X=wrong.X + torch.randn(wrong.X.shape, generator=generator, dtype=F64), poses=turned)
+    assert "contradict" in merge_models(a, wrong).fault()
     # The names are the same, but the photographs are of something else.
     g = whole_model(generator)
     lie = halves(g, 4, generator)[1]
