@@ -13,11 +13,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm._types import tensor_map
+from torchsfm.geometry import intrinsics
 from torchsfm.geometry.curve_places import CurvePlaces, curve_places
 from torchsfm.geometry.curves import Curve
 from torchsfm.geometry.poses import Pose
 from torchsfm.geometry.rotations import rotation_angle, rotation_from_rotvec
 from torchsfm.linalg import damped_solve
+from torchsfm.motion.many_views.bilinear_steps import schur_step
+from torchsfm.motion.many_views.curve_fit import near_curves
 from torchsfm.optim import GemanMcClure
 from torchsfm.optim.descent import Options, Problem, Step, descend
 from torchsfm.optim.pytree import Places, pick
@@ -28,6 +32,8 @@ _TURNS = (1.5, 5.0)
 """Degrees from a frame to the next that are tried."""
 _STEPS = 8
 """Of each descent, after which it is seen anew which samples a frame shows."""
+_CLOSE = 0.05
+"""Depth, that of samples in the first frame about 1, below which a sample cannot be seen."""
 _FLAT = 0.05
 """Weight of inverse depths' departure from their mean, so that those that nothing tells stay there."""
 _SCALES = (8.0, 4.0, 2.0, 1.0)
@@ -64,20 +70,7 @@ class Motion(NamedTuple):
     """Inverse depths of samples in the first frame, about 1."""
     zoom: Float[Tensor, "h"]
     """Logarithm of the focal length over the expected one."""
-    place: Float[Tensor, "h v n"]
-
-
-class Seen(NamedTuple):
-    """Samples in the frames."""
-
-    r: Float[Tensor, "h v n"]
-    """Distances from the image curves."""
-    slope: Float[Tensor, "h v n 3"]
-    """The derivative of `r` by the point in the camera's frame."""
-    turned: Float[Tensor, "h v n 3"]
-    """The ray in the camera's frame."""
-    by_zoom: Float[Tensor, "h v n"]
-    place: Float[Tensor, "h v n"]
+    place: Float[Tensor, "h v c m"]
 
 
 @dataclass(frozen=True)
@@ -86,18 +79,18 @@ class MotionSystem:
 
     x: Motion
     cost: Tensor
-    J: Float[Tensor, "h v n 6"]
-    by_zoom: Float[Tensor, "h v n"]
-    by_depth: Float[Tensor, "h v n"]
+    total: Tensor
     r: Float[Tensor, "h v n"]
     w: Float[Tensor, "h v n"]
-    total: Tensor
+    by_camera: Float[Tensor, "h v n 6"]
+    by_zoom: Float[Tensor, "h v n"]
+    by_depth: Float[Tensor, "h v n"]
     sigma: float
 
     def gradient(self) -> tuple[Tensor, Tensor]:
         """Of half the cost's sum by cameras (with the focal length last) and by depths."""
         wr = self.w * self.r
-        cameras = (wr[..., None] * self.J).sum(2).flatten(1)
+        cameras = (wr[..., None] * self.by_camera).sum(2).flatten(1)
         zoom = (wr * self.by_zoom).sum((1, 2)) + self.x.zoom / self.sigma**2
         return torch.cat((cameras, zoom[:, None]), 1), (wr * self.by_depth).sum(1) + _FLAT * (self.x.rho - 1)
 
@@ -107,32 +100,25 @@ class MotionSystem:
 
     def along(self, delta: tuple[Tensor, Tensor]) -> Tensor:
         """The derivative of the cost along a step."""
-        return sum((2 * (g * d).sum(-1) for g, d in zip(self.gradient(), delta, strict=True)), torch.zeros(())) / self.total
+        return 2 * (torch.cat(self.gradient(), 1) * torch.cat((delta[0], delta[1][:, 0]), 1)).sum(-1) / self.total
 
     def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
         """The step of cameras and depths; depths are eliminated."""
-        h, v, n = self.r.shape
-        wJ = self.w[..., None] * self.J
-        A = wJ.new_zeros(h, 6 * v + 1, 6 * v + 1)
-        own = wJ.mT @ self.J
-        for i in range(v):
-            A[:, 6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = own[:, i]
-        A[:, :-1, -1] = A[:, -1, :-1] = (wJ * self.by_zoom[..., None]).sum(2).flatten(1)
+        h, v = self.r.shape[:2]
+        J, w = self.by_camera, self.w[..., None]
+        # By all cameras and the focal length: own blocks, and what they share.
+        A = J.new_zeros(h, 6 * v + 1, 6 * v + 1)
+        A[:, :-1, :-1].view(h, v, 6, v, 6).diagonal(dim1=1, dim2=3).copy_(((w * J).mT @ J).movedim(1, -1))
+        A[:, :-1, -1] = A[:, -1, :-1] = (w * J * self.by_zoom[..., None]).sum(2).flatten(1)
         A[:, -1, -1] = (self.w * self.by_zoom.square()).sum((1, 2)) + 1 / self.sigma**2
-        E = torch.cat(((wJ * self.by_depth[..., None]).transpose(1, 2).flatten(2), A.new_zeros(h, n, 1)), -1)
-        E[..., -1] = (self.w * self.by_depth * self.by_zoom).sum(1)
-        C = (self.w * self.by_depth.square()).sum(1) + _FLAT
+        A.diagonal(dim1=1, dim2=2).mul_(1 + damping[:, None]).add_(1e-12)
+        C = ((self.w * self.by_depth.square()).sum(1) + _FLAT) * (1 + damping[:, None])
         a, b = self.gradient()
-        more = (1 + damping)[:, None]
-        A.diagonal(dim1=1, dim2=2).mul_(more)
-        C = C * more
-        S = A - E.mT @ (E / C[..., None])
-        move = damped_solve(S, -(a - (E * (b / C)[..., None]).sum(1))[..., None])[..., 0]
-        depth = -(b + (E @ move[..., None])[..., 0]) / C
-        promise = -(a * move).sum(-1) - (b * depth).sum(-1)
-        solved = torch.isfinite(move).all(-1) & torch.isfinite(depth).all(-1) & (move != 0).any(-1)
-        promise = torch.where(solved, promise / self.total, torch.inf)
-        return Step((move, depth), promise, solved, torch.zeros_like(solved))
+        inverse = C.rsqrt()[:, None]
+        E = (w * J * self.by_depth[..., None]).transpose(2, 3).flatten(1, 2)
+        F = inverse * torch.cat((E, (self.w * self.by_zoom * self.by_depth).sum(1, keepdim=True)), 1)
+        g = inverse * b[:, None]
+        return schur_step(A - F @ F.mT, a - (F @ g.mT)[..., 0], F, torch.stack((g, inverse), 1), self.total)
 
 
 @dataclass(frozen=True)
@@ -140,7 +126,7 @@ class MotionDistances(Problem[MotionSystem]):
     """The robust mean of squared normal distances over cameras, depths and the focal length."""
 
     images: CurvePlaces
-    """Of the frames but the first, (v, c)."""
+    """Of the frames but the first, (v, c); all guesses look at the same ones."""
     x: Float[Tensor, "n 2"]
     """Samples in the first frame, from the principal point."""
     centre: Float[Tensor, "2"]
@@ -155,74 +141,46 @@ class MotionDistances(Problem[MotionSystem]):
 
     def linearize(self, x: Motion) -> MotionSystem:
         """The system of cameras and depths."""
-        seen = self.sights(x)
-        s = seen.r.square()
+        f = self.focal * x.zoom.exp()
+        K = intrinsics(f, self.centre)[:, None]
+        d = self.x / f[:, None, None]
+        turned = torch.cat((d, torch.ones_like(d[..., :1])), -1)[:, None] @ x.R.mT
+        Y = turned + x.rho[:, None, :, None] * x.t[:, :, None]
+        near = near_curves(self.all_images, x.place, K @ torch.where(Y[..., 2:] > _CLOSE, Y, torch.nan).mT)
+        shown = self.weight > 0
+        r, slope = torch.where(shown, near.r, 0), torch.where(shown[..., None], (K.mT @ near.slope).mT, 0)
+        # A longer focal length magnifies images, and narrows the rays.
+        by_zoom = (slope[..., :2] * Y[..., :2]).sum(-1) - (slope * (d[:, None] @ x.R.mT[..., :2, :])).sum(-1)
+        by_camera = torch.cat((torch.linalg.cross(turned, slope), x.rho[:, None, :, None] * slope), -1)
         loss = GemanMcClure(self.scale)
         total = self.weight.sum((1, 2)).clamp_min(1)
         prior = _FLAT * (x.rho - 1).square().sum(-1) + x.zoom.square() / self.sigma**2
-        cost = ((self.weight * loss(s)).sum((1, 2)) + prior) / total
+        cost = ((self.weight * loss(r.square())).sum((1, 2)) + prior) / total
         cost = torch.where(cost.isfinite(), cost, torch.inf)
-        J = torch.cat((torch.linalg.cross(seen.turned, seen.slope), x.rho[:, None, :, None] * seen.slope), -1)
-        by_depth = (seen.slope * x.t[:, :, None]).sum(-1)
-        w = self.weight * loss.slope(s)
-        return MotionSystem(x._replace(place=seen.place), cost, J, seen.by_zoom, by_depth, seen.r, w, total, self.sigma)
+        x = x._replace(place=torch.where(shown.view(x.place.shape), near.place, x.place))
+        w, by_depth = self.weight * loss.slope(r.square()), (slope * x.t[:, :, None]).sum(-1)
+        return MotionSystem(x, cost, total, r, w, by_camera, by_zoom, by_depth, self.sigma)
 
     def advance(self, here: MotionSystem, step: Step) -> MotionSystem:
         """The system where a step leads."""
         move, depth = step.delta
         moves = move[:, :-1].unflatten(1, (-1, 6))
         R = rotation_from_rotvec(moves[..., :3]) @ here.x.R
-        x = Motion(R, here.x.t + moves[..., 3:], here.x.rho + depth, here.x.zoom + move[:, -1], here.x.place)
+        x = Motion(R, here.x.t + moves[..., 3:], here.x.rho + depth[:, 0], here.x.zoom + move[:, -1], here.x.place)
         return self.linearize(x)
 
     def rounding(self, here: MotionSystem) -> Tensor:
         """Nothing finer than a hundredth of a pixel matters here."""
         return torch.full_like(here.cost, 1e-6)
 
-    def sights(self, x: Motion) -> Seen:
-        """Where samples are seen, and how far from the image curves."""
-        f = self.focal * x.zoom.exp()
-        d = self.x / f[:, None, None]
-        ray = torch.cat((d, torch.ones_like(d[..., :1])), -1)
-        turned = ray[:, None] @ x.R.mT
-        y = turned + x.rho[:, None, :, None] * x.t[:, :, None]
-        z = torch.where(y[..., 2] > 0.05, y[..., 2], torch.nan)
-        u = y[..., :2] / z[..., None]
-        points = u * f[:, None, None, None] + self.centre
-        place, foot, first = self._feet(x.place, points)
-        tangent = torch.nn.functional.normalize(first, dim=-1)
-        normal = torch.stack((-tangent[..., 1], tangent[..., 0]), -1)
-        r = ((points - foot) * normal).sum(-1)
-        g = normal * (f[:, None, None] / z)[..., None]
-        slope = torch.cat((g, -(g * u).sum(-1, keepdim=True)), -1)
-        flat = torch.cat((-d, torch.zeros_like(d[..., :1])), -1)[:, None] @ x.R.mT
-        by_zoom = (slope * flat).sum(-1) + (normal * (points - self.centre)).sum(-1)
-        shown = self.weight > 0
-        r, by_zoom = (torch.where(shown, number, 0) for number in (r, by_zoom))
-        slope, turned = (torch.where(shown[..., None], vector, 0) for vector in (slope, turned))
-        return Seen(r, slope, turned, by_zoom, torch.where(shown, place, x.place))
+    @property
+    def all_images(self) -> CurvePlaces:
+        """The image curves of each guess, (h, v, c)."""
+        return tensor_map(lambda t: t.expand(len(self.focal), *t.shape), self.images)
 
-    def _feet(self, place: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The image curves' points nearest to given ones; all guesses look at the same curves."""
-        where = self.images.nearest(self._by_curves(place), self._by_curves(points))
-        foot, first, _ = self.images.at(where)
-        return self._by_guesses(where), self._by_guesses(foot), self._by_guesses(first)
-
-    def _by_curves(self, t: Tensor) -> Tensor:
-        """(h, v, n, ...) as (v, c, ..., ...), the guesses' samples of each curve one after the other."""
-        h, v, n = t.shape[:3]
-        c = self.images.number.shape[1]
-        return t.reshape(h, v, c, n // c, *t.shape[3:]).movedim(0, 2).flatten(2, 3)
-
-    def _by_guesses(self, t: Tensor) -> Tensor:
-        """Back."""
-        v, c, m = t.shape[:3]
-        h = len(self.focal)
-        return t.reshape(v, c, h, m // h, *t.shape[3:]).movedim(2, 0).flatten(2, 3)
-
-    def beyond(self, place: Float[Tensor, "h v n"]) -> Bool[Tensor, "h v n"]:
-        """Samples beyond the ends of what a frame shows of their curves."""
-        return self._by_guesses(self.images.beyond(self._by_curves(place)) > 0)
+    def inside(self, place: Float[Tensor, "h v c m"]) -> Bool[Tensor, "h v n"]:
+        """Samples that a frame shows, and not beyond the ends of what it shows of their curves."""
+        return (self.weight > 0) & (self.all_images.beyond(place) == 0).flatten(2)
 
 
 @dataclass(frozen=True)
@@ -264,12 +222,12 @@ def first_cameras(
     R = rotation_from_rotvec(turns[:, None] * (others - reference)[:, None])
     f = focal.expand(h)
     t = _translations(R, samples[reference], samples[others], shown, f)
-    motion = Motion(R, t, t.new_ones(h, c * _SAMPLES), torch.zeros_like(f), spread[others].flatten(1, 2).expand(h, -1, -1))
+    motion = Motion(R, t, t.new_ones(h, c * _SAMPLES), torch.zeros_like(f), spread[others].expand(h, -1, -1, -1))
     problem = MotionDistances(images, samples[reference], centre, f, shown.expand(h, -1, -1), sigma, 1.0)
 
     def descent(scale: float, steps: int) -> tuple[Motion, Tensor]:
-        inside = problem.weight * ~problem.beyond(motion.place)
-        found = descend(replace(problem, weight=inside, scale=scale), motion, Options(steps, 1e-4))
+        weight = problem.inside(motion.place).to(problem.weight)
+        found = descend(replace(problem, weight=weight, scale=scale), motion, Options(steps, 1e-4))
         return found.x, found.cost
 
     for scale in _SCALES:
@@ -277,12 +235,12 @@ def first_cameras(
     best = (cost.argsort()[:_BEST],)
     motion, problem = pick(best, motion), problem.pick(best)
     for _ in range(_LAST):
-        r = problem.sights(motion).r[0][problem.weight[0] > 0].abs()
+        r = problem.linearize(motion).r[0][problem.weight[0] > 0].abs()
         scale = max(_FINEST, _TRUSTED * float(r.median()))
         motion, cost = descent(scale, 2 * _STEPS)
     k = int(cost.argmin())
-    counts = (problem.weight[k] > 0) & ~problem.beyond(motion.place)[k]
-    good = (problem.sights(motion).r[k].abs() < scale) & counts
+    counts = problem.inside(motion.place)[k]
+    good = (problem.linearize(motion).r[k].abs() < scale) & counts
     apart = rotation_angle(motion.R @ motion.R[k].mT).rad2deg().amax(-1)
     depths = motion.rho[k].quantile(motion.rho.new_tensor([0.1, 0.9]))
     refusal = ""

@@ -14,7 +14,6 @@ Both have Hessians of one form in y, so one Schur complement serves both (`bilin
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,9 +22,9 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.linalg import eigh, eigvalsh
 from torchsfm.motion.many_views.bilinear_steps import (
+    BilinearSystem,
     Linearisation,
     back_substituted,
-    gauss_newton_step,
     orthonormal,
     point_hessians,
     reduced,
@@ -96,32 +95,7 @@ def fit_angles(
 
 
 @dataclass(frozen=True)
-class _System:
-    """The misfit linearised; `x` is what moves, cameras or both."""
-
-    x: Any
-    cost: Tensor
-    linear: Linearisation
-    total: Tensor
-
-    def steepest(self) -> Tensor:
-        """The largest derivative by a prediction."""
-        return self.linear.slope.abs().flatten(1).amax(-1)
-
-    def along(self, delta: tuple[Tensor, Tensor]) -> Tensor:
-        """The derivative of the cost along a step of cameras and points."""
-        step, move = delta
-        y = step @ self.linear.u[:, None] + self.linear.P @ move[:, None]
-        return 2 * (self.linear.slope * y).sum((-3, -2, -1)) / self.total
-
-    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
-        """The step of cameras and points."""
-        step, move, solved, promise = gauss_newton_step(self.linear, damping, points=isinstance(self.x, tuple))
-        return Step((step, move), torch.where(solved, promise / self.total, torch.inf), solved, torch.zeros_like(solved))
-
-
-@dataclass(frozen=True)
-class _WithPrior(Problem[_System]):
+class _WithPrior(Problem[BilinearSystem]):
     """The misfit with a prior over balanced cameras; points are where they are best."""
 
     rays: Rays
@@ -131,7 +105,7 @@ class _WithPrior(Problem[_System]):
         """Some of the problems."""
         return replace(self, rays=pick(at, self.rays))
 
-    def linearize(self, x: Tensor) -> _System:
+    def linearize(self, x: Tensor) -> BilinearSystem:
         """The system of cameras alone."""
         rays, prior = self.rays, self.prior
         u, cost = _best_points(rays, x, prior)
@@ -140,20 +114,20 @@ class _WithPrior(Problem[_System]):
         w = rays.w[:, :, None]
         slope = w * (y - ((1 - prior) * along + prior) * rays.a)
         q = ((1 - prior) * w).sqrt() * rays.a
-        return _System(x, cost, Linearisation(x, u, slope, rays.w, q[:, :, None]), _total(rays))
+        return BilinearSystem(x, cost, Linearisation(x, u, slope, rays.w, q[:, :, None]), _total(rays))
 
-    def advance(self, here: _System, step: Step) -> _System:
+    def advance(self, here: BilinearSystem, step: Step) -> BilinearSystem:
         """The system where a step of the cameras leads."""
         return self.linearize(_balanced(here.x + step.delta[0]))
 
-    def rounding(self, here: _System) -> Tensor:
+    def rounding(self, here: BilinearSystem) -> Tensor:
         """What rounding of the rays makes of the misfit."""
         square = self.rays.a.square().sum(2)
         return (10 * self.epsilon) ** 2 * (self.rays.w * square).sum((-2, -1)) / here.total
 
 
 @dataclass(frozen=True)
-class _Sines(Problem[_System]):
+class _Sines(Problem[BilinearSystem]):
     """The squared sines over cameras and points."""
 
     rays: Rays
@@ -162,16 +136,16 @@ class _Sines(Problem[_System]):
         """Some of the problems."""
         return _Sines(pick(at, self.rays))
 
-    def linearize(self, x: tuple[Tensor, Tensor]) -> _System:
+    def linearize(self, x: tuple[Tensor, Tensor]) -> BilinearSystem:
         """The system of cameras and points."""
-        return _System(x, sine_cost(self.rays, *x), _angles(self.rays, *x), _total(self.rays))
+        return BilinearSystem(x, sine_cost(self.rays, *x), _angles(self.rays, *x), _total(self.rays))
 
-    def advance(self, here: _System, step: Step) -> _System:
+    def advance(self, here: BilinearSystem, step: Step) -> BilinearSystem:
         """The system where a step leads."""
         (P, u), (moved, move) = here.x, step.delta
         return self.linearize(unit_frame(P + moved, u + move))
 
-    def rounding(self, here: _System) -> Tensor:
+    def rounding(self, here: BilinearSystem) -> Tensor:
         """What rounding makes of it: predictions are products of units that may cancel, steps come from normal equations."""
         return (100 * self.epsilon) ** 2 * here.linear.alpha.sum((-2, -1)) / here.total
 

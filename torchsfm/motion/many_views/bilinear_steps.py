@@ -5,12 +5,14 @@ their own. Arrays are (problem, view, coordinate, point), with the points last.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg import qr
+from torchsfm.optim.descent import Step
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,36 @@ class Linearisation:
     slope: Float[Tensor, "p v 3 n"]
     alpha: Float[Tensor, "p v n"]
     q: Float[Tensor, "p v k 3 n"]
+
+
+@dataclass(frozen=True)
+class BilinearSystem:
+    """A cost of predictions linearised; `x` is what moves, cameras or a tuple of these and points."""
+
+    x: Any
+    cost: Tensor
+    linear: Linearisation
+    total: Tensor
+    """What the cost's sum was divided by."""
+
+    def steepest(self) -> Tensor:
+        """The largest derivative by a prediction."""
+        return self.linear.slope.abs().flatten(1).amax(-1)
+
+    def along(self, delta: tuple[Tensor, Tensor]) -> Tensor:
+        """The derivative of the cost along a step of cameras and points."""
+        step, move = delta
+        y = step @ self.linear.u[:, None] + self.linear.P @ move[:, None]
+        return 2 * (self.linear.slope * y).sum((-3, -2, -1)) / self.total
+
+    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
+        """The step of cameras and points."""
+        points = isinstance(self.x, tuple)
+        S, right, F, rest = reduced(self.linear, damping, points)
+        if points:
+            _hold_frame(S, self.linear.P)
+        found = schur_step(S, right, F, rest, self.total)
+        return found._replace(delta=(found.delta[0].reshape(self.linear.P.shape), found.delta[1]))
 
 
 def point_hessians(P: Tensor, alpha: Tensor, m: Tensor) -> Float[Tensor, "p n r r"]:
@@ -91,20 +123,16 @@ def reduced(system: Linearisation, damping: Tensor, points: bool) -> tuple[Tenso
     return S, right, F, torch.stack((g, *inverse.unbind(1)), 1)
 
 
-def gauss_newton_step(system: Linearisation, damping: Tensor, points: bool) -> tuple[Tensor, Tensor, Bool[Tensor, "p"], Tensor]:
-    """A damped Gauss-Newton step of cameras and points, and where it could be solved."""
-    p, v, _ = system.alpha.shape
-    S, right, F, rest = reduced(system, damping, points)
-    if points:
-        _hold_frame(S, system.P)
+def schur_step(S: Tensor, right: Tensor, F: Tensor, rest: Tensor, total: Tensor) -> Step:
+    """The step of cameras and points by the Schur complement over the cameras and what back-substitution needs."""
     factor, info = torch.linalg.cholesky_ex(S)
     step = -torch.cholesky_solve(right[..., None], factor)
     solved = (info == 0) & torch.isfinite(step).all(-1).all(-1)
     step = torch.where(solved[:, None, None], step, 0)
-    g, move = rest[:, 0], back_substituted(F, rest, step)
     # The model: right' step + step' S step / 2 and what the points alone bring; twice that in units of the cost.
-    promise = -(right * step[..., 0]).sum(-1) + g.square().sum((-2, -1))
-    return step.reshape(p, v, 3, system.P.shape[-1]), move, solved, promise
+    promise = -(right * step[..., 0]).sum(-1) + rest[:, 0].square().sum((-2, -1))
+    promise = torch.where(solved, promise / total, torch.inf)
+    return Step((step[..., 0], back_substituted(F, rest, step)), promise, solved, torch.zeros_like(solved))
 
 
 def _hold_frame(S: Tensor, P: Tensor) -> None:

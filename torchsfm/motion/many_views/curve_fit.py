@@ -20,7 +20,7 @@ from torchsfm.geometry.curve_places import CurvePlaces
 from torchsfm.geometry.homogeneous import divide_safely
 from torchsfm.linalg import solve
 from torchsfm.motion.many_views.bilinear_fit import unit_frame
-from torchsfm.motion.many_views.bilinear_steps import Linearisation, gauss_newton_step
+from torchsfm.motion.many_views.bilinear_steps import BilinearSystem, Linearisation
 from torchsfm.optim.descent import Problem, Step
 from torchsfm.optim.pytree import Places, pick
 
@@ -64,33 +64,39 @@ class Pins(NamedTuple):
     tangent: Float[Tensor, "p v c m 2"]
 
 
+class Near(NamedTuple):
+    """The image curves next to images of samples."""
+
+    points: Float[Tensor, "p v c m 2"]
+    r: Float[Tensor, "p v n"]
+    """Distances, signed, along the image curve's normal."""
+    slope: Float[Tensor, "p v 3 n"]
+    """The derivative of `r` by y."""
+    place: Float[Tensor, "p v c m"]
+
+
+def near_curves(images: CurvePlaces, place: Float[Tensor, "p v c m"], y: Float[Tensor, "p v 3 n"]) -> Near:
+    """Distances of samples whose images are y from the nearest points of image curves that are reached from given places."""
+    points = _points(y, place)
+    place = images.nearest(place, points)
+    foot, first, _ = images.at(place)
+    tangent = torch.nn.functional.normalize(first, dim=-1)
+    normal = torch.stack((-tangent[..., 1], tangent[..., 0]), -1)
+    return Near(points, ((points - foot) * normal).sum(-1).flatten(2), _by_image(normal, points, y), place)
+
+
+def _points(y: Tensor, place: Tensor) -> Float[Tensor, "p v c m 2"]:
+    return divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).reshape(*place.shape, 2)
+
+
+def _by_image(way: Tensor, points: Tensor, y: Tensor) -> Float[Tensor, "p v 3 n"]:
+    """The derivative by y of how far points are along unit vectors."""
+    row = torch.cat((way, -(way * points).sum(-1, keepdim=True)), -1).flatten(2, 3)
+    return divide_safely(row, y[:, :, 2]).mT
+
+
 @dataclass(frozen=True)
-class CurveSystem:
-    """Squared distances linearised."""
-
-    x: Scene
-    cost: Tensor
-    linear: Linearisation
-    total: Tensor
-
-    def steepest(self) -> Tensor:
-        """The largest derivative by a prediction."""
-        return self.linear.slope.abs().flatten(1).amax(-1)
-
-    def along(self, delta: tuple[Tensor, Tensor]) -> Tensor:
-        """The derivative of the cost along a step of cameras and samples."""
-        step, move = delta
-        y = step @ self.linear.u[:, None] + self.linear.P @ move[:, None]
-        return 2 * (self.linear.slope * y).sum((-3, -2, -1)) / self.total
-
-    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
-        """The step of cameras and samples."""
-        step, move, solved, promise = gauss_newton_step(self.linear, damping, points=True)
-        return Step((step, move), torch.where(solved, promise / self.total, torch.inf), solved, torch.zeros_like(solved))
-
-
-@dataclass(frozen=True)
-class CurveDistances(Problem[CurveSystem]):
+class CurveDistances(Problem[BilinearSystem]):
     """The weighted mean of squared normal distances over cameras and samples."""
 
     images: CurvePlaces
@@ -102,32 +108,26 @@ class CurveDistances(Problem[CurveSystem]):
         """Some of the problems."""
         return CurveDistances(pick(at, self.images), pick(at, self.weight), pick(at, self.pins))
 
-    def linearize(self, x: Scene) -> CurveSystem:
+    def linearize(self, x: Scene) -> BilinearSystem:
         """The system of cameras and samples."""
         return self._system(x, self.sights(x))
 
-    def advance(self, here: CurveSystem, step: Step) -> CurveSystem:
+    def advance(self, here: BilinearSystem, step: Step) -> BilinearSystem:
         """The system where a step leads and samples have taken their own."""
         P, u = unit_frame(here.x.P + step.delta[0], here.x.u + step.delta[1])
         return self._system(*self.settled(Scene(P, u, here.x.place), _OWN))
 
-    def rounding(self, here: CurveSystem) -> Tensor:
+    def rounding(self, here: BilinearSystem) -> Tensor:
         """What bends of the second derivative between the curves' samples make of it, in image coordinates about 1."""
         return torch.full_like(here.cost, _BENDS**2)
 
     def sights(self, x: Scene) -> Sights:
         """Where samples are seen, and how far from the image curves."""
         y = x.P @ x.u[:, None]
-        points = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).reshape(*x.place.shape, 2)
-        place = self.images.nearest(x.place, points)
-        foot, first, _ = self.images.at(place)
-        tangent = torch.nn.functional.normalize(first, dim=-1)
-        normal = torch.stack((-tangent[..., 1], tangent[..., 0]), -1)
-        r = ((points - foot) * normal).sum(-1).flatten(2)
-        along = ((points - self.pins.x) * self.pins.tangent).sum(-1) * self.pins.at
-        rows = (torch.cat((d, -(d * points).sum(-1, keepdim=True)), -1).flatten(2, 3) for d in (normal, self.pins.tangent))
-        slope, along_slope = (divide_safely(row, y[:, :, 2]).mT for row in rows)
-        return Sights(y, r, slope, along.flatten(2), along_slope * self.pins.at.flatten(2)[:, :, None], place)
+        near, pins = near_curves(self.images, x.place, y), self.pins
+        along = ((near.points - pins.x) * pins.tangent).sum(-1) * pins.at
+        along_slope = _by_image(pins.tangent, near.points, y) * pins.at.flatten(2)[:, :, None]
+        return Sights(y, near.r, near.slope, along.flatten(2), along_slope, near.place)
 
     def misfit(self, seen: Sights) -> Float[Tensor, "p n"]:
         """The weighted sum of each sample's squared distances."""
@@ -163,7 +163,7 @@ class CurveDistances(Problem[CurveSystem]):
         move, _ = solve(A, J.mT @ (w * r).mT[..., None])
         return torch.nn.functional.normalize(x.u - move[..., 0].mT, dim=1)
 
-    def _system(self, x: Scene, seen: Sights) -> CurveSystem:
+    def _system(self, x: Scene, seen: Sights) -> BilinearSystem:
         w = self.weight.flatten(2)
         size = torch.linalg.vector_norm(seen.slope, dim=2, keepdim=True)
         # The Hessian g g' + h h' in axes along y, g and across both, by its eigenvalues: a I - a y y' - (a - b) e e'.
@@ -183,13 +183,12 @@ class CurveDistances(Problem[CurveSystem]):
         total = w.sum((-2, -1)).clamp_min(1e-100)
         cost = self._costs(seen).sum(-1) / total
         cost = torch.where(cost.isfinite(), cost, torch.inf)
-        return CurveSystem(x._replace(place=seen.place), cost, linear, total)
+        return BilinearSystem(x._replace(place=seen.place), cost, linear, total)
 
 
 def pinned(images: CurvePlaces, weight: Float[Tensor, "p v c m"], x: Scene) -> CurveDistances:
     """Distances of samples that are pinned where they are, each by the image in which its curve is seen least foreshortened."""
-    y = x.P @ x.u[:, None]
-    points = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).reshape(*x.place.shape, 2)
+    points = _points(x.P @ x.u[:, None], x.place)
     step = (points - points.roll(1, -2)).square().sum(-1)
     step = torch.where(weight > 0, (step + step.roll(-1, -1)).nan_to_num(0.0, 0.0), -1.0)
     at = torch.zeros_like(weight, dtype=torch.bool).scatter(1, step.argmax(1, keepdim=True), True)
