@@ -73,11 +73,17 @@ class BundleLines:
         check_index(**{"structure.view": (self.view, views)})
 
     def variables(self, sight: Sight) -> Block:
-        """Lines in frames of their own, where a view that sees them has its centre: no line that is seen passes there."""
+        """Lines in frames of their own, about the centre of the farthest view that sees them.
+
+        About one close to the line, a small step would turn it far.
+        """
         L, centre = self.L.double(), sight.poses.centre.detach().double()
-        of_line = self.view.new_full((len(L),), len(centre)).scatter_reduce(0, self.line, self.view, "amin")
-        origin = torch.cat((centre, centre.new_zeros(1, 3)))[of_line]
         d = L[:, :3]
+        away = (L[:, 3:].detach()[self.line] - cross(centre[self.view], d.detach()[self.line])).square().sum(-1)
+        most = away.new_zeros(len(L)).scatter_reduce(0, self.line, away, "amax")
+        farthest = torch.where(away == most[self.line], self.view, len(centre))
+        of_line = self.view.new_full((len(L),), len(centre)).scatter_reduce(0, self.line, farthest, "amin")
+        origin = torch.cat((centre, centre.new_zeros(1, 3)))[of_line]
         moment = L[:, 3:] - cross(origin, d)
         # The distance of the line for a unit makes direction and moment of one length.
         ratio = (moment.detach().square().sum(-1) / d.detach().square().sum(-1).clamp_min(_TINY)).sqrt()
