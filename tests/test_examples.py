@@ -37,6 +37,7 @@ def test_batched_ransac(runner: Runner) -> None:
 
 def test_differentiable_geometry(runner: Runner) -> None:
     text, _ = runner.run(EXAMPLES / "differentiable_geometry.py")
+    assert number(r"step  30: loss ([\d.]+)", text) < 1.5  # trusting the wrong matches more keeps it at 3.7
     assert number(r"all matches alike: median error ([\d.]+) px", text) > 20
     assert number(r"weights of the network: median error ([\d.]+) px", text) < 3
 
