@@ -1,5 +1,7 @@
 """What follows from a refined model being an optimum: its derivative and its covariance; and what its inliers may lack."""
 
+import sys
+from functools import partial
 from typing import Any
 
 import pytest
@@ -8,9 +10,14 @@ from chance import assert_share
 from robust_doors import DOORS, F64, Door, Scene, extremes, pixels
 from torch import Tensor
 
-from torchsfm._types import Status
+from torchsfm._types import Status, tensor_map
 from torchsfm.geometry import random_rotation, rotation_from_rotvec
 from torchsfm.robust import Degeneracy
+from torchsfm.robust.hypotheses import NUMBERS
+from torchsfm.robust.optimum import step_covariance
+
+ransac_file = sys.modules["torchsfm.robust.ransac"]
+"""The name `torchsfm.robust.ransac` is that of the function."""
 
 every_door = pytest.mark.parametrize("door", DOORS.values(), ids=DOORS)
 
@@ -125,6 +132,39 @@ def test_the_covariance_is_that_of_many_trials(door: Door, generator: torch.Gene
 @every_door
 def test_the_covariance_is_that_of_a_thousand_trials(door: Door, generator: torch.Generator) -> None:
     check_spread(door, *spread(door, 1000, generator), slack=0.2)
+
+
+@every_door
+def test_the_covariance_is_that_of_gradients_datum_by_datum(
+    door: Door, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if door is DOORS["point"]:
+        pytest.skip("triangulation has a covariance of its own")
+    asked: list[Any] = []
+    monkeypatch.setattr(ransac_file, "step_covariance", lambda *given: asked.append(given) or step_covariance(*given))
+    scene = door.make(2, 30, generator, noise=0.4, wrong=0.2)
+    n = scene.data[0].shape[1]
+    door(scene, covariance=True, weights=0.5 + torch.rand(2, n, generator=generator, dtype=F64))
+    estimator, model, data, weights, selected, reach = asked[0]
+
+    def loss(i: int, j: slice, step: Tensor) -> Tensor:
+        own, start = tensor_map(lambda t: t[i], (estimator, model))
+        u = own.squared_residual(own.retract(start, step), *(d[i, j][selected[i, j]] for d in data)) / reach[i]
+        return (weights[i, j][selected[i, j]] * (u - 0.5 * u * u)).sum()
+
+    wanted = []
+    for i in range(2):
+        size, k = int(selected[i].sum()), estimator.dimension
+        zero = torch.zeros(k, dtype=F64)
+        gradients = torch.stack([torch.func.grad(partial(loss, i, slice(j, j + 1)))(zero) for j in range(n)])
+        inverse = torch.linalg.inv(torch.func.jacrev(torch.func.grad(partial(loss, i, slice(None))))(zero))
+        wanted.append(inverse @ gradients.mT @ gradients @ inverse.mT * (size / (size - k)))
+    expected = torch.stack(wanted)
+    entry = {"rtol": 0.0, "atol": 1e-7 * float(expected.abs().max())}
+    torch.testing.assert_close(step_covariance(*asked[0]), expected, **entry)
+    # The same where rows of derivatives are found one by one, as for many data.
+    monkeypatch.setitem(NUMBERS, True, 1)
+    torch.testing.assert_close(step_covariance(*asked[0]), expected, **entry)
 
 
 def test_covariance_is_computed_on_request_only(generator: torch.Generator) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import tensor_map
 from torchsfm.optim import attach_optimum, wants_derivative
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.hypotheses import squared_residual
+from torchsfm.robust.hypotheses import NUMBERS, squared_residual
 from torchsfm.robust.models import tensors_of, zip_map
 
 M = TypeVar("M")
@@ -82,22 +82,18 @@ def step_covariance(
         size = tangent.shape[-1]
         safe = [_others_replaced(d, selected) for d in data]
 
-        def loss(step: Tensor) -> Tensor:
-            return _losses(estimator, estimator.retract(model, step), safe, weights, selected, reach).sum(-1)  # type: ignore[attr-defined]
+        def losses(step: Tensor) -> Tensor:
+            return _losses(estimator, estimator.retract(model, step), safe, weights, selected, reach)  # type: ignore[attr-defined]
 
-        def apart(steps: Tensor) -> Tensor:
-            """The losses, each datum with a step of its own."""
-            one = tensor_map(lambda t: t[:, None], estimator)
-            moved = one.retract(tensor_map(lambda t: t[:, None], model), steps)  # type: ignore[attr-defined]
-            single = [d[..., None, :] for d in safe]
-            return _losses(one, moved, single, weights[..., None], selected[..., None], reach[:, None])
+        def slope(step: Tensor, counts: Tensor) -> Tensor:
+            """The gradient of the sum of the losses, each so many times: linear in that, by a datum's own gradient."""
+            gradient: Tensor = torch.func.vjp(losses, step)[1](counts)[0]
+            return gradient
 
-        steps = tangent[:, None].expand(-1, selected.shape[-1], -1).contiguous()
-        gradients = torch.func.grad(lambda z: apart(z).sum())(steps)
-        gradients = torch.where(selected[..., None], gradients, 0)
-        hessian = derivative(torch.func.grad(lambda z: loss(z).sum()), tangent)
+        hessian, gradients = derivatives(slope, tangent, torch.ones_like(weights))
+        gradients = torch.where(selected[:, None], gradients, 0)
         number = selected.sum(-1).to(reach.dtype)
-        scatter = gradients.mT @ gradients * (number / (number - size).clamp(min=1))[:, None, None]
+        scatter = gradients @ gradients.mT * (number / (number - size).clamp(min=1))[:, None, None]
         # Scaled to a unit diagonal, as the unknowns may be of different units.
         scale = hessian.diagonal(dim1=-2, dim2=-1).clamp(min=1e-280).rsqrt()
         scale = scale[..., :, None] * scale[..., None, :]
@@ -108,21 +104,21 @@ def step_covariance(
         return torch.where(good[:, None, None], covariance, 0)
 
 
-def derivative(function: Callable[[Tensor], Tensor], x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch m k"]:
-    """The derivative of a function `(*batch, k) -> (*batch, m)` that treats the elements of a batch one by one."""
-    value, pull = torch.func.vjp(function, x)[:2]
-    rows = []
-    for i in range(value.shape[-1]):
-        seed = torch.zeros_like(value)
-        seed[..., i] = 1
-        rows.append(pull(seed)[0])
-    return torch.stack(rows, -2)
+def derivatives(function: Callable[..., Tensor], *x: Float[Tensor, "*batch _"]) -> list[Float[Tensor, "*batch m _"]]:
+    """The derivatives of a function to `(*batch, m)` by each argument; it treats the elements of a batch one by one."""
+    value, pull = torch.func.vjp(function, *x)[:2]
+    m = value.shape[-1]
+    seeds = torch.eye(m, dtype=value.dtype, device=value.device).view(m, *(1,) * (value.ndim - 1), m).expand(m, *value.shape)
+    # All rows together are faster until they leave the cache.
+    together = m * sum(t.numel() for t in x) <= NUMBERS[value.device.type == "cpu"]
+    rows = torch.func.vmap(pull)(seeds) if together else map(torch.stack, zip(*map(pull, seeds), strict=True))
+    return [row.movedim(0, -2) for row in rows]
 
 
 def push_forward(function: Callable[[Tensor], Tensor], covariance: Float[Tensor, "*batch k k"]) -> Float[Tensor, "*batch m m"]:
     """The covariance of `function(step)`, `(*batch, k) -> (*batch, m)`, from that of a step around zero, to first order."""
     with torch.no_grad():
-        J = derivative(function, torch.zeros_like(covariance[..., 0]))
+        (J,) = derivatives(function, torch.zeros_like(covariance[..., 0]))
         # Where no model was found, what stands in its place may have no derivative; its covariance is zero.
         J = torch.where(torch.isfinite(J), J, 0)
         return J @ covariance @ J.mT
