@@ -115,7 +115,13 @@ def write_bal(problem: BundleProblem, path: str | Path) -> None:
         ValueError: BAL cannot hold these cameras: skew, pixels that are not square, or other distortion.
         OSError: The file cannot be written.
 
-    See the example of `read_bal`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_bal(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "problem.txt")
+        >>> from pathlib import Path
+        >>> Path("problem.txt").read_text().splitlines()[0]  # images, points, observations
+        '3 20 50'
     """
     path = Path(path)
     cameras = problem.cameras

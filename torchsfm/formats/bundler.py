@@ -34,7 +34,15 @@ def write_bundler(reconstruction: Reconstruction, path: str | Path) -> None:
             are not square, or other distortion; or a name with a line break.
         OSError: A file cannot be written.
 
-    See the example of `read_bundler`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> torchsfm.write_bundler(torchsfm.formats.undistorted_model(model, centred=True), "bundle.out")
+        >>> from pathlib import Path
+        >>> Path("bundle.out").read_text().splitlines()[0]
+        '# Bundle file v0.3'
     """
     path = Path(path)
     model, f, centre = centred_cameras(reconstruction, "Bundler", Radial)

@@ -64,7 +64,14 @@ def write_colmap(
         ValueError: A camera has skew, or a distortion, which none of the models has, or text files cannot hold a name.
         OSError: The folder cannot be made or written.
 
-    See the example of `read_colmap`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_colmap(torchsfm.read_model("model.npz"), "sparse/0", text=True)
+        >>> from pathlib import Path
+        >>> Path("sparse/0/cameras.txt").read_text().splitlines()[-1].split()[1:4]  # camera model, width, height
+        ['RADIAL', '823', '672']
     """
     folder = Path(folder)
     if unknown := set(models) - set(PARAMETERS):

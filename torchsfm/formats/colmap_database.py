@@ -130,10 +130,19 @@ def read_features(path: str | Path) -> KnownFeatures:
         OSError: It cannot be read.
 
     Example:
-        >>> import torchsfm
-        >>> known = torchsfm.formats.read_features("database.db")  # doctest: +SKIP
-        >>> model = torchsfm.read_colmap("sparse/0")  # doctest: +SKIP
-        >>> result = torchsfm.reconstruction.register_photographs("new/", model, known)  # doctest: +SKIP
+        >>> import sqlite3, torch, torchsfm
+        >>> x, none = torch.rand(10, 2, generator=torch.Generator().manual_seed(0)), torch.zeros(0, 2, dtype=torch.int64)
+        >>> size, pairs = torch.tensor([[640, 480], [640, 480]]), torch.tensor([[0, 1]])
+        >>> torchsfm.write_database(torchsfm.MatchedImages(("a.jpg", "b.jpg"), size, (x, x), pairs, (none,)), "database.db")
+        >>> database = sqlite3.connect("database.db")
+        >>> table = database.execute("CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY, rows INT, cols INT, data BLOB)")
+        >>> rows = [(image, 10, 128, bytes([45]) * 1280) for image in (1, 2)]  # of both images
+        >>> change = database.executemany("INSERT INTO descriptors VALUES (?, ?, ?, ?)", rows)
+        >>> database.commit()
+        >>> database.close()
+        >>> known = torchsfm.formats.read_features("database.db")  # as register_photographs takes them
+        >>> known.names, known.descriptors[0].shape
+        (('a.jpg', 'b.jpg'), torch.Size([10, 128]))
     """
     path = Path(path)
     matched = read_database(path)
@@ -173,7 +182,17 @@ def write_database(matched: MatchedImages, path: str | Path) -> None:
         ValueError: Two images have one name, or one camera has two sizes of images.
         OSError: The file cannot be written.
 
-    See the example of `read_database`.
+    Example:
+        >>> import torch, torchsfm
+        >>> x, match = torch.rand(10, 2, generator=torch.Generator().manual_seed(0)), torch.arange(10)
+        >>> size = torch.tensor([[640, 480], [640, 480]])
+        >>> pairs, matches = torch.tensor([[0, 1]]), (torch.stack((match, match), 1),)
+        >>> torchsfm.write_database(torchsfm.MatchedImages(("a.jpg", "b.jpg"), size, (x, x), pairs, matches), "database.db")
+        >>> import sqlite3
+        >>> database = sqlite3.connect("database.db")
+        >>> database.execute("SELECT name FROM images").fetchall()
+        [('a.jpg',), ('b.jpg',)]
+        >>> database.close()
     """
     if len(set(matched.names)) < len(matched.names):
         raise ValueError("matched: wanted a name for each image, got one twice")

@@ -72,7 +72,18 @@ def read_conics(path: str | Path) -> Conics:
         ValueError: The file is no such text; one line that says where.
         OSError: It cannot be read.
 
-    See the example of `write_conics`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from dataclasses import replace
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> disc = torchsfm.Ellipsoid(torch.zeros(1, 3).double(), torch.diag(torch.tensor([2.0, 1.0, 0.0]))[None].double())
+        >>> none, index = torch.zeros(0, 5).double(), torch.zeros(0, dtype=torch.int64)  # measured nowhere
+        >>> seen, covariance = torchsfm.Ellipse(none[:, :2], none[:, :2], none[:, 0]), torch.zeros(0, 5, 5).double()
+        >>> conics = torchsfm.reconstruction.Conics.of(disc, seen, covariance, index, index)
+        >>> torchsfm.formats.write_conics(replace(torchsfm.read_model("model.npz"), conics=conics), "conics.txt")
+        >>> torchsfm.formats.read_conics("conics.txt").centre
+        tensor([[0., 0., 0.]], dtype=torch.float64)
     """
     rows: list[list[float]] = []
     seen: list[list[float]] = []

@@ -32,10 +32,16 @@ def read_hloc(features: str | Path, matches: str | Path, *, images: str | Path |
         OSError: A file cannot be read.
 
     Example:
-        >>> import torchsfm
-        >>> matched = torchsfm.read_hloc("features.h5", "matches.h5")  # doctest: +SKIP
-        >>> data = (matched.keypoints, matched.pairs, matched.matches, matched.image_size)  # doctest: +SKIP
-        >>> result = torchsfm.reconstruct_matches(*data, names=matched.names)  # doctest: +SKIP
+        >>> import h5py, torch, torchsfm
+        >>> with h5py.File("features.h5", "w") as features:
+        ...     for name in ("a.jpg", "b.jpg"):
+        ...         features[f"{name}/keypoints"] = torch.rand(10, 2, generator=torch.Generator().manual_seed(0)).numpy()
+        ...         features[f"{name}/image_size"] = [640, 480]
+        >>> with h5py.File("matches.h5", "w") as matches:
+        ...     matches["a.jpg/b.jpg/matches0"] = [0, 1, 2, 3, 4, -1, -1, -1, -1, -1]
+        >>> matched = torchsfm.read_hloc("features.h5", "matches.h5")
+        >>> matched.names, matched.pairs, len(matched.matches[0])  # as reconstruct_matches takes them
+        (('a.jpg', 'b.jpg'), tensor([[0, 1]]), 5)
     """
     try:
         import h5py

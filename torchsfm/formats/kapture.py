@@ -46,7 +46,14 @@ def write_kapture(reconstruction: Reconstruction, folder: str | Path) -> None:
             for which the format has no place; or the folder holds a dataset with rigs, which would be mixed with this one.
         OSError: A file cannot be written.
 
-    See the example of `read_kapture`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_kapture(torchsfm.read_model("model.npz"), "kapture")
+        >>> from pathlib import Path
+        >>> Path("kapture/sensors/sensors.txt").read_text().splitlines()[0]
+        '# kapture format: 1.1'
     """
     folder = Path(folder)
     if (folder / "sensors" / "rigs.txt").exists():

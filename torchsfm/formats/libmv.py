@@ -34,9 +34,16 @@ def read_libmv(path: str | Path) -> BundleProblem:
         OSError: It cannot be read.
 
     Example:
-        >>> import torchsfm
-        >>> problem = torchsfm.formats.read_libmv("problem.bin")  # doctest: +SKIP
-        >>> result = torchsfm.bundle_adjust(problem)  # doctest: +SKIP
+        >>> import struct, torchsfm
+        >>> data = b"vP" + struct.pack("<8f", 800, 320, 240, 0, 0, 0, 0, 0)  # focal length, principal point, k1, k2, k3, p1, p2
+        >>> data += struct.pack("<2i12f", 1, 7, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 5)  # one camera, of image 7: R by columns, t
+        >>> data += struct.pack("<2i3f", 1, 3, 0, 0, 0)  # one point, of track 3, at the origin
+        >>> data += struct.pack("<3i2f", 1, 7, 3, 321, 240)  # one marker: image, track, pixels
+        >>> with open("problem.bin", "wb") as file:
+        ...     size = file.write(data)
+        >>> problem = torchsfm.formats.read_libmv("problem.bin")
+        >>> problem.x, problem.poses.centre + 0.0
+        (tensor([[321., 240.]], dtype=torch.float64), tensor([[ 0.,  0., -5.]], dtype=torch.float64))
     """
     path = Path(path)
     data = path.read_bytes()

@@ -69,7 +69,17 @@ def read_lines(path: str | Path) -> Lines:
         ValueError: The file is no such text; one line that says where.
         OSError: It cannot be read.
 
-    See the example of `write_lines`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from dataclasses import replace
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model, index = torchsfm.read_model("model.npz"), torch.zeros(0, dtype=torch.int64)
+        >>> ends, empty = model.X[:10].reshape(5, 2, 3), torch.zeros(0, dtype=torch.float64)
+        >>> lines = torchsfm.Lines(ends, torch.ones_like(ends[:, 0]), empty.reshape(0, 2, 2), empty, index, index)
+        >>> torchsfm.write_lines(replace(model, lines=lines), "lines.txt")
+        >>> len(torchsfm.read_lines("lines.txt")), torchsfm.read_lines("lines.txt").support()  # seen in no image
+        (5, tensor([0, 0, 0, 0, 0]))
     """
     ends, color, segments, line = [], [], [], []
     for number, text in enumerate(Path(path).read_bytes().decode("ascii", "replace").splitlines(), 1):

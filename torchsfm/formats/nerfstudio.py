@@ -41,7 +41,15 @@ def write_nerfstudio(reconstruction: Reconstruction, path: str | Path) -> None:
         ValueError: A camera has skew, which the format has not.
         OSError: A file cannot be written.
 
-    See the example of `read_nerfstudio`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_nerfstudio(torchsfm.read_model("model.npz"), "transforms.json")
+        >>> import json
+        >>> from pathlib import Path
+        >>> len(json.loads(Path("transforms.json").read_text())["frames"])
+        3
     """
     path = Path(path)
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)

@@ -42,7 +42,15 @@ def write_nvm(reconstruction: Reconstruction, path: str | Path) -> None:
             skew, or pixels that are not square; or a name with a tab, a quotation mark or a line break.
         OSError: The file cannot be written.
 
-    See the example of `read_nvm`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> torchsfm.write_nvm(torchsfm.formats.undistorted_model(model, centred=True), "model.nvm")
+        >>> from pathlib import Path
+        >>> Path("model.nvm").read_text().splitlines()[0]
+        'NVM_V3'
     """
     model, f, centre = centred_cameras(registered_only(reconstruction), "NVM", NoDistortion)
     if odd := [name for name in model.names if any(c in name for c in '\n\r\t"') or not name]:

@@ -90,7 +90,15 @@ def camera_from_opencv(
     Raises:
         ValueError: There are more or fewer coefficients.
 
-    See the example of `opencv_from_camera`.
+    Example:
+        >>> import torch, torchsfm
+        >>> rvec, tvec = torch.tensor([0.0, torch.pi / 2, 0.0]), torch.tensor([0.0, 0.0, 5.0])
+        >>> K = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]])
+        >>> pose, camera = torchsfm.formats.camera_from_opencv(rvec, tvec, K, torch.tensor([0.1, 0.0, 0.0, 0.0]))
+        >>> pose.centre.round(decimals=4) + 0.0  # a quarter turn about y
+        tensor([5., 0., 0.])
+        >>> camera.distortion.k1
+        tensor(0.1000)
     """
     check_tensors(rvec=(rvec, "3"), tvec=(tvec, "3"), K=(K, "3 3"), distortion=(distortion, "?k"))
     pose = Pose(rotation_from_rotvec(rvec), tvec)
@@ -142,7 +150,13 @@ def camera_from_kornia(intrinsics: Float[Tensor, "*batch 4 4"], extrinsics: Floa
         intrinsics: K in pixels in the upper left 3x3.
         extrinsics: The motion from world to camera.
 
-    See the example of `kornia_from_camera`.
+    Example:
+        >>> import torch, torchsfm
+        >>> K, T = torch.eye(4)[None].clone(), torch.eye(4)[None].clone()
+        >>> K[:, :3, :3], T[:, 2, 3] = torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0])), 5.0
+        >>> pose, camera = torchsfm.formats.camera_from_kornia(K, T)
+        >>> camera.project(pose.transform(torch.zeros(1, 1, 3)))  # the origin, five ahead of the camera
+        tensor([[[320., 240.]]])
     """
     check_tensors(intrinsics=(intrinsics, "4 4"), extrinsics=(extrinsics, "4 4"))
     return Pose(extrinsics[..., :3, :3], extrinsics[..., :3, 3]), Camera(intrinsics[..., :3, :3])
@@ -201,7 +215,13 @@ def camera_from_pytorch3d(
         focal_length: Along x and y, in pixels.
         principal_point: In pixels, the corner of the image at (0, 0).
 
-    See the example of `pytorch3d_from_camera`.
+    Example:
+        >>> import torch, torchsfm
+        >>> focal, middle = torch.tensor([[800.0, 800.0]]), torch.tensor([[320.5, 240.5]])
+        >>> T = torch.tensor([[1.0, 0.0, 5.0]])  # x points to the left there
+        >>> pose, camera = torchsfm.formats.camera_from_pytorch3d(torch.eye(3)[None], T, focal, middle)
+        >>> camera.project(pose.transform(torch.zeros(1, 1, 3)))  # and a pixel's centre is half a pixel from its corner
+        tensor([[[160., 240.]]])
     """
     check_tensors(R=(R, "3 3"), T=(T, "3"), focal_length=(focal_length, "2"), principal_point=(principal_point, "2"))
     flip = _flip(R)
@@ -263,7 +283,14 @@ def camera_from_nerfstudio(
         distortion_params: Coefficients (k1, k2, k3, k4, p1, p2); none if not given.
         fisheye: Whether the cameras are fisheyes, of which k1 to k4 count; of others k1 to k3, p1 and p2.
 
-    See the example of `nerfstudio_from_camera`.
+    Example:
+        >>> import torch, torchsfm
+        >>> back = torch.eye(4)[None, :3].clone()
+        >>> back[:, 2, 3] = 5.0  # five from the origin along z; cameras look along -z there
+        >>> lens = {name: torch.tensor([value]) for name, value in {"fx": 800.0, "fy": 800.0, "cx": 320.5, "cy": 240.5}.items()}
+        >>> pose, camera = torchsfm.formats.camera_from_nerfstudio(camera_to_worlds=back, **lens)
+        >>> camera.project(pose.transform(torch.zeros(1, 1, 3)))
+        tensor([[[320., 240.]]])
     """
     check_tensors(camera_to_worlds=(camera_to_worlds, "3 4"), distortion_params=(distortion_params, "?6"))
     R = (camera_to_worlds[..., :3] * camera_to_worlds.new_tensor([1.0, -1.0, -1.0])).mT
@@ -287,9 +314,13 @@ def pycolmap_from_model(model: Reconstruction) -> Any:
         ValueError: COLMAP has no such cameras.
 
     Example:
-        >>> import torchsfm
-        >>> model = torchsfm.read_model("model.npz")  # doctest: +SKIP
-        >>> same = torchsfm.formats.model_from_pycolmap(torchsfm.formats.pycolmap_from_model(model))  # doctest: +SKIP
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> same = torchsfm.formats.model_from_pycolmap(torchsfm.formats.pycolmap_from_model(model))
+        >>> same.num_points, bool(same.X.allclose(model.X))
+        (20, True)
     """
     import pycolmap
 
@@ -307,7 +338,14 @@ def model_from_pycolmap(reconstruction: Any) -> Reconstruction:
     Raises:
         ValueError: It has cameras that have no equal here.
 
-    See the example of `pycolmap_from_model`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> import pycolmap
+        >>> torchsfm.write_colmap(torchsfm.read_model("model.npz"), "sparse")
+        >>> torchsfm.formats.model_from_pycolmap(pycolmap.Reconstruction("sparse")).num_registered
+        3
     """
     with tempfile.TemporaryDirectory() as folder:
         reconstruction.write(folder)

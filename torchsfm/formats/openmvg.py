@@ -38,7 +38,15 @@ def write_openmvg(reconstruction: Reconstruction, path: str | Path) -> None:
         ValueError: A camera has skew, or pixels that are not square, for which the format has no place.
         OSError: The file cannot be written.
 
-    See the example of `read_openmvg`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_openmvg(torchsfm.read_model("model.npz"), "sfm_data.json")
+        >>> import json
+        >>> from pathlib import Path
+        >>> list(json.loads(Path("sfm_data.json").read_text()))
+        ['sfm_data_version', 'root_path', 'views', 'intrinsics', 'extrinsics', 'structure', 'control_points']
     """
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)
     ids: dict[tuple[int, int, int], int] = {}

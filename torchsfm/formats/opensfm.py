@@ -49,7 +49,15 @@ def write_opensfm(reconstruction: Reconstruction, path: str | Path) -> None:
         ValueError: A camera has skew, or a name a tab or line break, for which the format has no place.
         OSError: A file cannot be written.
 
-    See the example of `read_opensfm`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> torchsfm.write_opensfm(torchsfm.read_model("model.npz"), "reconstruction.json")
+        >>> import json
+        >>> from pathlib import Path
+        >>> list(json.loads(Path("reconstruction.json").read_text())[0])
+        ['cameras', 'shots', 'points']
     """
     path = Path(path)
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)

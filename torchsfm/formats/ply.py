@@ -53,7 +53,12 @@ def write_ply(
         ValueError: `color` does not fit, or is given together with a reconstruction.
         OSError: The file cannot be written.
 
-    See the example of `read_ply`.
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.write_ply(torch.zeros(5, 3), "points.ply")
+        >>> from pathlib import Path
+        >>> Path("points.ply").read_bytes().splitlines()[2]
+        b'element vertex 5'
     """
     cameras: npt.NDArray[Any] | None = None
     if isinstance(points, Reconstruction):

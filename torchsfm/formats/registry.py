@@ -198,7 +198,14 @@ def write_model(model: Model, path: str | Path, format: str | None = None) -> No
         ValueError: There is no such format, or it cannot hold the model.
         OSError: It cannot be written.
 
-    See the example of `read_model`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> torchsfm.write_model(model, "sfm_data.json")  # the name says which format
+        >>> torchsfm.read_model("sfm_data.json").num_points
+        20
     """
     kind = format_for(path, format)
     assert kind.write is not None

@@ -48,9 +48,17 @@ def read_vgg(folder: str | Path) -> VggScene:
         ValueError: A file is missing or damaged, or holds a number that is not finite; one line that says which.
 
     Example:
-        >>> import torchsfm
-        >>> scene = torchsfm.formats.read_vgg("model_house")  # doctest: +SKIP
-        >>> result = torchsfm.triangulate_points(scene.x, scene.P, visible=scene.visible)  # doctest: +SKIP
+        >>> import os, torchsfm
+        >>> files = {"2D/a.000.corners": "320 240", "2D/a.001.corners": "240 240"}
+        >>> files |= {"2D/a.nview-corners": "0 0", "3D/a.p3d": "0 0 5"}
+        >>> files |= {f"3D/a.00{i}.P": f"400 0 320 {-400 * i} / 0 400 240 0 / 0 0 1 0" for i in range(2)}
+        >>> for name, text in files.items():
+        ...     os.makedirs(os.path.dirname(name), exist_ok=True)
+        ...     with open(name, "w") as file:
+        ...         size = file.write(text.replace(" / ", os.linesep))
+        >>> scene = torchsfm.formats.read_vgg(".")
+        >>> torchsfm.triangulate_points(scene.x, scene.P, visible=scene.visible).model
+        tensor([[0., 0., 5.]], dtype=torch.float64)
     """
     folder = Path(folder)
     corners = sorted((folder / "2D").glob("*.corners"))

@@ -47,7 +47,12 @@ def geodetic_from_enu(X: Float[Tensor, "*#batch 3"], origin: Float[Tensor, "*#ba
         X: Metres to the east, to the north, and up.
         origin: Latitude, longitude (degrees) and height (metres) of zero.
 
-    See the example of `enu_from_geodetic`.
+    Example:
+        >>> import torch, torchsfm
+        >>> lund = torch.tensor([55.704, 13.191, 50.0], dtype=torch.float64)
+        >>> east = torch.tensor([1000.0, 0.0, 0.0], dtype=torch.float64)
+        >>> torchsfm.geometry.geodetic_from_enu(east, lund)  # the Earth falls away by 8 cm
+        tensor([55.7040, 13.2069, 50.0782], dtype=torch.float64)
     """
     check_tensors(X=(X, "3"), origin=(origin, "3"))
     start = origin.double()

@@ -56,9 +56,15 @@ def extract_frames(
         OSError: A frame cannot be written.
 
     Example:
-        >>> import torchsfm
-        >>> frames = torchsfm.images.extract_frames("walk.mp4", "frames", fps=2)  # doctest: +SKIP
-        >>> result = torchsfm.reconstruct("frames", sequence=True)  # doctest: +SKIP
+        >>> import cv2, torch, torchsfm
+        >>> film = cv2.VideoWriter("walk.avi", cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
+        >>> g = torch.Generator().manual_seed(0)
+        >>> sharp = torch.randint(0, 255, (48, 64, 3), dtype=torch.uint8, generator=g).numpy()
+        >>> for number in range(20):  # two seconds; every fifth picture is sharp
+        ...     done = film.write(sharp if number % 5 == 3 else cv2.blur(sharp, (5, 5)))
+        >>> film.release()
+        >>> [path.name for path in torchsfm.images.extract_frames("walk.avi", "frames", fps=2.0)]
+        ['frame000003.jpg', 'frame000008.jpg', 'frame000013.jpg', 'frame000018.jpg']
     """
     film, folder = Path(film), Path(folder)
     if not (math.isfinite(fps) and fps > 0):

@@ -200,7 +200,18 @@ def align_to_points(model: Reconstruction, control: ControlPoints) -> Alignment:
         model: The model; observations in images without a pose do not count.
         control: The measured points.
 
-    See the example of `adjust_to_points`, which also bends the model to them.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.reconstruction import ControlPoints, align_to_points
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(6, 60, 250, noise=0.0, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> row = (model.point < 6).nonzero()[:, 0]
+        >>> images = tuple(model.names[i] for i in model.view[row].tolist())
+        >>> known = ControlPoints(tuple("abcdef"), 3 * model.X[:6], images, model.x[row], model.point[row])
+        >>> found = align_to_points(model, known)
+        >>> found.fault(), found.similarity.scale
+        ('', tensor(3.0000, dtype=torch.float64))
     """
     model = model.to("cpu", torch.float64)
     place = {name: i for i, name in enumerate(model.names) if bool(model.registered[i])}

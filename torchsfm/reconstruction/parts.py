@@ -21,7 +21,14 @@ def part_of_model(model: Reconstruction, images: Bool[Tensor, "v"]) -> Reconstru
         model: The model.
         images: Which of its images to keep.
 
-    See the example of `merge_models`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(8, 150, 800, generator=g).truth, "model.npz")
+        >>> whole = torchsfm.read_model("model.npz")
+        >>> part = torchsfm.reconstruction.part_of_model(whole, torch.arange(8) < 3)
+        >>> part.num_registered, int(part.track_lengths().min()), part.num_points < whole.num_points
+        (3, 2, True)
     """
     return shown_often(with_images(model, images))
 
