@@ -3,9 +3,10 @@
     TORCHSFM_DATA=/path/to/data python -m bench.doors [--out FOLDER]
 
 reconstructs castle-P19 whole, in two halves that share three images, and without one image, and prints how good the merged
-halves are beside the whole, where the image left out is placed beside where the whole model has it, and for fountain-P11 what
-points the true poses give beside free ones; then temple_ring as a film, and fountain-P11 by COLMAP's features and matches in
-its database, where pycolmap is installed. With `--out`, what was finished there is not computed again.
+halves are beside the whole, with their lines and curves, where the image left out is placed beside where the whole has it, and
+for fountain-P11 what points the true poses give beside free ones; then temple_ring as a film, and fountain-P11 by COLMAP's
+features and matches in its database and in hloc's two files, where pycolmap and h5py are installed. With `--out`, what was
+finished there is not computed again.
 """
 
 import argparse
@@ -13,18 +14,23 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import cv2
+import numpy as np
 import torch
 
+from bench import merged_structure
 from bench.real_data import PhotographSet, data_folder, strecha, temple
+from torchsfm.formats import read_hloc
 from torchsfm.geometry import Camera, Pose, rotation_angle
 from torchsfm.reconstruction import (
     Reconstruction,
     align_models,
     merge_models,
     reconstruct,
+    reconstruct_matches,
     register_photographs,
     saved_features,
     triangulate_photographs,
@@ -51,11 +57,13 @@ def true_camera(photographs: PhotographSet) -> Camera:
     return Camera(torch.tensor([[float(word) for word in row] for row in rows], dtype=torch.float64)[None])
 
 
-def model_of(paths: list[Path], out: Path) -> Reconstruction:
-    """The model of some photographs, made once."""
-    if not (out / "model.npz").exists():
-        reconstruct(paths, shared_camera=True, out=out, resume=True).model.save(out / "model.npz")
-    return Reconstruction.load(out / "model.npz")
+def model_of(paths: list[Path], out: Path, *, structure: bool = False) -> Reconstruction:
+    """The model of some photographs, with lines and curves or without, made once."""
+    file = out / ("structure.npz" if structure else "model.npz")
+    if not file.exists():
+        found = reconstruct(paths, shared_camera=True, out=out, resume=True, lines=structure, curves=structure)
+        found.model.save(file)
+    return Reconstruction.load(file)
 
 
 def describe(name: str, model: Reconstruction, truth: Pose) -> str:
@@ -78,6 +86,24 @@ def merging(castle: PhotographSet, out: Path) -> None:
     for name, model in (("whole", whole), ("first", first), ("second", second), ("merged", merged.model)):
         print(describe(name, model, true_poses(castle, model.names)))
     print(merged.fault() or merged.summary())
+
+
+def merging_structure(castle: PhotographSet, out: Path) -> None:
+    """Lines and curves of the merged halves against those of the whole."""
+    middle = (len(castle.paths) + SHARED) // 2
+    parts = {"whole": castle.paths, "first": castle.paths[:middle], "second": castle.paths[middle - SHARED :]}
+    models = {name: model_of(paths, out / name, structure=True) for name, paths in parts.items()}
+    merged = merge_models(models["first"], models["second"])
+    models["merged"] = merged.model
+    print(merged.fault() or merged.summary())
+    # The whole in metres of the truth, all others on it: a model bends by more than its lines are thick.
+    whole = models["whole"]
+    whole = whole.transform(align_poses(whole.poses, true_poses(castle, whole.names), whole.registered))
+    metric = {name: model.transform(align_models(model, whole).similarity) for name, model in models.items()}
+    for row, what in ((merged_structure.line_row, "lines"), (merged_structure.curve_row, "curve samples")):
+        print(merged_structure.HEAD.format(what=what))
+        for name, model in metric.items():
+            print(row(name, model, whole))
 
 
 def placing(castle: PhotographSet, out: Path) -> None:
@@ -150,6 +176,39 @@ def by_colmap(fountain: PhotographSet, out: Path) -> None:
         command(out / "database.db", "--out", out)
     model = Reconstruction.load(out / "model.npz")
     print(describe("fountain-P11, COLMAP's database", model, true_poses(fountain, model.names)))
+    try:
+        import h5py
+    except ImportError:
+        print("h5py is not installed")
+        return
+    files = out / "features.h5", out / "matches.h5"
+    if not files[1].exists():
+        with pycolmap.Database.open(out / "database.db") as database, h5py.File(files[0], "w") as features:
+            images = database.read_all_images()
+            for image in images:
+                camera = database.read_camera(image.camera_id)
+                # hloc has the centre of the top-left pixel at (0, 0), COLMAP at (0.5, 0.5).
+                features[f"{image.name}/keypoints"] = database.read_keypoints(image.image_id)[:, :2] - 0.5
+                features[f"{image.name}/image_size"] = [camera.width, camera.height]
+            with h5py.File(files[1], "w") as matches:
+                for first, second in combinations(images, 2):
+                    pairs = database.read_matches(first.image_id, second.image_id)
+                    match = np.full(len(features[f"{first.name}/keypoints"]), -1, dtype=np.int16)
+                    match[pairs[:, 0]] = pairs[:, 1]
+                    group = f"{first.name}/{second.name}"
+                    matches[f"{group}/matches0"] = match
+                    matches[f"{group}/matching_scores0"] = (match >= 0).astype(np.float16)
+    found = read_hloc(*files)
+    result = reconstruct_matches(
+        found.keypoints,
+        found.pairs,
+        found.matches,
+        found.image_size,
+        weights=found.weights,
+        names=found.names,
+        shared_camera=True,
+    )
+    print(describe("fountain-P11, hloc's two files", result.model, true_poses(fountain, result.model.names)))
 
 
 def command(*words: object) -> None:
@@ -169,6 +228,7 @@ def main() -> None:
         out = arguments.out or Path(temporary)
         castle, fountain = strecha(data, "castle-P19"), strecha(data, "fountain-P11")
         merging(castle, out / "castle")
+        merging_structure(castle, out / "castle")
         placing(castle, out / "castle")
         pointing(fountain, out / "fountain")
         print(HEAD)
