@@ -311,6 +311,7 @@ def best_of_few(logits: torch.Tensor | None, data: tuple[torch.Tensor, ...]) -> 
         FundamentalEstimator(), x1, x2, threshold=3 / 500, logits=logits, mask=visible, hypotheses=24,
         generator=torch.Generator().manual_seed(1),
     ).best()  # fmt: skip
+    # A model is F and, in a fourth column, an epipole, which tells front from behind.
     return float(500 * sampson_distance(chosen[..., :3], y1, y2).median(-1).values.median())
 
 
