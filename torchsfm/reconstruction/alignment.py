@@ -200,6 +200,8 @@ def align_to_points(model: Reconstruction, control: ControlPoints) -> Alignment:
         model: The model; observations in images without a pose do not count.
         control: The measured points.
 
+    `adjust_to_points` also bends the model to them.
+
     Example:
         >>> import torch, torchsfm
         >>> from torchsfm.reconstruction import ControlPoints, align_to_points
