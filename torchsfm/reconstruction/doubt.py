@@ -13,7 +13,7 @@ from torchsfm.reconstruction.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
 
 WRONG_ANGLE = 5.0
 """Degrees by which a camera may be turned or displaced before it counts as wrong."""
@@ -50,6 +50,7 @@ def examine(
     prior: CameraPrior,
     threshold: float,
     uncertain: Bool[Tensor, "v"] | None = None,
+    conflicts: Conflicts | None = None,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
@@ -59,6 +60,7 @@ def examine(
         prior: What was expected of the cameras before any image point was seen.
         threshold: Largest reprojection error of an observation, in pixels.
         uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
+        conflicts: What missing correspondences say of this model where that is known; else it is found.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -71,7 +73,7 @@ def examine(
     matches, agreeing = (agreement.per_view(one > 0, n, v) for n in (agreement.matches, agreement.agreeing))
     explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
     outvoted = agreement.balance(v) < 0
-    conflicts = missing_correspondences(mapping)
+    conflicts = conflicts or missing_correspondences(mapping)
     refuted = conflicts.refuted
     guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL
     degrees = torch.atan(position).rad2deg()

@@ -38,8 +38,8 @@ ALIKE = 0.85
 """Descriptors of one point, seen from like viewpoints, have at least this cosine; those of others rarely do."""
 WRONG = 0.02
 """Share of points at which a wrong match is found where there can be no right one."""
-SHIFT = 7
-"""Pixels beside a predicted place, where an image point is found by chance alone."""
+BESIDE = ((7, 7), (-7, 7), (7, -7), (-7, -7))
+"""Pixels by which places beside a predicted one are off, where an image point is found by chance alone."""
 SIGNIFICANCE = 0.01
 """Chance that a right model has a conflict anywhere, were all its points equally easy to find again."""
 NEAREST = 48
@@ -110,23 +110,18 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
         p = mapping.point[mine]
         x, depth, near = _predicted(mapping, p, a, b)
         seen = observed.has(p * v + b[:, None])
-        found = seen | occupied.at(b[:, None], x, mine)
-        chance = torch.stack([
-            occupied.at(b[:, None], x + x.new_tensor(step), mine).double()
-            for step in ((SHIFT, SHIFT), (-SHIFT, SHIFT), (SHIFT, -SHIFT), (-SHIFT, -SHIFT))
-        ]).mean(0)  # fmt: skip
-        near &= length[p] - seen.long() >= 2
-        hidden = nearest.at(b[:, None], x) < BEHIND * depth
-        through = (farthest.at(b[:, None], x) > FARTHER * depth) & (beside.at(b[:, None], x) > BEHIND * depth)
-        first = _cell(mapping.graph.x[mine], mapping.graph.image_size[a]).expand(len(b), -1)
-        second = _cell(x, mapping.graph.image_size[b][:, None])
-        offset = torch.arange(len(b))[:, None] * cells
-        bare, through = near & ~hidden, near & through
+        # Of the points that count, one row each: where the other camera should see them.
+        k, n = (near & (length[p] - seen.long() >= 2)).nonzero(as_tuple=True)
+        image, like, x, depth = b[k], mine[n], x[k, n], depth[k, n]
+        found = seen[k, n] | occupied.at(image, x, like)
+        chance = occupied.at(image, x + x.new_tensor(BESIDE)[:, None], like).double().mean(0)
+        bare = nearest.at(image, x) >= BEHIND * depth
+        through = (farthest.at(image, x) > FARTHER * depth) & (beside.at(image, x) > BEHIND * depth)
+        first, second = _cell(mapping.graph.x[like], mapping.graph.image_size[a]), _cell(x, mapping.graph.image_size[image])
+        weights = torch.stack([torch.ones_like(chance), found.double(), chance])
         for table, cell, counts in ((own, first, bare), (other, second, bare), (open_, first, through)):
-            index = (cell + offset)[counts]
-            for k, weights in enumerate((torch.ones_like(chance), found.double(), chance)):
-                flat = torch.zeros(len(b) * cells, dtype=torch.float64).index_add_(0, index, weights[counts].double())
-                table[k, rows] = flat.reshape(-1, cells)
+            flat = table.new_zeros(3, len(b) * cells).index_add_(1, (cell + k * cells)[counts], weights[:, counts])
+            table[:, rows] = flat.reshape(3, -1, cells)
     expected = _Shares.of(own)
     swapped = torch.arange(len(directed)).roll(len(pairs))
     both = 2 * torch.minimum(expected.against(own), expected.against(other)[swapped]).sum(-1)
@@ -196,7 +191,7 @@ class _Occupied:
         looks = None if graph.descriptors is None else graph.descriptors()
         return cls(pixel[order], order // 9, looks, width, height)
 
-    def at(self, view: Int[Tensor, "k 1"], x: Float[Tensor, "k n 2"], like: Int[Tensor, "n"]) -> Bool[Tensor, "k n"]:
+    def at(self, view: Int[Tensor, "n"], x: Float[Tensor, "*k n 2"], like: Int[Tensor, "n"]) -> Bool[Tensor, "*k n"]:
         """Whether an image has a point at a place, within a pixel or so, that looks like a given one where that is known."""
         place = x.nan_to_num(-9.0).clamp(-9, max(self.width, self.height) + 9).round().long() + 1
         inside = (place >= 0).all(-1) & (place[..., 0] < self.width) & (place[..., 1] < self.height)
@@ -234,7 +229,7 @@ class _DepthMap:
         around = torch.nn.functional.max_pool2d(table.reshape(-1, 1, columns, rows), 3, 1, 1)[:, 0]
         return cls(sign * around, size)
 
-    def at(self, view: Int[Tensor, "k 1"], x: Float[Tensor, "k n 2"]) -> Float[Tensor, "k n"]:
+    def at(self, view: Int[Tensor, "n"], x: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
         """The depth at or beside a place; infinite with the other sign where nothing is seen."""
         return self.table.flatten(1)[view, _cell(x, self.size[view], (self.table.shape[1], self.table.shape[2]))]
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
@@ -27,7 +27,7 @@ from torchsfm.reconstruction.report import ImageReport, Progress, Reconstruction
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.tracks import build_tracks
-from torchsfm.reconstruction.unfold import hanging_on_copies, unfold
+from torchsfm.reconstruction.unfold import Unfolded, hanging_on_copies, unfold
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
 
 METHODS = ("incremental", "projective", "global", "auto")
@@ -99,7 +99,7 @@ def build_models(
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, options.focal_sigma[camera_index])
         empty = Mapping.start(graph, track, cameras, camera_index)
-        made: list[tuple[Reconstruction, Mapping, MappingOptions, Bool[Tensor, "v"] | None]] = []
+        made: list[tuple[Reconstruction, Mapping, MappingOptions, Unfolded | None]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
         taken = given_up = empty.registered
@@ -132,11 +132,11 @@ def build_models(
             model, failed = mapped
             model, parted = settle(model, taken, known, report)
             failed |= parted
-            uncertain = None
+            unfolded = None
             if matched and method != "projective":
                 unfolded = unfold(empty, model, taken, known, report)
                 given_up = given_up | (model.registered & ~unfolded.model.registered)
-                model, uncertain = unfolded.model, unfolded.uncertain
+                model = unfolded.model
                 # What is left is mapped without the relations that were given up.
                 empty = replace(empty, graph=model.graph, track=model.track)
             lines = None
@@ -150,15 +150,20 @@ def build_models(
             if not made:
                 reasons |= failed
             taken = taken | model.registered
-            made.append((replace(model.reconstruction(), lines=lines, curves=curves), model, known, uncertain))
+            made.append((replace(model.reconstruction(), lines=lines, curves=curves), model, known, unfolded))
             if stages.folder is not None:
                 _save_model(made[-1][0], stages.folder, len(made) - 1)
         found: list[tuple[Reconstruction, Standing, Calibration]] = []
-        for finished, model, known, uncertain in made:
+        for finished, model, known, unfolded in made:
             prior, threshold = known.prior(model), options.reprojection
+            uncertain = None if unfolded is None else unfolded.uncertain
+            # Lines move the cameras.
+            conflicts = None if unfolded is None or model is not unfolded.model else unfolded.conflicts
             if uncertain is not None and bool(given_up.any()):
                 uncertain = uncertain | hanging_on_copies(graph, model, taken & ~model.registered, threshold=threshold)
-            standing = examine(model, open_numbers=free, prior=prior, threshold=threshold, uncertain=uncertain)
+            standing = examine(
+                model, open_numbers=free, prior=prior, threshold=threshold, uncertain=uncertain, conflicts=conflicts
+            )
             found.append((finished, standing, calibration_of(model, prior, loss=LOSS)))
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", len(graph.names), len(graph.names))
