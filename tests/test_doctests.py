@@ -21,11 +21,8 @@ import torchsfm
 
 # The program, which is run and not called.
 NOT_CALLED = {"cli"}
-# Their examples are shown and not run: they want weights, photographs and seconds, or viser.
-NOT_RUN = {
-    "images.load_detector", "images.load_matcher", "plot.LiveViewer", "reconstruction.align_to_gps",
-    "reconstruction.reconstruct", "reconstruction.register_photographs", "reconstruction.triangulate_photographs",
-}  # fmt: skip
+# Their examples are shown and not run: they want weights, photographs with positions, or viser.
+NOT_RUN = {"images.load_detector", "images.load_matcher", "plot.LiveViewer", "reconstruction.align_to_gps"}
 # Those that run where a package is installed which torchsfm does without.
 WANTED = {
     "formats.model_from_pycolmap": "pycolmap", "formats.pycolmap_from_model": "pycolmap", "formats.read_hloc": "h5py",

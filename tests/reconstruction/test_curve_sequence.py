@@ -13,7 +13,7 @@ from torchsfm.geometry import Pose, intrinsics, project_points, rotation_angle, 
 from torchsfm.images import detect_edges, save_image
 from torchsfm.linalg import nearest_rotation
 from torchsfm.reconstruction import ReconstructionError, reconstruct
-from torchsfm.reconstruction.curve_sequence import as_edges
+from torchsfm.reconstruction.curve_windows import as_edges
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.simulation import orbit_poses, paint_shapes
 

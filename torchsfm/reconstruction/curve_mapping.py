@@ -127,18 +127,18 @@ class CurveMapping:
         return BundleProblem(self.poses, self.camera[(None,)], one, self.poses.t[:0], x, index, index)
 
 
-def add_pieces(mapping: CurveMapping, view: int) -> CurveMapping:
-    """Samples of what the edges of a frame are images of, by the frames around."""
+def add_pieces(mapping: CurveMapping, view: int, near: float = NEAR) -> CurveMapping:
+    """Samples of what the edges of a frame are images of, by the frames around; edges so many pixels away still show them."""
     known = mapping.known
-    near = known[(known - view).abs().argsort(stable=True)]
-    views = [view, *near[near != view][:_AROUND].tolist()]
+    around = known[(known - view).abs().argsort(stable=True)]
+    views = [view, *around[around != view][:_AROUND].tolist()]
     points = [mapping.sights[j].points for j in views]
     # Every other edge point will do here.
     points[0] = EdgePoints(*(t[::2].contiguous() for t in points[0]))
     if len(views) < 3 or not len(points[0].x):
         return mapping
     found = image_pieces(
-        view, points, mapping.P[views], mapping.size, threshold=NEAR, least_views=min(_AGREE, len(views)), shortest=_SHORTEST
+        view, points, mapping.P[views], mapping.size, threshold=near, least_views=min(_AGREE, len(views)), shortest=_SHORTEST
     )
     rank = torch.arange(len(found.X)) - torch.searchsorted(found.piece, found.piece)
     keep = rank % max(1, -(-len(found.X) // _SAMPLES)) == 0
@@ -155,12 +155,12 @@ def add_pieces(mapping: CurveMapping, view: int) -> CurveMapping:
     return mapping.with_curves(curves, torch.cat((mapping.home, torch.full_like(piece, view))))
 
 
-def track(mapping: CurveMapping) -> CurveMapping:
+def track(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
     """Which edges of all placed frames show the samples."""
     known = mapping.known
     seen = [mapping.sights[i] for i in known.tolist()]
     curves = track_samples(
-        mapping.curves, [s.edges for s in seen], [s.points for s in seen], mapping.P[known], mapping.size, NEAR
+        mapping.curves, [s.edges for s in seen], [s.points for s in seen], mapping.P[known], mapping.size, near
     )
     return replace(mapping, curves=replace(curves, view=known[curves.view]))
 
@@ -196,14 +196,14 @@ def adjust(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float,
     return replace(mapping, poses=found.poses, camera=camera, curves=curves, sights=sights)
 
 
-def prune(mapping: CurveMapping) -> CurveMapping:
+def prune(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
     """Without samples that their frames do not show in one place, as those of outlines."""
     r, scale = distances(mapping)
     old = mapping.curves
     n = len(old.X)
     number = torch.bincount(old.sample, minlength=n)
     square = torch.zeros_like(old.X[:, 0]).index_add(0, old.sample, r.square())
-    keep = (square < (_TRUSTED * scale) ** 2 * (number - 2)) & (number >= _AGREE) & _confirmed(mapping)
+    keep = (square < (_TRUSTED * scale) ** 2 * (number - 2)) & (number >= _AGREE) & _confirmed(mapping, near)
     seen = old.seen_where(keep[old.sample])
     left, curve = torch.unique(old.curve[keep], return_inverse=True)
     curves = replace(
@@ -213,12 +213,22 @@ def prune(mapping: CurveMapping) -> CurveMapping:
     return mapping.with_curves(curves, mapping.home[keep])
 
 
-def settle(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float, iterations: int) -> CurveMapping:
+def settle(
+    mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float, iterations: int, near: float = NEAR
+) -> CurveMapping:
     """The cameras adjusted, and without samples that are of no curve; `cameras` as for `adjust`."""
-    return prune(adjust(track(mapping), cameras, tolerance=tolerance, iterations=iterations))
+    return prune(adjust(track(mapping, near), cameras, tolerance=tolerance, iterations=iterations), near)
 
 
-def _confirmed(mapping: CurveMapping) -> Bool[Tensor, "n"]:
+def sampled(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
+    """All samples found anew, from the edges of all placed frames."""
+    mapping = mapping.with_curves(no_curves(mapping.poses.R))
+    for view in mapping.known.tolist():
+        mapping = add_pieces(mapping, view, near)
+    return mapping
+
+
+def _confirmed(mapping: CurveMapping, near: float) -> Bool[Tensor, "n"]:
     """Samples that lie on those of other frames' edges: of a surface's outline, each frame has another curve in space."""
     X, tangent, home = mapping.curves.X, mapping.curves.tangents(), mapping.home
     depth = (X * mapping.poses.R[home, 2]).sum(-1) + mapping.poses.t[home, 2]
@@ -226,7 +236,7 @@ def _confirmed(mapping: CurveMapping) -> Bool[Tensor, "n"]:
     a, b = near_pairs(X, _BESIDE * float(pixel.median()))
     d = X[b] - X[a]
     across = torch.linalg.vector_norm(d - (d * tangent[a]).sum(-1, keepdim=True) * tangent[a], dim=-1)
-    same = (across < NEAR * pixel[a]) & ((tangent[a] * tangent[b]).sum(-1) > _PARALLEL) & (home[a] != home[b])
+    same = (across < near * pixel[a]) & ((tangent[a] * tangent[b]).sum(-1) > _PARALLEL) & (home[a] != home[b])
     pairs = torch.unique(torch.stack((a[same], home[b[same]])), dim=1)
     return torch.bincount(pairs[0], minlength=len(X)) >= _CONFIRM
 

@@ -141,6 +141,8 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
             return "curves followed through the frames around do not tell its camera by themselves"
         if contradicted > _CONTRADICTED:
             return f"cameras turn by {contradicted:.1f} degrees less or more than a few frames by themselves say"
+        if settled.zoomed() != 1:
+            return f"its focal length is {settled.zoomed():.2f} times the one that a few frames at a time say"
         if settled.moved > _RESTLESS:
             return f"cameras still turn by {settled.moved:.1f} degrees as more of the edges are left out"
         if not DEVIATIONS * rotation[i] < WRONG_ANGLE:

@@ -190,6 +190,8 @@ class FirstCameras:
     poses: Pose
     """Of all frames; the world is the reference frame's camera, and samples are about 1 away."""
     focal: Float[Tensor, ""]
+    X: Float[Tensor, "n 3"]
+    """Samples that most frames agree on."""
     refusal: str
     """Why these are not to be used; empty where they are."""
 
@@ -256,11 +258,15 @@ def first_cameras(
         refusal = "no motion explains the curves"
     own = torch.eye(3, dtype=t.dtype, device=t.device).repeat(v, 1, 1)
     own[others] = motion.R[k]
-    return FirstCameras(Pose(own, t.new_zeros(v, 3).index_copy(0, others, motion.t[k])), focal * motion.zoom[k].exp(), refusal)
+    poses = Pose(own, t.new_zeros(v, 3).index_copy(0, others, motion.t[k]))
+    found = focal * motion.zoom[k].exp()
+    sure = 2 * good.sum(0) >= v - 1
+    rays = torch.cat((samples[reference] / found, torch.ones_like(samples[reference][:, :1])), -1)
+    return FirstCameras(poses, found, (rays / motion.rho[k][:, None])[sure & (motion.rho[k] > 0)], refusal)
 
 
 def _refused(v: int, focal: Tensor, why: str) -> FirstCameras:
-    return FirstCameras(Pose.identity(v, dtype=focal.dtype, device=focal.device), focal, why)
+    return FirstCameras(Pose.identity(v, dtype=focal.dtype, device=focal.device), focal, focal.new_zeros(0, 3), why)
 
 
 def _turns(like: Tensor) -> Float[Tensor, "h 3"]:

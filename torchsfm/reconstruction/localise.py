@@ -62,10 +62,18 @@ def register_photographs(
         ReconstructionError: Wrong input: no new photographs, features of other photographs, a model without points.
 
     Example:
-        >>> import torchsfm
-        >>> model = torchsfm.Reconstruction.load("run/model.npz")  # doctest: +SKIP
-        >>> known = torchsfm.reconstruction.saved_features("run", model)  # doctest: +SKIP
-        >>> result = torchsfm.reconstruction.register_photographs("new/", model, known)  # doctest: +SKIP
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.render_sequence(
+        ...     views=6, width=320, height=240, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> photos = [f"view{i}.png" for i in range(6)]
+        >>> for path, image in zip(photos, scene.images):
+        ...     torchsfm.images.save_image(path, image)
+        >>> model = torchsfm.reconstruct(photos[:5], out="run").model
+        >>> known = torchsfm.reconstruction.saved_features("run", model)
+        >>> result = torchsfm.reconstruction.register_photographs(photos[5], model, known)
+        >>> int(result.model.registered.sum())
+        6
     """
     report = progress or (lambda stage, done, total: None)
     generator = torch.Generator().manual_seed(seed)

@@ -76,9 +76,9 @@ def reconstruct(
             focal length; "auto" is "global" for 500 images or more that many pairs hold together and whose focal lengths are
             roughly known, else "incremental"; "curves" goes by edges alone, where points do not suffice: smooth things with
             painted curves. The images are consecutive frames of one camera that is a little elsewhere each time; its principal
-            point is held centred. Curves are followed through a few frames, which tells their cameras, then one frame after the
-            other is placed by the curves in space, and all are adjusted together. There are no points then: the curves are in
-            `Reconstruction.curves`. `report.refusal` says why where there is no model.
+            point is held centred. Curves are followed through a few frames at a time, which tells their cameras; these are
+            joined, other frames are placed by the curves in space, and all are adjusted together. There are no points then: the
+            curves are in `Reconstruction.curves`. `report.refusal` says why where there is no model.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
         curves: Find curves in space, too, with the cameras that have been found: edges of the photographs, scaled down to a
@@ -103,10 +103,17 @@ def reconstruct(
         ValueError: An argument has the wrong shape.
 
     Example:
-        >>> import torchsfm
-        >>> result = torchsfm.reconstruct("photos/")  # doctest: +SKIP
-        >>> print(result.report.summary())  # doctest: +SKIP
-        >>> result.model.save("model.npz")  # doctest: +SKIP
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.render_sequence(
+        ...     views=5, width=320, height=240, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> photos = [f"view{i}.png" for i in range(5)]
+        >>> for path, image in zip(photos, scene.images):
+        ...     torchsfm.images.save_image(path, image)
+        >>> result = torchsfm.reconstruct(photos)  # a folder's name does as well
+        >>> int(result.model.registered.sum())
+        5
+        >>> result.model.save("model.npz")
     """
     if camera is not None and camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")

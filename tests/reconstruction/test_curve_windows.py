@@ -1,0 +1,112 @@
+"""Windows of a few frames: what they agree on, chains of them in one world, and models that contradict them."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Pose, Similarity, intrinsics, rotation_from_rotvec
+from torchsfm.geometry.distortion import Radial
+from torchsfm.reconstruction.curve_mapping import CurveMapping
+from torchsfm.reconstruction.curve_sequence import Expected, Settled
+from torchsfm.reconstruction.curve_start import FirstCameras
+from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of
+
+F64 = torch.float64
+FRAMES = 13
+K = intrinsics(torch.tensor(400.0, dtype=F64), torch.tensor([199.5, 149.5], dtype=F64))
+
+
+def arc(frames: int = FRAMES) -> Pose:
+    """Cameras around the origin, five units away."""
+    turn = math.radians(4.0) * torch.arange(frames, dtype=F64)[:, None] * torch.tensor([0.1, 1.0, 0.2], dtype=F64)
+    t = torch.tensor([0.0, 0.0, 5.0], dtype=F64) + 0.1 * torch.stack([(turn[:, 1] * k).sin() for k in (2, 3, 4)], -1)
+    return Pose(rotation_from_rotvec(turn), t)
+
+
+def window(first: int, poses: Pose, X: Tensor, generator: torch.Generator, focal: float = 400.0) -> Window:
+    """What these frames would say, in the world of their middle camera and a unit of their own."""
+    views = torch.arange(first, first + WIDTH)
+    middle = poses[first + WIDTH // 2]
+    own = Similarity(0.1 + torch.rand((), dtype=F64, generator=generator), middle.R, middle.t)
+    own = replace(own, t=own.scale * own.t)
+    found = FirstCameras(own.transform_pose(poses[views]), torch.tensor(focal, dtype=F64), own.transform(X), "")
+    return Window(views, found)
+
+
+@pytest.fixture
+def X(generator: torch.Generator) -> Tensor:
+    return 2 * torch.rand(300, 3, dtype=F64, generator=generator) - 1
+
+
+def test_windows_that_overlap_are_one_chain(X: Tensor, generator: torch.Generator) -> None:
+    poses = arc()
+    windows = [window(first, poses, X, generator) for first in (0, 2, 3, 5, 7, 8)]
+    (chain,) = chains(windows, K)
+    # The frames at both ends are those of one window each, and farthest from its middle.
+    assert chain.views.tolist() == list(range(1, FRAMES - 1))
+    middle = windows[0].found.poses
+    scale = torch.linalg.vector_norm(middle.centre[1] - middle.centre[0]) / torch.linalg.vector_norm(
+        poses.centre[1] - poses.centre[0]
+    )
+    world = Similarity(scale, poses.R[2], scale * poses.t[2])
+    truth = world.transform_pose(poses)
+    assert torch.allclose(chain.poses.R, truth.R[1:-1], atol=1e-9)
+    assert torch.allclose(chain.poses.t, truth.t[1:-1], atol=1e-9)
+
+
+def test_a_chain_ends_where_windows_share_too_little_or_contradict_each_other(X: Tensor, generator: torch.Generator) -> None:
+    poses = arc()
+    apart = [window(first, poses, X, generator) for first in (0, 4, 6, 8)]
+    assert [chain.views.tolist() for chain in chains(apart, K)] == [list(range(5, 12)), list(range(5))]
+    shaken = 0.1 * torch.randn(WIDTH, 3, dtype=F64, generator=generator)
+    wrong = apart[2].found.poses
+    wrong = replace(apart[2].found, poses=Pose(rotation_from_rotvec(shaken) @ wrong.R, wrong.t))
+    torn = [apart[1], Window(apart[2].views, wrong), apart[3]]
+    assert [len(chain.views) for chain in chains(torn, K)] == [WIDTH] * 3
+    right = [window(first, poses, X, generator) for first in (0, 2, 4, 6, 8)]
+    longest, other = chains([*right[:4], torn[1], right[4]], K)
+    assert longest.views.tolist() == [1, 2, 3, 4, 5, 11]
+    assert len(other.views) == WIDTH
+    nowhere = replace(apart[2].found, X=X[:0])
+    assert len(chains([apart[1], Window(apart[2].views, nowhere)], K)) == 2
+
+
+def test_the_focal_length_of_windows(X: Tensor, generator: torch.Generator) -> None:
+    poses = arc()
+    zooms = 1 + 0.1 * torch.randn(9, dtype=F64, generator=generator)
+    zooms[3] = 3.0
+    focal, sigma = focal_of([window(i, poses, X, generator, 400 * float(zoom)) for i, zoom in enumerate(zooms)])
+    assert abs(float(focal) / 400 - 1) < 4 * sigma
+    assert 0.02 <= sigma < 0.2
+    assert focal_of([window(0, poses, X, generator)])[1] == 0.02
+
+
+def test_frames_that_a_model_turns_otherwise_are_told(X: Tensor, generator: torch.Generator) -> None:
+    poses = arc()
+    windows = [window(first, poses, X, generator) for first in (0, 4)]
+    there = torch.ones(FRAMES, dtype=torch.bool)
+    apart = contradictions(windows, poses, there)
+    assert apart[:9].amax() < 1e-5
+    assert bool(apart[9:].isinf().all())
+    bent = poses.R.clone()
+    bent[6] = rotation_from_rotvec(torch.tensor([0.0, math.radians(3.0), 0.0], dtype=F64)) @ bent[6]
+    apart = contradictions(windows, Pose(bent, poses.t), there)
+    assert apart[:4].amax() < 1e-5
+    assert torch.allclose(apart[4:9], torch.full((5,), 3.0, dtype=F64), atol=1e-6)
+    refused = Window(windows[0].views, replace(windows[0].found, refusal="why"))
+    assert bool(contradictions([refused], poses, there).isinf().all())
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(1.05, 1.0), (0.86, 0.86), (1.2, 1.2)])
+def test_a_focal_length_that_windows_contradict_is_told(ratio: float, said: float) -> None:
+    zero = torch.zeros((), dtype=F64)
+    camera = Camera(K, Radial(zero, zero))
+    mapping = CurveMapping.start([], (300, 400), camera)
+    expected = Expected(camera, ("focal", "k1", "k2"), {"focal": 0.5}).told(K[0, 0] / ratio, 0.025)
+    settled = Settled(mapping, 0.0, zero[None], expected)
+    assert settled.zoomed() == pytest.approx(said)
+    given = replace(expected, free=())
+    assert settled._replace(told=given).zoomed() == 1

@@ -1,0 +1,238 @@
+"""What few neighbouring frames at a time say of their cameras, by themselves, and chains of such windows."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.geometry import Curve, Pose, Similarity, rotation_angle
+from torchsfm.images import Edges, track_curves
+from torchsfm.linalg import nearest_rotation
+from torchsfm.reconstruction.curve_start import FirstCameras, first_cameras
+from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.similarities import DEVIATION
+
+WIDTH = 5
+"""Frames of a window."""
+_NEXT = 2
+"""Frames from one window to the next."""
+_LENGTH = 30.0
+"""Shortest curves that are followed, in pixels."""
+_CURVES = 100
+"""Most of them."""
+_LINKED = 2.0
+"""Pixels between the ends of a closed chain, the most."""
+_SURE = 0.02
+"""Standard deviation of a focal length, as a part of it, that is given to windows, and the least that they tell."""
+_SHARED = WIDTH // 2 + 1
+"""Frames that two windows of a chain share, at least: the middle one of each is among them."""
+_ONE_TURN = 1.0
+"""Degrees by which rotations from one window to another may differ, from one shared frame to the other."""
+_BESIDE = 4.0
+"""Pixels between samples of two windows that are on the same edge."""
+_FEWEST = 20
+"""Such samples that tell their scale."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A few consecutive frames, and what their curves say of the cameras."""
+
+    views: Int[Tensor, "w"]
+    found: FirstCameras
+
+    @property
+    def middle(self) -> int:
+        """The frame whose camera is the world."""
+        return int(self.views[len(self.views) // 2])
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Cameras of all frames of windows that overlap, in one world."""
+
+    views: Int[Tensor, "k"]
+    poses: Pose
+
+
+def window_at(edges: Sequence[ImageEdges], first: int, K: Float[Tensor, "3 3"], sigma: float = _SURE) -> Window:
+    """Cameras of a few frames by what is followed through them.
+
+    Args:
+        edges: Of each frame of the sequence.
+        first: The window's first frame.
+        K: Calibration to expect; the focal length is found,
+        sigma: known to such a part of it.
+    """
+    views = torch.arange(first, min(first + WIDTH, len(edges)))
+    tracked = track_curves(as_edges([edges[i] for i in views.tolist()]), min_length=_LENGTH, max_curves=_CURVES).curves
+    curves = Curve(tracked.x.double(), tracked.valid, tracked.closed)
+    return Window(views, first_cameras(curves, len(views) // 2, K[0, 0], K[:2, 2], sigma))
+
+
+def all_windows(edges: Sequence[ImageEdges], K: Float[Tensor, "3 3"], sigma: float) -> list[Window]:
+    """Windows that overlap from end to end; next to those that tell nothing there are two more.
+
+    Args:
+        edges: Of each frame.
+        K: Calibration to expect.
+        sigma: Standard deviation of its focal length, as a part of it.
+    """
+    last = max(len(edges) - WIDTH, 0)
+    firsts = sorted({*range(0, last + 1, _NEXT), last})
+    found = {first: window_at(edges, first, K, sigma) for first in firsts}
+    refused = [first for first, window in found.items() if window.found.refusal]
+    beside = {first + step for first in refused for step in (-1, 1) if 0 <= first + step <= last} - found.keys()
+    found |= {first: window_at(edges, first, K, sigma) for first in sorted(beside)}
+    return [found[first] for first in sorted(found)]
+
+
+def focal_of(windows: Sequence[Window]) -> tuple[Float[Tensor, ""], float]:
+    """The focal length that windows agree on, and its standard deviation as a part of it."""
+    focal = torch.stack([window.found.focal for window in windows])
+    middle = focal.quantile(0.5)
+    # Windows that overlap are not independent.
+    number = len(focal) * min(1.0, _NEXT / WIDTH) if len(focal) > 1 else 1
+    scatter = DEVIATION * float((focal / middle).log().abs().median())
+    return middle, max(_SURE, scatter / math.sqrt(number))
+
+
+def chains(windows: Sequence[Window], K: Float[Tensor, "3 3"]) -> list[Chain]:
+    """Cameras of windows that overlap and agree, the longest chain first.
+
+    Frames about which two windows contradict each other, or of which only the end of one tells, are left out where enough
+    others remain.
+
+    Args:
+        windows: In the order of their frames, all with an answer.
+        K: The calibration, for the principal point.
+    """
+    runs: list[list[tuple[Window, Similarity]]] = []
+    contested = set[int]()
+    for k, window in enumerate(windows):
+        for before in windows[:k]:
+            if _turn(window, before).off > _ONE_TURN:
+                contested |= {*window.views.tolist()} & {*before.views.tolist()}
+        for run, before, world in [(chain, *link) for chain in reversed(runs) for link in reversed(chain)]:
+            step = _between(window, before, K[:2, 2])
+            if step is not None:
+                run.append((window, _after(world, step)))
+                break
+        else:
+            one = torch.ones((), dtype=K.dtype)
+            runs.append([(window, Similarity(one, torch.eye(3, dtype=K.dtype), torch.zeros(3, dtype=K.dtype)))])
+    return sorted((_joined(run, contested) for run in runs), key=lambda chain: -len(chain.views))
+
+
+def _joined(run: Sequence[tuple[Window, Similarity]], contested: set[int]) -> Chain:
+    """Each frame as the window has it in whose middle it is nearest; the end of a single window is not sure of a frame."""
+    frames: dict[int, tuple[int, Pose]] = {}
+    confirmed = set[int]()
+    for window, world in run:
+        poses = world.transform_pose(window.found.poses)
+        for k, view in enumerate(window.views.tolist()):
+            away = abs(view - window.middle)
+            if view in frames or away < WIDTH // 2:
+                confirmed.add(view)
+            if view not in frames or away < frames[view][0]:
+                frames[view] = away, poses[k]
+    sure = confirmed - contested
+    views = sorted(sure if len(sure) >= WIDTH else frames)
+    return Chain(torch.tensor(views), Pose(*(torch.stack([getattr(frames[i][1], name) for i in views]) for name in ("R", "t"))))
+
+
+class _Turn(NamedTuple):
+    R: Float[Tensor, "3 3"]
+    """From the world of a window to that of one before it."""
+    off: float
+    """Degrees by which a frame that both share departs from it; NaN where they share too few."""
+
+
+def _turn(window: Window, before: Window) -> _Turn:
+    """How one window's world is turned in another's."""
+    a, b = _shared(window, before)
+    if len(a.R) < _SHARED:
+        return _Turn(torch.eye(3, dtype=a.R.dtype), math.nan)
+    turns = b.R.mT @ a.R
+    R = nearest_rotation(turns.mean(0))
+    return _Turn(R, float(rotation_angle(turns @ R.mT).rad2deg().amax()))
+
+
+def _between(window: Window, before: Window, centre: Float[Tensor, "2"]) -> Similarity | None:
+    """From the world of a window to that of one before it; None where they share too little, or contradict each other."""
+    turn = _turn(window, before)
+    scale = _scale(window, before, centre) if turn.off <= _ONE_TURN else None
+    if scale is None:
+        return None
+    a, b = _shared(window, before)
+    return Similarity(scale, turn.R, (b.centre - scale * a.centre @ turn.R.mT).mean(0))
+
+
+def _shared(window: Window, before: Window) -> tuple[Pose, Pose]:
+    """The frames that two windows share, as each sees them."""
+    own, other = torch.isin(window.views, before.views), torch.isin(before.views, window.views)
+    return window.found.poses[own], before.found.poses[other]
+
+
+def _scale(window: Window, before: Window, centre: Float[Tensor, "2"]) -> Float[Tensor, ""] | None:
+    """How much larger the world of the window before is, by the depths of samples that are seen on the same edges."""
+    looks = []
+    for one in (window, before):
+        Y = one.found.poses[int((one.views == window.middle).nonzero()[0, 0])].transform(one.found.X)
+        looks.append((one.found.focal * Y[:, :2] / Y[:, 2:] + centre, Y[:, 2]))
+    (x, depth), (y, other) = looks
+    if not len(x) or not len(y):
+        return None
+    gap, nearest = torch.cdist(x, y).min(1)
+    same = (gap < _BESIDE) & (depth > 0) & (other[nearest] > 0)
+    if int(same.sum()) < _FEWEST:
+        return None
+    return (other[nearest][same] / depth[same]).median()
+
+
+def _after(outer: Similarity, inner: Similarity) -> Similarity:
+    """One map, then the other."""
+    return Similarity(outer.scale * inner.scale, outer.R @ inner.R, outer.transform(inner.t[None])[0])
+
+
+def contradictions(windows: Iterable[Window], poses: Pose, registered: Bool[Tensor, "v"]) -> Float[Tensor, "v"]:
+    """Degrees by which windows see cameras turned otherwise than a model has them; infinite for frames that none tells of."""
+    apart = torch.full_like(poses.t[:, 0], torch.inf)
+    for window in windows:
+        views = window.views
+        if window.found.refusal or not bool(registered[views].all()):
+            continue
+        R = poses.R[views]
+        middle = poses.R[window.middle]
+        off = rotation_angle(window.found.poses.R @ (R @ middle.mT).mT).rad2deg().amax()
+        before = apart[views]
+        apart[views] = torch.where(before.isfinite(), torch.maximum(before, off), off)
+    return apart
+
+
+def as_edges(found: Sequence[ImageEdges]) -> Edges:
+    """The edges of frames as `track_curves` takes them."""
+    n = max(1, *(len(own) for own in found))
+
+    def slots(rows: Iterable[Tensor], empty: int = 0) -> Tensor:
+        return torch.stack([torch.cat((r, r.new_full((n - len(r), *r.shape[1:]), empty))) for r in rows])
+
+    x, normal, sigma, curvature = (slots(getattr(own, name) for own in found) for name in ("x", "normal", "sigma", "curvature"))
+    chain, closed = slots((own.chain for own in found), -1), slots(_closed(own) for own in found)
+    none = sigma.new_zeros(len(found))
+    return Edges(x, -normal, sigma, torch.zeros_like(sigma), curvature, chain, closed, chain >= 0, none, none.long())
+
+
+def _closed(own: ImageEdges) -> Bool[Tensor, "n"]:
+    """Whether each edge point's chain ends next to where it begins."""
+    if not len(own):
+        return own.chain > 0
+    _, index, number = torch.unique_consecutive(own.chain, return_inverse=True, return_counts=True)
+    last = number.cumsum(0) - 1
+    gap = torch.linalg.vector_norm(own.x[last] - own.x[last - number + 1], dim=-1)
+    closed: Tensor = (gap < _LINKED) & (number > 2 * _LINKED)
+    return closed[index]
