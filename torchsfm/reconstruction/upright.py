@@ -172,7 +172,20 @@ def align_to_ground(model: Reconstruction, *, generator: torch.Generator | None 
         model: The model.
         generator: Source of the samples that are tried; the same ones each time if not given.
 
-    See the example of `align_upright`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from dataclasses import replace
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(8, 300, 900, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> X = torch.rand(300, 3, dtype=torch.float64, generator=g)
+        >>> X[:, 2] = (X[:, 2] + 0.2).where(torch.arange(300) >= 200, 0.0)  # 200 points on the ground, 100 above it
+        >>> model = replace(model, poses=torchsfm.simulation.orbit_poses(8, radius=5.0), X=X - 0.5)
+        >>> level = torchsfm.reconstruction.align_to_ground(model)
+        >>> level.fault(), int(level.ground.sum())
+        ('', 200)
+        >>> bool(level.similarity.transform(model.X)[:200, 2].abs().max() < 1e-6)
+        True
     """
     level = align_upright(model)
     if level.fault():
