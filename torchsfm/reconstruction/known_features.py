@@ -51,7 +51,18 @@ def saved_features(folder: str | Path, model: Reconstruction) -> KnownFeatures |
     Raises:
         ReconstructionError: What is there is damaged, or belongs to other photographs.
 
-    See the example of `register_photographs`.
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.render_sequence(
+        ...     views=3, width=320, height=240, generator=torch.Generator().manual_seed(0)
+        ... )
+        >>> photos = [f"view{i}.png" for i in range(3)]
+        >>> for path, image in zip(photos, scene.images):
+        ...     torchsfm.images.save_image(path, image)
+        >>> model = torchsfm.reconstruct(photos, out="run").model
+        >>> known = torchsfm.reconstruction.saved_features("run", model)
+        >>> len(known.x), known.names == model.names
+        (3, True)
     """
     paths = sorted((Path(folder) / "stages" / "features").glob("*.npz"))
     if not paths:
