@@ -83,7 +83,9 @@ def blank(tmp_path: Path, generator: torch.Generator) -> Path:
 
 
 def test_frames_without_curves_are_refused(blank: Path) -> None:
-    found = reconstruct(blank, method="curves")
+    told = list[tuple[str, int, int]]()
+    found = reconstruct(blank, method="curves", progress=lambda *news: told.append(news))
+    assert ("follow", 1, 1) in told
     assert found.models == ()
     assert "curves could be followed" in found.report.refusal
     assert {image.reason for image in found.report.images} == {found.report.refusal}

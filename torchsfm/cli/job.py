@@ -44,6 +44,7 @@ LABELS = {
     "merge": "joining the models",
     "edges": "finding edges",
     "follow": "following edges through images",
+    "curves": "finding curves in space",
     "write": "writing results",
     "pictures": "writing pictures",
 }

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera, rotation_angle
 from torchsfm.reconstruction.curve_mapping import CurveMapping, add_pieces, prune, register, sampled, settle, track
-from torchsfm.reconstruction.curve_windows import WIDTH, Chain, all_windows, chains, contradictions, focal_of, window_at
+from torchsfm.reconstruction.curve_windows import Chain, all_windows, chains, contradictions, focal_of, windows_by_themselves
 from torchsfm.reconstruction.curves import curves_of_edges
 from torchsfm.reconstruction.doubt import DEVIATIONS
 from torchsfm.reconstruction.image_edges import ImageEdges
@@ -112,7 +112,7 @@ def map_sequence(
     v = len(edges)
     if v < FEWEST:
         return None, f"{v} frames: curves alone need {FEWEST}"
-    found = all_windows(edges, expected.camera.K, expected.sigma["focal"])
+    found = all_windows(edges, expected.camera.K, expected.sigma["focal"], progress)
     windows = [window for window in found if not window.found.refusal]
     if not windows:
         reasons = [window.found.refusal for window in found]
@@ -179,9 +179,7 @@ def _together(mapping: CurveMapping, expected: Expected, told: Expected, progres
         moved = float(rotation_angle(turned @ turned[len(known) // 2].mT).rad2deg().amax())
         if moved < _STILL:
             break
-    firsts = {*range(0, max(len(mapping.edges) - WIDTH, 0) + 1, WIDTH - 1), max(len(mapping.edges) - WIDTH, 0)}
-    seen = [sight.edges for sight in mapping.sights]
-    alone = [window_at(seen, first, told.camera.K) for first in sorted(firsts)]
+    alone = windows_by_themselves([sight.edges for sight in mapping.sights], told.camera.K)
     return Settled(mapping, moved, contradictions(alone, mapping.poses, mapping.registered), told)
 
 

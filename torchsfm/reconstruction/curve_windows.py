@@ -14,6 +14,7 @@ from torchsfm.images import Edges, track_curves
 from torchsfm.linalg import nearest_rotation
 from torchsfm.reconstruction.curve_start import FirstCameras, first_cameras
 from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.similarities import DEVIATION
 
 WIDTH = 5
@@ -74,21 +75,40 @@ def window_at(edges: Sequence[ImageEdges], first: int, K: Float[Tensor, "3 3"], 
     return Window(views, first_cameras(curves, len(views) // 2, K[0, 0], K[:2, 2], sigma))
 
 
-def all_windows(edges: Sequence[ImageEdges], K: Float[Tensor, "3 3"], sigma: float) -> list[Window]:
+def all_windows(edges: Sequence[ImageEdges], K: Float[Tensor, "3 3"], sigma: float, progress: Progress) -> list[Window]:
     """Windows that overlap from end to end; next to those that tell nothing there are two more.
 
     Args:
         edges: Of each frame.
         K: Calibration to expect.
         sigma: Standard deviation of its focal length, as a part of it.
+        progress: Called as the work goes on.
     """
-    last = max(len(edges) - WIDTH, 0)
-    firsts = sorted({*range(0, last + 1, _NEXT), last})
-    found = {first: window_at(edges, first, K, sigma) for first in firsts}
+    found = dict[int, Window]()
+
+    def add(firsts: Iterable[int]) -> None:
+        waiting = sorted({*firsts} - found.keys())
+        for k, first in enumerate(waiting):
+            progress("follow", k, len(waiting))
+            found[first] = window_at(edges, first, K, sigma)
+        progress("follow", len(waiting), len(waiting))
+
+    add(_firsts(edges, _NEXT))
+    last = _firsts(edges, 1)[-1]
     refused = [first for first, window in found.items() if window.found.refusal]
-    beside = {first + step for first in refused for step in (-1, 1) if 0 <= first + step <= last} - found.keys()
-    found |= {first: window_at(edges, first, K, sigma) for first in sorted(beside)}
+    add(first + step for first in refused for step in (-1, 1) if 0 <= first + step <= last)
     return [found[first] for first in sorted(found)]
+
+
+def windows_by_themselves(edges: Sequence[ImageEdges], K: Float[Tensor, "3 3"]) -> list[Window]:
+    """Windows from end to end, each sharing its last frame with the next, with a focal length that is known."""
+    return [window_at(edges, first, K) for first in _firsts(edges, WIDTH - 1)]
+
+
+def _firsts(edges: Sequence[ImageEdges], step: int) -> list[int]:
+    """First frames of windows, so many frames apart, up to the end."""
+    last = max(len(edges) - WIDTH, 0)
+    return sorted({*range(0, last + 1, step), last})
 
 
 def focal_of(windows: Sequence[Window]) -> tuple[Float[Tensor, ""], float]:
