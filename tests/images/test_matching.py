@@ -79,8 +79,14 @@ def test_equal_descriptors_are_matched_once() -> None:
     assert match_descriptors(a.float(), a.float(), ratio=1.0).tolist() == [[0, 0], [2, 2], [3, 3]]
 
 
-def test_column_chunks_and_row_blocks_change_nothing(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Long descriptors of large values leave room for few column numbers: several chunks must be merged.
+@pytest.mark.parametrize("bytes_pay", [None, False])
+def test_column_chunks_and_row_blocks_change_nothing(
+    bytes_pay: bool | None, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Long descriptors of large values leave room for few column numbers: several chunks must be merged. Nor can float32 hold
+    # their products, where bytes are not multiplied as such.
+    if bytes_pay is not None:
+        monkeypatch.setattr(matching, "_bytes_pay", lambda: bytes_pay)
     a = torch.randint(100, 128, (150, 3000), generator=generator, dtype=torch.uint8)
     b = torch.cat([a.flip(0), torch.randint(100, 128, (150, 3000), generator=generator, dtype=torch.uint8)])
     monkeypatch.setattr(matching, "_ROWS", 7)

@@ -17,6 +17,8 @@ from torchsfm.images.features import Features, check_features
 _ROWS = 128
 """Rows of one block of similarities: 128 x 8192 integers stay in a processor's cache through all that is done with them."""
 
+_WHOLE = 1 << 24
+"""Below that float32 holds every whole number, so that sums of products of bytes are exact."""
 
 _LOCK = Lock()
 
@@ -212,7 +214,7 @@ def _top_two(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         columns = part.shape[0]
         packed = torch.empty(a.shape[0], min(2, columns), dtype=torch.int32, device=a.device)
         for start in range(0, a.shape[0], _ROWS):
-            block = _products(a[start : start + _ROWS], part)
+            block = _products(a[start : start + _ROWS], part, bound)
             torch.add(counter[:columns], block, alpha=width, out=block)  # among equal products the first column is the largest
             top = block.amax(1)
             packed[start : start + _ROWS, 0] = top
@@ -253,12 +255,12 @@ def _merge(values: list[Tensor], indices: list[Tensor]) -> tuple[Tensor, Tensor]
     return value, index
 
 
-def _products(a: Tensor, b: Tensor) -> Tensor:
-    if a.dtype != torch.int8:
-        return a @ b.mT
+def _products(a: Tensor, b: Tensor, bound: int) -> Tensor:
+    """Products of rows of bytes, none of which is larger than the bound."""
     if a.device.type == "cpu" and _bytes_pay():
         return torch._int_mm(a, b.mT)
-    return (a.float() @ b.float().mT).to(torch.int32)  # exact: sums below 2^24 of integers
+    exact = torch.float32 if bound < _WHOLE else torch.float64
+    return (a.to(exact) @ b.to(exact).mT).to(torch.int32)
 
 
 @cache
