@@ -14,18 +14,11 @@ from torchsfm.formats.libmv import read_libmv
 from torchsfm.formats.lines import read_lines, write_lines
 from torchsfm.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from torchsfm.formats.nvm import read_nvm, write_nvm
-from torchsfm.formats.objects import (
-    camera_from_kornia,
-    camera_from_nerfstudio,
-    camera_from_opencv,
-    camera_from_pytorch3d,
-    kornia_from_camera,
-    model_from_pycolmap,
-    nerfstudio_from_camera,
-    opencv_from_camera,
-    pycolmap_from_model,
-    pytorch3d_from_camera,
-)
+from torchsfm.formats.objects.kornia import camera_from_kornia, kornia_from_camera
+from torchsfm.formats.objects.nerfstudio import camera_from_nerfstudio, nerfstudio_from_camera
+from torchsfm.formats.objects.opencv import camera_from_opencv, opencv_from_camera
+from torchsfm.formats.objects.pycolmap import model_from_pycolmap, pycolmap_from_model
+from torchsfm.formats.objects.pytorch3d import camera_from_pytorch3d, pytorch3d_from_camera
 from torchsfm.formats.openmvg import read_openmvg, write_openmvg
 from torchsfm.formats.opensfm import read_opensfm, write_opensfm
 from torchsfm.formats.pictures import undistorted_model
