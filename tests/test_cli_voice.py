@@ -17,7 +17,7 @@ from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, report, torchsfm
 from torchsfm.cli import job
 from torchsfm.cli.job import Job, duration
 from torchsfm.cli.voice import plain
-from torchsfm.formats import write_colmap
+from torchsfm.formats import write_colmap, write_model
 from torchsfm.geometry import Pose, Similarity, random_rotation, rotation_from_rotvec
 from torchsfm.images import read_image
 from torchsfm.reconstruction import Reconstruction
@@ -79,7 +79,13 @@ def test_every_command_speaks_json(saved: Path, tmp_path: Path) -> None:
     found = spoken("info", saved)[1]["models"][0]
     assert [image["name"] for image in found["images"]] == list(model.names)
     assert [image["observations"] for image in found["images"]] == torch.bincount(model.view, minlength=4).tolist()
-    assert found["images"][3]["mean_error_px"] is None or not found["images"][3]["registered"]
+    assert not found["images"][3]["registered"]
+    assert found["images"][3]["mean_error_px"] is None
+    # What holds no observations has no error of zero.
+    write_model(model, tmp_path / "transforms.json")
+    found = spoken("info", tmp_path / "transforms.json")[1]["models"][0]
+    assert {image["mean_error_px"] for image in found["images"]} == {None}
+    assert "0.000" not in torchsfm("info", tmp_path / "transforms.json")[1]
 
 
 def test_what_align_and_merge_tell_to_programs(saved: Path, tmp_path: Path) -> None:

@@ -152,5 +152,7 @@ def test_what_others_cannot_hold_is_refused(generator: torch.Generator) -> None:
     for convert_sized in (kornia_from_camera, pytorch3d_from_camera):
         with pytest.raises(ValueError, match="distortion"):
             convert_sized(pose, bent, SIZE)
+        idle = type(bent.distortion).from_parameters(torch.zeros_like(bent.distortion.parameters()))
+        assert convert_sized(pose, Camera(camera.K, idle), SIZE).keys() == convert_sized(pose, camera, SIZE).keys()
     with pytest.raises(ValueError, match="4 or 5 coefficients"):
         camera_from_opencv(pose.t, pose.t, K, torch.zeros(COUNT, 8, dtype=F64))

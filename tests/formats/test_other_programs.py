@@ -271,6 +271,31 @@ def test_what_a_format_cannot_hold_is_not_written(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("name", "lens", "zero"),
+    [
+        ("model.nvm", "radial", ("k1", "k2")),
+        ("model.glb", "opencv", ("k1", "k2", "k3", "p1", "p2")),
+        ("bundle.out", "opencv", ("k3", "p1", "p2")),
+        ("model.txt", "opencv", ("k3", "p1", "p2")),
+    ],
+)
+def test_distortion_of_zero_is_none(name: str, lens: str, zero: tuple[str, ...], tmp_path: Path) -> None:
+    """A format holds a lens whose other numbers are 0, and none where one of them is not."""
+    model = small_model.make(lens)
+    numbers = {key: getattr(model.cameras.distortion, key) for key in model.cameras.distortion.parameter_names}
+    idle = replace(model.cameras.distortion, **{key: torch.zeros_like(numbers[key]) for key in zero})
+    model = replace(model, cameras=Camera(model.cameras.K, idle))
+    write_model(model, tmp_path / name)
+    if name != "model.glb":
+        again = read_model(tmp_path / name).residuals()
+        torch.testing.assert_close(again.sort().values, model.residuals().sort().values, rtol=0, atol=1e-8)
+    for key in zero:
+        bent = replace(model, cameras=Camera(model.cameras.K, replace(idle, **{key: numbers[key]})))
+        with pytest.raises(ValueError, match=r"distortion|holds"):
+            write_model(bent, tmp_path / "new" / name)
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_no_such_file(case: str, tmp_path: Path) -> None:
     kind = CASES[case]

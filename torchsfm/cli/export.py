@@ -175,11 +175,17 @@ def write_export(job: Job, model: Reconstruction, target: str, out: Path, images
     Raises:
         UserError: It cannot be written.
     """
-    job.progress("pictures", 0, 1)
+    undistort = options.get("undistort")
+    stage = "pictures" if (TARGETS[target].pictures if undistort is None else undistort) else "write"
+    job.progress(stage, 0, 1)
+
+    def progress(done: int, total: int) -> None:
+        job.progress(stage, done, total)
+
     try:
-        export_model(
-            model, target, out, images=images, progress=lambda done, total: job.progress("pictures", done, total), **options
-        )
+        export_model(model, target, out, images=images, progress=progress, **options)
+        if stage == "write":
+            job.progress(stage, 1, 1)
     except ValueError as error:
         raise UserError(" ".join(str(error).split())) from None
     job.close()

@@ -30,12 +30,14 @@ def info(
             model = load(file)
             typer.echo(f"{file}\n{model.summary()}\n")
             counts = torch.bincount(model.view, minlength=len(model.names)).tolist()
-            errors = model.view_errors().tolist()
+            # A format without observations says nothing of how well images fit: no error is not an error of zero.
+            errors = [error if count else None for error, count in zip(model.view_errors().tolist(), counts, strict=True)]
             names = [printable(name) for name in model.names]
             width = max(map(len, ("image", *names)))
             typer.echo(f"{'image':<{width}}  observations  mean error, px")
             for name, registered, count, mean in zip(names, model.registered.tolist(), counts, errors, strict=True):
-                typer.echo(f"{name:<{width}}  " + (f"{count:>12}  {mean:>14.3f}" if registered else "not registered"))
+                fit = "" if mean is None else f"{mean:.3f}"
+                typer.echo(f"{name:<{width}}  " + (f"{count:>12}  {fit:>14}".rstrip() if registered else "not registered"))
             typer.echo("")
             rows = zip(model.names, model.registered.tolist(), counts, errors, strict=True)
             keys = ("name", "registered", "observations", "mean_error_px")

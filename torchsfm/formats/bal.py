@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from torchsfm.formats.joining import cameras_within
 from torchsfm.geometry import (
     BundleProblem,
     Camera,
@@ -124,9 +125,9 @@ def write_bal(problem: BundleProblem, path: str | Path) -> None:
         '3 20 50'
     """
     path = Path(path)
-    cameras = problem.cameras
-    if not Radial.includes(type(cameras.distortion)):
-        raise ValueError(f"problem: BAL holds two radial coefficients, not {type(cameras.distortion).__name__}")
+    cameras = cameras_within(problem.cameras, Radial)
+    if cameras is None:
+        raise ValueError(f"problem: BAL holds two radial coefficients, not {type(problem.cameras.distortion).__name__}")
     K = cameras.K.detach().double().cpu()
     if bool((K[:, 0, 1] != 0).any()):
         raise ValueError("problem: BAL has no skew")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from torchsfm.formats.joining import cameras_within
 from torchsfm.geometry import NoDistortion
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -39,7 +40,7 @@ def write_gltf(reconstruction: Reconstruction, path: str | Path) -> None:
         >>> torchsfm.write_gltf(model, "model.glb")
     """
     model = reconstruction.to("cpu").to(dtype=reconstruction.X.double().dtype)
-    if not NoDistortion.includes(type(model.cameras.distortion)):
+    if cameras_within(model.cameras, NoDistortion) is None:
         raise ValueError(f"glTF has no {type(model.cameras.distortion).__name__} distortion; undistorted pictures have none")
     posed = model.registered.nonzero()[:, 0].tolist()
     R, centre = model.poses.R.mT.numpy() @ np.diag([1.0, -1.0, -1.0]), model.poses.centre.numpy()

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,17 @@ def join_cameras(lenses: Sequence[Lens]) -> Camera:
     rows = [[lens.numbers.get(name, 0.0) for name in common[0].parameter_names] for lens in lenses]
     numbers = torch.tensor(rows, dtype=torch.float64)
     return Camera(intrinsics(f[:, 0], c, aspect=f[:, 1] / f[:, 0]), common[0].from_parameters(numbers))
+
+
+def cameras_within(cameras: Camera, lens: type[Distortion]) -> Camera | None:
+    """The same cameras with a model of distortion that others have; None where a number that it lacks is not 0."""
+    own = cameras.distortion
+    if lens.includes(type(own)):
+        return cameras
+    names = lens.parameter_names
+    if not type(own).includes(lens) or any(bool((getattr(own, k) != 0).any()) for k in set(own.parameter_names) - set(names)):
+        return None
+    return Camera(cameras.K, lens(**{name: getattr(own, name) for name in names}))
 
 
 @dataclass
@@ -210,11 +221,11 @@ def centred_cameras(
     Raises:
         ValueError: A camera is not so, or has distortion that is no case of `lens`.
     """
-    kind = type(model.cameras.distortion)
-    if not lens.includes(kind):
-        wanted = ", ".join(lens.parameter_names) or "no distortion"
-        raise ValueError(f"{format} holds {wanted}, not {kind.__name__}; undistorted pictures have none")
-    model = model.to("cpu", torch.float64)
+    cameras = cameras_within(model.cameras, lens)
+    if cameras is None:
+        wanted, kind = ", ".join(lens.parameter_names) or "no distortion", type(model.cameras.distortion).__name__
+        raise ValueError(f"{format} holds {wanted}, not {kind}; undistorted pictures have none")
+    model = replace(model, cameras=cameras).to("cpu", torch.float64)
     K = model.cameras.K[model.camera_index]
     centre = (model.image_size.double() - 1) / 2
     if bool((K[:, 0, 1].abs() > 1e-9 * K[:, 0, 0]).any()) or bool(((K[:, 1, 1] - K[:, 0, 0]).abs() > 1e-9 * K[:, 0, 0]).any()):

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.formats.joining import cameras_within
 from torchsfm.geometry import Camera, NoDistortion, Pose
 
 HALF_PIXEL = 0.5
@@ -35,7 +36,7 @@ def refuse_distortion(camera: Camera, library: str) -> None:
     Raises:
         ValueError: There is.
     """
-    if not isinstance(camera.distortion, NoDistortion):
+    if cameras_within(camera, NoDistortion) is None:
         kind = type(camera.distortion).__name__
         raise ValueError(f"camera: wanted no distortion, which {library} has not, got {kind}; undistort the images")
 
