@@ -23,6 +23,7 @@ from torchsfm.reconstruction.curves import no_curves
 from torchsfm.reconstruction.edge_maps import EdgePoints
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.report import Progress
 
 NEAR = 2.0
 """Distance in pixels of an edge that still shows a sample."""
@@ -220,11 +221,14 @@ def settle(
     return prune(adjust(track(mapping, near), cameras, tolerance=tolerance, iterations=iterations), near)
 
 
-def sampled(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
+def sampled(mapping: CurveMapping, progress: Progress, near: float = NEAR) -> CurveMapping:
     """All samples found anew, from the edges of all placed frames."""
     mapping = mapping.with_curves(no_curves(mapping.poses.R))
-    for view in mapping.known.tolist():
+    known = mapping.known.tolist()
+    for done, view in enumerate(known):
+        progress("curves", done, len(known))
         mapping = add_pieces(mapping, view, near)
+    progress("curves", len(known), len(known))
     return mapping
 
 

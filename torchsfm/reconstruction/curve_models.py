@@ -128,7 +128,7 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
     position = torch.where(there, variance[:, 3:].sum(-1).sqrt() / depth.abs(), torch.inf)
     told = settled.apart[settled.apart.isfinite()]
     contradicted = float(told.amax()) if len(told) else 0.0
-    focal = 0.0
+    focal, zoomed = 0.0, settled.zoomed()
     if "focal" in expected.free:
         focal = float(covariance.cameras[0, 0, 0].sqrt() / mapping.camera.K[0, 0])
 
@@ -141,8 +141,8 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
             return "curves followed through the frames around do not tell its camera by themselves"
         if contradicted > _CONTRADICTED:
             return f"cameras turn by {contradicted:.1f} degrees less or more than a few frames by themselves say"
-        if settled.zoomed() != 1:
-            return f"its focal length is {settled.zoomed():.2f} times the one that a few frames at a time say"
+        if zoomed is not None:
+            return f"its focal length is {zoomed:.2f} times the one that a few frames at a time say"
         if settled.moved > _RESTLESS:
             return f"cameras still turn by {settled.moved:.1f} degrees as more of the edges are left out"
         if not DEVIATIONS * rotation[i] < WRONG_ANGLE:

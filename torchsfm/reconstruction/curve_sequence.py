@@ -61,12 +61,12 @@ class Settled(NamedTuple):
     told: "Expected"
     """The camera as few frames at a time say it is."""
 
-    def zoomed(self) -> float:
-        """The focal length, as a part of the one that few frames at a time say, where these contradict it; else 1."""
+    def zoomed(self) -> float | None:
+        """The focal length over the one that few frames at a time say; None where these do not contradict it."""
         if "focal" not in self.told.free:
-            return 1.0
+            return None
         ratio = float(self.mapping.camera.K[0, 0] / self.told.camera.K[0, 0])
-        return ratio if abs(math.log(ratio)) > DEVIATIONS * self.told.sigma["focal"] else 1.0
+        return ratio if abs(math.log(ratio)) > DEVIATIONS * self.told.sigma["focal"] else None
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,8 @@ def map_sequence(
         return None, max(set(reasons), key=reasons.count)
     told = expected.told(*focal_of(windows))
     best: CurveMapping | None = None
-    for chain in chains(windows, expected.camera.K)[:_TRIES]:
-        begun = _begin(edges, size, told, chain)
+    for chain in chains(windows)[:_TRIES]:
+        begun = _begin(edges, size, told, chain, progress)
         if not len(begun.curves):
             continue
         grown = _grow(begun, told, progress)
@@ -133,11 +133,13 @@ def map_sequence(
     return _together(best, expected, told, progress), ""
 
 
-def _begin(edges: Sequence[ImageEdges], size: tuple[int, int], told: Expected, chain: Chain) -> CurveMapping:
+def _begin(
+    edges: Sequence[ImageEdges], size: tuple[int, int], told: Expected, chain: Chain, progress: Progress
+) -> CurveMapping:
     """A model of the frames of a chain of windows."""
     mapping = CurveMapping.start(edges, size, told.camera).placed(chain.views, chain.poses)
     for near in _NEARER:
-        mapping = sampled(mapping, near)
+        mapping = sampled(mapping, progress, near)
         for _ in range(2):
             mapping = settle(mapping, told.terms(lens=True), near=near, **_ROUGH)
     return mapping
@@ -168,9 +170,7 @@ def _grow(mapping: CurveMapping, told: Expected, progress: Progress) -> CurveMap
 def _together(mapping: CurveMapping, expected: Expected, told: Expected, progress: Progress) -> Settled:
     """All cameras, from samples that are found anew."""
     known = mapping.known
-    progress("curves", 0, len(known))
-    mapping = prune(track(sampled(mapping)))
-    progress("curves", len(known), len(known))
+    mapping = prune(track(sampled(mapping, progress)))
     # What the windows say of the focal length counts only until it is clear which samples stay in one place.
     mapping = settle(mapping, told.terms(lens=True), **_ROUGH)
     for _ in range(_LAST):

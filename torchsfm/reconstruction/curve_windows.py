@@ -121,38 +121,49 @@ def focal_of(windows: Sequence[Window]) -> tuple[Float[Tensor, ""], float]:
     return middle, max(_SURE, scatter / math.sqrt(number))
 
 
-def chains(windows: Sequence[Window], K: Float[Tensor, "3 3"]) -> list[Chain]:
+def chains(windows: Sequence[Window]) -> list[Chain]:
     """Cameras of windows that overlap and agree, the longest chain first.
 
     Frames about which two windows contradict each other, or of which only the end of one tells, are left out where enough
     others remain.
 
     Args:
-        windows: In the order of their frames, all with an answer.
-        K: The calibration, for the principal point.
+        windows: In the order of their frames, no two of the same, all with an answer.
     """
-    runs: list[list[tuple[Window, Similarity]]] = []
+    placed: list[_Placed] = []
     contested = set[int]()
     for k, window in enumerate(windows):
-        for before in windows[:k]:
-            if _turn(window, before).off > _ONE_TURN:
-                contested |= {*window.views.tolist()} & {*before.views.tolist()}
-        for run, before, world in [(chain, *link) for chain in reversed(runs) for link in reversed(chain)]:
-            step = _between(window, before, K[:2, 2])
-            if step is not None:
-                run.append((window, _after(world, step)))
-                break
-        else:
-            one = torch.ones((), dtype=K.dtype)
-            runs.append([(window, Similarity(one, torch.eye(3, dtype=K.dtype), torch.zeros(3, dtype=K.dtype)))])
+        own = None
+        # Of windows in order, only so many can share a frame with one.
+        for before in reversed(placed[max(k - WIDTH, 0) :]):
+            turn = _turn(window, before.window)
+            if turn.off > _ONE_TURN:
+                contested |= {*window.views.tolist()} & {*before.window.views.tolist()}
+            elif own is None and turn.off <= _ONE_TURN and (step := _step(window, before.window, turn.R)) is not None:
+                own = _Placed(window, before.chain, _after(before.world, step))
+        placed.append(own or _Placed(window, k, _nowhere(window.found.poses)))
+    runs = [[one for one in placed if one.chain == k] for k in dict.fromkeys(one.chain for one in placed)]
     return sorted((_joined(run, contested) for run in runs), key=lambda chain: -len(chain.views))
 
 
-def _joined(run: Sequence[tuple[Window, Similarity]], contested: set[int]) -> Chain:
+class _Placed(NamedTuple):
+    window: Window
+    chain: int
+    """Number of the window with which its chain begins."""
+    world: Similarity
+    """To that one's world from the window's own."""
+
+
+def _nowhere(like: Pose) -> Similarity:
+    """A world as it is."""
+    return Similarity(like.t.new_ones(()), torch.eye(3, dtype=like.t.dtype), like.t.new_zeros(3))
+
+
+def _joined(run: Sequence[_Placed], contested: set[int]) -> Chain:
     """Each frame as the window has it in whose middle it is nearest; the end of a single window is not sure of a frame."""
     frames: dict[int, tuple[int, Pose]] = {}
     confirmed = set[int]()
-    for window, world in run:
+    for window, _, world in run:
         poses = world.transform_pose(window.found.poses)
         for k, view in enumerate(window.views.tolist()):
             away = abs(view - window.middle)
@@ -182,14 +193,13 @@ def _turn(window: Window, before: Window) -> _Turn:
     return _Turn(R, float(rotation_angle(turns @ R.mT).rad2deg().amax()))
 
 
-def _between(window: Window, before: Window, centre: Float[Tensor, "2"]) -> Similarity | None:
-    """From the world of a window to that of one before it; None where they share too little, or contradict each other."""
-    turn = _turn(window, before)
-    scale = _scale(window, before, centre) if turn.off <= _ONE_TURN else None
+def _step(window: Window, before: Window, R: Float[Tensor, "3 3"]) -> Similarity | None:
+    """From the world of a window to that of one before it, which it is turned against; None where nothing tells its size."""
+    scale = _scale(window, before)
     if scale is None:
         return None
     a, b = _shared(window, before)
-    return Similarity(scale, turn.R, (b.centre - scale * a.centre @ turn.R.mT).mean(0))
+    return Similarity(scale, R, (b.centre - scale * a.centre @ R.mT).mean(0))
 
 
 def _shared(window: Window, before: Window) -> tuple[Pose, Pose]:
@@ -198,17 +208,18 @@ def _shared(window: Window, before: Window) -> tuple[Pose, Pose]:
     return window.found.poses[own], before.found.poses[other]
 
 
-def _scale(window: Window, before: Window, centre: Float[Tensor, "2"]) -> Float[Tensor, ""] | None:
+def _scale(window: Window, before: Window) -> Float[Tensor, ""] | None:
     """How much larger the world of the window before is, by the depths of samples that are seen on the same edges."""
     looks = []
     for one in (window, before):
         Y = one.found.poses[int((one.views == window.middle).nonzero()[0, 0])].transform(one.found.X)
-        looks.append((one.found.focal * Y[:, :2] / Y[:, 2:] + centre, Y[:, 2]))
+        Y = Y[Y[:, 2] > 0]
+        looks.append((one.found.focal * Y[:, :2] / Y[:, 2:], Y[:, 2]))
     (x, depth), (y, other) = looks
     if not len(x) or not len(y):
         return None
     gap, nearest = torch.cdist(x, y).min(1)
-    same = (gap < _BESIDE) & (depth > 0) & (other[nearest] > 0)
+    same = gap < _BESIDE
     if int(same.sum()) < _FEWEST:
         return None
     return (other[nearest][same] / depth[same]).median()
