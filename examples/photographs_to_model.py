@@ -13,7 +13,6 @@ from pathlib import Path
 
 import torch
 
-from torchsfm.images import save_image
 from torchsfm.reconstruction import reconstruct
 from torchsfm.reconstruction.evaluation import align_reconstruction, pose_errors
 from torchsfm.simulation import RenderedSequence, courtyard_scene, orbit_poses, render_sequence
@@ -25,8 +24,7 @@ def photograph(folder: Path) -> RenderedSequence:
     scene = courtyard_scene(texel=0.012, generator=generator)
     poses = orbit_poses(8, radius=5.2, height=(0.6, 2.2), sweep=math.radians(60), start=math.radians(-75), target=(0, 0, 0.7))
     truth = render_sequence(scene, poses=poses, width=480, height=360, generator=generator)
-    for i, image in enumerate(truth.images):
-        save_image(folder / f"view{i}.png", image)
+    truth.save(folder)
     return truth
 
 

@@ -120,6 +120,16 @@ def test_a_folded_model_is_doubted_whole(generator: torch.Generator) -> None:
         assert all("look alike" in reason for reason in judged(mapping))
 
 
+def test_conflicts_that_are_known_are_those_that_are_found(generator: torch.Generator) -> None:
+    mapping = folded(generator)
+    prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), 0.5, dtype=torch.float64))
+    known = {"open_numbers": ("focal", "k1"), "prior": prior, "threshold": 4.0}
+    given = examine(mapping, conflicts=missing_correspondences(mapping), **known)  # type: ignore[arg-type]
+    assert given.doubt == judged(mapping)
+    none = missing_correspondences(scene(generator, v=len(mapping.registered)))
+    assert not any("look alike" in reason for reason in examine(mapping, conflicts=none, **known).doubt)  # type: ignore[arg-type]
+
+
 def test_what_hides_points_explains_that_they_are_missing(generator: torch.Generator) -> None:
     mapping = folded(generator)
     # Something seen by all stands before the surroundings, wide enough for the cameras at both ends of the arc.

@@ -1,11 +1,13 @@
 """From keypoints and matches of any program to a model."""
 
+from types import ModuleType
+
 import pytest
 import torch
 from chance import seeded
 from test_reconstruct_tracks import Scene, make_scene
 
-from torchsfm.reconstruction import MatchedImages, SfmResult, reconstruct_matches
+from torchsfm.reconstruction import MatchedImages, SfmResult, doubt, reconstruct_matches, unfold
 from torchsfm.reconstruction.evaluation import pose_errors
 
 
@@ -50,6 +52,20 @@ def test_the_scene_is_found(weighted: bool) -> None:
     # The observations are keypoints of their images.
     for i in range(len(m.names)):
         assert bool(torch.isin(model.x[model.view == i, 0], m.keypoints[i][:, 0]).all())
+
+
+def test_missing_correspondences_are_looked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was found of a model when it was made serves to judge it."""
+    m, looks = matched(make_scene(points=300, outliers=0.0)), list[str]()
+
+    def spy(room: ModuleType) -> None:
+        find = room.missing_correspondences
+        monkeypatch.setattr(room, "missing_correspondences", lambda mapping: (looks.append(room.__name__), find(mapping))[1])
+
+    spy(unfold)
+    spy(doubt)
+    assert bool(run(m).model.registered.all())
+    assert looks == [unfold.__name__]
 
 
 def test_order_of_pairs_and_matches_that_are_absent_do_not_matter() -> None:

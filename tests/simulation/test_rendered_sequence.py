@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from torch.nn import functional
 from torchsfm.geometry.cameras import Camera, intrinsics
 from torchsfm.geometry.distortion import KannalaBrandt, Radial
 from torchsfm.geometry.poses import Pose
+from torchsfm.images import read_image
 from torchsfm.simulation import RenderedSequence, TexturedScene, courtyard_scene, look_at, orbit_poses, render_sequence
 from torchsfm.simulation.rendering import default_camera
 from torchsfm.simulation.surfaces import Rectangle, Sphere
@@ -66,6 +68,15 @@ def test_another_default_dtype_changes_nothing() -> None:
         torch.set_default_dtype(usual)
     assert torch.equal(other.X, plain.X)
     torch.testing.assert_close(other.images, plain.images, rtol=0, atol=1e-4)
+
+
+def test_images_are_saved_in_order(rendered: RenderedSequence, tmp_path: Path) -> None:
+    files = rendered.save(tmp_path / "new" / "photos")
+    assert sorted((tmp_path / "new" / "photos").iterdir()) == files
+    again = torch.stack([read_image(file).pixels for file in files])
+    assert again.shape == rendered.images.shape
+    # Eight bits.
+    assert (again - rendered.images).abs().max() < 0.51 / 255
 
 
 def test_points_have_the_depth_of_the_map(rendered: RenderedSequence) -> None:

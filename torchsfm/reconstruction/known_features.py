@@ -53,13 +53,9 @@ def saved_features(folder: str | Path, model: Reconstruction) -> KnownFeatures |
 
     Example:
         >>> import torch, torchsfm
-        >>> scene = torchsfm.simulation.render_sequence(
-        ...     views=3, width=320, height=240, generator=torch.Generator().manual_seed(0)
-        ... )
-        >>> photos = [f"view{i}.png" for i in range(3)]
-        >>> for path, image in zip(photos, scene.images):
-        ...     torchsfm.images.save_image(path, image)
-        >>> model = torchsfm.reconstruct(photos, out="run").model
+        >>> g = torch.Generator().manual_seed(0)
+        >>> files = torchsfm.render_sequence(views=3, width=320, height=240, generator=g).save("photos")
+        >>> model = torchsfm.reconstruct("photos", out="run").model
         >>> known = torchsfm.reconstruction.saved_features("run", model)
         >>> len(known.x), known.names == model.names
         (3, True)

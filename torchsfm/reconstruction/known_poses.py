@@ -80,14 +80,10 @@ def triangulate_photographs(
 
     Example:
         >>> import torch, torchsfm
-        >>> scene = torchsfm.simulation.render_sequence(
-        ...     views=4, width=320, height=240, generator=torch.Generator().manual_seed(0)
-        ... )
-        >>> photos = [f"view{i}.png" for i in range(4)]
-        >>> for path, image in zip(photos, scene.images):
-        ...     torchsfm.images.save_image(path, image)
-        >>> poses = torchsfm.reconstruct(photos).model  # or `torchsfm.read_model` of any program's
-        >>> result = torchsfm.triangulate_photographs(photos, poses)
+        >>> g = torch.Generator().manual_seed(0)
+        >>> files = torchsfm.render_sequence(views=4, width=320, height=240, generator=g).save("photos")
+        >>> poses = torchsfm.reconstruct("photos").model  # or `torchsfm.read_model` of any program's
+        >>> result = torchsfm.triangulate_photographs("photos", poses)
         >>> len(result.model.X) > 100
         True
     """

@@ -63,12 +63,8 @@ def register_photographs(
 
     Example:
         >>> import torch, torchsfm
-        >>> scene = torchsfm.simulation.render_sequence(
-        ...     views=6, width=320, height=240, generator=torch.Generator().manual_seed(0)
-        ... )
-        >>> photos = [f"view{i}.png" for i in range(6)]
-        >>> for path, image in zip(photos, scene.images):
-        ...     torchsfm.images.save_image(path, image)
+        >>> g = torch.Generator().manual_seed(0)
+        >>> photos = torchsfm.render_sequence(views=6, width=320, height=240, generator=g).save("photos")
         >>> model = torchsfm.reconstruct(photos[:5], out="run").model
         >>> known = torchsfm.reconstruction.saved_features("run", model)
         >>> result = torchsfm.reconstruction.register_photographs(photos[5], model, known)

@@ -104,13 +104,9 @@ def reconstruct(
 
     Example:
         >>> import torch, torchsfm
-        >>> scene = torchsfm.simulation.render_sequence(
-        ...     views=5, width=320, height=240, generator=torch.Generator().manual_seed(0)
-        ... )
-        >>> photos = [f"view{i}.png" for i in range(5)]
-        >>> for path, image in zip(photos, scene.images):
-        ...     torchsfm.images.save_image(path, image)
-        >>> result = torchsfm.reconstruct(photos)  # a folder's name does as well
+        >>> g = torch.Generator().manual_seed(0)
+        >>> files = torchsfm.render_sequence(views=5, width=320, height=240, generator=g).save("photos")
+        >>> result = torchsfm.reconstruct("photos")
         >>> int(result.model.registered.sum())
         5
         >>> result.model.save("model.npz")

@@ -1,7 +1,9 @@
 """Real images of textured scenes, with the truth about cameras and surfaces: for tests and demonstrations."""
 
 import math
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,6 +12,7 @@ from torch import Tensor
 from torchsfm.geometry.cameras import Camera, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.poses import Pose
+from torchsfm.images.reading import save_image
 from torchsfm.simulation.ray_casting import cast, lit, shade
 from torchsfm.simulation.textured_scene import TexturedScene, courtyard_scene
 from torchsfm.simulation.viewpoints import orbit_poses
@@ -40,6 +43,22 @@ class RenderedSequence:
     """Where the points project, in pixels; finite but meaningless where not visible."""
     visible: Bool[Tensor, "v n"]
     """Which points are inside each image and not hidden by a surface."""
+
+    def save(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Write the images as `view00.png`, `view01.png`, ... into a folder, which is made where there is none.
+
+        Args:
+            folder: Where to.
+
+        Returns:
+            The files, in the order of the images.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        files = [folder / f"view{i:02d}.png" for i in range(len(self.images))]
+        for file, image in zip(files, self.images, strict=True):
+            save_image(file, image)
+        return files
 
 
 def default_camera(
