@@ -36,6 +36,7 @@ from torchsfm.formats import (
     read_conics,
     read_database,
     read_features,
+    read_hloc,
     read_libmv,
     read_lines,
     read_model,
@@ -150,6 +151,7 @@ def _faults(found: Any) -> list[str]:
             return faults
         case MatchedImages():
             faults = [] if len(found.pairs) == len(found.matches) else ["pairs"]
+            faults += [] if all(bool(x.isfinite().all()) for x in found.keypoints) else ["keypoints are not finite"]
             for (i, j), rows in zip(found.pairs.tolist(), found.matches, strict=True):
                 limit = torch.tensor([len(found.keypoints[i]), len(found.keypoints[j])])
                 faults += [] if bool(((rows >= 0) & (rows < limit)).all()) else ["matches are out of range"]
@@ -283,6 +285,8 @@ def _formats() -> list[Format]:
         matched = MatchedImages(model.names[:3], model.image_size[:3], keypoints, pairs, (rows, rows))
         write_database(matched, folder / "database.db")
         formats.append(Format("database", _files(folder, "database.db"), read_database))
+        hloc = _hloc(replace(matched, names=("a.jpg", "b/c.jpg", "d.jpg")))
+        formats += [Format("hloc", hloc, lambda place: read_hloc(place / "features.h5", place / "matches.h5"))] if hloc else []
         _describe(folder / "database.db", [len(x) for x in keypoints])
         formats.append(Format("database of features", _files(folder, "database.db"), read_features))
         formats.append(
@@ -333,6 +337,25 @@ def _problem(g: torch.Generator) -> tuple[BundleProblem, Reconstruction]:
     registered = torch.tensor([True, True, True, False])
     size = torch.tensor([[640, 480]]).repeat(4, 1)
     return problem, Reconstruction(names, size, cameras, index, poses, registered, X, color, x, view, point)
+
+
+def _hloc(matched: MatchedImages) -> Files:
+    """Features and matches, packed and not; none where h5py is not installed."""
+    try:
+        import h5py
+    except ImportError:
+        return {}
+    features, matches = io.BytesIO(), io.BytesIO()
+    with h5py.File(features, "w") as file:
+        for name, x, size in zip(matched.names, matched.keypoints, matched.image_size, strict=True):
+            file[f"{name}/keypoints"], file[f"{name}/image_size"] = x.numpy(), size.numpy()
+    with h5py.File(matches, "w") as file:
+        for (i, j), rows in zip(matched.pairs.tolist(), matched.matches, strict=True):
+            pair = "/".join(matched.names[k].replace("/", "-") for k in (i, j))
+            match = rows[:, 1].numpy().astype(np.int16)
+            file.create_dataset(f"{pair}/matches0", data=match, compression="gzip")
+            file[f"{pair}/matching_scores0"] = np.ones(len(match), np.float16)
+    return {"features.h5": features.getvalue(), "matches.h5": matches.getvalue()}
 
 
 def _libmv(problem: BundleProblem) -> bytes:

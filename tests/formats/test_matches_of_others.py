@@ -125,6 +125,32 @@ def test_hloc(tmp_path: Path) -> None:
         read_hloc(tmp_path / "features.h5", tmp_path / "matches.h5")
 
 
+def test_damaged_files_of_hloc_are_told(tmp_path: Path) -> None:
+    """Also where HDF5 opens them and finds the damage later, or would make room for what a file cannot hold."""
+    h5py = pytest.importorskip("h5py")
+    features, matches = tmp_path / "features.h5", tmp_path / "matches.h5"
+    with h5py.File(features, "w") as file:
+        for name in ("a.jpg", "b.jpg"):
+            file[f"{name}/keypoints"], file[f"{name}/image_size"] = np.ones((50, 2)), [640, 480]
+    with h5py.File(matches, "w") as file:
+        file["a.jpg/b.jpg/matches0"] = np.arange(50)
+    assert len(read_hloc(features, matches).matches[0]) == 50
+    for path in (features, matches):
+        good = path.read_bytes()
+        # The tables of groups lose their marks, which is not seen as the file is opened; files that end too early.
+        for data in (*(good.replace(mark, b"xxxx") for mark in (b"TREE", b"SNOD", b"HEAP")), good[:2000], good[:100], b""):
+            path.write_bytes(data)
+            with pytest.raises(ValueError, match="not a file of hloc's") as caught:
+                read_hloc(features, matches)
+            assert str(path) in str(caught.value)
+            assert "\n" not in str(caught.value)
+        path.write_bytes(good)
+    with h5py.File(matches, "w") as file:
+        file.create_dataset("a.jpg/b.jpg/matches0", (10**13,), "i8", chunks=(1000,))
+    with pytest.raises(ValueError, match="says that it holds 80000000000000 bytes"):
+        read_hloc(features, matches)
+
+
 def test_what_is_no_database(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write_database(make(), path)

@@ -5,6 +5,8 @@ the top-left pixel is at (0, 0), as here. In the file of matches the group of a 
 written as `-`, and holds `matches0`, the match of each keypoint of the first image or -1, and often `matching_scores0`.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import numpy as np
 import torch
 
 from torchsfm.formats.joining import numbers, picture_size, reading
+from torchsfm.reconstruction.files import FREE_BYTES, MAX_RATIO
 from torchsfm.reconstruction.matched import MatchedImages
 
 
@@ -58,8 +61,8 @@ def read_hloc(features: str | Path, matches: str | Path, *, images: str | Path |
         file.visititems(lambda name, item: found.append(name) if isinstance(item, h5py.Group) and "keypoints" in item else None)
         for name in sorted(found):
             names.append(name)
-            keypoints.append(torch.from_numpy(numbers(file[name]["keypoints"][()], -1, 2).astype(np.float32)))
-            size = file[name]["image_size"][()] if "image_size" in file[name] else None
+            keypoints.append(torch.from_numpy(numbers(_values(file[name]["keypoints"]), -1, 2).astype(np.float32)))
+            size = _values(file[name]["image_size"]) if "image_size" in file[name] else None
             if size is None and images is not None:
                 size = picture_size(Path(images) / name)
             if size is None:
@@ -73,14 +76,14 @@ def read_hloc(features: str | Path, matches: str | Path, *, images: str | Path |
         for first, group in file.items():
             for second, pair in group.items():
                 i, j = number[first], number[second]
-                match = numbers(pair["matches0"][()], -1).astype(np.int64)
+                match = numbers(_values(pair["matches0"]), -1).astype(np.int64)
                 if i == j or len(match) != len(keypoints[i]) or (len(match) and int(match.max()) >= len(keypoints[j])):
                     raise ValueError(f"the matches of {first} and {second} are of keypoints that are not there")
                 good = np.flatnonzero(match >= 0)
                 pairs.append([i, j])
                 rows.append(torch.from_numpy(np.stack([good, match[good]], -1)))
                 if "matching_scores0" in pair:
-                    scores.append(torch.from_numpy(numbers(pair["matching_scores0"][()], len(match))[good]))
+                    scores.append(torch.from_numpy(numbers(_values(pair["matching_scores0"]), len(match))[good]))
     return MatchedImages(
         names=tuple(names),
         image_size=torch.tensor(sizes, dtype=torch.long).reshape(-1, 2),
@@ -91,9 +94,23 @@ def read_hloc(features: str | Path, matches: str | Path, *, images: str | Path |
     )
 
 
-def _opened(h5py: Any, path: Path) -> Any:
-    """The file, whose damage is a ValueError as that of any other."""
+@contextmanager
+def _opened(h5py: Any, path: Path) -> Iterator[Any]:
+    """The file, whose damage is a ValueError as that of any other: HDF5 finds most of it only when asked for what is there."""
     try:
-        return h5py.File(path, "r")
-    except (OSError, RuntimeError) as error:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, MemoryError) as error:
         raise ValueError(str(error)) from None
+
+
+def _values(dataset: Any) -> Any:
+    """What a dataset holds.
+
+    Raises:
+        ValueError: It says that it holds far more than its file can.
+    """
+    whole = Path(dataset.file.filename).stat().st_size
+    if dataset.nbytes > max(FREE_BYTES, MAX_RATIO * whole):
+        raise ValueError(f"{dataset.name} says that it holds {dataset.nbytes} bytes, in a file of {whole}")
+    return dataset[()]
