@@ -311,6 +311,15 @@ def test_what_is_no_such_file(case: str, tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
+def test_no_room_is_made_for_points_that_are_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "bundle.out"
+    write_bundler(pinholes(), path)
+    head, counts, rest = path.read_bytes().split(b"\n", 2)
+    path.write_bytes(b"\n".join((head, counts.split()[0] + b" 1099511627775", rest)))
+    with pytest.raises(ValueError, match="ends too early"):
+        read_bundler(path)
+
+
 def test_nvm_with_distortion_is_refused(tmp_path: Path) -> None:
     write_nvm(pinholes(), tmp_path / "a.nvm")
     text = (tmp_path / "a.nvm").read_text()

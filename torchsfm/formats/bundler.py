@@ -96,6 +96,8 @@ def read_bundler(path: str | Path) -> Reconstruction:
         v, n = _counts(table[:2])
         cameras = _part(table, 2, 15 * v).reshape(v, 15)
         place = 2 + 15 * v
+        # A point has seven numbers at least: no room is made for more points than there can be.
+        _part(table, place, 7 * n)
         head = np.empty((n, 6))
         parts: list[NDArray[np.float64]] = []
         for k in range(n):
