@@ -44,7 +44,18 @@ _RANK = 1e-11
 class ConicPoses:
     """Poses from which coplanar conics look as they were seen, the best first.
 
-    See the example of `camera_conics`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.geometry import conic_from_ellipse, rotation_from_rotvec, transform_conic
+        >>> centre = torch.tensor([[-1.0, 0.0], [1.0, 0.0]]).double()  # two equal circles
+        >>> drawn = conic_from_ellipse(torchsfm.Ellipse(centre, torch.ones(2, 2).double(), torch.zeros(2).double()))
+        >>> turn, t = torch.tensor([0.5, -0.3, 0.2]).double(), torch.tensor([0.0, 0.0, 6.0]).double()
+        >>> P = torchsfm.Pose(rotation_from_rotvec(turn), t).matrix()
+        >>> found = torchsfm.camera_conics(transform_conic(P[:, [0, 1, 3]], drawn), drawn)
+        >>> found.valid  # they look alike from the front and from behind
+        tensor([ True,  True, False, False])
+        >>> found.pose.centre[found.valid][:, 2].sign(), bool((found.error[found.valid] < 1e-6).all())
+        (tensor([-1.,  1.], dtype=torch.float64), True)
     """
 
     model: Float[Tensor, "*batch 4 3 4"]

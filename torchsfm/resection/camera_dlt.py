@@ -20,7 +20,16 @@ BLURRED = 3.0
 class CameraEstimate:
     """Cameras and whether the data determine them.
 
-    See the example of `camera_dlt`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X = torch.stack([torchsfm.random_points(8, kind=kind, generator=g) for kind in ("ball", "plane")])
+        >>> P = torchsfm.random_poses(generator=g).matrix()
+        >>> found = torchsfm.resection.camera_dlt(torchsfm.project_points(P, X), X)
+        >>> [torchsfm.Status(k).name for k in found.status.tolist()]  # a plane does not determine all of a camera
+        ['OK', 'DEGENERATE']
+        >>> bool((found.model[0] / found.model[0, 2, 3]).allclose(P / P[2, 3]))
+        True
     """
 
     model: Float[Tensor, "*batch 3 4"]

@@ -21,7 +21,17 @@ _STILL = 1e-10
 class PlanarPoses:
     """Both poses of planar problems, the better one first.
 
-    See the example of `camera_planar`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(20, kind="plane", generator=g), torchsfm.random_poses(generator=g)
+        >>> d = pose.transform(X)
+        >>> found = torchsfm.camera_planar(d / d[:, 2:] + 0.003 * torch.randn(20, 3, generator=g), X)
+        >>> found.valid, bool(found.error[0] < found.error[1])  # seen from far, a plane may be turned either way
+        (tensor([True, True]), True)
+        >>> turned = torchsfm.geometry.rotation_angle(found.pose.R @ pose.R.mT).rad2deg()
+        >>> bool(turned[0] < 2), bool(turned[1] > 5)
+        (True, True)
     """
 
     model: Float[Tensor, "*batch 2 3 4"]

@@ -23,7 +23,16 @@ _KEPT = 2
 class PoseEstimate:
     """Poses and how well they fit.
 
-    See the example of `camera_pnp`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(3, 20, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> X[2] = X[2, :1]  # one point, twenty times
+        >>> found = torchsfm.camera_pnp(poses.transform(X), X)
+        >>> [torchsfm.Status(k).name for k in found.status.tolist()]
+        ['OK', 'OK', 'DEGENERATE']
+        >>> bool(found.pose.centre[:2].allclose(poses.centre[:2])), bool((found.error[:2] < 1e-6).all())  # radians
+        (True, True)
     """
 
     model: Float[Tensor, "*batch 3 4"]

@@ -22,7 +22,16 @@ class FocalCameraEstimator:
 
     Distances are reprojection errors in the unit of the image points.
 
-    See the example of `estimate_camera_focal`, which uses it.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(200, generator=g), torchsfm.random_poses(1, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0), torch.zeros(2)).double()  # the origin is the principal point
+        >>> seen = torchsfm.simulate_images(X, pose, torchsfm.Camera(K), outliers=0.3, generator=g)
+        >>> estimator = torchsfm.resection.FocalCameraEstimator()
+        >>> found = torchsfm.ransac(estimator, seen.x[0], X, threshold=2.0, generator=g)
+        >>> estimator.sample_size, bool((found.inliers != seen.outlier[0]).float().mean() > 0.95)
+        (4, True)
     """
 
     model_name: ClassVar[str] = "focal_camera"

@@ -26,7 +26,16 @@ class ProjectiveCameraEstimator:
     A sample is six points, of which the last gives one equation. Distances are reprojection errors in the unit of the image
     points.
 
-    See the example of `estimate_camera_projective`, which uses it.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(200, generator=g), torchsfm.random_poses(1, generator=g)
+        >>> camera = torchsfm.Camera(torchsfm.random_intrinsics(generator=g))
+        >>> seen = torchsfm.simulate_images(X, pose, camera, outliers=0.3, generator=g)
+        >>> estimator = torchsfm.resection.ProjectiveCameraEstimator()
+        >>> found = torchsfm.ransac(estimator, seen.x[0], X, threshold=2.0, generator=g)
+        >>> estimator.sample_size, bool((found.inliers != seen.outlier[0]).float().mean() > 0.95)
+        (6, True)
     """
 
     model_name: ClassVar[str] = "projective_camera"

@@ -44,7 +44,20 @@ class PointLineCameraEstimator:
     Attributes:
         K: Intrinsics of the camera of each problem; its last row is (0, 0, 1).
 
-    See the example of `estimate_camera`, which uses it where there are lines.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.geometry import pluecker_from_points
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P = torchsfm.random_poses(generator=g).matrix()
+        >>> points, ends = torchsfm.random_points(20, generator=g), torchsfm.random_points(20, generator=g).reshape(10, 2, 3)
+        >>> seen = torchsfm.project_points(P, torch.cat((points[:, None].expand(20, 2, 3), ends)))  # a point twice, or two ends
+        >>> seen[:3] += 0.1  # wrong
+        >>> X = torch.cat((torch.cat((points, torch.zeros_like(points)), -1), pluecker_from_points(ends[:, 0], ends[:, 1])))
+        >>> kind = torch.arange(30).ge(20).to(torch.int64)  # 0 is a point, 1 a segment
+        >>> estimator = torchsfm.resection.PointLineCameraEstimator(torch.eye(3).double())
+        >>> found = torchsfm.ransac(estimator, seen.flatten(-2), X, kind[:, None].double(), threshold=0.001, generator=g)
+        >>> bool(found.model.allclose(P, atol=1e-6)), found.inliers.sum()
+        (True, tensor(27))
     """
 
     K: Float[Tensor, "*batch 3 3"]

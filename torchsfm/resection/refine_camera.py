@@ -28,7 +28,19 @@ PIECE = 16384
 class CameraRefinement:
     """Refined cameras and how well they are determined.
 
-    See the example of `refine_camera`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(50, generator=g), torchsfm.random_poses(generator=g)
+        >>> camera = torchsfm.Camera(torchsfm.random_intrinsics(generator=g))
+        >>> x = torchsfm.project_points(pose, X, camera)
+        >>> found = torchsfm.refine_camera(x + torch.randn(50, 2, generator=g), X, pose, camera)  # noise of one pixel
+        >>> found.covariance.shape, found.in_front.all().item(), round(found.error.item(), 1)
+        (torch.Size([6, 6]), True, 1.5)
+        >>> sigma = found.covariance.diagonal().sqrt()
+        >>> turned = torchsfm.geometry.rotation_angle(found.pose.R @ pose.R.mT)
+        >>> bool(turned < 3 * sigma[:3].norm())  # as sure as it says
+        True
     """
 
     pose: Pose

@@ -24,7 +24,18 @@ _STEPS = 8
 class ResectedCameras:
     """Cameras, what they agree with and what became of each.
 
-    See the example of `resect_cameras`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(20, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> x = torchsfm.project_points(poses.matrix(), X)
+        >>> x[1, :5] += 0.3  # wrong
+        >>> visible = torch.ones(3, 20, dtype=torch.bool)
+        >>> visible[2, 2:] = False  # two points do not make a pose
+        >>> K = torch.eye(3).double().expand(3, 3, 3)
+        >>> found = torchsfm.resect_cameras(x, X, K, visible=visible, threshold=0.01)
+        >>> found.inliers.sum(-1), [torchsfm.Status(k).name for k in found.status.tolist()]
+        (tensor([20, 15,  0]), ['OK', 'OK', 'TOO_FEW'])
     """
 
     model: Float[Tensor, "*batch v 3 4"]

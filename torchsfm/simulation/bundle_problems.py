@@ -22,7 +22,16 @@ ROUNDS = 50
 class SimulatedBundle:
     """A bundle adjustment problem and its truth.
 
-    See the example of `random_bundle_problem`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> simulated = torchsfm.random_bundle_problem(4, 50, 150, noise=0.5, outliers=0.1, generator=g)
+        >>> error = simulated.truth.residuals()  # pixels
+        >>> bool(error[simulated.outlier].median() > 2 * error[~simulated.outlier].median())
+        False
+        >>> start, truth = simulated.problem.poses.centre, simulated.truth.poses.centre
+        >>> bool((start - truth).norm(dim=-1).max() > 0)  # an adjustment starts at `problem`
+        True
     """
 
     problem: BundleProblem

@@ -26,7 +26,15 @@ from torchsfm.simulation.viewpoints import look_at
 class SimulatedConics:
     """Conics in space or ellipsoids, and their images; n of them in v views.
 
-    See the example of `simulate_conics`.
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.simulation.simulate_conics((), conics=2, views=3, generator=torch.Generator().manual_seed(0))
+        >>> outline, is_ellipse = torchsfm.geometry.ellipse_from_conic(scene.C)
+        >>> outline.centre.shape, is_ellipse.all()  # two discs in three images
+        (torch.Size([3, 2, 2]), tensor(True))
+        >>> x = torchsfm.to_homogeneous(scene.x)  # points of the outlines
+        >>> bool(torch.einsum("vmni,vmij,vmnj->vmn", x, scene.C, x).abs().max() < 1e-6 * scene.C.abs().max())
+        True
     """
 
     model: Ellipsoid

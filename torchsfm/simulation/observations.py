@@ -16,7 +16,16 @@ from torchsfm.geometry.poses import Pose
 class SimulatedImages:
     """What the cameras measured, and what they would have measured without errors.
 
-    See the example of `simulate_images`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(100, generator=g), torchsfm.random_poses(2, generator=g)
+        >>> camera = torchsfm.Camera(torchsfm.random_intrinsics(generator=g))
+        >>> seen = torchsfm.simulate_images(X, poses, camera, noise=0.5, outliers=0.2, generator=g)
+        >>> right = (seen.visible & ~seen.outlier).all(0)
+        >>> F = torchsfm.fundamental_8pt(seen.x[0, right], seen.x[1, right])
+        >>> bool(torchsfm.sampson_distance(F, seen.x_true[0], seen.x_true[1]).mean() < 1)  # against points without noise
+        True
     """
 
     x: Float[Tensor, "*batch v n 2"]

@@ -22,7 +22,15 @@ from torchsfm.simulation.viewpoints import orbit_poses
 class RenderedSequence:
     """Images and everything that is true about them. Images and colours are float32, the rest has the poses' dtype.
 
-    See the example of `render_sequence`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> scene = torchsfm.render_sequence(views=2, width=64, height=48, points=50, generator=g)
+        >>> x = torchsfm.project_points(scene.poses, scene.X, scene.cameras)  # where points are in both images, seen or hidden
+        >>> x.shape, bool(x[scene.visible].allclose(scene.x[scene.visible]))
+        (torch.Size([2, 50, 2]), True)
+        >>> [file.name for file in scene.save("photographs")]
+        ['view00.png', 'view01.png']
     """
 
     images: Float[Tensor, "v 3 h w"]

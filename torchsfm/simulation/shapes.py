@@ -22,7 +22,15 @@ _MARGIN = 4.0
 class RenderedShapes:
     """Images of shapes; what comes later hides what comes before, ellipses and polygons in turn.
 
-    See the example of `render_shapes`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> drawn = torchsfm.render_shapes((), ellipses=1, radius=(15.0, 25.0), width=120, height=90, generator=g)
+        >>> drawn.images.shape, drawn.ellipses_seen  # how much of the outline no other shape hides
+        (torch.Size([1, 90, 120]), tensor([0.5438], dtype=torch.float64))
+        >>> found = torchsfm.images.detect_ellipses(drawn.images)
+        >>> bool(torch.cdist(drawn.ellipses.centre, found.ellipse.centre.double()).min() < 0.1)  # pixels
+        True
     """
 
     images: Float[Tensor, "*batch 1 h w"]

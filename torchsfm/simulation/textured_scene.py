@@ -24,7 +24,15 @@ class Textured:
 class TexturedScene:
     """What `render_sequence` renders: textured surfaces under a sun and an even sky, the z axis up.
 
-    See the example of `courtyard_scene`.
+    Example:
+        >>> import torch
+        >>> from dataclasses import replace
+        >>> from torchsfm.simulation import courtyard_scene, render_sequence
+        >>> scene = courtyard_scene(texel=0.1, generator=torch.Generator().manual_seed(0))
+        >>> darker = replace(scene, ambient=0.5 * scene.ambient)
+        >>> bright, dark = (render_sequence(s, views=1, width=32, height=24, points=10).images.mean() for s in (scene, darker))
+        >>> bool(dark < bright), len(scene.objects) > 1
+        (True, True)
     """
 
     objects: tuple[Textured, ...]

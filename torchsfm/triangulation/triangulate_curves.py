@@ -35,7 +35,17 @@ _SHARE = 0.5
 class CurveTriangulation:
     """Curves in space, and what is known of their samples.
 
-    See the example of `triangulate_curves`.
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, 5, 100, dtype=torch.float64)
+        >>> X = torch.stack((t.cos(), t.sin(), 0.2 * t), -1)  # a helix
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0, dtype=X.dtype), torch.tensor([320.0, 240.0], dtype=X.dtype))
+        >>> P = K @ torchsfm.random_poses(3, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> curves = torchsfm.geometry.curve_from_samples(torchsfm.project_points(P, X))
+        >>> found = torchsfm.triangulate_curves(curves, P, samples=30)
+        >>> samples = found.curve.x[found.measured]
+        >>> bool(torch.cdist(samples, X).min(-1).values.max() < 0.05), found.covariance.shape
+        (True, torch.Size([30, 3, 3]))
     """
 
     curve: Curve

@@ -39,7 +39,17 @@ _UNSURE = 0.3
 class LineFault(IntEnum):
     """Why views do not determine a line.
 
-    See the example of `triangulate_lines`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.triangulation import LineFault
+        >>> t = torch.tensor([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]).double()  # two cameras side by side
+        >>> pose = torchsfm.Pose(torch.eye(3).double().expand(2, 3, 3), t)
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0])).double()
+        >>> P = K @ pose.matrix()
+        >>> upright, level = [[0.0, -1.0, 5.0], [0.0, 1.0, 5.0]], [[-1.0, 0.5, 5.0], [1.0, 0.5, 5.0]]
+        >>> x = torchsfm.project_points(P[:, None], torch.tensor([upright, level]).double())
+        >>> [LineFault(k).name for k in torchsfm.triangulate_lines(x, P).fault.tolist()]
+        ['NONE', 'EPIPOLAR_PLANE']
     """
 
     NONE = 0
@@ -59,7 +69,14 @@ class LineFault(IntEnum):
 class LineTriangulation:
     """Lines and what is known about them.
 
-    See the example of `triangulate_lines`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P = torchsfm.random_intrinsics(3, generator=g) @ torchsfm.random_poses(3, generator=g).matrix()
+        >>> X = torchsfm.random_points(10, generator=g).reshape(5, 2, 3)  # ends of five segments
+        >>> found = torchsfm.triangulate_lines(torchsfm.project_points(P[:, None], X), P)
+        >>> bool(found.ends.allclose(X)), found.model.shape, found.end_covariance.shape
+        (True, torch.Size([5, 6]), torch.Size([5, 2, 3, 3]))
     """
 
     model: Float[Tensor, "*batch n 6"]

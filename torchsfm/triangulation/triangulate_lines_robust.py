@@ -30,7 +30,16 @@ class LineEstimator:
     Attributes:
         seen: Whether the ends say what is seen of the line: else they are points of image lines, and nothing is behind.
 
-    See the example of `triangulate_lines_robust`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P = torchsfm.random_poses(6, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, torchsfm.random_points(2, generator=g))  # the ends of a segment
+        >>> x[5] += 0.5  # wrong in the last view
+        >>> estimator = torchsfm.triangulation.LineEstimator()
+        >>> found = torchsfm.ransac(estimator, x.flatten(-2), P.flatten(-2), threshold=0.01, generator=g)  # a row a view
+        >>> found.inliers, found.model.shape
+        (tensor([ True,  True,  True,  True,  True, False]), torch.Size([6]))
     """
 
     seen: bool = True
@@ -126,7 +135,16 @@ def _applied(A: Tensor, v: Tensor) -> Tensor:
 class RobustLineTriangulation:
     """Lines and which of their observations they agree with.
 
-    See the example of `triangulate_lines_robust`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P = torchsfm.random_poses(6, generator=g).matrix()
+        >>> X = torchsfm.random_points(4, generator=g).reshape(2, 2, 3)  # ends of two segments
+        >>> x = torchsfm.project_points(P[:, None], X)
+        >>> x[4:, 0] += 0.5  # the first is wrong in two views
+        >>> found = torchsfm.triangulate_lines_robust(x, P, threshold=0.01, generator=g)
+        >>> found.inliers.sum(0), bool(found.ends.allclose(X, atol=1e-6))
+        (tensor([4, 6]), True)
     """
 
     model: Float[Tensor, "*batch n 6"]

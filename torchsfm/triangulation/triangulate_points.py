@@ -19,7 +19,18 @@ from torchsfm.triangulation.triangulate_points_dlt import euclidean, linear_poin
 class Triangulation:
     """Points and what is known about them.
 
-    See the example of `triangulate_points`.
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.tensor([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]).double()  # two cameras side by side
+        >>> pose = torchsfm.Pose(torch.eye(3).double().expand(2, 3, 3), t)
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0])).double()
+        >>> P = K @ pose.matrix()
+        >>> X = torch.tensor([[0.0, 0.0, 5.0], [0.0, 0.0, 50.0], [0.0, 0.0, -5.0]]).double()
+        >>> found = torchsfm.triangulate_points(torchsfm.project_points(P, X), P)
+        >>> found.in_front, found.parallax.rad2deg().round()
+        (tensor([ True,  True, False]), tensor([11.,  1., 11.], dtype=torch.float64))
+        >>> found.covariance[:2, 2, 2].sqrt()  # ten times as far, a hundred times less sure in depth
+        tensor([0.0442, 4.4194], dtype=torch.float64)
     """
 
     model: Float[Tensor, "*batch n 3"]

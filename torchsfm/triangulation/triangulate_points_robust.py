@@ -23,7 +23,16 @@ class PointEstimator:
     Cameras are scaled so that the third coordinate of P X is the depth. Distances are reprojection errors in pixels, and
     infinite behind the camera.
 
-    See the example of `triangulate_points_robust`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(1, generator=g), torchsfm.random_poses(6, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, X)[:, 0]  # one point in six views
+        >>> x[5] += 0.5  # wrong in the last
+        >>> estimator = torchsfm.triangulation.PointEstimator()
+        >>> found = torchsfm.ransac(estimator, x, P.flatten(-2), threshold=0.01, generator=g)  # a row a view
+        >>> found.inliers, bool(found.model.allclose(X[0]))
+        (tensor([ True,  True,  True,  True,  True, False]), True)
     """
 
     model_name: ClassVar[str] = "point"
@@ -138,7 +147,16 @@ class _Views:
 class RobustTriangulation:
     """Points and which of their observations they agree with.
 
-    See the example of `triangulate_points_robust`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(50, generator=g), torchsfm.random_poses(6, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, X) + 0.001 * torch.randn(6, 50, 2, generator=g)
+        >>> x[5] += 0.5  # wrong in the last view
+        >>> found = torchsfm.triangulate_points_robust(x, P, threshold=0.01, generator=g)
+        >>> sigma = found.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        >>> bool(((found.model - X).norm(dim=-1) < 4 * sigma).all()), found.inliers.sum(1)
+        (True, tensor([50, 50, 50, 50, 50,  0]))
     """
 
     model: Float[Tensor, "*batch n 3"]
