@@ -25,7 +25,18 @@ do."""
 class IntrinsicsEstimate:
     """Intrinsics that all views share, from algebraic constraints.
 
-    See the example of `constant_intrinsics`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(8, generator=g)
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X) + 0.3 * torch.randn(8, 60, 2, generator=g)
+        >>> projective = torchsfm.factorize_points(x)
+        >>> found = torchsfm.autocalibration.constant_intrinsics(projective.P, projective.X, image_size=(1000.0, 750.0))
+        >>> torchsfm.Status(found.status.item()).name, bool((found.K[0, 0] / 900 - 1).abs() < 0.02)
+        ('OK', True)
+        >>> bool(found.deviation < 0.01)  # how far images are from having these intrinsics
+        True
     """
 
     K: Float[Tensor, "*batch 3 3"]

@@ -30,7 +30,20 @@ class AssumptionFit:
 
     `status`, `chi2` and `redundancy` are as in `Autocalibration`.
 
-    See the example of `autocalibrate_points`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> X, poses = torchsfm.random_points(30, generator=g), torchsfm.random_poses(6, wobble=0.5, generator=g)
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X) + 0.3 * torch.randn(6, 30, 2, generator=g)
+        >>> projective = torchsfm.factorize_points(x)
+        >>> found = torchsfm.autocalibrate_points(projective.P, projective.X, x, image_size=(1000.0, 750.0))
+        >>> fit = found.fits[found.assumption]  # one focal length in all images
+        >>> fit.assumption.names(6), bool(fit.chi2 < 2 * fit.redundancy)  # the data agree
+        (('focal', 'cx', 'cy'), True)
+        >>> sigma = 1 / fit.singular_values  # of log f and the principal point over 1000 pixels, or combinations of them
+        >>> bool((sigma < 0.01).all()), fit.combinations.shape
+        (True, torch.Size([3, 3]))
     """
 
     assumption: Assumption

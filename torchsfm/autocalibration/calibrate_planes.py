@@ -41,7 +41,18 @@ MAX_DEVIATION = 0.3
 class PlaneCalibration:
     """A calibrated camera and its poses before the plane z = 0.
 
-    See the example of `calibrate_planes`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(40, kind="plane", generator=g), torchsfm.random_poses(6, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X) + 0.3 * torch.randn(6, 40, 2, generator=g)
+        >>> found = torchsfm.calibrate_planes(x, X[:, :2], image_size=(1000.0, 750.0))
+        >>> found.parameter_names[:4], bool(0.2 < found.rms < 0.6)  # pixels
+        (('fx', 'fy', 'cx', 'cy'), True)
+        >>> fx = found.parameter_names.index("fx")
+        >>> bool((found.camera.K[0, 0] - 900).abs() < 4 * found.deviation[fx])
+        True
     """
 
     camera: Camera

@@ -41,7 +41,19 @@ class ViewGraphFocals:
         asymmetry: `(s1 - s2) / (s1 + s2)` of each pair's essential matrix at the focal lengths found; 1 for pairs that do not
             count.
 
-    See the example of `calibrate_view_graph`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> f, c = torch.tensor([800.0, 900.0, 1000.0, 1100.0]).double(), torch.zeros(4, 2).double()
+        >>> P = torchsfm.intrinsics(f, c) @ torchsfm.random_poses(4, wobble=1.0, generator=g).matrix()
+        >>> pairs = torch.combinations(torch.arange(4))
+        >>> F = torchsfm.tensors.bifocal_tensors(P, pairs)
+        >>> F[5] = torch.randn(3, 3, generator=g)  # one of six pairs is wrong
+        >>> found = torchsfm.calibrate_view_graph(F, pairs, c, torch.full_like(f, 950), torch.full_like(f, 0.3))
+        >>> bool((found.model / f - 1).abs().max() < 0.05), found.asymmetry.argmax()  # and is told
+        (True, tensor(5))
+        >>> bool((found.deviation < 0.3).all())  # less than before anything was seen
+        True
     """
 
     model: Float[Tensor, "*batch v"]

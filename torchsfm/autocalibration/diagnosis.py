@@ -28,7 +28,15 @@ SMALL_SPREAD = 0.05
 class Motion:
     """How the cameras moved. Angles in radians, lengths as ratios; flags say where a measure is small.
 
-    See the example of `diagnose_motion`.
+    Example:
+        >>> import torch, torchsfm
+        >>> poses = torchsfm.simulation.orbit_poses(8, height=(1.0, 1.0))  # around a point on a circle
+        >>> moved = torch.ones(8, dtype=torch.bool)
+        >>> motion = torchsfm.autocalibration.diagnose_motion(poses.R, poses.centre, moved)
+        >>> bool(motion.planar), bool(motion.one_axis), bool(motion.collinear)  # all turns are about the normal of one plane
+        (True, True, False)
+        >>> bool(motion.critical)
+        True
     """
 
     rotation: Float[Tensor, "*batch"]

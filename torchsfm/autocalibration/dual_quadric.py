@@ -29,7 +29,18 @@ SIGMA = {"aspect": 0.1, "skew": 0.01, "principal_point": 0.05, "focal": 3.0}
 class DualQuadric:
     """An absolute dual quadric and the intrinsics that it gives each view.
 
-    See the example of `dual_quadric_linear`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> poses = torchsfm.random_poses(4, spread=3.0, generator=g)
+        >>> still = torchsfm.Pose(poses.R[:1].expand(4, 3, 3), poses.t)  # the camera shifts, but never turns
+        >>> P = torch.stack((K @ poses.matrix(), K @ still.matrix()))
+        >>> found = torchsfm.autocalibration.dual_quadric_linear(P, image_size=(1000.0, 750.0))
+        >>> [torchsfm.Status(k).name for k in found.status.tolist()]
+        ['OK', 'DEGENERATE']
+        >>> bool((found.K[0] - K).abs().max() < 1), found.plane[0].shape
+        (True, torch.Size([4]))
     """
 
     model: Float[Tensor, "*batch 4 4"]

@@ -23,7 +23,16 @@ class Orientation:
     `P` and `X` differ from what was given by signs alone. `consistent` is the share of the observations that are in front of
     their cameras then: 1 for a reconstruction of a real scene; 1 as well where nothing is visible.
 
-    See the example of `orient_projective`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(20, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> X = torchsfm.to_homogeneous(X)
+        >>> X[5] *= -1  # signs are lost
+        >>> P[1] *= -1
+        >>> found = torchsfm.autocalibration.orient_projective(P, X)
+        >>> float(found.consistent), bool(((found.P @ found.X.mT)[:, 2] > 0).all())  # every point is in front of every camera
+        (1.0, True)
     """
 
     P: Float[Tensor, "*batch v 3 4"]

@@ -28,7 +28,19 @@ _FAR = 3.0
 class Autocalibration:
     """Metric cameras and points, or samples of curves, and how far the data determine them.
 
-    See the example of `autocalibrate_points`, and for curves that of `autocalibrate_curves`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> X, poses = torchsfm.random_points(30, generator=g), torchsfm.random_poses(6, wobble=0.5, generator=g)
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X) + 0.3 * torch.randn(6, 30, 2, generator=g)
+        >>> projective = torchsfm.factorize_points(x)
+        >>> found = torchsfm.autocalibrate_points(projective.P, projective.X, x, image_size=(1000.0, 750.0))
+        >>> torchsfm.Status(found.status.item()).name, found.assumptions[found.assumption].varying  # nothing varies
+        ('OK', ())
+        >>> relative = found.K[0, 0, 0] / 900 - 1
+        >>> bool(relative.abs() < 3 * found.deviation[0, 0]), bool(found.determined[0, 0])
+        (True, True)
     """
 
     K: Float[Tensor, "*batch v 3 3"]

@@ -44,7 +44,17 @@ class BundleTerms(TypedDict, total=False):
         intrinsics_mean: Where these are centred; the cameras given if not given.
         structure: What the views see besides points: `BundleLines`, `BundleConics`, `BundleCurves`. One of a kind.
 
-    See the example of `bundle_adjust`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.bundle import BundleTerms
+        >>> g = torch.Generator().manual_seed(0)
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 150, noise=0.5, generator=g).problem
+        >>> terms: BundleTerms = {"free": ("focal",), "fixed_poses": torch.arange(4) == 0, "loss": torchsfm.Huber(2.0)}
+        >>> better = torchsfm.bundle_adjust_model(problem, **terms).model
+        >>> bool(better.poses.t[0].equal(problem.poses.t[0]))
+        True
+        >>> torchsfm.bundle_covariance(better, **terms).nullity  # of the same terms: the size of the world alone is open
+        1
     """
 
     free: Sequence[str]

@@ -36,7 +36,16 @@ class BundleResult:
     `status`: `OK` where a tolerance was met, `NOT_CONVERGED` where the iteration limit came first, `INTERRUPTED` where it was
     stopped, `TOO_FEW` where nothing was free and observed, `NOT_FINITE` where no observation could be used.
 
-    See the example of `bundle_adjust`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 150, noise=0.0, generator=g).problem
+        >>> found = torchsfm.bundle_adjust(problem, free=("focal", "k1", "k2"), max_iterations=1)
+        >>> found.status.name, found.cost < found.initial_cost  # there is more to gain
+        ('NOT_CONVERGED', True)
+        >>> found = torchsfm.bundle_adjust(problem, free=("focal", "k1", "k2"))
+        >>> found.status.name, found.residuals.shape, bool(found.used.all())
+        ('OK', torch.Size([150]), True)
     """
 
     poses: Pose

@@ -93,7 +93,15 @@ class BundleOptions(BundleTerms, total=False):
 class AdjustedModel(Generic[M]):
     """A model with adjusted poses, cameras and points, and how the adjustment went.
 
-    See the example of `bundle_adjust_model`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 150, noise=0.0, generator=g).problem
+        >>> better = torchsfm.bundle_adjust_model(problem, free=("focal", "k1", "k2"))
+        >>> bool(better.model.residuals().max() < 0.1)  # pixels
+        True
+        >>> better.result.status.name, better.result.cost < 1e-3 * better.result.initial_cost
+        ('OK', True)
     """
 
     model: M

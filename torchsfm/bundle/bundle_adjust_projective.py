@@ -24,7 +24,17 @@ class ProjectiveBundleResult:
     distances in the image, pixels, inf where `used` is False: weight 0, or not finite at the start. `cost` and `initial_cost`
     are `sum w rho(residual^2) / 2`. `status` is as in `BundleResult`.
 
-    See the example of `bundle_adjust_projective`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(20, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> P = torchsfm.random_intrinsics(3, generator=g) @ P
+        >>> x, view, point = torchsfm.project_points(P, X).flatten(0, 1), torch.arange(3), torch.arange(20)
+        >>> x[7] = torch.nan  # not seen
+        >>> seen = (x, view.repeat_interleave(20), point.repeat(3))
+        >>> found = torchsfm.bundle_adjust_projective(P, torchsfm.to_homogeneous(X), *seen)
+        >>> found.P.shape, found.X.shape, int(found.used.sum()), found.cost < 1e-9
+        (torch.Size([3, 3, 4]), torch.Size([20, 4]), 59, True)
     """
 
     P: Float[Tensor, "v 3 4"]

@@ -46,7 +46,16 @@ class Structure(Protocol):
 
     They are eliminated as points are, each by itself, so that no residual may depend on two of them.
 
-    See the example of `BundleLines`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> truth = torchsfm.random_bundle_problem(4, 50, 100, layout="dome", noise=0.0, generator=g).truth
+        >>> L = torchsfm.geometry.pluecker_from_points(truth.X[:1], truth.X[1:2])  # a line through two points
+        >>> x = torchsfm.project_points(truth.poses, truth.X[:2], truth.cameras)  # the ends of a segment in every view
+        >>> lines = torchsfm.BundleLines(L, x, torch.arange(4), torch.zeros(4, dtype=torch.int64))
+        >>> found = torchsfm.bundle_adjust(truth, structure=(lines,))
+        >>> lines.block, [type(s).__name__ for s in found.structure], bool(found.structure[0].L.allclose(L, atol=1e-4))
+        ('line', ['BundleLines'], True)
     """
 
     @property

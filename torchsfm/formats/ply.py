@@ -26,7 +26,13 @@ ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 class PointCloud:
     """Points and, where the file has them, colours.
 
-    See the example of `read_ply`.
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+        >>> torchsfm.write_ply(X, "points.ply")
+        >>> cloud = torchsfm.read_ply("points.ply")
+        >>> cloud.X.equal(X), cloud.color is None  # the file told no colours
+        (True, True)
     """
 
     X: Float[Tensor, "n 3"]

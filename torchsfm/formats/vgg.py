@@ -23,7 +23,20 @@ class VggScene:
         segments_visible: Which lines were matched in which view.
         L: Line segments in space, their end points.
 
-    See the example of `read_vgg`.
+    Example:
+        >>> import os, torchsfm
+        >>> files = {"2D/a.000.corners": "320 240", "2D/a.001.corners": "240 240"}
+        >>> files |= {"2D/a.nview-corners": "0 0", "3D/a.p3d": "0 0 5"}
+        >>> files |= {f"3D/a.00{i}.P": f"400 0 320 {-400 * i} / 0 400 240 0 / 0 0 1 0" for i in range(2)}
+        >>> for name, text in files.items():
+        ...     os.makedirs(os.path.dirname(name), exist_ok=True)
+        ...     with open(name, "w") as file:
+        ...         size = file.write(text.replace(" / ", os.linesep))
+        ...
+        >>> scene = torchsfm.formats.read_vgg(".")
+        >>> torchsfm.project_points(scene.P, scene.X)[scene.visible]  # the truth in both images
+        tensor([[320., 240.],
+                [240., 240.]], dtype=torch.float64)
     """
 
     x: Float[Tensor, "v n 2"]

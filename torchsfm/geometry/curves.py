@@ -87,7 +87,14 @@ class Curve:
 class FootPoints(NamedTuple):
     """The points of curves nearest to given points.
 
-    See the example of `foot_points`.
+    Example:
+        >>> import torch, torchsfm
+        >>> line = torchsfm.geometry.curve_from_samples(torch.tensor([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]))
+        >>> x = torch.tensor([[0.5, 3.0], [-1.0, 0.0]])
+        >>> foot = torchsfm.geometry.foot_points(line, x)
+        >>> normal = torch.stack((-foot.tangent[:, 1], foot.tangent[:, 0]), -1)
+        >>> ((x - foot.x) * normal).sum(-1).abs(), foot.within  # distances across; the second point is beyond the end
+        (tensor([3., 0.]), tensor([ True, False]))
     """
 
     x: Float[Tensor, "*batch m d"]
@@ -101,7 +108,14 @@ class FootPoints(NamedTuple):
 class Crossings(NamedTuple):
     """Where curves of the plane cross lines, along the curve, in slots of which the first are `valid`.
 
-    See the example of `curve_crossings`.
+    Example:
+        >>> import torch, torchsfm
+        >>> x = torch.tensor([[0.0, -1.0], [2.0, 1.0], [3.0, 0.0], [4.0, 1.0]])  # up through the line y = 0, then down to it
+        >>> curve = torchsfm.geometry.curve_from_samples(x)
+        >>> found = torchsfm.geometry.curve_crossings(curve, torch.tensor([[0.0, 1.0, 0.0]]), most=4)
+        >>> found.x[found.valid], found.sine[found.valid]  # both at 45 degrees
+        (tensor([[1., 0.],
+                [3., 0.]]), tensor([0.7071, 0.7071]))
     """
 
     x: Float[Tensor, "*batch m k 2"]

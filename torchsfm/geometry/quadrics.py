@@ -51,7 +51,17 @@ class Ellipsoid:
 class PlaneConic:
     """Conics in space as a plane with a conic in it.
 
-    See the example of `plane_conic_from_dual_quadric`.
+    Example:
+        >>> import torch, torchsfm
+        >>> disc = torchsfm.Ellipsoid(torch.tensor([0.0, 0.0, 3.0]), torch.diag(torch.tensor([2.0, 1.0, 0.0])))
+        >>> Q_dual = torchsfm.geometry.dual_quadric_from_ellipsoid(disc)
+        >>> found, known = torchsfm.geometry.plane_conic_from_dual_quadric(Q_dual)
+        >>> flat, is_ellipse = torchsfm.geometry.ellipse_from_conic(found.C)  # in the coordinates of the plane
+        >>> bool(is_ellipse), flat.semi_axes
+        (True, tensor([2., 1.]))
+        >>> on = found.frame @ torch.tensor([0.3, 0.2, 1.0])  # a point of the plane, in space
+        >>> bool((found.plane @ on).abs() < 1e-5)
+        True
     """
 
     plane: Float[Tensor, "*batch 4"]

@@ -30,7 +30,16 @@ class BoardPoints:
     On the board x turns to y as it does in the image: none is seen from behind. A pattern that looks the same when it is turned
     may be numbered from another of its ends.
 
-    See the example of `detect_chessboard`.
+    Example:
+        >>> import torch, torchsfm
+        >>> centre = torch.tensor([2.0, 1.5, -6.0], dtype=torch.float64)  # before the middle of the board
+        >>> poses = torchsfm.Pose(torch.eye(3, dtype=centre.dtype)[None], -centre[None])
+        >>> camera = torchsfm.Camera(torchsfm.intrinsics(torch.tensor(300.0), torch.tensor([149.5, 112.0])).double())
+        >>> image = torchsfm.simulation.render_board(poses, camera, 5, 4, width=300, height=225)
+        >>> found = torchsfm.images.detect_chessboard(torch.cat((image, torch.zeros_like(image))), 5, 4)
+        >>> found.found, found.x[0, :2].round(decimals=1)  # nothing is in the second image
+        (tensor([ True, False]), tensor([[49.5000, 37.0000],
+                [99.5000, 37.0000]], dtype=torch.float64))
     """
 
     x: Float[Tensor, "*batch n 2"]

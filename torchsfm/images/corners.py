@@ -16,7 +16,13 @@ _SOBEL = ((-0.125, 0.0, 0.125), (-0.25, 0.0, 0.25), (-0.125, 0.0, 0.125))
 class Corners:
     """Corners of images, in slots of which `valid` ones hold a corner, strongest first.
 
-    See the example of `detect_corners`.
+    Example:
+        >>> import torch, torchsfm
+        >>> images = torch.zeros(2, 60, 80)
+        >>> images[0, 20:40, 30:50] = 1.0  # a square, and an empty image
+        >>> found = torchsfm.images.detect_corners(images[:, None])
+        >>> found.valid.sum(-1), bool((found.score[0, :-1] >= found.score[0, 1:]).all())  # the best first
+        (tensor([4, 0]), True)
     """
 
     x: Float[Tensor, "*batch n 2"]

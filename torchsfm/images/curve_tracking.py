@@ -41,7 +41,17 @@ _CONTROLS = (6, 120)
 class TrackedCurves:
     """Curves followed through images, as `factorize_curves` takes them.
 
-    See the example of `track_curves`.
+    Example:
+        >>> import torch, torchsfm
+        >>> def paint(x):
+        ...     disc = torchsfm.Ellipse(torch.tensor([x, 40.0]), torch.tensor([20.0, 14.0]), torch.tensor(0.3))
+        ...     return torchsfm.simulation.paint_shapes([disc], torch.tensor([0.2, 0.9]), width=100, height=80)
+        ...
+        >>> tracked = torchsfm.track_curves(torchsfm.detect_edges(torch.stack([paint(x) for x in (40.0, 45.0, 51.0)])))
+        >>> tracked.curves.x.shape[:2]  # three images of one outline
+        torch.Size([3, 1])
+        >>> tracked.curves.x[:, 0].mean(-2)[:, 0].round()  # where it is in each
+        tensor([40., 45., 51.])
     """
 
     curves: Curve

@@ -27,7 +27,15 @@ class Edges:
     Edge points of a chain are in consecutive slots, in order: the brighter side is to the left as seen on the screen. What
     empty slots hold is 0, their chain is -1.
 
-    See the example of `detect_edges`.
+    Example:
+        >>> import torch, torchsfm
+        >>> centre = torch.tensor([60.0, 45.0])
+        >>> disc = torchsfm.Ellipse(centre, torch.tensor([20.0, 20.0]), torch.tensor(0.0))
+        >>> image = torchsfm.simulation.paint_shapes([disc], torch.tensor([0.2, 0.9]), width=120, height=90)
+        >>> found = torchsfm.detect_edges(image)
+        >>> outline = found.x[found.chain == 0]  # in order, as are all chains
+        >>> found.closed[0], (outline - centre).norm(dim=-1).mean()
+        (tensor(True), tensor(19.9996))
     """
 
     x: Float[Tensor, "*batch n 2"]

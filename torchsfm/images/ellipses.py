@@ -50,7 +50,16 @@ _SHARED = 0.5
 class Ellipses:
     """Ellipses of images, in slots of which the first ones are `valid`, the most edge points first; zero in empty slots.
 
-    See the example of `detect_ellipses`.
+    Example:
+        >>> import torch, torchsfm
+        >>> disc = torchsfm.Ellipse(torch.tensor([60.0, 45.0]), torch.tensor([30.0, 20.0]), torch.tensor(0.3))
+        >>> image = torchsfm.simulation.paint_shapes([disc], torch.tensor([0.2, 0.9]), width=120, height=90)
+        >>> found = torchsfm.detect_ellipses(image)
+        >>> best = found.ellipse.centre[found.valid][0]
+        >>> bool((best - disc.centre).norm() < 0.1), bool(found.coverage[0] > 0.9)  # nearly all of the outline was seen
+        (True, True)
+        >>> found.covariance.shape[-2:], bool(found.scatter[0] < 0.1)  # pixels
+        (torch.Size([5, 5]), True)
     """
 
     ellipse: Ellipse

@@ -23,7 +23,14 @@ _CELLS = 24
 class Features:
     """Points of one image, each with a description of what is around it.
 
-    See the example of `detect_features`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> found = torchsfm.detect_features(image)
+        >>> best = found.response.topk(5).indices
+        >>> found.x[best].shape, bool((found.scale > 0).all()), found.descriptors.dtype
+        (torch.Size([5, 2]), True, torch.uint8)
     """
 
     x: Float[Tensor, "n 2"]

@@ -28,7 +28,17 @@ _RANK = 1e-12
 class EllipseFit:
     """Ellipses and what is known about them.
 
-    See the example of `fit_ellipse`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> truth = torchsfm.Ellipse(torch.tensor([50.0, 40.0]), torch.tensor([30.0, 20.0]), torch.tensor(0.5))
+        >>> arcs = torch.stack([truth.points(torch.linspace(0, end, 50)) for end in (6.0, 1.0)])  # most of it, and a sixth
+        >>> found = torchsfm.fit_ellipse(arcs + 0.1 * torch.randn(2, 50, 2, generator=g))
+        >>> [torchsfm.Status(k).name for k in found.status.tolist()]  # too short an arc is told
+        ['OK', 'DEGENERATE']
+        >>> sigma = found.covariance[0].diagonal().sqrt()
+        >>> bool(((found.model.centre[0] - truth.centre).abs() < 4 * sigma[:2]).all())
+        True
     """
 
     model: Ellipse

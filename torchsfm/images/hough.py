@@ -27,7 +27,13 @@ _APART = (math.radians(0.5), 1.0)
 class HoughLines:
     """Straight lines of images in slots, those with most edge points first; zero in empty slots.
 
-    See the example of `hough_lines`.
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, 30:] = 1.0  # a step between the rows 29 and 30
+        >>> found = torchsfm.images.hough_lines(image)
+        >>> found.ends[found.valid][0].sort(0).values.round()[:, 1], bool(found.scatter[0] < 0.1), bool(found.count[0] > 60)
+        (tensor([30., 30.]), True, True)
     """
 
     line: Float[Tensor, "*batch n 3"]

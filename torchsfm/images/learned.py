@@ -27,7 +27,15 @@ MatcherName = Literal["disk", "dedode-b", "dedode-g", "sift"]
 class LearnedDetector:
     """A network that finds and describes points; made by `load_detector`, called like `detect_features`.
 
-    See the example of `load_detector`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from kornia.feature import DISK
+        >>> weights = DISK().state_dict()  # untrained; those of its authors come as a file
+        >>> torch.save(weights, "weights.pth")
+        >>> detector = torchsfm.images.load_detector("disk", "weights.pth")
+        >>> features = detector(torch.rand(3, 64, 80, generator=torch.Generator().manual_seed(0)), max_features=50)
+        >>> detector.name, features.descriptors.shape[1], bool((features.response.diff() <= 0).all())  # the best first
+        ('disk', 128, True)
     """
 
     name: str
@@ -80,7 +88,17 @@ class LearnedDetector:
 class LearnedMatcher:
     """A network that matches the points of two images; made by `load_matcher`.
 
-    See the example of `load_matcher`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from kornia.feature import LightGlue
+        >>> torch.save(LightGlue(None, input_dim=128, add_scale_ori=True).state_dict(), "weights.pth")  # untrained
+        >>> matcher = torchsfm.images.load_matcher("sift", "weights.pth", min_score=0.0)
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> features = torchsfm.detect_features(image)
+        >>> matches = matcher(features, features, (160, 120), (160, 120))  # each point in one match at most
+        >>> matches.shape[1], bool((matches[:, 0].diff() > 0).all())
+        (2, True)
     """
 
     name: str
@@ -150,9 +168,13 @@ def load_detector(
         ValueError: An unknown name, or a file that is missing, unreadable or of another network.
 
     Example:
-        >>> import torchsfm
-        >>> detector = torchsfm.images.load_detector("disk", "depth-save.pth")  # doctest: +SKIP
-        >>> features = detector(torchsfm.read_image("view.jpg"))  # doctest: +SKIP
+        >>> import torch, torchsfm
+        >>> from kornia.feature import DISK
+        >>> torch.save(DISK().state_dict(), "weights.pth")  # untrained; those of its authors come as a file
+        >>> detector = torchsfm.images.load_detector("disk", "weights.pth")
+        >>> features = detector(torch.rand(3, 64, 80, generator=torch.Generator().manual_seed(0)), max_features=50)
+        >>> features.x.shape[1], features.descriptors.shape[1]
+        (2, 128)
     """
     from kornia import feature
 
@@ -196,9 +218,14 @@ def load_matcher(
         ValueError: An unknown name, or a file that is missing, unreadable or of another network.
 
     Example:
-        >>> import torchsfm
-        >>> matcher = torchsfm.images.load_matcher("disk", "disk_lightglue.pth")  # doctest: +SKIP
-        >>> matches = matcher(features1, features2, (1600, 1200), (1600, 1200))  # doctest: +SKIP
+        >>> import torch, torchsfm
+        >>> from kornia.feature import LightGlue
+        >>> torch.save(LightGlue(None, input_dim=128).state_dict(), "weights.pth")  # untrained; theirs come as a file
+        >>> matcher = torchsfm.images.load_matcher("disk", "weights.pth", min_score=0.0)
+        >>> x, one = torch.rand(20, 2, generator=torch.Generator().manual_seed(0)) * 100, torch.ones(20)
+        >>> features = torchsfm.images.Features(x, one, 0 * one, one, torch.eye(20, 128))
+        >>> matcher(features, features, (100, 100), (100, 100)).shape[1]
+        2
     """
     from kornia.feature import LightGlue
 

@@ -53,7 +53,14 @@ class ImageError(ValueError):
 class Photograph:
     """An image with what its file says of the camera.
 
-    See the example of `read_image`.
+    Example:
+        >>> import torch, torchsfm
+        >>> torchsfm.images.save_image("view.png", torch.rand(3, 48, 64))
+        >>> photograph = torchsfm.read_image("view.png", max_size=32)
+        >>> photograph.name, photograph.size, (photograph.width, photograph.height)  # of the file, and as read
+        ('view.png', (64, 48), (32, 24))
+        >>> photograph.focal is None  # the file does not tell it
+        True
     """
 
     pixels: Float[Tensor, "c h w"]

@@ -23,7 +23,19 @@ _BESIDE = 0.7
 class Segments:
     """Line segments of images, in slots of which the first ones are `valid`, the longest first; zero in empty slots.
 
-    See the example of `detect_segments`.
+    Example:
+        >>> import torch, torchsfm
+        >>> image = torch.zeros(1, 60, 80)
+        >>> image[:, 20:40, 30:60] = 1.0  # a rectangle
+        >>> found = torchsfm.detect_segments(image)
+        >>> found.valid.sum(), found.length[found.valid].round(decimals=-1), bool(found.scatter[found.valid].max() < 0.1)
+        (tensor(4), tensor([30., 30., 20., 20.]), True)
+        >>> direction = found.ends[found.valid][:, 1] - found.ends[found.valid][:, 0]
+        >>> direction.round(decimals=-1).abs()
+        tensor([[30.,  0.],
+                [30.,  0.],
+                [ 0., 20.],
+                [ 0., 20.]])
     """
 
     ends: Float[Tensor, "*batch n 2 2"]

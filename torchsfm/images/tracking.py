@@ -19,7 +19,15 @@ from torchsfm.images.reading import Photograph, pixels_of
 class TrackedPoints:
     """Where points of one image are in another.
 
-    See the example of `track_points`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> moved = image.roll(3, -1)
+        >>> moved[:, 40:60, 30:60] = 0.5  # something hides the second point
+        >>> found = torchsfm.track_points(image, moved, torch.tensor([[80.0, 80.0], [40.0, 50.0]]))
+        >>> found.valid, found.x[0].round(), found.error.shape
+        (tensor([ True, False]), tensor([83., 80.]), torch.Size([2]))
     """
 
     x: Float[Tensor, "*batch n 2"]
@@ -34,7 +42,15 @@ class TrackedPoints:
 class Tracks:
     """Points followed through frames: one row for each sighting, sorted by track, then frame.
 
-    See the example of `track_sequence`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> image = torch.nn.functional.avg_pool2d(torch.rand(1, 120, 160, generator=g), 5, stride=1, padding=2)
+        >>> tracks = torchsfm.track_sequence([image.roll(3 * i, -1) for i in range(4)], max_points=50)
+        >>> longest = tracks.track.bincount().argmax()
+        >>> path = tracks.x[tracks.track == longest]
+        >>> len(path), path.diff(dim=0).round()[0]  # in all four frames, three columns in each step
+        (4, tensor([3., 0.]))
     """
 
     frame: Int[Tensor, " m"]

@@ -17,7 +17,15 @@ BORDER = 257
 class Pinholes(NamedTuple):
     """Cameras without distortion, and the sizes of their pictures.
 
-    See the example of `undistorted_cameras`.
+    Example:
+        >>> import torch, torchsfm
+        >>> K = torchsfm.intrinsics(torch.tensor(60.0), torch.tensor([39.5, 29.5]))
+        >>> camera = torchsfm.Camera(K, torchsfm.SimpleRadial(torch.tensor(-0.1)))
+        >>> pinholes = torchsfm.images.undistorted_cameras(camera, torch.tensor([80, 60]))
+        >>> image, size = torch.rand(1, 60, 80), tuple(pinholes.size.tolist())
+        >>> straight = torchsfm.images.undistort_images(image, camera, pinholes.cameras, size)
+        >>> straight.shape[:0:-1] == size, bool(straight.isfinite().all())
+        (True, True)
     """
 
     cameras: Camera

@@ -30,7 +30,18 @@ class SparseCovariance:
     `redundancy` is the number of residual components minus the number of unknowns determined: at a good fit `square_sum`, the
     weighted sum of squared residuals, is about that.
 
-    See the example of `sparse_covariance`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.optim import Block, Term
+        >>> x = Block(torch.zeros(2, 2))
+        >>> first = torch.zeros(4, dtype=torch.int64)
+        >>> measured = Term(lambda x: x, ("x",), (first,))  # the first variable four times, the second never
+        >>> found = torchsfm.optim.sparse_covariance({"x": x}, [measured])
+        >>> found.blocks["x"][0], found.determined["x"]
+        (tensor([[0.2500, 0.0000],
+                [0.0000, 0.2500]], dtype=torch.float64), tensor([ True, False]))
+        >>> found.redundancy, found.square_sum
+        (6, 0.0)
     """
 
     blocks: dict[str, Tensor]

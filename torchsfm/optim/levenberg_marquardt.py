@@ -34,7 +34,18 @@ class LeastSquaresResult(Generic[M]):
     the cost though more is promised. It is `TOO_FEW` where there are fewer residuals than parameters and `NOT_FINITE` where the
     cost or its slope at the start is not finite: there `x` is the start, and a cost that is not a number is inf.
 
-    See the example of `levenberg_marquardt`.
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, 1, 20, dtype=torch.float64)
+        >>> rate = torch.tensor([[1.0], [2.0], [torch.nan]], dtype=t.dtype)  # three problems, and the last has no data
+        >>> def residual(x, y):
+        ...     return (torch.exp(-x * t) - y)[..., None]
+        ...
+        >>> found = torchsfm.optim.levenberg_marquardt(residual, torch.zeros_like(rate), torch.exp(-rate * t))
+        >>> found.x[:2, 0], [torchsfm.Status(k).name for k in found.status.tolist()]
+        (tensor([1., 2.], dtype=torch.float64), ['OK', 'OK', 'NOT_FINITE'])
+        >>> bool((found.cost[:2] < 1e-9 * found.initial_cost[:2]).all())
+        True
     """
 
     x: M

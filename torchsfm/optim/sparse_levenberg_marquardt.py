@@ -39,7 +39,14 @@ class SparseResult:
     outside, `TOO_FEW` where nothing is free or observed, `NOT_FINITE` where no residual is finite, or where their sum or its
     derivatives are not: then `x` is the best seen.
 
-    See the example of `sparse_levenberg_marquardt`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.optim import Block, Cauchy, Term, sparse_levenberg_marquardt
+        >>> y = torch.tensor([[1.0], [1.1], [0.9], [100.0], [torch.nan]])  # one number measured five times, twice badly
+        >>> term = Term(lambda x, y: x - y, ("x",), (torch.zeros(5, dtype=torch.int64),), (y,), loss=Cauchy(0.1))
+        >>> found = sparse_levenberg_marquardt({"x": Block(torch.ones(1, 1))}, [term])
+        >>> found.status.name, found.x["x"].round(decimals=2), found.used[0]
+        ('OK', tensor([[1.]]), tensor([ True,  True,  True,  True, False]))
     """
 
     x: dict[str, Tensor]

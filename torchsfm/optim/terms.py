@@ -20,7 +20,19 @@ from torchsfm.optim.manifold import Manifold
 class Block:
     """Variables of one kind: `x (N, k)`, how they move, and which of them do not.
 
-    See the example of `sparse_levenberg_marquardt`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.optim import Block, Rotation, Term, sparse_levenberg_marquardt
+        >>> g = torch.Generator().manual_seed(0)
+        >>> R, d = torchsfm.geometry.random_rotation(generator=g).double(), torch.randn(5, 3, generator=g).double()
+        >>> def residual(R, d, turned):
+        ...     return (R.unflatten(-1, (3, 3)) @ d[..., None])[..., 0] - turned
+        ...
+        >>> term = Term(residual, ("R",), (torch.zeros(5, dtype=torch.int64),), (d, d @ R.mT))
+        >>> block = Block(torch.eye(3).double().reshape(1, 9), Rotation())  # one rotation: nine numbers that three move
+        >>> found = sparse_levenberg_marquardt({"R": block}, [term])
+        >>> block.tangent, bool(found.x["R"].allclose(R.reshape(1, 9), atol=1e-6))
+        (3, True)
     """
 
     x: Float[Tensor, "n k"]
@@ -65,7 +77,21 @@ class Term:
     residuals and fills `out`: for each block a tensor `(m, d, tangent)` for the derivatives with respect to its tangent step
     (stored with m last), or None where they are not needed.
 
-    See the example of `sparse_levenberg_marquardt`.
+    Example:
+        >>> import torch
+        >>> from torchsfm.optim import Block, Huber, Term, sparse_levenberg_marquardt
+        >>> blocks = {"centre": Block(torch.zeros(1, 2)), "radius": Block(torch.ones(1, 1))}
+        >>> angle = torch.arange(8).double()
+        >>> x = 3 * torch.stack((angle.cos(), angle.sin()), -1) + torch.tensor([1.0, 2.0])
+        >>> x[0] += 10  # wrong
+        >>> def residual(centre, radius, x):  # one row a point
+        ...     return (x - centre).norm(dim=-1, keepdim=True) - radius
+        ...
+        >>> one = torch.zeros(8, dtype=torch.int64)  # all depend on the same circle
+        >>> term = Term(residual, ("centre", "radius"), (one, one), (x,), loss=Huber(0.1), weights=torch.ones(8))
+        >>> found = sparse_levenberg_marquardt(blocks, [term]).x
+        >>> found["centre"].round(decimals=1), found["radius"].round(decimals=1)
+        (tensor([[1., 2.]]), tensor([[3.]]))
     """
 
     residual: Callable[..., Tensor]

@@ -33,7 +33,17 @@ class SearchOptions(TypedDict, total=False):
         confidence: Wanted probability of having drawn a sample without outliers; 0.9999 if not given.
         max_iterations: Most samples to draw for a problem; 10,000 if nothing else is said where the model is estimated.
 
-    See the example of `RansacOptions`, which have two options more.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.robust import SearchOptions
+        >>> search: SearchOptions = {"scoring": torchsfm.Magsac(), "max_iterations": 500, "confidence": 0.999}
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, pose = torchsfm.random_points(50, generator=g), torchsfm.random_poses(generator=g)
+        >>> x = torchsfm.project_points(pose.matrix(), X)
+        >>> camera = torchsfm.estimate_camera(x, X, torch.eye(3).double(), threshold=1e-3, **search)  # the same for every door
+        >>> plane = torchsfm.estimate_homography(x, x + 0.1, threshold=1e-3, **search)
+        >>> camera.inliers.sum(), plane.inliers.sum()
+        (tensor(50), tensor(50))
     """
 
     quality: Float[Tensor, "*#batch n"] | None

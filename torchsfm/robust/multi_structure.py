@@ -51,7 +51,15 @@ class Structures(Generic[M]):
         status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample had a
             solution; `NO_CONSENSUS`: no group is large enough.
 
-    See the example of `find_structures`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(70, 2, generator=g, dtype=torch.float64)
+        >>> x2 = torch.cat((x1[:40] + 0.1, x1[40:60] * 0.8, torch.rand(10, 2, generator=g).double()))  # two motions, ten wrong
+        >>> estimator = torchsfm.motion.HomographyEstimator()
+        >>> found = torchsfm.find_structures(estimator, x1, x2, threshold=1e-3, hypotheses=200, kept=50, generator=g)
+        >>> found.model[found.valid].shape, [int((found.label == k).sum()) for k in (0, 1, -1)]
+        (torch.Size([2, 3, 3]), [40, 20, 10])
     """
 
     model: M

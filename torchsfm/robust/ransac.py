@@ -48,7 +48,18 @@ class RobustResult(Generic[M]):
         covariance: If asked for, that of the model by the scatter of the data around it: of its entries, row by row, unless
             said otherwise where the model is estimated. Zero where the model is no optimum or not determined.
 
-    See the example of `ransac`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(2, 50, 2, generator=g, dtype=torch.float64)
+        >>> x2 = x1 + 0.1 + 1e-4 * torch.randn(2, 50, 2, generator=g)
+        >>> x2[1] = torch.rand(50, 2, generator=g, dtype=torch.float64)  # the second pair has nothing in common
+        >>> options = {"threshold": 1e-3, "max_iterations": 200, "covariance": True}
+        >>> found = torchsfm.estimate_homography(x1, x2, generator=g, **options)
+        >>> [torchsfm.Status(k).name for k in found.status.tolist()], int(found.inliers[0].sum())
+        (['OK', 'NO_CONSENSUS'], 50)
+        >>> found.covariance.shape, bool(found.support[0] > found.support[1])
+        (torch.Size([2, 9, 9]), True)
     """
 
     model: M

@@ -24,7 +24,17 @@ class Sampler(Protocol):
     What a sampler draws for a problem must be a function of the problem, the seed and the number of the sample alone: then the
     result for a problem does not depend on the batch it is in.
 
-    See the example of `Prosac`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.robust import Neighbours, Prosac, Uniform
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(200, 2, generator=g, dtype=torch.float64)
+        >>> x2 = torch.cat((x1[:60] + 0.1, torch.rand(140, 2, generator=g, dtype=torch.float64)))  # 70 % are wrong
+        >>> samplers = Uniform(), Prosac(), Neighbours()
+        >>> options = {"quality": torch.linspace(1, 0, 200).double(), "threshold": 1e-3}
+        >>> found = [torchsfm.estimate_homography(x1, x2, sampler=s, generator=g, **options) for s in samplers]
+        >>> [bool(f.inliers[:60].all()) for f in found], bool(found[1].iterations < found[0].iterations)
+        ([True, True, True], True)
     """
 
     def draw(

@@ -25,7 +25,16 @@ BLUNT = {2: 9.2103, 3: 11.3449, 4: 13.2767}
 class Scoring(Protocol):
     """How models are compared. Small frozen objects; `Msac()`, `Magsac()`, `InlierCount()`, `LeastMedian()`.
 
-    See the example of `Msac`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.robust import InlierCount, Magsac, Msac
+        >>> squared = torch.tensor([[[0.1, 0.2, 30.0], [3.0, 3.5, 3.9]]])  # squared distances of three data to two models
+        >>> for scoring in (InlierCount(), Msac(), Magsac()):  # which is better, where the threshold is 2?
+        ...     print(type(scoring).__name__, scoring.cost(squared, torch.tensor([4.0]), None, 2).argmin().item())
+        ...
+        InlierCount 1
+        Msac 0
+        Magsac 0
     """
 
     needs_threshold: ClassVar[bool]

@@ -43,7 +43,21 @@ class SoftSelection(Generic[M]):
         status: `OK`; `TOO_FEW` data for a sample; `DEGENERATE`: no sample has a solution; `NOT_FINITE`: too few of the data are
             finite.
 
-    See the example of `soft_ransac`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x1 = torch.rand(50, 2, generator=g, dtype=torch.float64)
+        >>> x2 = torch.cat((x1[:30] + 0.1, torch.rand(20, 2, generator=g, dtype=torch.float64)))  # 40 % are wrong
+        >>> logits = torch.zeros(50, dtype=x1.dtype, requires_grad=True)
+        >>> estimator = torchsfm.motion.HomographyEstimator()
+        >>> chosen = torchsfm.soft_ransac(estimator, x1, x2, threshold=1e-2, logits=logits, generator=g)
+        >>> chosen.model.shape, chosen.probability.shape  # of 64 samples each
+        (torch.Size([64, 1, 3, 3]), torch.Size([64, 1]))
+        >>> chosen.best().shape
+        torch.Size([3, 3])
+        >>> (-chosen.expectation(chosen.support)).backward()  # what lowers the expected loss
+        >>> bool(logits.grad[:30].mean() < logits.grad[30:].mean())  # trusting right matches more
+        True
     """
 
     model: M

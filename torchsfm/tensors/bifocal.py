@@ -23,7 +23,14 @@ class RelativePose:
     `status` is OK, TOO_FEW (no finite ray has weight), BEHIND (half of the weight or less is in front), DEGENERATE (E has rank
     below 2) or NOT_FINITE (E is not finite).
 
-    See the example of `pose_from_essential`.
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torchsfm.random_points(20, generator=torch.Generator().manual_seed(0)) + torch.tensor([0, 0, 5])
+        >>> R, t = torch.eye(3, dtype=X.dtype), torch.tensor([0.6, 0.0, 0.8], dtype=X.dtype)
+        >>> E = torchsfm.tensors.essential_from_pose(R, t)
+        >>> found = torchsfm.tensors.pose_from_essential(E, X, X @ R.mT + t)
+        >>> found.pose.centre, found.model.shape, found.in_front.all()
+        (tensor([-0.6000, -0.0000, -0.8000], dtype=torch.float64), torch.Size([3, 4]), tensor(True))
     """
 
     model: Float[Tensor, "*batch 3 4"]

@@ -26,7 +26,16 @@ class Focals:
     geometry does not determine them: sensitivity above 1 / sqrt(eps); or no real focal length fits) or NOT_FINITE; where it is
     not OK, `model` is 1 and `sensitivity` infinite.
 
-    See the example of `focals_from_fundamental`.
+    Example:
+        >>> import torch, torchsfm
+        >>> f, c = torch.tensor([800.0, 900.0], dtype=torch.float64), torch.tensor([320.0, 240.0], dtype=torch.float64)
+        >>> poses = torchsfm.random_poses(2, generator=torch.Generator().manual_seed(1))
+        >>> aligned = torchsfm.Pose(torch.eye(3).double().expand(2, 3, 3), torch.eye(3)[:2].double())  # both axes in one plane
+        >>> P = torchsfm.intrinsics(f, c) @ torch.stack((poses.matrix(), aligned.matrix()))
+        >>> F = torchsfm.tensors.fundamental_from_cameras(P[:, 0], P[:, 1])
+        >>> found = torchsfm.tensors.focals_from_fundamental(F, c, c)
+        >>> found.valid, found.model[0]  # where the axes meet, one equation is missing
+        (tensor([ True, False]), tensor([800.0000, 900.0000], dtype=torch.float64))
     """
 
     model: Float[Tensor, "*batch 2"]

@@ -26,7 +26,15 @@ class ProjectiveCameras:
     `P` are the cameras. `status` is OK, DEGENERATE (the input does not determine them) or NOT_FINITE; they are finite
     always, and mean something only where it is OK.
 
-    See the example of `cameras_from_trifocal`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(10, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> found = torchsfm.tensors.cameras_from_trifocal(torchsfm.tensors.trifocal_from_cameras(*P))
+        >>> x = torchsfm.project_points(P, X)
+        >>> seen = torchsfm.triangulate_points(x, found.P)  # in the frame of these cameras
+        >>> bool(torchsfm.project_points(found.P, seen.model).allclose(x)), torchsfm.Status(found.status.item()).name
+        (True, 'OK')
     """
 
     P: Float[Tensor, "*batch v 3 4"]

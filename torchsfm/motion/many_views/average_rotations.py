@@ -57,7 +57,15 @@ class AveragedRotations:
         covariance: If asked for, that of each rotation, for a turn `exp(w) R` in the frame of the camera, relative to the
             smallest camera of its component; infinite for cameras that are not OK.
 
-    See the example of `average_rotations`.
+    Example:
+        >>> import torch, torchsfm
+        >>> R = torchsfm.random_poses(6, spread=3.0, generator=torch.Generator().manual_seed(0)).R
+        >>> edges = torch.cat((torch.combinations(torch.arange(4)), torch.tensor([[4, 5]])))  # two groups of cameras
+        >>> found = torchsfm.motion.average_rotations(R[edges[:, 1]] @ R[edges[:, 0]].mT, edges, views=6)
+        >>> found.component, bool(found.angle.max() < 1e-6)  # radians, of each edge
+        (tensor([0, 0, 0, 0, 4, 4]), True)
+        >>> bool(found.model[3].allclose(R[3] @ R[0].mT))
+        True
     """
 
     model: Float[Tensor, "v 3 3"]

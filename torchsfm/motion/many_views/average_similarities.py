@@ -54,7 +54,18 @@ class AveragedSimilarities:
         inliers: Edges that agree to within four times the scatter of the right ones.
         scale: That scatter, in units of what `deviation` says.
 
-    See the example of `average_similarities`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> size = torch.tensor([1.0, 2.0, 0.5, 1.5, 1.0])  # of five models
+        >>> world = torchsfm.Similarity(size, torchsfm.geometry.random_rotation(5, generator=g), torch.randn(5, 3, generator=g))
+        >>> local = world.inverse().transform(torch.randn(20, 3, generator=g))  # the same points in each
+        >>> edges = torch.combinations(torch.arange(5))
+        >>> between = torchsfm.geometry.similarity_from_points(local[edges[:, 0]], local[edges[:, 1]])
+        >>> between.t[4] += 5  # one of ten is wrong
+        >>> found = torchsfm.motion.average_similarities(between, edges, models=5)
+        >>> found.inliers.sum(), found.distance.argmax(), bool((found.component == 0).all())
+        (tensor(9), tensor(4), True)
     """
 
     model: Similarity

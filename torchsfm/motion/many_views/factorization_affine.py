@@ -45,7 +45,18 @@ class AffineFactorization:
             cameras that are not of the kind asked for (P and X are then some affine frame's, R and scale mean nothing);
             `NOT_FINITE`: numbers beyond what the dtype holds, all fields are zero.
 
-    See the example of `factorize_affine`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(30, generator=g), torchsfm.random_poses(5, generator=g)
+        >>> found = torchsfm.factorize_affine(100 * (X @ poses.R.mT)[..., :2])  # five views from far away
+        >>> relative = found.R[1:] @ found.R[:1].mT
+        >>> truth = poses.R[1:] @ poses.R[:1].mT
+        >>> mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0]).double())  # far away, relief and hollow look alike
+        >>> bool(relative.allclose(truth) or relative.allclose(mirror @ truth @ mirror))
+        True
+        >>> found.singular_values.shape, bool(found.used_view.all())
+        (torch.Size([3]), True)
     """
 
     P: Float[Tensor, "*batch v 3 4"]

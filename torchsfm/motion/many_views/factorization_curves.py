@@ -35,7 +35,21 @@ _POINT_STEPS = 30
 class CurveFactorization:
     """Cameras and space curves of many images, up to one projective transformation of space.
 
-    See the example of `factorize_curves`.
+    Example:
+        >>> import torch, torchsfm
+        >>> t = torch.linspace(0, 6.2, 60).double()
+        >>> x, y, z = t.cos(), t.sin(), 0.3 * (2 * t).cos()
+        >>> X = torch.stack((torch.stack((x, y, z), -1), torch.stack((z, x, y), -1), torch.stack((y, z, x), -1)))
+        >>> K = torchsfm.intrinsics(torch.tensor(800.0), torch.tensor([320.0, 240.0])).double()
+        >>> P = K @ torchsfm.random_poses(6, spread=0.5, generator=torch.Generator().manual_seed(0)).matrix()
+        >>> curves = torchsfm.geometry.curve_from_samples(torchsfm.project_points(P[:, None], X))
+        >>> found = torchsfm.factorize_curves(curves, oriented=True, aligned=True)
+        >>> found.used_view.all(), bool(found.error.nanmedian() < 0.1)  # pixels, across the curves
+        (tensor(True), True)
+        >>> X_found = found.X[0, :, :3] / found.X[0, :, 3:]  # samples of the first curve, in a projective frame
+        >>> off = torchsfm.project_points(found.P[0], X_found) - found.x[0, 0]
+        >>> bool(off.norm(dim=-1)[found.measured[0]].median() < 0.1)
+        True
     """
 
     P: Float[Tensor, "*batch v 3 4"]

@@ -67,7 +67,16 @@ class Factorization:
         status: `OK`; `NOT_CONVERGED`; `TOO_FEW` views or points; `DEGENERATE`: the data leave cameras undetermined (points in
             a plane, views without baseline, parts that hang together too loosely).
 
-    See the example of `factorize_points`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(30, generator=g), torchsfm.random_poses(6, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, X)
+        >>> visible = torch.rand(6, 30, generator=g) < 0.8
+        >>> found = torchsfm.factorize_points(x, visible=visible)  # what is not seen is filled in
+        >>> X_found = found.X[found.used_point]
+        >>> bool(torchsfm.project_points(found.P, X_found[:, :3] / X_found[:, 3:]).allclose(x[:, found.used_point], atol=1e-4))
+        True
     """
 
     P: Float[Tensor, "*batch v 3 4"]

@@ -71,7 +71,16 @@ class GlobalPositions:
         inliers: Rays that agree to within four standard deviations.
         scale: Standard deviation of the right rays in each of two directions, in radians.
 
-    See the example of `position_globally`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(30, generator=g), torchsfm.random_poses(6, spread=3.0, generator=g)
+        >>> view, point = torch.arange(6).repeat_interleave(30), torch.arange(30).repeat(6)  # all see all
+        >>> d = poses[view].transform(X[point][:, None])[:, 0]
+        >>> d[7] = torch.randn(3, generator=g)  # one ray is wrong
+        >>> found = torchsfm.motion.position_globally(d, view, point, poses.R, points=30)
+        >>> found.inliers.sum(), found.angle.argmax(), bool(found.valid.all())
+        (tensor(179), tensor(7), True)
     """
 
     centres: Float[Tensor, "v 3"]

@@ -35,7 +35,16 @@ class QuadrifocalFit:
             coincide), exactly or within their noise; NOT_CONVERGED; NOT_FINITE: numbers with weight that
             are not.
 
-    See the example of `quadrifocal_6pt`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(8, generator=g), torchsfm.random_poses(4, generator=g).matrix()
+        >>> found = torchsfm.motion.quadrifocal_6pt(torchsfm.project_points(P, X))
+        >>> found.Q.shape, bool(found.error.max() < 1e-6), torchsfm.Status(found.status.item()).name
+        (torch.Size([3, 3, 3, 3]), True, 'OK')
+        >>> seen = torchsfm.triangulate_points(torchsfm.project_points(P, X), found.P)  # in the frame of these cameras
+        >>> bool((seen.error < 1e-6).all())
+        True
     """
 
     Q: Float[Tensor, "*batch 3 3 3 3"]

@@ -39,7 +39,17 @@ class PointLineTrifocalEstimator:
         sample_size: 7, six points and one to choose among their solutions, or four points and three lines; or 13 where there
             are fewer than four points: then any sample will do, by linear equations.
 
-    See the example of `estimate_trifocal`, which uses it where there are lines.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(40, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, X)
+        >>> rows = torch.cat((x[:, :10].repeat(1, 1, 2), x[:, 10:].reshape(3, 15, 4)), 1)  # ten points, each twice; 15 segments
+        >>> kind = torch.cat((torch.zeros(10), torch.ones(15)))[:, None].double()
+        >>> estimator = torchsfm.motion.PointLineTrifocalEstimator()
+        >>> found = torchsfm.ransac(estimator, *rows, kind, threshold=1e-3, generator=g)
+        >>> estimator.mixtures, found.inliers.sum()  # samples of seven points, or of four points and three lines
+        (((7, 0), (4, 3)), tensor(25))
     """
 
     sample_size: int = 7

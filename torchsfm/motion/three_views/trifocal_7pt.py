@@ -34,7 +34,17 @@ class TrifocalFit:
             centres that coincide, lines that meet), exactly or within their noise; NOT_CONVERGED;
             NOT_FINITE: numbers with weight that are not.
 
-    See the example of `trifocal_7pt`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(10, generator=g), torchsfm.random_poses(3, generator=g).matrix()
+        >>> x = torchsfm.project_points(P, X)
+        >>> found = torchsfm.motion.trifocal_7pt(x)
+        >>> torchsfm.Status(found.status.item()).name, bool(found.error.max() < 1e-6)
+        ('OK', True)
+        >>> again = torchsfm.tensors.trifocal_from_cameras(*found.P)  # the tensor and the cameras say the same
+        >>> bool((again / again.norm()).abs().allclose((found.T / found.T.norm()).abs(), atol=1e-6))
+        True
     """
 
     T: Float[Tensor, "*batch 3 3 3"]

@@ -28,7 +28,16 @@ class UprightPoseEstimator:
         gravity2: The vertical in the second camera, of length 1.
         slack: By which angle in radians rays must miss the front to count as behind.
 
-    See the example of `estimate_upright`, which uses it.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, t = torchsfm.random_points(200, generator=g), torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+        >>> R = torchsfm.geometry.rotation_from_rotvec(torch.tensor([0.0, 0.5, 0.0], dtype=t.dtype))  # about the vertical
+        >>> d1, down = X + 5 * t, torch.tensor([0.0, 1.0, 0.0], dtype=t.dtype)
+        >>> estimator = torchsfm.motion.UprightPoseEstimator(down, down, slack=torch.tensor(1e-3).double())
+        >>> found = torchsfm.ransac(estimator, d1, d1 @ R.mT + t, threshold=1e-3, generator=g)
+        >>> estimator.sample_size, found.inliers.sum()
+        (3, tensor(200))
     """
 
     gravity1: Float[Tensor, "*batch 3"]

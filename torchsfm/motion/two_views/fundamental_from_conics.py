@@ -51,7 +51,15 @@ _SIX, _THREE = _basis(3), _basis(2)
 class ConicEpipolarFit:
     """Fundamental matrices and what is known about them.
 
-    See the example of `fundamental_from_conics`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> scene = torchsfm.simulation.simulate_conics((), conics=5, views=2, generator=g)
+        >>> found = torchsfm.fundamental_from_conics(*scene.C, starts=4, generator=g)
+        >>> torchsfm.Status(found.status.item()).name, bool(found.error < 1e-6)
+        ('OK', True)
+        >>> torchsfm.tensors.epipoles(found.model)[0].shape
+        torch.Size([3])
     """
 
     model: Float[Tensor, "*batch 3 3"]

@@ -29,7 +29,14 @@ class PlaneMotion:
     The plane is `normal' X = 1` in the frame of the first camera, with its distance from that camera as the unit of length;
     |normal| = 1. In that unit X2 = R X1 + t. H ~ R + t normal'.
 
-    See the example of `motions_from_homography`.
+    Example:
+        >>> import torch, torchsfm
+        >>> normal, t = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([0.5, 0.0, 0.0])
+        >>> found = torchsfm.motion.motions_from_homography(torch.eye(3) + torch.outer(t, normal))
+        >>> motion = found.model
+        >>> H = motion.R + motion.t[..., :, None] * motion.normal[..., None, :]  # each of both explains the images
+        >>> H.shape, bool((H / H[..., 2:, 2:]).allclose(torch.eye(3) + torch.outer(t, normal), atol=1e-5))
+        (torch.Size([2, 3, 3]), True)
     """
 
     R: Float[Tensor, "*batch 3 3"]
@@ -46,7 +53,15 @@ class SelectedMotion:
     DEGENERATE where the camera only turned (R is right, t = 0, the normal means nothing) or H is singular; TOO_FEW (no finite
     point has weight); BEHIND (half of the weight or less is in front); NOT_FINITE (H).
 
-    See the example of `motion_from_homography`.
+    Example:
+        >>> import torch, torchsfm
+        >>> X = torchsfm.random_points(20, kind="plane", generator=torch.Generator().manual_seed(0))
+        >>> X[:, 2] += 2
+        >>> t = torch.tensor([0.5, 0.0, 0.0], dtype=X.dtype)  # sideways, before a wall two units away
+        >>> H = torch.eye(3, dtype=X.dtype) + torch.outer(t, torch.tensor([0.0, 0.0, 0.5], dtype=X.dtype))
+        >>> found = torchsfm.motion.motion_from_homography(H, X, X + t)
+        >>> found.model.normal.round(decimals=6).abs(), found.alternative_fits  # no other motion explains the points
+        (tensor([0., 0., 1.], dtype=torch.float64), tensor(False))
     """
 
     model: PlaneMotion

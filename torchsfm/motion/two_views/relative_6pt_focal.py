@@ -61,7 +61,16 @@ class FocalMotion:
 
     `d2' E d1 = 0` for rays d = (x, f), |E|^2 = 2 (Frobenius). F = diag(1, 1, f) E diag(1, 1, f) up to scale.
 
-    See the example of `relative_6pt_focal`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, P = torchsfm.random_points(6, generator=g), torchsfm.random_poses(2, generator=g).matrix()
+        >>> x1, x2 = 800 * torchsfm.project_points(P, X)
+        >>> found = torchsfm.motion.relative_6pt_focal(x1, x2)
+        >>> f, E = found.model.f[found.valid], found.model.E[found.valid]
+        >>> best = (f - 800).abs().argmin()
+        >>> f[best], bool((torch.linalg.svdvals(E[best])[:2].diff() < 1e-6).all())
+        (tensor(800.0000, dtype=torch.float64), True)
     """
 
     E: Float[Tensor, "*batch 3 3"]
