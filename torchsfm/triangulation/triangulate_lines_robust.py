@@ -138,13 +138,16 @@ class RobustLineTriangulation:
     Example:
         >>> import torch, torchsfm
         >>> g = torch.Generator().manual_seed(0)
-        >>> P = torchsfm.random_poses(6, generator=g).matrix()
-        >>> X = torchsfm.random_points(4, generator=g).reshape(2, 2, 3)  # ends of two segments
-        >>> x = torchsfm.project_points(P[:, None], X)
-        >>> x[4:, 0] += 0.5  # the first is wrong in two views
-        >>> found = torchsfm.triangulate_lines_robust(x, P, threshold=0.01, generator=g)
-        >>> found.inliers.sum(0), bool(found.ends.allclose(X, atol=1e-6))
-        (tensor([4, 6]), True)
+        >>> P = torchsfm.random_intrinsics(6, generator=g) @ torchsfm.random_poses(6, generator=g).matrix()
+        >>> X = torchsfm.random_points(2, generator=g)  # the ends of a segment
+        >>> x = torchsfm.project_points(P, X)[:, None].repeat(1, 2, 1, 1)  # twice
+        >>> x[4:, 0] += 50  # the first is wrong in two views, the second in all but one
+        >>> x[1:, 1] += 200 * torch.rand(5, 2, 2, generator=g)
+        >>> found = torchsfm.triangulate_lines_robust(x, P, threshold=2.0, generator=g)
+        >>> [torchsfm.Status(k).name for k in found.status.tolist()], found.inliers[:, 0]
+        (['OK', 'NO_CONSENSUS'], tensor([ True,  True,  True,  True, False, False]))
+        >>> bool(found.ends[0].allclose(X)), bool(found.end_covariance[0].any())
+        (True, True)
     """
 
     model: Float[Tensor, "*batch n 6"]
@@ -214,12 +217,12 @@ def triangulate_lines_robust(
     Example:
         >>> import torch, torchsfm
         >>> g = torch.Generator().manual_seed(0)
-        >>> P = torchsfm.random_poses(6, generator=g).matrix()
+        >>> P = torchsfm.random_intrinsics(6, generator=g) @ torchsfm.random_poses(6, generator=g).matrix()
         >>> x = torchsfm.project_points(P, torchsfm.random_points(2, generator=g))  # the ends of a segment
-        >>> x[5] += 0.5  # wrong in the last view
-        >>> found = torchsfm.triangulate_lines_robust(x[:, None], P, threshold=0.01, generator=g)
-        >>> found.inliers[:, 0]
-        tensor([ True,  True,  True,  True,  True, False])
+        >>> x[5] += 50  # wrong in the last view
+        >>> found = torchsfm.triangulate_lines_robust(x[:, None], P, threshold=2.0, generator=g)
+        >>> found.status == torchsfm.Status.OK, found.inliers[:, 0]
+        (tensor([True]), tensor([ True,  True,  True,  True,  True, False]))
     """
     segments = isinstance(l, Tensor) and l.ndim > 3 and l.shape[-2:] == (2, 2)
     own = {"l": (l, "v n 2 2" if segments else "v n 3"), "P": (P, "v 3 4"), "visible": (visible, "?v n: bool")}
