@@ -1,5 +1,7 @@
 """A model in a web page that this program serves, so that it can change while one looks: viser, the extra `viser`."""
 
+import contextlib
+import io
 import math
 from pathlib import Path
 from typing import Any
@@ -35,11 +37,13 @@ class LiveViewer:
         ImportError: viser is not installed.
 
     Example:
-        >>> import torchsfm
-        >>> viewer = torchsfm.plot.LiveViewer()  # doctest: +SKIP
-        >>> viewer.show(torchsfm.read_model("model.npz"))  # doctest: +SKIP
-        >>> viewer.address  # doctest: +SKIP
-        'http://127.0.0.1:8080'
+        >>> import torch, torchsfm
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(3, 20, 50).truth, "model.npz")
+        >>> viewer = torchsfm.plot.LiveViewer()
+        >>> viewer.show(torchsfm.read_model("model.npz"))  # a browser shows it at once
+        >>> viewer.address.startswith("http://127.0.0.1:")
+        True
+        >>> viewer.close()
     """
 
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -47,7 +51,8 @@ class LiveViewer:
             import viser
         except ImportError:
             raise ImportError(MISSING) from None
-        self._server = viser.ViserServer(host=host, port=port, verbose=False)
+        with _quietly():
+            self._server = viser.ViserServer(host=host, port=port, verbose=False)
         self._shown: list[Any] = []
 
     @property
@@ -97,7 +102,13 @@ class LiveViewer:
 
     def close(self) -> None:
         """End the server."""
-        self._server.stop()
+        with _quietly():
+            self._server.stop()
+
+
+def _quietly() -> contextlib.redirect_stdout[io.StringIO]:
+    """What viser prints by itself is left to those who ask for `address`."""
+    return contextlib.redirect_stdout(io.StringIO())
 
 
 def _photograph(path: Path) -> NDArray[np.uint8] | None:

@@ -36,7 +36,19 @@ class Alignment:
         apart: The same as vectors, along the axes of the other world.
         known: How well places that were measured with errors determine the similarity; None where the poses are compared.
 
-    See the example of `align_to_positions`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(8, 20, 100, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> measured = 10 * model.poses.centre + 0.01 * torch.randn(8, 3, generator=g)  # metres
+        >>> measured[3] += 1000
+        >>> found = torchsfm.reconstruction.align_to_positions(model, model.names, measured)
+        >>> found.used.tolist().index(False), bool(found.distance[found.used].max() < 0.1)
+        (3, True)
+        >>> metric = model.transform(found.similarity)
+        >>> bool((metric.poses.centre - measured)[found.used].norm(dim=-1).max() < 0.1)
+        True
     """
 
     similarity: Similarity
@@ -180,7 +192,18 @@ class ControlPoints:
         x: Where it is, pixels.
         point: Which point it shows.
 
-    See the example of `adjust_to_points`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.reconstruction import ControlPoints, align_to_points
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(6, 60, 250, noise=0.0, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> row = (model.point < 4).nonzero()[:, 0]  # where images show the first four points
+        >>> images = tuple(model.names[i] for i in model.view[row].tolist())
+        >>> known = ControlPoints(("door", "gable", "lamp", "step"), 3 * model.X[:4], images, model.x[row], model.point[row])
+        >>> found = align_to_points(model, known)
+        >>> found.names, found.similarity.scale
+        (('door', 'gable', 'lamp', 'step'), tensor(3.0000, dtype=torch.float64))
     """
 
     names: tuple[str, ...]

@@ -17,7 +17,16 @@ from torchsfm.optim import Loss
 class Conics:
     """Ellipses in space and their tracks: what images show of them, as `detect_ellipses` and `fit_ellipse` measure it.
 
-    See the example of `write_conics`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> scene = torchsfm.simulation.simulate_conics((), conics=2, views=3, generator=g)
+        >>> seen = torchsfm.geometry.ellipse_from_conic(scene.C)[0]
+        >>> seen = torchsfm.Ellipse(seen.centre.flatten(0, 1), seen.semi_axes.flatten(0, 1), seen.angle.flatten())
+        >>> view, conic = torch.arange(3).repeat_interleave(2), torch.arange(2).repeat(3)
+        >>> conics = torchsfm.reconstruction.Conics.of(scene.model, seen, torch.eye(5).double().expand(6, 5, 5), view, conic)
+        >>> len(conics), conics.support(), conics.outlines(100).shape  # how many images show each, and points to draw
+        (2, tensor([3, 3]), torch.Size([2, 100, 3]))
     """
 
     centre: Float[Tensor, "n 3"]

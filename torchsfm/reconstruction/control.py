@@ -39,7 +39,20 @@ class ControlledModel:
         terms: what of it was adjusted, held and known, for its covariance; None where there was no adjustment.
         sigma: Standard deviation of the model's image points, pixels.
 
-    See the example of `adjust_to_points`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.reconstruction import ControlPoints, adjust_to_points
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(6, 60, 250, noise=0.0, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> row = (model.point < 6).nonzero()[:, 0]
+        >>> images = tuple(model.names[i] for i in model.view[row].tolist())
+        >>> known = ControlPoints(tuple("abcdef"), 3 * model.X[:6], images, model.x[row], model.point[row])
+        >>> found = adjust_to_points(model, known, sigma=0.001)
+        >>> found.status.name, bool(found.apart.norm(dim=-1).max() < 1e-3), found.alignment.similarity.scale
+        ('OK', True, tensor(3.0000, dtype=torch.float64))
+        >>> found.covariance().X.shape  # of all points, and of the control points after them
+        torch.Size([66, 3, 3])
     """
 
     model: Reconstruction

@@ -27,7 +27,24 @@ class GpsAlignment:
         origin: Latitude and longitude in degrees, WGS84, and height in metres, of zero.
         photographs: How many files of the model's images were found.
 
-    See the example of `align_to_gps`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from pathlib import Path
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(6, 20, 100, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> home = torch.tensor([55.7041, 13.1914, 52.0]).double()  # latitude, longitude, height
+        >>> flown = torchsfm.geometry.geodetic_from_enu(10 * model.poses.centre, home)
+        >>> words = "drone-dji:GpsLatitude", "drone-dji:GpsLongitude", "drone-dji:AbsoluteAltitude"
+        >>> for name, place in zip(model.names, flown.tolist()):
+        ...     said = " ".join(f"{word}='{value}'" for word, value in zip(words, place))
+        ...     size = Path(name).write_text(f"<rdf:RDF><a {said}/></rdf:RDF>")
+        ...
+        >>> found = torchsfm.reconstruction.align_to_gps(model, ".")
+        >>> metric = model.transform(found.alignment.similarity)  # metres east, north and up of `found.origin`
+        >>> again = torchsfm.geometry.geodetic_from_enu(metric.poses.centre, found.origin)
+        >>> bool(again.allclose(flown)), bool(found.alignment.distance.max() < 0.01)
+        (True, True)
     """
 
     alignment: Alignment
@@ -61,10 +78,21 @@ def align_to_gps(model: Reconstruction, images: str | Path) -> GpsAlignment:
         OSError: A photograph cannot be read.
 
     Example:
-        >>> import torchsfm
-        >>> model = torchsfm.read_model("model.npz")  # doctest: +SKIP
-        >>> found = torchsfm.reconstruction.align_to_gps(model, "photos/")  # doctest: +SKIP
-        >>> metric = model.transform(found.alignment.similarity)  # doctest: +SKIP
+        >>> import torch, torchsfm
+        >>> from pathlib import Path
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(6, 20, 100, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> home = torch.tensor([55.7041, 13.1914, 52.0]).double()  # latitude, longitude, height
+        >>> flown = torchsfm.geometry.geodetic_from_enu(10 * model.poses.centre, home)
+        >>> words = "drone-dji:GpsLatitude", "drone-dji:GpsLongitude", "drone-dji:AbsoluteAltitude"
+        >>> for name, place in zip(model.names, flown.tolist()):  # as drones write it into photographs
+        ...     said = " ".join(f"{word}='{value}'" for word, value in zip(words, place))
+        ...     size = Path(name).write_text(f"<rdf:RDF><a {said}/></rdf:RDF>")
+        ...
+        >>> found = torchsfm.reconstruction.align_to_gps(model, ".")
+        >>> found.alignment.similarity.scale, found.fault()
+        (tensor(10.0000, dtype=torch.float64), '')
     """
     files = {name: Path(images) / name for name, there in zip(model.names, model.registered.tolist(), strict=True) if there}
     files = {name: path for name, path in files.items() if path.is_file() and path.stat().st_size < MOST_BYTES}

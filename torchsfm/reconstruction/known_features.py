@@ -32,7 +32,16 @@ class KnownFeatures:
         descriptors: What they look like: RootSIFT times 256 as uint8, as `detect_features` makes them.
         labels: What the files say of the camera, empty where nothing is known.
 
-    See the example of `register_photographs`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(4, 50, 150, generator=g).truth, "model.npz")
+        >>> model = torchsfm.read_model("model.npz")
+        >>> x = tuple(model.x[model.view == i].float() for i in range(4))  # where features of each image are
+        >>> descriptors = tuple(torch.randint(0, 256, (len(part), 128), generator=g, dtype=torch.uint8) for part in x)
+        >>> known = torchsfm.reconstruction.KnownFeatures(model.names, x, descriptors, ("",) * 4)
+        >>> len(known.names), sum(map(len, known.descriptors))
+        (4, 150)
     """
 
     names: tuple[str, ...]

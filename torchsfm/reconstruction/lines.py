@@ -21,7 +21,18 @@ class Lines:
 
     Several segments of one image may be parts of the same line.
 
-    See the example of `write_lines`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> P, ends = torchsfm.random_poses(3, generator=g).matrix(), torchsfm.random_points(8, generator=g).reshape(4, 2, 3)
+        >>> x = torchsfm.project_points(P[:, None], ends).flatten(0, 1)  # four lines in three images
+        >>> view, line = torch.arange(3).repeat_interleave(4), torch.arange(4).repeat(3)
+        >>> order = line.argsort(stable=True)
+        >>> lines = torchsfm.Lines(ends, torch.ones(4, 3).double(), x[order], torch.ones(12).double(), view[order], line[order])
+        >>> len(lines), lines.L.shape, lines.support()  # how many images show each
+        (4, torch.Size([4, 6]), tensor([3, 3, 3, 3]))
+        >>> lines.select(torch.tensor([True, False, False, True])).line
+        tensor([0, 0, 0, 1, 1, 1])
     """
 
     ends: Float[Tensor, "l 2 3"]

@@ -29,7 +29,20 @@ class MatchedImages:
         camera_index: Which camera took each image; None where nothing tells.
         focal: Focal length in pixels that is known of each image, as far as it is.
 
-    See the example of `read_database`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X)
+        >>> pairs, same = torch.tensor([[0, 1], [0, 2], [1, 2]]), torch.arange(60)[:, None].expand(60, 2)
+        >>> size = torch.tensor([[1000, 750]] * 3)
+        >>> matched = torchsfm.MatchedImages(("a.jpg", "b.jpg", "c.jpg"), size, tuple(x), pairs, (same,) * 3)
+        >>> torchsfm.write_database(matched, "database.db")
+        >>> read = torchsfm.read_database("database.db")  # such as other programs write
+        >>> found = torchsfm.reconstruct_matches(read.keypoints, read.pairs, read.matches, read.image_size, K=K)
+        >>> found.model.num_registered
+        3
     """
 
     names: tuple[str, ...]

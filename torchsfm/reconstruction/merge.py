@@ -48,7 +48,19 @@ class MergedModel:
         status: Of the last adjustment.
         why: Why the models were not merged; empty where they were.
 
-    See the example of `merge_models`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> torchsfm.write_model(torchsfm.random_bundle_problem(8, 150, 800, generator=g).truth, "model.npz")
+        >>> whole = torchsfm.read_model("model.npz")
+        >>> first = torchsfm.reconstruction.part_of_model(whole, torch.arange(8) < 5)
+        >>> second = torchsfm.reconstruction.part_of_model(whole, torch.arange(8) > 2)
+        >>> larger = torchsfm.Similarity(torch.tensor(2.0).double(), torch.eye(3).double(), torch.zeros(3).double())
+        >>> merged = torchsfm.reconstruction.merge_models(first, second.transform(larger))
+        >>> merged.status.name, merged.shared_images, merged.similarity.scale.round(decimals=2)
+        ('OK', ('000003', '000004'), tensor(0.5000, dtype=torch.float64))
+        >>> merged.model.num_registered
+        8
     """
 
     model: Reconstruction

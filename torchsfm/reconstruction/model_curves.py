@@ -16,7 +16,14 @@ from torchsfm.optim import Loss
 class Curves:
     """Curves in space, sample by sample, and their tracks: the edge points of images next to which samples are seen.
 
-    See the example of `reconstruct_curves`.
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.render_sequence(views=3, width=96, height=72, generator=torch.Generator().manual_seed(0))
+        >>> images, cameras, poses = scene.images, scene.cameras, scene.poses
+        >>> found = torchsfm.reconstruction.reconstruct_curves(images, cameras, poses, points=scene.X)
+        >>> longest = found.select(found.length() >= found.length().max())
+        >>> len(longest), bool((longest.support() >= 2).all()), bool((longest.sigma > 0).all())
+        (1, True, True)
     """
 
     X: Float[Tensor, "n 3"]

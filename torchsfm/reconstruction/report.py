@@ -49,7 +49,19 @@ class ImageReport:
         rotation_sigma: Standard deviation of its rotation, degrees; infinite where it is not known.
         position_sigma: Standard deviation of its place over the median distance of the points that it sees.
 
-    See the example of `reconstruct_tracks`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(4, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X)
+        >>> x[3] = x[3, torch.randperm(60, generator=g)]  # the last image has nothing to do with the others
+        >>> view, track = torch.arange(4).repeat_interleave(60), torch.arange(60).repeat(4)
+        >>> found = torchsfm.reconstruct_tracks(x.flatten(0, 1), view, track, torch.tensor([[1000, 750]] * 4), K=K)
+        >>> [image.model for image in found.report.images]
+        [0, 0, 0, None]
+        >>> found.report.images[3].reason
+        'has too little in common with every other image'
     """
 
     name: str
@@ -65,7 +77,20 @@ class ImageReport:
 class PairReport:
     """All compared pairs: matches, how many agree with F and with H, and what that says of the pair.
 
-    See the example of `reconstruct_matches`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.reconstruction import Verdict
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X)
+        >>> x[2] = x[2, torch.randperm(60, generator=g)]
+        >>> pairs, same = torch.tensor([[0, 1], [0, 2], [1, 2]]), torch.arange(60)[:, None].expand(60, 2)
+        >>> report = torchsfm.reconstruct_matches(list(x), pairs, [same] * 3, torch.tensor([[1000, 750]] * 3), K=K).report.pairs
+        >>> report.num_matches, report.fundamental_inliers > 50
+        (tensor([60, 60, 60]), tensor([ True, False, False]))
+        >>> [Verdict(k).name for k in report.verdict.tolist()]
+        ['GENERAL', 'UNRELATED', 'UNRELATED']
     """
 
     pairs: Int[Tensor, "q 2"]
@@ -100,7 +125,18 @@ class Report:
         method: How the models were made: "incremental", "projective", "global" or "curves"; empty where the cameras were given.
         refusal: Why there is no model, where the method can tell; empty else.
 
-    See the example of `reconstruct_tracks`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(60, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ poses.matrix(), X).flatten(0, 1)
+        >>> view, track = torch.arange(3).repeat_interleave(60), torch.arange(60).repeat(3)
+        >>> report = torchsfm.reconstruct_tracks(x, view, track, torch.tensor([[1000, 750]] * 3), K=K).report
+        >>> report.focal_source, report.method, len(report.pairs.pairs)
+        (('given',), 'incremental', 3)
+        >>> report.summary().splitlines()[0]
+        '3 pairs compared: 3 general, 0 planar, 0 pure rotation, 0 unrelated'
     """
 
     images: tuple[ImageReport, ...]
@@ -159,7 +195,17 @@ def describe_skipped(skipped: Sequence[tuple[str, str]]) -> list[str]:
 class SfmResult:
     """Models, the largest first (none when nothing could be reconstructed), and the report.
 
-    See the example of `reconstruct_tracks`.
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> x, track = torch.rand(60, 2, generator=g, dtype=torch.float64) * 700, torch.arange(60)
+        >>> still = x.repeat(2, 1)  # two images of a camera that did not move
+        >>> view = torch.arange(2).repeat_interleave(60)
+        >>> found = torchsfm.reconstruct_tracks(still, view, track.repeat(2), torch.tensor([[1000, 750]] * 2))
+        >>> len(found.models)
+        0
+        >>> found.failure()
+        'the camera only turned about its centre, which gives no depth'
     """
 
     models: tuple[Reconstruction, ...]

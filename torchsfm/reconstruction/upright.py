@@ -43,7 +43,16 @@ class Levelling:
         ground: The points that lie on the ground, where that was looked for.
         why: Why the direction, or the ground, is not known; empty where it is.
 
-    See the example of `align_upright`.
+    Example:
+        >>> import dataclasses, torch, torchsfm
+        >>> poses = torchsfm.simulation.orbit_poses(8, radius=5.0)  # the world's z points up
+        >>> problem = torchsfm.random_bundle_problem(8, 20, 100, generator=torch.Generator().manual_seed(0)).truth
+        >>> torchsfm.write_model(problem, "model.npz")
+        >>> tilted = torchsfm.geometry.rotation_from_rotvec(torch.tensor([0.3, 0.0, 0.0]).double())
+        >>> model = dataclasses.replace(torchsfm.read_model("model.npz"), poses=torchsfm.Pose(poses.R @ tilted, poses.t))
+        >>> level = torchsfm.reconstruction.align_upright(model)
+        >>> bool((level.similarity.R @ tilted.mT)[2, 2] > 0.999), bool(level.roll.abs().max() < 1e-6)
+        (True, True)
     """
 
     similarity: Similarity

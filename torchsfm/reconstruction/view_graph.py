@@ -31,7 +31,20 @@ _ROWS_PER_CALL = 4_000_000
 class Verdict(IntEnum):
     """What two images have to do with each other.
 
-    See the example of `reconstruct_matches`.
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.reconstruction import Verdict
+        >>> g = torch.Generator().manual_seed(0)
+        >>> X, poses = torchsfm.random_points(80, generator=g), torchsfm.random_poses(3, generator=g)
+        >>> turned = torchsfm.geometry.rotation_from_rotvec(torch.tensor([0.0, 0.1, 0.0]).double())
+        >>> R, t = poses.R.clone(), poses.t.clone()
+        >>> R[2], t[2] = turned @ R[1], turned @ t[1]  # the third camera is where the second was
+        >>> K = torchsfm.intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+        >>> x = torchsfm.project_points(K @ torchsfm.Pose(R, t).matrix(), X)
+        >>> pairs, same = torch.tensor([[0, 1], [1, 2]]), torch.arange(80)[:, None].expand(80, 2)
+        >>> found = torchsfm.reconstruct_matches(list(x), pairs, [same] * 2, torch.tensor([[1000, 750]] * 3), K=K)
+        >>> [Verdict(k).name for k in found.report.pairs.verdict.tolist()]
+        ['GENERAL', 'ROTATION']
     """
 
     UNRELATED = 0
