@@ -35,7 +35,8 @@ from torchsfm.geometry import (
 )
 from torchsfm.geometry.line_manifold import line_tangents
 from torchsfm.optim import Block, Cauchy, Huber, Loss, RigidMotion, Term, sparse_levenberg_marquardt
-from torchsfm.optim.terms import Workspace, curvature, linearize, prepare, term_residual
+from torchsfm.optim.curvature import curvature
+from torchsfm.optim.terms import Workspace, linearize, prepare, term_residual
 
 F64 = torch.float64
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TypedDict
 
 import torch
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_index, check_one_problem, check_options, check_tensors
+from torchsfm.bundle.bending import bend
 from torchsfm.bundle.intrinsics import Switched, free_columns, free_switches, intrinsics_prior
 from torchsfm.bundle.priors import Prior
 from torchsfm.bundle.projection import Projection
@@ -188,7 +189,8 @@ class Bundle:
             of_view = (self.rig.frame, self.rig.sensor, self.start.camera_index)
         seen_by = cameras[self.start.camera_index]
         sight = Sight(names, of_view, projection, through.residual, through.linearize, view_poses, seen_by)
-        terms = [Term(through.residual, (*names, "point"), (*sight.at(view), point), data, *options, through.linearize)]
+        seen = (*names, "point"), (*sight.at(view), point)
+        terms = [Term(through.residual, *seen, data, *options, through.linearize, bend=partial(bend, projection))]
         for some in self.structure:
             blocks[some.block] = some.variables(sight)
             terms.append(some.term(sight, blocks[some.block]))

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import backward, factor, forward, hold, measure, place
+from torchsfm.optim.curvature import curvature
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.multigrid import PairGraph
 from torchsfm.optim.normal_equations import Eliminated, NormalEquations
@@ -30,7 +31,6 @@ from torchsfm.optim.terms import (
     Block,
     Term,
     Workspace,
-    curvature,
     gather,
     lift_of,
     linearize,

@@ -109,7 +109,10 @@ class Term:
     linearize: Callable[..., Tensor] | None = None
     """Residuals and hand-written derivatives; automatic ones if not given."""
     reduction: Reduction | None = None
-    """For second derivatives, which are those of `residual` if it is not given."""
+    """For second derivatives, which are those of `residual` if neither it nor `bend` is given."""
+    bend: Callable[..., Tensor] | None = None
+    """Hand-written second derivatives, where `linearize` is given: `(*variables, *data, by=, wanted=)` gives those of `by .
+    residual`, `by (d, m)`, by the steps of the wanted variables, `(n, n, m)`; below the diagonal is nothing of account."""
 
     def select(self, rows: Tensor) -> "Term":
         """The term with some of its residuals."""
@@ -195,7 +198,8 @@ def gather(x: Float[Tensor, "n k"], index: Int[Tensor, "m"], out: Tensor | None 
     return torch.gather(columns, 1, index.expand(columns.shape[0], -1), out=out).mT
 
 
-def _arguments(term: Term, x: dict[str, Tensor], work: Workspace | None) -> list[Tensor]:
+def arguments_of(term: Term, x: dict[str, Tensor], work: Workspace | None) -> list[Tensor]:
+    """The variables of each residual of a term."""
     found = []
     for k, (name, index) in enumerate(zip(term.blocks, term.index, strict=True)):
         out = None if work is None else work.get(f"{k} {name}", x[name].shape[1], index.shape[0])
@@ -205,7 +209,7 @@ def _arguments(term: Term, x: dict[str, Tensor], work: Workspace | None) -> list
 
 def term_residual(term: Term, x: dict[str, Tensor], work: Workspace | None = None) -> Float[Tensor, "m d"]:
     """The residuals at `x`."""
-    return term.residual(*_arguments(term, x, work), *term.data)
+    return term.residual(*arguments_of(term, x, work), *term.data)
 
 
 def term_cost(term: Term, residual: Float[Tensor, "m d"]) -> Float[Tensor, ""]:
@@ -231,7 +235,7 @@ def linearize(
     Scaled by `sqrt(w rho')`, their squares add up to the robust Gauss-Newton model (the first-order variant of Triggs et al.
     2000, 4.3, which stays positive definite). None is no scaling.
     """
-    arguments = _arguments(term, x, work)
+    arguments = arguments_of(term, x, work)
     if term.linearize is not None:
         residual = term.linearize(*arguments, *term.data, out=out)
     else:
@@ -265,99 +269,6 @@ def _differentiate(term: Term, arguments: list[Tensor], lifts: dict[str, Tensor 
                     ambient = (ambient[:, None] * lift.index_select(-1, index)).sum(0)
                 target[:, k] = ambient.mT
     return value.detach()
-
-
-def curvature(
-    term: Term,
-    x: dict[str, Tensor],
-    blocks: dict[str, Block],
-    wanted: Sequence[bool],
-    eliminated: str | None,
-    slots: tuple[Int[Tensor, "m"], Int[Tensor, "s"]],
-) -> tuple[Float[Tensor, "c c s"], Float[Tensor, "c q m"], Float[Tensor, "q q m"]]:
-    """The exact second derivatives of the cost, in which the loss's and the residual's own are, so they need not be positive.
-
-    Args:
-        term: The residuals.
-        x: All variables.
-        blocks: The blocks they belong to.
-        wanted: The blocks of the term by whose tangent steps to differentiate.
-        eliminated: The block that is eliminated.
-        slots: The slot of each residual, of s in which all wanted retained variables are the same, and a residual of each.
-
-    Returns:
-        Those by the retained variables summed over each slot, by retained and eliminated ones, and by eliminated ones.
-    """
-    slot, some = slots
-    kept, point, moved = [], [], []
-    with torch.enable_grad():
-        arguments = _arguments(term, x, None)
-        for name, a, index, w in zip(term.blocks, arguments, term.index, wanted, strict=True):
-            if not w:
-                moved.append(a)
-            elif name == eliminated:
-                point.append(a.new_zeros((blocks[name].tangent, len(a))).requires_grad_())
-                moved.append(blocks[name].retract(a, point[-1].mT))
-            else:
-                kept.append(a.new_zeros((blocks[name].tangent, len(some))).requires_grad_())
-                each = blocks[name].retract(gather(x[name], index[some]), kept[-1].mT)
-                # Fixed variables, whichever they are, share a slot: they stay.
-                same = index == index[some][slot]
-                moved.append(torch.where(same, each.mT.index_select(1, slot), a.mT).mT)
-        if term.reduction is None:
-            cost = term_cost(term, term.residual(*moved, *term.data))
-        else:
-            cost = _expanded_cost(term, term.reduction, arguments, moved)
-        by_kept, by_point = _rows(cost, kept, [*kept, *point]), _rows(cost, point, point)
-    size = sum(len(k) for k in kept)
-    empty = x[term.blocks[0]].new_zeros
-    U = torch.stack([torch.cat(row[: len(kept)]) for row in by_kept]) if kept else empty((0, 0, len(some)))
-    if not point:
-        return U, empty((size, 0, len(slot))), empty((0, 0, len(slot)))
-    W = torch.stack([row[-1] for row in by_kept]) if kept else empty((0, len(point[0]), len(slot)))
-    return U, W, torch.stack([row[0] for row in by_point])
-
-
-def _expanded_cost(term: Term, reduction: Reduction, still: Sequence[Tensor], moved: Sequence[Tensor]) -> Tensor:
-    """The cost to second order about where the variables are, but for a constant."""
-    with torch.no_grad():
-        r, J, H = reduction.expand(*still, *term.data)
-        slope = (r[..., None] * J).sum(1)
-        A = J.mT @ J + (r[..., None, None] * H).sum(1)
-        if term.loss is not None:
-            first, second = _loss_slopes(term.loss, r.square().sum(-1))
-            A = first[:, None, None] * A + 2 * second[:, None, None] * (slope[:, :, None] * slope[:, None])
-            slope = first[:, None] * slope
-        if term.weights is not None:
-            slope, A = term.weights[:, None] * slope, term.weights[:, None, None] * A
-        start = reduction.numbers(*still)
-    step = reduction.numbers(*moved) - start
-    return (step * (slope + 0.5 * (A @ step[..., None])[..., 0])).sum()
-
-
-def _loss_slopes(loss: Loss, square: Float[Tensor, "m"]) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """First and second derivatives of a loss."""
-    with torch.enable_grad():
-        leaf = square.detach().requires_grad_()
-        (first,) = torch.autograd.grad(loss(leaf).sum(), leaf, create_graph=True)
-        if not first.requires_grad:
-            return first, torch.zeros_like(first)
-        (second,) = torch.autograd.grad(first.sum(), leaf, materialize_grads=True)
-    return first.detach(), second
-
-
-def _rows(cost: Tensor, by: list[Tensor], then: list[Tensor]) -> list[tuple[Tensor, ...]]:
-    """The derivatives of a cost by the rows of some leaves, and of each of these, summed, by all rows of others."""
-    if not by or not cost.requires_grad:
-        return [tuple(torch.zeros_like(leaf) for leaf in then) for leaf in by for _ in leaf]
-    slopes = torch.autograd.grad(cost, by, create_graph=True, materialize_grads=True)
-    rows = [row for slope in slopes for row in slope]
-    return [
-        torch.autograd.grad(row.sum(), then, retain_graph=True, materialize_grads=True)
-        if row.requires_grad
-        else tuple(torch.zeros_like(leaf) for leaf in then)
-        for row in rows
-    ]
 
 
 def lift_of(block: Block, x: Float[Tensor, "n k"]) -> Tensor | None:
