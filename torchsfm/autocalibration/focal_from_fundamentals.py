@@ -41,10 +41,9 @@ class FocalEstimate:
         >>> P = K @ torchsfm.random_poses(3, wobble=1.0, generator=g).matrix()
         >>> F = torchsfm.tensors.bifocal_tensors(P, torch.tensor([[0, 1], [0, 2], [1, 2]]))
         >>> found = torchsfm.autocalibration.focal_from_fundamentals(F, c, c)
-        >>> found.candidates[found.cost.argmin()].round(decimals=-1), found.model  # the best that was tried, and made better
-        (tensor(910., dtype=torch.float64), tensor(900.0000, dtype=torch.float64))
-        >>> bool(found.uncertainty < 0.01)  # relative
-        True
+        >>> best = found.candidates[found.cost.argmin()]  # of those that were tried
+        >>> bool((best / found.model - 1).abs() < 0.05), found.model, bool(found.uncertainty < 0.01)  # relative
+        (True, tensor(900.0000, dtype=torch.float64), True)
     """
 
     model: Float[Tensor, "*batch"]

@@ -29,8 +29,8 @@ class RelativePose:
         >>> R, t = torch.eye(3, dtype=X.dtype), torch.tensor([0.6, 0.0, 0.8], dtype=X.dtype)
         >>> E = torchsfm.tensors.essential_from_pose(R, t)
         >>> found = torchsfm.tensors.pose_from_essential(E, X, X @ R.mT + t)
-        >>> found.pose.centre, found.model.shape, found.in_front.all()
-        (tensor([-0.6000, -0.0000, -0.8000], dtype=torch.float64), torch.Size([3, 4]), tensor(True))
+        >>> bool(found.pose.centre.allclose(-t)), found.model.shape, int(found.in_front.sum())
+        (True, torch.Size([3, 4]), 20)
     """
 
     model: Float[Tensor, "*batch 3 4"]
