@@ -67,6 +67,7 @@ sphinx_gallery_conf = {
     "show_signature": False,
     "write_computation_times": False,
     "abort_on_example_error": True,
+    "capture_repr": (),  # what is printed is shown, and not what a cell's last line returns
     "matplotlib_animations": False,
 }
 

@@ -192,11 +192,11 @@ print(f"after the last, metric bundle adjustment: f = {last.cameras.K[0, 0, 0]:.
 world = similarity_from_points(last.X, cloud)
 print(f"points off by {(world.transform(last.X) - cloud).norm(dim=-1).median():.4f} (median), the scene being 2 wide")
 
-fig = plt.figure(figsize=(11, 5), layout="constrained")
-left, right = (fig.add_subplot(1, 2, k, projection="3d") for k in (1, 2))
+fig = plt.figure(figsize=(7, 5), layout="constrained")
+ax = fig.add_subplot(projection="3d")
 v, p = seen_points.visible.nonzero().unbind(-1)
-plot_tracks(seen_points.x[v, p], v, p, image_size=SIZE, ax=left)
-left.set_title("tracks of points, as drawn in 1999")
+plot_tracks(seen_points.x[v, p], v, p, image_size=SIZE, ax=ax)
+ax.set_title("Tracks of points, as drawn in 1999")
 
 # %% [markdown]
 # The second example: curves
@@ -212,12 +212,15 @@ cameras = camera_from_krt(last.cameras.K, last.poses.R, last.poses.t)
 again = triangulate_curves(chosen, cameras[few], samples=60)
 Y = world.transform(again.curve.x[again.measured])
 print(f"{Status(int(again.status)).name}: {len(Y)} of 60 samples found, {gap(Y).mean():.4f} off on average")
+
+fig = plt.figure(figsize=(7, 5), layout="constrained")
+ax = fig.add_subplot(projection="3d")
 for k in range(VIEWS):
     loop = torch.cat((contours.x[k], contours.x[k, :1]))
-    right.plot(torch.full((81,), float(k)), *loop.T, color=plt.get_cmap("viridis")(k / VIEWS), linewidth=1)
-right.set(xlabel="image", ylabel="x [px]", zlabel="y [px]", title="images of a curve, as drawn in 1999")
-right.set_ylim3d(-0.5, SIZE[0] - 0.5)
-right.set_zlim3d(SIZE[1] - 0.5, -0.5)
+    ax.plot(torch.full((81,), float(k)), *loop.T, color=plt.get_cmap("viridis")(k / VIEWS), linewidth=1)
+ax.set(xlabel="image", ylabel="x [px]", zlabel="y [px]", title="Images of a curve, as drawn in 1999")
+ax.set_ylim3d(-0.5, SIZE[0] - 0.5)
+ax.set_zlim3d(SIZE[1] - 0.5, -0.5)
 
 # %% [markdown]
 # **Exercise 3.** How many views does the curve need? Try two, three and all. With two, look at ``again.measured`` where
