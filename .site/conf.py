@@ -75,6 +75,7 @@ html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"torchsfm {release}"
 html_static_path = ["static"]
+html_favicon = "static/favicon.svg"
 html_css_files = ["site.css"]
 html_show_sphinx = False
 html_copy_source = False
