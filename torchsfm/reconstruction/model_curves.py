@@ -18,12 +18,18 @@ class Curves:
 
     Example:
         >>> import torch, torchsfm
-        >>> scene = torchsfm.render_sequence(views=3, width=96, height=72, generator=torch.Generator().manual_seed(0))
-        >>> images, cameras, poses = scene.images, scene.cameras, scene.poses
-        >>> found = torchsfm.reconstruction.reconstruct_curves(images, cameras, poses, points=scene.X)
-        >>> longest = found.select(found.length() >= found.length().max())
-        >>> len(longest), bool((longest.support() >= 2).all()), bool((longest.sigma > 0).all())
-        (1, True, True)
+        >>> angle = torch.arange(100).double() * (torch.pi / 50)
+        >>> circle = torch.stack((angle.cos(), angle.sin(), 0 * angle), -1)
+        >>> X = torch.cat((circle, circle[:51] + 3))  # a circle, and half of one beside it
+        >>> curve = (torch.arange(151) >= 100).long()
+        >>> none, empty = torch.zeros(0, dtype=torch.int64), torch.zeros(0).double()  # measured nowhere
+        >>> ones, seen = torch.ones(151, 3).double(), (empty.reshape(0, 2), empty.reshape(0, 2), empty, empty, none, none)
+        >>> curves = torchsfm.reconstruction.Curves(X, curve, torch.tensor([True, False]), ones, ones[:, 0], *seen)
+        >>> curves.number, curves.length()  # around the circle, from end to end of the other
+        (tensor([100,  51]), tensor([6.2822, 3.1411], dtype=torch.float64))
+        >>> spline = curves.select(torch.tensor([False, True])).splines(tolerance=1e-3)[0]
+        >>> spline.control.shape  # instead of 51 samples
+        torch.Size([8, 3])
     """
 
     X: Float[Tensor, "n 3"]
