@@ -25,7 +25,7 @@ SLOW = 0.25
 NEAR = 1e-2
 """They do so only once they gain less than this fraction of the cost: before, the exact Hessian is rarely positive."""
 LOOSE = 1e-4
-"""And only where less than this fraction of the cost may be left: Newton steps are for the last digits."""
+"""And only where no more than this fraction of the cost may be left: Newton steps are for the last digits."""
 MINIMUM = 1e-13
 """Relative decrease still promised at which a place is the minimum that a derivative belongs to."""
 LIGHT = 1e-6
@@ -266,7 +266,7 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     plain = accepted & ~exact
     done = active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
     dull, slow, curved = state.dull, state.slow, state.curved
-    if problem.patience is not None and options.function_tolerance < LOOSE:
+    if problem.patience is not None and options.function_tolerance <= LOOSE:
         crawls, slow = plain & (rate > SLOW) & (gain <= NEAR * cost), exact
         dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
         if bool(crawls.any()):
