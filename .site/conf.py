@@ -26,8 +26,8 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "myst_parser",
-    "building.extension",
     "sphinx_gallery.gen_gallery",
+    "building.extension",
 ]
 exclude_patterns = [
     "generated/examples/**",

@@ -1,7 +1,7 @@
 """Robust estimation as a batched operation: the motion between 64 image pairs, of different sizes, in one call.
 
-Every pair has between 100 and 400 matches, of which up to half are wrong. The matches of all pairs lie in one tensor, padded to
-the longest, and `mask` says which of them exist. Each pair draws as many samples as it needs and then leaves the batch; its
+Every pair has between 100 and 400 matches, of which nearly half are wrong. The matches of all pairs lie in one tensor, padded
+to the longest, and `mask` says which of them exist. Each pair draws as many samples as it needs and then leaves the batch; its
 result is what it would be alone: the same inliers, the same model up to rounding.
 
     python examples/batched_ransac.py

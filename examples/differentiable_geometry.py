@@ -3,6 +3,7 @@
 Half of the matches are wrong. Each comes with two numbers: how alike the two image patches looked, which is higher for right
 matches but not by much, and one that means nothing. The network turns them into weights, `fundamental_8pt` turns the weighted
 matches into F, and the loss is how well F fits points that took no part: its gradient reaches the network through the solver.
+Each step takes image pairs never seen before, up to step 30 with more and more wrong matches, so the printed loss wavers.
 
     python examples/differentiable_geometry.py
 """

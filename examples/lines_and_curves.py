@@ -36,7 +36,7 @@ segments = project_points(P, seen) + noise(4, 2, 2)
 line = triangulate_lines(segments[:, None], P)
 direction = torch.nn.functional.normalize(line.model[0, :3], dim=-1)
 angle = torch.linalg.cross(direction, torch.nn.functional.normalize(ends[1] - ends[0], dim=-1)).norm().asin().rad2deg()
-print(f"line: direction off by {angle:.2f} degrees, {line.status.tolist()}")
+print(f"line: {torchsfm.Status(int(line.status)).name}, direction off by {angle:.2f} degrees")
 
 # An ellipse: edge points around its images, ellipses through these, then the ellipse in space.
 t = torch.arange(60, dtype=F64) * (2 * math.pi / 60)

@@ -1,4 +1,4 @@
-"""An estimator of one's own: RANSAC over lines in the plane, and over similarities of space, in a dozen lines each.
+"""An estimator of one's own: RANSAC over lines in the plane, and over similarities of space, in about thirty lines each.
 
 What the engine wants to know of a model is how to solve a minimal sample, which samples are not worth it, how far data are from
 a model, and how to take a robust step. It then samples, scores, optimises and stops, for all problems of a batch at once.

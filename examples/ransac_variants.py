@@ -56,13 +56,13 @@ def compare(
     name: str, title: str, across: str, values: list[float], up: str, variants: dict[str, Callable[[float], Tensor]]
 ) -> None:
     """Call each variant, which returns a number for each pair, with each value; print and draw what comes out."""
-    print(f"{name}: {up}\n  {across:32s}" + "".join(f"{value:9g}" for value in values))
+    print(f"{name}: {up}\n  {across:32s}" + "".join(f"{value:8g}" for value in values))
     fig, axes = plt.subplots(figsize=(5.5, 3.8), layout="constrained")
     least, most = float("inf"), 0.0
     for label, variant in variants.items():
         levels = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)
         low, median, high = torch.stack([variant(value).double().quantile(levels) for value in values]).T
-        print(f"  {label:32s}" + "".join(f"{number:9.3f}" for number in median))
+        print(f"  {label:32s}" + "".join(f"{number:8.4g}" for number in median))
         (line,) = axes.plot(values, median, marker="o", label=label)
         axes.fill_between(values, low, high, color=line.get_color(), alpha=0.1, linewidth=0)
         least, most = min(least, float(low.min())), max(most, float(high.max()))

@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from building import api, examples, figures, formulas, links, pages, plain, signatures
+from sphinx_gallery.directives import depart_imgsg_html, imgsgnode
+
+from building import api, examples, figures, formulas, gallery, links, pages, plain, signatures
 
 GENERATED = Path(__file__).parent.parent / "generated"
 ROOT = GENERATED.parent.parent
@@ -17,6 +19,8 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", plain.types_beside_names, priority=900)
     app.add_html_math_renderer("mathml", (formulas.inline, None), (formulas.block, None))
     app.add_post_transform(links.LinkNames)
+    app.add_post_transform(gallery.Thumbnails)
+    app.add_node(imgsgnode, override=True, html=(gallery.figure, depart_imgsg_html))
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 

@@ -4,6 +4,9 @@ from typing import Any
 
 from docutils import nodes
 from docutils.utils.math import MathError, latex2mathml
+from sphinx.util import logging
+
+logger = logging.getLogger(__name__)
 
 
 def inline(writer: Any, node: nodes.Element) -> None:
@@ -19,8 +22,9 @@ def block(writer: Any, node: nodes.Element) -> None:
 
 
 def _mathml(writer: Any, node: nodes.Element, *, block: bool) -> str:
-    """The formula; as it was typed where it uses a command that docutils does not know."""
+    """The formula; as it was typed, and with a warning, where it uses a command that docutils does not know."""
     try:
         return str(latex2mathml.tex2mathml(node.astext(), as_block=block))
-    except MathError:
+    except MathError as error:
+        logger.warning("%s", error, location=node)
         return f"<code>{writer.encode(node.astext())}</code>"

@@ -85,6 +85,8 @@ plot_points_2d(seen.x[0, ::5], visible=seen.visible[0, ::5], ax=left, color="cya
 plot_points_3d(seen.X, color=seen.color.double(), ax=right)
 plot_cameras(poses, Camera(K), names=["1", "2"], size=1.2, ax=right)
 right.view_init(elev=35, azim=-60)
+right.set_zlabel("z", labelpad=-5)
+right.set_zticks(range(4))
 right.set_title("the points in space, in metres")
 
 # %% [markdown]
@@ -131,7 +133,7 @@ for i, (name, color) in enumerate(zip("xyz", ("tab:red", "tab:green", "tab:blue"
     if name != "z":
         ax.plot(*v[i], "o", color=color)
         ax.annotate(f"vanishing point of {name}", v[i].tolist(), (0, 12), textcoords="offset points", color=color, ha="center")
-ax.set(xlim=(-280, 760), ylim=(430, -80), title="Parallel lines meet in a vanishing point; that of z is far below")
+ax.set(xlim=(-340, 780), ylim=(430, -80), title="Parallel lines meet in a vanishing point; that of z is far below")
 for name, point in zip("xyz", v, strict=True):
     print(f"vanishing point of {name}: {point.numpy().round(1)} pixels")
 
@@ -165,7 +167,7 @@ for ax, image, camera, title in ((axes[0], seen.images[0], Camera(K), "pinhole")
     for row in wall:
         on = pose.transform(row)
         u = camera.project(on)[camera.in_domain(on)]
-        ax.plot(*u.T, color="tab:red", linewidth=1)
+        ax.plot(*u.T, color="cyan", linewidth=1)
     ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
 
 grid = torch.cartesian_prod(torch.linspace(0, width - 1, 25), torch.linspace(0, height - 1, 19))

@@ -90,7 +90,7 @@ scale = torch.diag(torch.tensor([0.01, 0.01, 1.0]))  # one pixel of the result i
 front, _ = warp(photograph, image_from_wall @ scale, (190, 480))
 fig, axes = plt.subplots(1, 2, figsize=(11, 4.7), layout="constrained")
 show_image(photograph, title="photograph with the four points", ax=axes[0])
-plot_points_2d(on_the_wall(corners), ax=axes[0], color="red", markersize=10, markeredgewidth=2)
+plot_points_2d(on_the_wall(corners), ax=axes[0], color="cyan", markersize=10, markeredgewidth=2)
 show_image(front, title="the wall from the front: a pixel is a centimetre", ax=axes[1])
 
 # %% [markdown]
@@ -198,7 +198,7 @@ show_image(panorama(walked, best), title="the camera walked: only one plane fits
 # Features are one way to find the turn. Another is to ask the pixels: warp one photograph onto the other and compare. With
 # the turn as a rotation vector *w*, every pixel gives a residual
 #
-# .. math:: r(w) = I_1\big(K R(w) K^{-1} x\big) - I_2(x),
+# .. math:: r(w) = I_1\bigl(K R(w) K^{-1} x\bigr) - I_2(x),
 #
 # and its derivative is a chain of two. How the place in :math:`I_1` moves with *w*, two numbers by three for each pixel:
 # few inputs, many outputs, which is what forward mode is good at (``torch.func.jacfwd``). And how the interpolated grey

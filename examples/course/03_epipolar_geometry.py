@@ -61,8 +61,9 @@ show_image(seen.images[0], title="one pixel of the first photograph ...", ax=lef
 left.plot(*pixel.T, "o", color="cyan", markeredgecolor="black", markersize=9)
 show_image(seen.images[1], title="... at different depths, in the second", ax=right)
 right.plot(*landed.T, "o-", color="cyan", markeredgecolor="black")
-for depth, at in zip(depths, landed, strict=True):
-    right.annotate(f"{depth:.0f} m", at.tolist(), (3, 6), textcoords="offset points", color="white")
+for k, (depth, at) in enumerate(zip(depths, landed, strict=True)):  # in turn above and below the line
+    shift = (-8, 8) if k % 2 else (-8, -17)
+    right.annotate(f"{depth:.0f} m", at.tolist(), shift, textcoords="offset points", color="white")
 right.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
 
 # %% [markdown]
@@ -105,11 +106,13 @@ print(f"determinant of F: {F.det():.0e}; singular values: {torch.linalg.svdvals(
 fig = plt.figure(figsize=(8, 6.5), layout="constrained")
 ax = fig.add_subplot(projection="3d")
 plot_points_3d(seen.X, color=seen.color.double(), s=3, ax=ax)
-plot_cameras(poses, camera, names=["first", "second"], size=0.9, ax=ax)
+plot_cameras(poses, camera, size=0.9, ax=ax)
 ax.add_collection3d(Poly3DCollection([torch.stack((*centres, apex)).numpy()], color="cyan", alpha=0.25))
 for a, b, color in ((centres[0], apex, "tab:blue"), (centres[1], apex, "tab:blue"), (*centres, "tab:green")):
     ax.plot(*torch.stack((a, b)).T, color=color, linewidth=2)
 ax.scatter(*apex[:, None], color="black", s=25)
+for name, centre in zip(("first", "second"), centres, strict=True):
+    ax.text(*(centre - torch.tensor([0.0, 0.2, 0.9])), name, color="tab:red", ha="center")
 ax.view_init(elev=30, azim=-25)
 ax.set_title("The epipolar plane (cyan), both rays (blue), the baseline (green)")
 

@@ -205,8 +205,8 @@ axes[1].legend()
 # Three ways to score a model. ``InlierCount`` counts, as in 1981: all within the threshold are equal, so with a wide
 # threshold a crooked model is as good as a straight one. ``Msac`` adds squared distances, cut at the threshold: nearer is
 # better. ``Magsac`` averages over all noise levels up to the threshold, and suffers least from one that is too wide. For
-# the median pair a threshold sixteen times too wide costs little: the final fit finds the noise by itself. The worst pair
-# tells the scores apart.
+# the median pair even a threshold of 16 pixels costs ``Msac`` and ``Magsac`` little: the final fit finds the noise by
+# itself. The worst pair tells the scores apart.
 #
 # **Exercise 2.** Try a threshold of 0.1, a fifth of the noise. How many samples are drawn, and why? *Hint:* by what count
 # is the share of right matches judged?

@@ -167,7 +167,7 @@ for ax, baseline in zip(axes, (2.0, 0.2), strict=True):
         xlabel="error in x",
         title=f"baseline {baseline}, {math.degrees(angle):.1f} degrees of parallax",
         xlim=(-0.15, 0.15),
-        ylim=(-2.7, 2.7),
+        ylim=(-4, 4),
     )
 axes[0].set_ylabel("error in y, which is depth")
 axes[0].legend()
@@ -271,7 +271,7 @@ for name, C in (("image noise", from_noise), ("uncertain rotation", from_turn), 
     print(f"{name:18s}: deviation in depth {C[1, 1].sqrt():.4f}")
 
 # %% [markdown]
-# A tenth of a degree matters as much as some pixels: a rig must be calibrated better than its image points are measured.
+# A tenth of a degree costs more than a pixel of noise: a rig must be calibrated better than its image points are measured.
 #
 # Turned round: calibrate with a stick
 # ------------------------------------

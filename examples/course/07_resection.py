@@ -349,7 +349,7 @@ generator = torch.Generator().manual_seed(99)
 views = random_views(4, 1, generator=generator)
 exact = project_points(views.matrix(), X)
 images = draw(exact, generator)
-fig, axes = plt.subplots(1, 2, figsize=(10, 4.8), layout="constrained", sharex=True, sharey=True)
+fig, axes = plt.subplots(1, 2, figsize=(10, 5.4), layout="compressed", sharex=True, sharey=True)
 for ax, (name, (_, _, network)) in zip(axes, runs.items(), strict=True):
     with torch.no_grad():
         points = network(images)[0, 0] * FOCAL

@@ -179,6 +179,7 @@ fig = plt.figure(figsize=(11, 5), layout="constrained")
 for k, (points, title) in enumerate(((projective, "one projective reconstruction"), (aligned, "after autocalibration"))):
     ax = plot_points_3d(points, color=colors, ax=fig.add_subplot(1, 2, k + 1, projection="3d"), s=14)
     ax.view_init(elev=28, azim=38)
+    ax.locator_params(nbins=5)
     ax.set_title(title)
 
 # %% [markdown]

@@ -54,7 +54,7 @@ NOISE = 0.5
 # An image line *l* and the camera's centre span a *plane of sight*, :math:`\pi = P^T l`. Two views give two planes, and
 # they meet in the line of space. The ends of the segments play no part: each view may see another piece. A line has four
 # degrees of freedom; the library writes it as a Pluecker vector :math:`(d, m)`, the direction and the moment :math:`m = p
-# \times d` of any of its points *p*. Both are perpendicular, :math:`d^T m = 0`.
+# \times d` of any of its points *p*. They are perpendicular, :math:`d^T m = 0`.
 
 # %%
 ends = torch.tensor([[-1.0, 0.3, 0.2], [1.2, -0.4, 0.5]])
@@ -82,7 +82,9 @@ deviation = NOISE * flat.end_covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean(
 good = flat.status == Status.OK
 fig, ax = plt.subplots(figsize=(7, 4), layout="constrained")
 ax.semilogy(tilt[good], deviation[good], "o-")
-ax.set(xlabel="angle between the line and the plane of the two centres, degrees", ylabel="standard deviation of its ends")
+ax.set(xlabel="angle between the line and the baseline, degrees", ylabel="standard deviation of its ends, units")
+ax.set_yticks([0.02, 0.05, 0.1, 0.2], ["0.02", "0.05", "0.1", "0.2"])
+ax.minorticks_off()
 ax.set_title("Two views: a line along the baseline cannot be placed")
 print(f"along the baseline: {Status(int(flat.status[0])).name}, because of {LineFault(int(flat.fault[0])).name}")
 print(f"at {tilt[good][0]:.0f} degrees known to {deviation[good][0]:.3f}, upright to {deviation[-1]:.4f}")
@@ -93,7 +95,8 @@ print(f"at {tilt[good][0]:.0f} degrees known to {deviation[good][0]:.3f}, uprigh
 # A circle is seen as an ellipse
 # ------------------------------
 # A conic is a symmetric matrix, :math:`x^T C x = 0`, and cameras take conics to conics. But the centre of the circle is
-# *not* seen in the centre of the ellipse. Calibration with round targets is wrong by just this, if one forgets it.
+# *not* seen in the centre of the ellipse. Calibration with round targets is wrong by just this, if one forgets it. The same
+# holds for an ellipse of space, and that is what we take: it has two axes to find, not one.
 
 # %%
 turn = torch.arange(60) * (2 * math.pi / 60)
@@ -151,7 +154,7 @@ print(f"{Status(int(found.status)).name}: {len(X)} of 60 samples found, {gap(X).
 
 fig = plt.figure(figsize=(8, 6), layout="constrained")
 ax = fig.add_subplot(projection="3d")
-plot_lines_3d(line.ends, color="tab:green", ax=ax, linewidths=2)
+plot_lines_3d(line.ends, color="tab:green", ax=ax, linewidths=2, label="the line")
 disc = ellipse.model
 rim = disc.centre + torch.stack((turn.cos(), turn.sin()), -1) @ disc.axes[0, :2]
 ax.plot(*torch.cat((rim, rim[:1])).T, color="tab:orange", label="the ellipse")
