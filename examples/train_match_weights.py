@@ -4,7 +4,7 @@ Two thirds of the matches are wrong. A match comes with what a matcher knows: th
 second-best candidate, and the score of the detector, which tells nothing. A small network turns them into logits, by which
 `soft_ransac` draws samples; the loss is how badly the hypotheses it then chooses fit exact points that took no part. Its
 expectation has a derivative although drawing and choosing have none. The trained logits then guide `soft_ransac` with few
-hypotheses, and `ransac` as its `scores`.
+hypotheses, and `ransac` as its `quality`.
 
     python examples/train_match_weights.py
 """
