@@ -185,10 +185,9 @@ for name, E in (("K' F K", E_from_F), ("estimated as E", essential.model)):
     motion = pose_from_essential(E, d1, d2, good).pose
     turn = math.degrees(rotation_angle(motion.R @ second_from_first.R.mT))
     cosine = torch.dot(motion.t, second_from_first.t) / second_from_first.t.norm() / motion.t.norm()
-    print(
-        f"{name:15s} singular values {(singular / singular[0]).numpy().round(4)}, "
-        f"rotation off by {turn:.2f} degrees, direction of t by {math.degrees(math.acos(cosine.clamp(-1, 1))):.2f} degrees"
-    )
+    direction = math.degrees(math.acos(cosine.clamp(-1, 1)))
+    print(f"{name:15s} singular values {(singular / singular[0]).numpy().round(4)}")
+    print(f"{name:15s} rotation off by {turn:.2f} degrees, direction of t by {direction:.2f} degrees")
 
 # %% [markdown]
 # :math:`K^T F K` is nearly an essential matrix, its singular values tell how nearly. The direct estimate is one exactly:

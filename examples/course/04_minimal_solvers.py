@@ -147,9 +147,9 @@ for ax, name, found, true in (
 #
 # Gradients, the easy way
 # -----------------------
-# PyTorch differentiates ``torch.linalg.svd``, ``eigh`` and so on. So why not differentiate the solver by hand as it stands?
-# The Newton step at its end lets the derivative of the root through. Two common ways to the null space, and as the
-# reference the library's derivative, which the next section explains:
+# PyTorch differentiates ``torch.linalg.svd``, ``torch.linalg.eigh`` and so on. So why not differentiate the solver by hand
+# as it stands? The Newton step at its end lets the derivative of the root through. Two common ways to the null space, and
+# as the reference the library's derivative, which the next section explains:
 
 
 # %%
@@ -179,8 +179,8 @@ for name, null in (("svd", null_by_svd), ("eigh", null_by_eigh)):
     )
 
 # %% [markdown]
-# Through ``svd`` the gradient is zero: *A* has seven rows, and PyTorch gives no derivative to the right singular vectors
-# beyond the seventh. Nothing warns; a network behind it would just not learn. Through ``eigh`` the two eigenvalues are
+# Through the *svd* the gradient is zero: *A* has seven rows, and PyTorch gives no derivative to the right singular vectors
+# beyond the seventh. Nothing warns; a network behind it would just not learn. Through *eigh* the two eigenvalues are
 # zero, equal up to rounding. The derivative of an eigenvector divides by their difference; zero over zero happens to cancel
 # in *F*, but digits are lost, and where the eigenvalues come out equal it is NaN. The null *space* is well determined, its
 # basis is not. The way out is not to look inside the solver at all.
@@ -281,8 +281,8 @@ left.legend()
 number = found.valid.sum(-1)
 change = (number[1:] != number[:-1]).nonzero()[:, 0]
 beside = torch.maximum(speed[change], speed[change + 1]).amax(-1)
-print(f"problem {i}: three solutions along {100 * (number == 3).double().mean():.0f} % of the path; |dF/ds| is typically "
-      f"{speed[found.valid].median():.1f}, beside the folds {beside.min():.0f} to {beside.max():.0f}")  # fmt: skip
+print(f"problem {i}: three solutions along {100 * (number == 3).double().mean():.0f} % of the path")
+print(f"|dF/ds| is typically {speed[found.valid].median():.1f}, beside the folds {beside.min():.0f} to {beside.max():.0f}")
 
 # %% [markdown]
 # Slots are filled in no order, so the colours change along a curve. In empty slots the derivative is exactly zero, and

@@ -187,11 +187,12 @@ def errors_with(threshold: float, **options: object) -> torch.Tensor:
     return sampson_distance(F, y1, y2).median(-1).values
 
 
-print(f"{'threshold':12s}" + "".join(f"{threshold:15g}" for threshold in thresholds))
+print("errors in pixels, of the median pair and of the worst one")
+print(f"{'threshold':11s}" + "".join(f"{threshold:13g}" for threshold in thresholds))
 for scoring in (InlierCount(), Msac(), Magsac()):
     name = type(scoring).__name__
     errors = torch.stack([errors_with(threshold, scoring=scoring) for threshold in thresholds])
-    print(f"{name:12s}" + "".join(f"{error.median():8.2f} {error.max():6.2f}" for error in errors) + "   median, worst pair")
+    print(f"{name:11s}" + "".join(f"{error.median():8.2f}{error.max():5.2f}" for error in errors))
     axes[1].loglog(thresholds, errors.amax(1), "o-", label=f"{name}, worst pair")
     axes[1].loglog(thresholds, errors.median(1).values, "--", color=axes[1].lines[-1].get_color())
 axes[1].axvline(NOISE, color="black", linestyle=":", label="noise")
@@ -270,10 +271,8 @@ at = (visible[0] & ~wrong[0]).nonzero()[0]
 distance = sampson_distance(found.model, y1[0, at], y2[0, at])  # how far F is off, at one exact match
 (gradient,) = torch.autograd.grad(distance.sum(), x1)
 influence = gradient.norm(dim=-1)
-print(
-    f"a match that moves by a pixel moves F there by: {influence[found.inliers].mean():.4f} px if it is an inlier, on average"
-)
-print(f"                                                {influence[~found.inliers].max():.4f} px if it is not")
+print(f"a match moves by a pixel, and F there by {influence[found.inliers].mean():.4f} px if it is an inlier, on average,")
+print(f"                                         {influence[~found.inliers].max():.4f} px if it is not")
 
 # %% [markdown]
 # What autograd adds, second: learning whom to trust

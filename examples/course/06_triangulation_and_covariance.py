@@ -159,8 +159,9 @@ for ax, baseline in zip(axes, (2.0, 0.2), strict=True):
     angle = float(once.parallax[0])
     print(
         f"baseline {baseline:.1f}: rays meet at {math.degrees(angle):4.1f} degrees; deviation across {deviation[0]:.4f}, "
-        f"in depth {deviation[1]:.4f}; {inside:.1%} of the trials inside the 95 % ellipsoid"
+        f"in depth {deviation[1]:.4f}"
     )
+    print(f"baseline {baseline:.1f}: the 95 % ellipsoid holds {inside:.1%} of the trials")
     ax.plot(*off[:, :2].T, ".", markersize=3, alpha=0.5, label="1000 trials")
     ax.plot(*ellipse(C[:2, :2], 0.95).T, color="tab:red", label="95 % by the covariance")
     ax.set(

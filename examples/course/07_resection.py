@@ -53,8 +53,8 @@ for P in found.model[found.valid]:
 # twelve numbers where a pose has six.
 #
 # ``camera_pnp`` minimises angles between rays and points, over poses and nothing else. Which difference does it make? We make
-# the object flatter and flatter. A plane is harmless to a pose, but for the DLT it is degenerate: then *A* has four null
-# vectors.
+# the object flatter and flatter. A plane determines a pose as well, but for the DLT it is degenerate: then *A* has four
+# null vectors.
 
 
 # %%
@@ -201,11 +201,11 @@ def examine(layer: Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]], 
     return float(error.detach()[good].median()), float(size.median()), *shares
 
 
-print("points off by      layer   pose error   gradient per pixel   steps that help   object behind")
+print("points off        layer  pose error   gradient/px  steps that help  object behind")
 for noise in (2.0, 20.0, 80.0):
     for name, layer in (("camera_pnp", layer_pnp), ("DLT", layer_dlt)):
         error, slope, helped, behind = examine(layer, noise)
-        print(f"{noise:10.0f} px {name:>12s} {error:12.3f} {slope:20.4f} {helped:17.0%} {behind:15.0%}")
+        print(f"{noise:7.0f} px {name:>12s} {error:11.3f} {slope:13.4f} {helped:16.0%} {behind:14.0%}")
 
 # %% [markdown]
 # Both derivatives are right: nearly every small step helps. With two pixels both layers serve. With eighty, which is what
@@ -321,10 +321,8 @@ for (name, (errors, distances, _)), color in zip(runs.items(), ("tab:blue", "tab
     for ax in axes:
         ax.plot([], [], color=color, label=f"through {name}")
     first, last = errors[0].median(), errors[-10:].mean(0)
-    print(
-        f"{name:10s}: pose error {first:5.2f} at first, {last.min():.2f} to {last.max():.2f} at the end; "
-        f"landmarks {distances[0].median():.0f} px off at first, {distances[-1].median():.0f} at the end"
-    )
+    print(f"{name:10s}: pose error {first:5.2f} at first, {last.min():.2f} to {last.max():.2f} at the end")
+    print(f"{name:10s}: landmarks {distances[0].median():.0f} px off at first, {distances[-1].median():.0f} at the end")
 axes[0].set(xlabel="step", ylabel="median pose error, units of the object", title="What the loss asks for")
 axes[1].set(xlabel="step", ylabel="mean distance of landmarks, pixels", title="What it was never told")
 axes[0].legend()

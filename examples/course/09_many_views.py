@@ -78,7 +78,7 @@ for bend in bends:
 fig, ax = plt.subplots(figsize=(7, 4), layout="constrained")
 for name, values in errors.items():
     ax.loglog(bends, values, "o-", label=name)
-    print(f"{name:18s}: {values[0]:7.2f} px off with centres nearly on a line, {values[-1]:.2f} px in a wide triangle")
+    print(f"{name:18s}: {values[0]:7.2f} px off, centres nearly on a line; {values[-1]:.2f} px in a triangle")
 ax.set(xlabel="bend of the path (units)", ylabel="median error in view 3, pixels", title="Transfer to the third view")
 ax.legend()
 
@@ -220,14 +220,12 @@ for name, poses in motions.items():
     motion = result.motion
     kinds = [kind for kind in ("translation", "one_axis", "collinear", "orbital") if bool(getattr(motion, kind))]
     status, f, relative = Status(int(result.status)).name, result.K[0, 0, 0], result.deviation[0, 0]
-    print(
-        f"{name:16s}: explained to {error:.2f} px; {status:12s} f = {f:5.0f} +- {relative:.1%}; {', '.join(kinds) or 'general'}"
-    )
+    print(f"{name:15s}: {error:.2f} px {status:10s} f = {f:4.0f} +- {relative:.1%}; {', '.join(kinds) or 'general'}")
 
 # %% [markdown]
-# The projective reconstruction is as good in all cases. Sideways, the focal length cannot be had, and ``status`` says
-# ``DEGENERATE``: the numbers are not to be used, whatever they look like. Carried around, the motion is recognised, and the
-# answer is given with the deviation that it has: some times that of the general motion.
+# The projective reconstruction is as good in all cases: its error comes first. Sideways, the focal length cannot be had,
+# and ``status`` says ``DEGENERATE``: the numbers are not to be used, whatever they look like. Carried around, the motion is
+# recognised, and the answer is given with the deviation that it has: some times that of the general motion.
 #
 # How far from critical is far enough? Let the camera turn while it moves sideways, by a random rotation of a given size in
 # each view, and ask ``bundle_covariance`` how well the focal length is known.
