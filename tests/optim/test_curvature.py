@@ -4,9 +4,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchsfm.bundle import bundle_adjust
 from torchsfm.optim import Block, Cauchy, Huber, RigidMotion, Term, schur, sparse_levenberg_marquardt
 from torchsfm.optim.layout import lay_out
+from torchsfm.optim.schur import Elimination
 from torchsfm.optim.terms import term_cost, term_residual
+from torchsfm.simulation import random_bundle_problem
 
 F64 = torch.float64
 
@@ -116,3 +119,20 @@ def test_no_derivative_along_a_flat_valley(eliminate: str | None, generator: tor
     for name, k in ((name, k) for name in ("p", "q") for k in range(2)):
         (slope,) = torch.autograd.grad(found.x[name][:, k].sum(), first, retain_graph=True)
         torch.testing.assert_close(slope, share[name][:, None] * across[:, k], rtol=1e-4, atol=1e-5)
+
+
+def test_newton_steps_are_for_the_last_digits(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a thousandth of the cost may be left, their Hessian costs more than they gain."""
+    problems = [random_bundle_problem(6, 40, 160, noise=1.0, outliers=0.2, generator=generator).problem for _ in range(4)]
+    calls = []
+    curve = Elimination.curve
+    monkeypatch.setattr(Elimination, "curve", lambda *a, **k: calls.append(1) or curve(*a, **k))
+
+    def newton_steps(tolerance: float) -> int:
+        calls.clear()
+        for problem in problems:
+            bundle_adjust(problem, free=("focal", "k1"), loss=Cauchy(1.0), tolerance=tolerance, max_iterations=60)
+        return len(calls)
+
+    assert newton_steps(1e-3) == 0
+    assert newton_steps(1e-9) > 0
