@@ -31,10 +31,8 @@ def bend(projection: Projection, *rows: Tensor, by: Float[Tensor, "2 m"], wanted
         The upper triangle; below it is nothing of account.
     """
     *motions, camera, point, _ = rows
-    free = len(projection.free) if wanted[-2] else 0
-    widths = [6 * w for w in wanted[:-2]] + [free, 3 * wanted[-1]]
-    ends = torch.tensor(widths).cumsum(0).tolist()
-    columns = [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
+    columns = columns_of(projection, wanted, 3)
+    free = columns[-2].stop - columns[-2].start
     places: list[Tensor] = []
     for motion in motions:
         places.append(transform(motion, places[-1].mT if places else point))
@@ -44,7 +42,7 @@ def bend(projection: Projection, *rows: Tensor, by: Float[Tensor, "2 m"], wanted
         slopes.append(_turned_back(motion, slopes[-1]))
     in_world, *slopes = slopes[::-1]
 
-    H = slope.new_zeros((ends[-1], ends[-1], len(point)))
+    H = slope.new_zeros((columns[-1].stop, columns[-1].stop, len(point)))
     unit = torch.eye(3, dtype=H.dtype, device=H.device)[:, :, None].expand(3, 3, len(point))
     inner: list[tuple[slice, Tensor]] = []  # how the point in the frame reached moves with steps before it
     if wanted[-1]:
@@ -57,32 +55,69 @@ def bend(projection: Projection, *rows: Tensor, by: Float[Tensor, "2 m"], wanted
             continue
         turn = slice(own.start, own.start + 3)
         for other, moved in inner:
-            across = torch.empty_like(moved)  # w x d counts d x s
-            turn_slopes(moved, s[None, :, None].expand(1, *moved.shape), across[None])
-            if other.start > own.start:
-                H[turn, other] += across
-            else:
-                H[other, turn] += across.transpose(0, 1)
-        _turned_twice(place, s, H[turn, turn])
-        inner += [(turn, _turns(place)), (slice(turn.stop, own.stop), unit)]
+            add_block(H, turn, other, crossed(moved, s))
+        turned_twice(place, s, H[turn, turn])
+        inner += [(turn, turns(place)), (slice(turn.stop, own.stop), unit)]
+    add_lens(projection, H, inner, lens, columns[-2], camera)
+    return H
+
+
+def columns_of(projection: Projection, wanted: Sequence[bool], last: int) -> list[slice]:
+    """Where the steps of motions, of free numbers of cameras, and of what they show, which has `last`, are in H."""
+    free = len(projection.free) if wanted[-2] else 0
+    widths = [6 * w for w in wanted[:-2]] + [free, last * wanted[-1]]
+    ends = torch.tensor(widths).cumsum(0).tolist()
+    return [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
+
+
+def add_block(H: Float[Tensor, "n n m"], first: slice, second: slice, block: Float[Tensor, "a b m"]) -> None:
+    """Add a block to the upper triangle."""
+    if first.start <= second.start:
+        H[first, second] += block
+    else:
+        H[second, first] += block.transpose(0, 1)
+
+
+def add_lens(
+    projection: Projection,
+    H: Float[Tensor, "n n m"],
+    inner: Sequence[tuple[slice, Tensor]],
+    lens: Float[Tensor, "c c m"],
+    own: slice,
+    camera: Float[Tensor, "m k"],
+) -> None:
+    """Add what the lens bends.
+
+    Args:
+        projection: From the camera's frame to pixels.
+        H: What to add to, in the upper triangle.
+        inner: The steps by which the three numbers of the camera's frame move, and how.
+        lens: Second derivatives by these three, then by free numbers of the camera.
+        own: The steps of the latter.
+        camera: The cameras, whose switches count.
+    """
     for other, moved in inner:
         bent = product(lens[:3, :3], moved)
         for some, also in inner:
             if some.start <= other.start:
                 H[some, other] += product(also.transpose(0, 1), bent)
-    if free:
-        own, switches = columns[-2], camera.mT[-free:] if projection.switched else None
-        mixed, twice = lens[3:, :3], lens[3:, 3:]
-        if switches is not None:
-            mixed, twice = mixed * switches[:, None], twice * switches * switches[:, None]
-        H[own, own] += twice
-        for other, moved in inner:
-            crossed = product(mixed, moved)
-            if other.start > own.start:
-                H[own, other] += crossed
-            else:
-                H[other, own] += crossed.transpose(0, 1)
-    return H
+    free = own.stop - own.start
+    if not free:
+        return
+    mixed, twice = lens[3:, :3], lens[3:, 3:]
+    if projection.switched:
+        switches = camera.mT[-free:]
+        mixed, twice = mixed * switches[:, None], twice * switches * switches[:, None]
+    H[own, own] += twice
+    for other, moved in inner:
+        add_block(H, own, other, product(mixed, moved))
+
+
+def crossed(moved: Float[Tensor, "3 n m"], s: Float[Tensor, "3 m"]) -> Float[Tensor, "3 n m"]:
+    """Each direction d cross the slopes s: what a turn w counts by `s . (w x d)`."""
+    across = torch.empty_like(moved)
+    turn_slopes(moved, s[None, :, None].expand(1, *moved.shape), across[None])
+    return across
 
 
 def _of_lens(
@@ -110,14 +145,14 @@ def _along_ray(point: Float[Tensor, "m 6"], s: Float[Tensor, "3 m"], H: Float[Te
     H.add_(s[:, None] * unit).add_(unit[:, None] * s)
 
 
-def _turned_twice(place: Float[Tensor, "3 m"], s: Float[Tensor, "3 m"], H: Float[Tensor, "3 3 m"]) -> None:
+def turned_twice(place: Float[Tensor, "3 m"], s: Float[Tensor, "3 m"], H: Float[Tensor, "3 3 m"]) -> None:
     """Add the second derivatives of `s . exp(w) Y` by w."""
     half = s / 2
     H.addcmul_(half[:, None], place).addcmul_(place[:, None], half)
     H.diagonal().sub_((s * place).sum(0)[:, None])
 
 
-def _turns(place: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
+def turns(place: Float[Tensor, "3 m"]) -> Float[Tensor, "3 3 m"]:
     """The derivatives of `w x Y`, a column for each coordinate of w."""
     x, y, z = place
     none = torch.zeros_like(x)

@@ -1,6 +1,6 @@
 """Lines of space in a bundle: the two ends of each segment against the image of its line, whatever the lens makes of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_index, check_options, check_tensors
+from torchsfm.bundle.line_bending import bend_line
 from torchsfm.bundle.line_images import curve_distances, expand_distances, into_frames, nearest_on_curve, pull_back
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.structure import Sight
@@ -16,7 +17,6 @@ from torchsfm.geometry.intrinsic_parameters import row_from_camera
 from torchsfm.geometry.line_manifold import line_tangents, world_covariance
 from torchsfm.linalg import cross
 from torchsfm.optim import Block, Loss, Term
-from torchsfm.optim.terms import Reduction
 
 _TINY = 1e-300
 
@@ -115,20 +115,14 @@ class BundleLines:
                 _line_slopes(line, by_d, by_m, by_line)
             return nearest.distance.mT
 
-        free = list(sight.projection.free)
-
-        def numbers(*rows: Tensor) -> Tensor:
-            *poses, camera, line = rows
-            return torch.cat((into_frames(line.mT, sight.motions(*poses))[-1][-1].mT, camera[:, free]), 1)
-
-        def expand(*rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        def second(*rows: Tensor, by: Tensor, wanted: Sequence[bool]) -> Tensor:
             *poses, camera, line, x, rays = rows
-            moment = into_frames(line.mT, sight.motions(*poses))[-1][-1]
-            r, J, H = expand_distances(sight.projection, camera.mT, moment, _ends_first(x), _ends_first(rays))
-            return r.mT, J.permute(2, 1, 0), H.permute(3, 2, 0, 1)
+            frames = into_frames(line.mT, sight.motions(*poses))
+            _, slope, lens = expand_distances(sight.projection, camera.mT, frames[-1][-1], _ends_first(x), _ends_first(rays))
+            return bend_line(sight.projection, line, frames, camera, (by * slope[:3]).sum(1), (by * lens).sum(2), wanted)
 
-        blocks, reduction = (*sight.blocks, self.block), Reduction(numbers, expand)
-        return Term(residual, blocks, index, (x, rays), self.loss, self.weights, linearize, reduction)
+        blocks = (*sight.blocks, self.block)
+        return Term(residual, blocks, index, (x, rays), self.loss, self.weights, linearize, second)
 
     def covariance(self, x: Tensor, C: Tensor) -> Tensor:
         """Covariances (l, 4, 4) of the steps of `Line3D` from the lines in the world; zero for lines through its origin."""

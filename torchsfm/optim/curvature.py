@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.optim.loss import Loss
-from torchsfm.optim.terms import Block, Reduction, Term, arguments_of, gather, term_cost
+from torchsfm.optim.terms import Block, Term, arguments_of, gather, term_cost
 
 PIECE = 16384
 """Residuals whose second derivatives are written out at once: more take more memory and no less time."""
@@ -55,10 +55,7 @@ def curvature(
                 # Fixed variables, whichever they are, share a slot: they stay.
                 same = index == index[some][slot]
                 moved.append(torch.where(same, each.mT.index_select(1, slot), a.mT).mT)
-        if term.reduction is None:
-            cost = term_cost(term, term.residual(*moved, *term.data))
-        else:
-            cost = _expanded_cost(term, term.reduction, arguments, moved)
+        cost = term_cost(term, term.residual(*moved, *term.data))
         by_kept, by_point = second_rows(cost, kept, [*kept, *point]), second_rows(cost, point, point)
     size = sum(len(k) for k in kept)
     empty = x[term.blocks[0]].new_zeros
@@ -124,23 +121,6 @@ def product(A: Float[Tensor, "a b #m"], B: Float[Tensor, "b c #m"]) -> Float[Ten
     for b in range(1, A.shape[1]):
         C.addcmul_(A[:, b, None], B[b])
     return C
-
-
-def _expanded_cost(term: Term, reduction: Reduction, still: Sequence[Tensor], moved: Sequence[Tensor]) -> Tensor:
-    """The cost to second order about where the variables are, but for a constant."""
-    with torch.no_grad():
-        r, J, H = reduction.expand(*still, *term.data)
-        slope = (r[..., None] * J).sum(1)
-        A = J.mT @ J + (r[..., None, None] * H).sum(1)
-        if term.loss is not None:
-            first, second = _loss_slopes(term.loss, r.square().sum(-1))
-            A = first[:, None, None] * A + 2 * second[:, None, None] * (slope[:, :, None] * slope[:, None])
-            slope = first[:, None] * slope
-        if term.weights is not None:
-            slope, A = term.weights[:, None] * slope, term.weights[:, None, None] * A
-        start = reduction.numbers(*still)
-    step = reduction.numbers(*moved) - start
-    return (step * (slope + 0.5 * (A @ step[..., None])[..., 0])).sum()
 
 
 def _loss_slopes(loss: Loss, square: Float[Tensor, "m"]) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:

@@ -53,19 +53,6 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Reduction:
-    """Few numbers on which residuals depend, and their derivatives by these, first and second, written out.
-
-    Those by the variables follow by the chain rule.
-    """
-
-    numbers: Callable[..., Tensor]
-    """Of `(*variables)`: the numbers (m, p)."""
-    expand: Callable[..., tuple[Tensor, Tensor, Tensor]]
-    """Of `(*variables, *data)`: residuals (m, d), their first derivatives (m, d, p) by the numbers, and second (m, d, p, p)."""
-
-
-@dataclass(frozen=True)
 class Term:
     """Residuals of one kind.
 
@@ -108,11 +95,11 @@ class Term:
     """Weight of each residual's squared norm; 0 leaves it out, whatever number it has."""
     linearize: Callable[..., Tensor] | None = None
     """Residuals and hand-written derivatives; automatic ones if not given."""
-    reduction: Reduction | None = None
-    """For second derivatives, which are those of `residual` if neither it nor `bend` is given."""
     bend: Callable[..., Tensor] | None = None
-    """Hand-written second derivatives, where `linearize` is given: `(*variables, *data, by=, wanted=)` gives those of `by .
-    residual`, `by (d, m)`, by the steps of the wanted variables, `(n, n, m)`; below the diagonal is nothing of account."""
+    """Hand-written second derivatives, where `linearize` is given; automatic ones if not.
+
+    `(*variables, *data, by=, wanted=)` gives those of `by . residual`, `by (d, m)`, by the steps of the wanted variables,
+    `(n, n, m)`; below the diagonal is nothing of account."""
 
     def select(self, rows: Tensor) -> "Term":
         """The term with some of its residuals."""
