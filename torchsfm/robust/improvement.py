@@ -15,9 +15,9 @@ from torchsfm._types import tensor_map
 from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
-from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally, step_within
+from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally
 from torchsfm.robust.models import cast, join, put, select, take_slots
-from torchsfm.robust.noise import SCALE_DATA, scale_of_noise
+from torchsfm.robust.noise import scale_of_noise
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.samplers import Among, Sampler, draws
 from torchsfm.robust.scoring import Msac, Scoring, limits
@@ -225,9 +225,7 @@ def refine_finally(fine: Problems, coarse: Problems, best: Best) -> tuple[Best, 
     parts = []
     for part in _portions(_all(fine), fine.width, _NUMBERS):
         some, rough, old = fine.take(part), coarse.take(part), best.take(part)
-        near = [d[:, :SCALE_DATA] for d in rough.data]
-        model, reach = scale_of_noise(rough.estimator, old.model, near, old.limit, rough.counts[:, :SCALE_DATA])
-        model, _ = step_within(rough.estimator, model, rough.data, reach * old.limit, rough.counts)
+        model, reach = scale_of_noise(rough.estimator, old.model, rough.data, old.limit, rough.counts)
         old = cast(old, torch.float64)
         found, squared, won = _refined(some, old, cast(model, torch.float64), reach.double() * old.limit)
         lost = (~won & old.solved).nonzero()[:, 0]

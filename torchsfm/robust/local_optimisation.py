@@ -18,7 +18,7 @@ LOCAL_STEPS = (9.0, 3.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 LOCAL_DATA = 256
 """How many data local optimisation looks at."""
-_LAST_STEPS, _MOST_STEPS = 3, 64
+_LAST_STEPS, _MOST_STEPS = 2, 64
 """Steps of the final refinement at least, and at most for what still moves."""
 _STILL, _SMALL = 1e-5, 1e-10
 """What moves by less than so much of the first step, or of the model, is still."""
@@ -93,7 +93,10 @@ def optimise_fully(
         start, least = select(good, model, start), torch.where(good, loss, least)
         entries = _entries(moved)
         before, step = step, entries - _entries(model)
-        done = good & (_length(step) <= torch.maximum(_STILL * first, _SMALL * _length(entries)))
+        length, shrunk = _length(step), _length(before)
+        # As a geometric series, steps that shrink have length^2 / (shrunk - length) before them.
+        most = torch.maximum(_STILL * first, _SMALL * _length(entries))
+        done = good & (length * length <= most * torch.maximum(length, shrunk - length))
         drawn = _drawn_out(moved, last, step, before) if count > 2 else moved
         last, model = moved, select(good, drawn, start)
         if count < _LAST_STEPS or not (bool(done.any()) or count == _MOST_STEPS):

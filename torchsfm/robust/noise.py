@@ -17,10 +17,8 @@ from torchsfm.robust.models import select, zip_map
 M = TypeVar("M")
 T = TypeVar("T")
 
-SCALE_DATA = 512
-"""The estimation of the scale looks at so many data at most."""
-_GLANCE = 128
-"""And its first guess at so many."""
+_GLANCE, _SCALE_DATA = 128, 512
+"""How many data the first guess at the scale looks at, and each round but the last."""
 _LEAST, _MOST = 1e-6, 16.0
 """Smallest and largest variance of the noise in units of the squared threshold."""
 _VARIANCES, _SHARE_STEPS = tuple(4.0**i for i in range(-4, 3)), 2
@@ -71,9 +69,11 @@ def scale_of_noise(
 
         found, own = _widened(take(estimator), take(model), take(data), limit[rows], counts[rows])
         model, noise = zip_map(lambda t, new: t.index_copy(0, rows, new), (model, noise), (found, own))
-    for _ in range(_SCALE_STEPS):
-        model, noise, reach = _scale_step(estimator, model, data, limit, counts, noise)
-    return model, torch.exp2((4 * reach.log2()).round() / 4)
+    some, counted = [d[:, :_SCALE_DATA] for d in data], counts[:, :_SCALE_DATA]
+    for _ in range(_SCALE_STEPS - 1):
+        model, noise, _ = _scale_step(estimator, model, some, limit, counted, noise)
+    model, _, reach = _scale_step(estimator, model, data, limit, counts, noise)
+    return model, reach
 
 
 def _widened(
@@ -131,6 +131,7 @@ def _scale_step(
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, _MOST)
         odds, reach = _odds_and_reach(total, number, variance, k)
+        reach = torch.exp2((4 * reach.log2()).round() / 4)
         found = reach[:, 0]
         return falling((ratio / reach).clamp(max=1), counts, k)
 
