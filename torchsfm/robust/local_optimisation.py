@@ -14,7 +14,7 @@ from torchsfm.robust.scoring import Scoring
 
 M = TypeVar("M")
 
-LOCAL_STEPS = (9.0, 3.0, 1.0)
+LOCAL_STEPS = (9.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
 LOCAL_DATA = 256
 """How many data local optimisation looks at."""
