@@ -53,7 +53,7 @@ def line_and_plane_distances(
 
 
 def least_number_off(
-    X: Float[Tensor, "*batch n d"], present: Bool[Tensor, "*batch n"], tolerance: Float[Tensor, "*#batch #n"]
+    X: Float[Tensor, "*#batch n d"], present: Bool[Tensor, "*#batch n"], tolerance: Float[Tensor, "*#batch #n"]
 ) -> Int[Tensor, "*batch"]:
     """How many points are farther than a tolerance from any hyperplane whatsoever (in two dimensions, line), at least.
 

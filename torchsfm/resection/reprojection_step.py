@@ -102,6 +102,11 @@ class _Views:
         return squared_in_front(r[:, :, :1], r[:, :, 1:], depth, z).view(*self.batch, self.n)
 
 
+def _scalar_product(a: Float[Tensor, "b k 2 n"], b: Float[Tensor, "b k 2 n"]) -> Float[Tensor, "b k 1 n"]:
+    (a0, a1), (b0, b1) = a.chunk(2, 2), b.chunk(2, 2)
+    return torch.addcmul(a0 * b0, a1, b1)
+
+
 def _flat(t: Tensor, batch: torch.Size, rows: int, columns: int) -> Tensor:
     """One batch dimension."""
     if t.shape[:-2] != batch:
@@ -124,20 +129,17 @@ def normal_equations(
     """(J'CJ | -J'Wr) over the entries of P in float64 with the weights W and C of `weigh`, and the batch that b stands for."""
     views = _Views(P, x, X)
     X, n, k = views.X, views.n, views.k
-    products = torch.cat((X, X[:, 1:], X[:, 2:], X, views.one()), 1)
+    a, b, c = X.chunk(3, 1)
+    products = torch.cat((X * a, X[:, 1:] * b, c * c, X, views.one()), 1)
     points = products[:, 6:]
     image, depth, z, inverse = views.project(points)
-    products[:, :3].mul_(X[:, :1])
-    products[:, 3:5].mul_(X[:, 1:2])
-    products[:, 5:6].mul_(X[:, 2:])
     uv = image * inverse
     r = views.x - uv
     slope, curvature = weigh(views.squares(r, depth, z))
-    slope, curvature = (_flat(w, views.batch, 1, n) for w in (slope[..., None, :], curvature[..., None, :]))
-    c, slope = curvature.view_as(z) * (inverse * inverse), slope.view_as(z) * inverse * r
-    first, u, v = c * uv, uv[:, :, :1], uv[:, :, 1:]
-    both = torch.addcmul(first[:, :, :1] * u, first[:, :, 1:], v)
-    last = torch.addcmul(slope[:, :, :1] * u, slope[:, :, 1:], v)
+    slope, curvature = (w.expand(*views.batch, n).reshape(z.shape) for w in (slope, curvature))
+    c, slope = curvature * (inverse * inverse), slope * inverse * r
+    first = c * uv
+    both, last = _scalar_product(first, uv), _scalar_product(slope, uv)
     matrix = torch.bmm(torch.cat((c, first, both), 2).view(X.shape[0], 4 * k, n), products.mT)
     vector = torch.bmm(torch.cat((slope, last), 2).view(X.shape[0], 3 * k, n), points.mT)
     moments = torch.cat((matrix.view(X.shape[0] * k, 40), vector.view(X.shape[0] * k, 12)), 1).double()
@@ -172,7 +174,7 @@ def moved_pose(
     turn = torch.baddbmm(W, W, W, alpha=0.5) / torch.baddbmm(_ONE.on(w.device), w.mT, w, alpha=0.25)
     moved = torch.baddbmm(pose, pose[..., :3], torch.cat((turn, step[:, 3:6]), -1))
     R = moved[..., :3]
-    mended = torch.baddbmm(R, R, R.mT @ R, beta=1.5, alpha=-0.5)
+    mended = torch.baddbmm(R, R, torch.bmm(R.mT, R), beta=1.5, alpha=-0.5)
     return torch.cat((mended, moved[..., 3:]), -1).view(*batch, 3, 4)
 
 

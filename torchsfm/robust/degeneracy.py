@@ -12,9 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.robust.estimator import Diagnosed
-from torchsfm.robust.hypotheses import squared_residual
 from torchsfm.robust.problems import Problems
-from torchsfm.robust.stopping import around_model
 
 GLANCE = 128
 """How many data to look at: any part of packed data is spread over all."""
@@ -53,8 +51,8 @@ def glance(
     problems: Problems,
     model: Any,
     limit: Float[Tensor, "p"],
-    inliers: Bool[Tensor, "p _"] | None = None,
-    chance: Float[Tensor, "p"] | None = None,
+    inliers: Bool[Tensor, "p _"],
+    chance: Float[Tensor, "p"],
 ) -> Bool[Tensor, "p"]:
     """Where the inliers may be degenerate, judging by a part of the data.
 
@@ -62,16 +60,11 @@ def glance(
         problems: The problems, of an estimator that is `Diagnosed`.
         model: The model of each.
         limit: Squared thresholds.
-        inliers: Which of the first data or more agree with the model; found out if not given.
-        chance: How many data agree by chance; estimated if not given.
+        inliers: Which of the first data or more agree with the model.
+        chance: How many data agree by chance.
     """
     estimator: Any = problems.estimator
     data = [d[:, :GLANCE] for d in problems.data]
-    if inliers is None or chance is None:
-        inside = problems.inside[:, :GLANCE]
-        ratio = squared_residual(estimator, model, *data) / limit[:, None]
-        inliers = (ratio < 1) & inside
-        chance = around_model(ratio, inside, estimator.codimension) * (problems.width / inside.shape[-1])
     found: Bool[Tensor, "p"] = estimator.may_be_degenerate(
         model, *data, inliers=inliers[:, :GLANCE], threshold=limit.sqrt(), chance=chance
     )

@@ -16,7 +16,7 @@ from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
 from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally
-from torchsfm.robust.models import cast, join, put, select, take_slots
+from torchsfm.robust.models import cast, join, put, select, take_slots, zip_map
 from torchsfm.robust.noise import scale_of_noise
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.samplers import Among, Sampler, draws
@@ -64,6 +64,8 @@ class Best:
         solved: Whether any sample had a solution.
         iterations: Number of samples drawn.
         reach: The squared distance at which weights vanish in the loss of which the model is the optimum; 0 if it is none.
+        near: Which data were within the threshold of the best model of the search.
+        chance: How many of them chance explains.
         doubtful: Where a glance left open that the inliers are degenerate; None where nobody looked.
     """
 
@@ -75,15 +77,17 @@ class Best:
     solved: Bool[Tensor, "p"]
     iterations: Int[Tensor, "p"]
     reach: Float[Tensor, "p"]
+    near: Bool[Tensor, "p width"]
+    chance: Float[Tensor, "p"]
     doubtful: Bool[Tensor, "p"] | None = None
 
     @classmethod
     def none(cls, coarse: Problems) -> "Best":
         """Before the first sample."""
-        infinite = torch.full_like(coarse.limit, torch.inf)
-        drawn = torch.zeros_like(coarse.count)
+        infinite, zero = torch.full_like(coarse.limit, torch.inf), torch.zeros_like(coarse.limit)
+        drawn, near = torch.zeros_like(coarse.count), torch.zeros_like(coarse.inside)
         return cls(
-            None, infinite, coarse.limit, infinite.double(), infinite, drawn > 0, drawn, torch.zeros_like(infinite)
+            None, infinite, coarse.limit, infinite.double(), infinite, drawn > 0, drawn, zero, near, zero
         )  # fmt: skip
 
     def take(self, index: Tensor) -> "Best":
@@ -148,8 +152,9 @@ def _optimised(
     candidate_loss = scoring.cost(squared, coarse.limit, counts, k)
     new_loss, winner = candidate_loss.min(-1, keepdim=True)
     new_limit = limits(scoring, new_loss, coarse.limit, coarse.count, size, k)[:, 0]
-    squared = squared.gather(1, winner[..., None].expand(-1, -1, squared.shape[-1]))[:, 0]
-    needed = options.sampler.needed(coarse, (squared < new_limit[:, None]) & coarse.inside, options.confidence)
+    ratio = squared.gather(1, winner[..., None].expand(-1, -1, squared.shape[-1]))[:, 0] / new_limit[:, None]
+    near = (ratio < 1) & coarse.inside
+    needed = options.sampler.needed(coarse, near, options.confidence)
     if not scoring.needs_threshold:
         # The threshold follows from the model: a wrong one would vouch for itself. The median takes half of the data for good.
         needed = torch.maximum(needed, draws(torch.full_like(needed, 0.5**size), options.confidence))
@@ -162,6 +167,8 @@ def _optimised(
         limit=torch.where(gain, new_limit, old.limit),
         needed=torch.where(gain, needed, old.needed),
         minimal_loss=torch.minimum(loss[:, 0], old.minimal_loss),
+        near=torch.where(gain[:, None], near, old.near),
+        chance=torch.where(gain, around_model(ratio, coarse.inside, k), old.chance),
     )
     return put(best, index, new)
 
@@ -172,16 +179,10 @@ def search_inliers(fine: Problems, coarse: Problems, best: Best, options: Option
     Each of these is in or out: the cost has many minima, and a model straight from a sample leads to one of them. The effort
     is a part of that of the search.
     """
-    near, number = [], []
-    for part in _portions(_all(fine), fine.width, _NUMBERS):
-        some, old = coarse.take(part), best.take(part)
-        ratio = squared_residual(some.estimator, old.model, *some.data) / old.limit[:, None]
-        near.append((ratio < 1) & some.inside)
-        chance = around_model(ratio, some.inside, fine.estimator.codimension)
-        worthwhile = (chance >= _AMBIGUOUS) & (near[-1].sum(-1) > 2 * fine.estimator.sample_size)
-        number.append(torch.where(worthwhile & old.solved, old.iterations // _PER_START, 0))
+    worthwhile = best.solved & (best.chance >= _AMBIGUOUS) & (best.near.sum(-1) > 2 * fine.estimator.sample_size)
+    number = torch.where(worthwhile, best.iterations // _PER_START, 0)
     sizes = torch.tensor((0, *STARTS), device=fine.count.device)
-    starts, sampler = sizes[torch.searchsorted(sizes, torch.cat(number), right=True) - 1], Among(torch.cat(near))
+    starts, sampler = sizes[torch.searchsorted(sizes, number, right=True) - 1], Among(best.near)
     for size in sorted(set(starts.tolist()) - {0}):
         drawn = max(4 * size, 64)
         for part in _portions((starts == size).nonzero()[:, 0], drawn, _SAMPLES):
@@ -197,7 +198,7 @@ def try_alternatives(fine: Problems, coarse: Problems, best: Best, options: Opti
     """Look for better models in places that samples do not lead to, where the estimator knows such."""
     if not isinstance(fine.estimator, WithAlternatives):
         return best
-    doubtful = glance(fine, cast(best.model, torch.float64), best.limit.double())
+    doubtful = glance(fine, cast(best.model, torch.float64), best.limit.double(), best.near, best.chance)
     best = replace(best, doubtful=doubtful)
     for part in _portions(doubtful.nonzero()[:, 0], fine.width, _NUMBERS):
         some = fine.take(part)
@@ -241,10 +242,11 @@ def _refined(some: Problems, old: Best, model: Any, reach: Float[Tensor, "g"]) -
     """The optima of losses near some models where they are better than the old ones, the distances, and where that is."""
     model, settled = optimise_fully(some.estimator, model, some.data, reach, some.counts)
     # In double precision too: in single precision what is far may look near by a threshold below rounding.
-    squared, before = (squared_residual(some.estimator, m, *some.data) for m in (model, old.model))
+    wide, models = some.spread(), zip_map(lambda *pair: torch.stack(pair, 1), model, old.model)
+    both = squared_residual(wide.estimator, models, *wide.data)
     # A threshold smaller than the noise would blame the better model.
     judged = torch.maximum(old.limit, reach)
-    score, k, both, counts = Msac(), some.estimator.codimension, torch.stack((squared, before), 1), some.counts
+    score, k, counts = Msac(), some.estimator.codimension, some.counts
     loss, before_loss = score.cost(both, judged, counts, k).unbind(1)
     # One datum more or less proves nothing: it may sit at the edge of what is in front of the cameras.
     won = (loss <= 1.02 * before_loss + 1) & (loss < torch.inf)
@@ -260,7 +262,7 @@ def _refined(some: Problems, old: Best, model: Any, reach: Float[Tensor, "g"]) -
         loss=torch.where(won, loss, before_loss),
         reach=torch.where(won & settled, reach, 0),
     )
-    return found, torch.where(won[:, None], squared, before), won
+    return found, torch.where(won[:, None], both[:, 0], both[:, 1]), won
 
 
 def _portions(index: Int[Tensor, "g"], each: int, budget: int) -> Iterator[Int[Tensor, "_"]]:

@@ -20,8 +20,8 @@ LOCAL_DATA = 256
 """How many data local optimisation looks at."""
 _LAST_STEPS, _MOST_STEPS = 2, 64
 """Steps of the final refinement at least, and at most for what still moves."""
-_STILL, _SMALL = 1e-5, 1e-10
-"""What moves by less than so much of the first step, or of the model, is still."""
+_STILL, _SMALL = 1e-7, 1e-10
+"""What has no more than so much of the first step, or of the model, before it is still."""
 _ROUNDING, _DRAWN = 1e-6, 9.0
 """The share by which a step may raise the loss, as it leaves its manifold a little; how many times its length a step is drawn
 out at most."""
@@ -55,7 +55,7 @@ def optimise_locally(
 def _local_step(
     estimator: Estimator[M], model: M, data: Sequence[Tensor], limit: Tensor, counts: Tensor, scoring: Scoring
 ) -> M:
-    scale = (1 / limit)[..., None]
+    scale = limit.reciprocal()[..., None]
 
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
         weights = scoring.weigh(squared * scale, estimator.codimension) * counts[:, None]

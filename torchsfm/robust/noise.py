@@ -152,7 +152,7 @@ def _odds_and_reach(total: Tensor, number: Tensor, variance: Tensor, k: int) -> 
     # Never less than half an outlier between two and six thresholds.
     outlying = (total - number).clamp(min=0) / _WINDOW**k + 0.5 / (6**k - 2**k)
     odds = outlying / (number * _peak(k) * variance ** (-k / 2))
-    return odds, (1.6 * k * variance * (1 / odds).clamp(min=3).log()).clamp(max=_WINDOW**2)
+    return odds, (-1.6 * k * variance * odds.clamp(max=1 / 3).log()).clamp(max=_WINDOW**2)
 
 
 def _peak(k: int) -> float:

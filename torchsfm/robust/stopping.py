@@ -26,8 +26,8 @@ def rounds(
         most: Most samples of a problem.
     """
     drawn, needed = drawn[active], needed[active]
-    rest = torch.maximum(needed, torch.full_like(needed, least)).clamp(max=most) - drawn
-    wanted = torch.minimum(rest, (3 * drawn).clamp(min=least).to(rest.dtype))
+    rest = needed.clamp(min=least, max=most) - drawn
+    wanted = torch.minimum(rest, (3 * drawn).clamp(min=least))
     sizes = torch.tensor(ROUNDS, device=drawn.device)
     size = sizes[torch.searchsorted(sizes, wanted.ceil().long()).clamp(max=len(ROUNDS) - 1)]
     size = torch.where(rest > 0, size, 0)

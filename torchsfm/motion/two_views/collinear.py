@@ -23,8 +23,8 @@ def collinear_suspected(
     chance: Float[Tensor, "p"],
 ) -> Bool[Tensor, "p"]:
     """Whether that may be so, at a glance: where it is so, this says yes."""
-    few = [~more_than_chance(least_number_off(view, inliers, 2 * threshold[..., None]), chance, _FREE) for view in x]
-    return torch.stack(few).any(0)
+    off = least_number_off(torch.stack(list(x)), inliers, 2 * threshold[..., None]).amin(0)
+    return ~more_than_chance(off, chance, _FREE)
 
 
 def collinear(

@@ -66,7 +66,7 @@ def _unit(d: Tensor) -> tuple[Tensor, Tensor]:
     d = d.contiguous()
     largest = d.abs().amax((0, 1))
     # Squares neither overflow nor vanish.
-    d = d * (1 / largest)
+    d = d * largest.reciprocal()
     square = combine_rows(d, d)
     return d.mul_(square.rsqrt()), (largest < torch.inf) & (square > 0).all(0)
 

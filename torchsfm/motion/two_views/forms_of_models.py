@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.motion.two_views.epipolar_fit import product
+
 Term = tuple[int, int, int, int, float]
 """The form, the monomial, two of the numbers of a model and a factor."""
 ONE = -1
@@ -55,7 +57,7 @@ class Forms:
         one, other = (first * second * factors).chunk(2, -2)
         # (monomial, form and model): the forms come out one after the other.
         coefficients = (one + other).reshape(*rows.shape[:-2], len(self.monomials), self.count * rows.shape[-1])
-        values: Tensor = coefficients.mT @ z
+        values = product(coefficients.mT, z)
         return values.reshape(*values.shape[:-2], self.count, rows.shape[-1], values.shape[-1]).unbind(-3)
 
 

@@ -118,7 +118,7 @@ def _around_the_first(x: Tensor) -> tuple[Tensor, Sequence[Tensor], Tensor]:
     centre = x[:, 0]
     moved = x[:, 1:] - centre[:, None]
     size = moved.abs().amax((0, 1))
-    return moved * (1 / size), centre.unbind(0), size
+    return moved * size.reciprocal(), centre.unbind(0), size
 
 
 def _cofactors(f: Sequence[Tensor]) -> list[Tensor]:
