@@ -256,7 +256,11 @@ def _merge(values: list[Tensor], indices: list[Tensor]) -> tuple[Tensor, Tensor]
 
 
 def _products(a: Tensor, b: Tensor, bound: int) -> Tensor:
-    """Products of rows of bytes, none of which is larger than the bound."""
+    """Products of rows of bytes, none of which is larger than the bound.
+
+    PyTorch has no public product of bytes that is exact. Its private one makes matching 4 to 5 times as fast; a version without
+    it gives the same answers, more slowly.
+    """
     if a.device.type == "cpu" and _bytes_pay():
         return torch._int_mm(a, b.mT)
     exact = torch.float32 if bound < _WHOLE else torch.float64

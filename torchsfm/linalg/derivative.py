@@ -9,6 +9,4 @@ def followed(x: Tensor) -> bool:
     """Whether reverse- or forward-mode differentiation follows x right now."""
     if torch.is_grad_enabled() and x.requires_grad:
         return True
-    # Inside a level of forward mode only; unpacking outside one is an error in some versions.
-    inside = getattr(forward_ad, "_current_level", -1) >= 0
-    return inside and forward_ad.unpack_dual(x).tangent is not None  # type: ignore[no-untyped-call]
+    return forward_ad.unpack_dual(x).tangent is not None  # type: ignore[no-untyped-call]

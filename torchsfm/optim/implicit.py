@@ -30,9 +30,6 @@ def wants_derivative(*inputs: Tensor) -> bool:
     """
     if torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
         return True
-    # Inside a level of forward mode only; unpacking outside one is an error in some versions.
-    if getattr(forward_ad, "_current_level", -1) < 0:
-        return False
     return any(forward_ad.unpack_dual(x).tangent is not None for x in inputs)  # type: ignore[no-untyped-call]
 
 
@@ -149,8 +146,15 @@ def attach_optimum(
 
 
 def _transformed() -> bool:
-    """Whether `torch.func` is at work. Only then are its own functions used: their first call imports dynamo, for a second."""
-    return bool(torch._C._functorch.peek_interpreter_stack() is not None)
+    """Whether `torch.func` is at work. Only then are its own functions used: their first call imports dynamo, for a second.
+
+    It forbids to say of a tensor that it wants a gradient.
+    """
+    try:
+        torch.empty(0).requires_grad_()
+    except RuntimeError:
+        return True
+    return False
 
 
 def _gradient(function: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
