@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.real_roots import real_root_list
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
@@ -25,7 +26,9 @@ _CUBICS += [(0, 1, 2), (0, 1, 3)]
 _CUBICS += [(0, 3, 3), (0, 2, 3), (0, 2, 2), (1, 3, 3), (1, 2, 3), (1, 2, 2), (3, 3, 3), (2, 3, 3), (2, 2, 3), (2, 2, 2)]
 _SQUARES = [(0, 0), (1, 1), (2, 2), (3, 3), (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 # Number of the monomial that a quadratic one times a variable is, by variable.
-_TIMES = [[_CUBICS.index((*sorted((*q, v)),)) for q in _SQUARES] for v in range(4)]
+_TIMES = [Constant(torch.tensor([_CUBICS.index((*sorted((*q, v)),)) for q in _SQUARES])) for v in range(4)]
+# Where the quadratic monomials are in a square of pairs.
+_PLACES = Constant(torch.tensor([4 * i + j for i, j in _SQUARES]))
 # A quaternion's product with any other: orthonormal.
 _TURN = [[0.5, -0.1, 0.7, -0.5], [0.1, 0.5, 0.5, 0.7], [-0.7, -0.5, 0.5, 0.1], [0.5, -0.7, -0.1, 0.5]]
 _INDEPENDENT = 1e-13
@@ -138,7 +141,7 @@ def constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"]
     left, right = round_[:, None, :, 0], round_[None, :, :, 1]
     C = (left[:, :, 1:4] * right[:, :, 2:]).addcmul_(left[:, :, 2:], right[:, :, 1:4], value=-1)
     C += C.transpose(0, 1).clone()
-    C = torch.stack([C[i, j] for i, j in _SQUARES])
+    C = C.flatten(0, 1).index_select(0, _PLACES.on(C.device))
     C[:4] *= 0.5
     # Times E, one variable after the other.
     out = E.new_zeros(20, 10, batch)
@@ -148,7 +151,7 @@ def constraints(E: Float[Tensor, "4 3 3 batch"]) -> Float[Tensor, "20 10 batch"]
     for times, matrix in zip(_TIMES, E.unbind(0), strict=True):
         _sum_of_products(squares, matrix.unbind(0), trace)
         _sum_of_products(cofactors, matrix[:, 0].unbind(0), determinant)
-        out.index_add_(0, torch.tensor(times, device=E.device), part)
+        out.index_add_(0, times.on(E.device), part)
     return out
 
 
@@ -162,7 +165,7 @@ def eliminate(A: Float[Tensor, "20 10 batch"]) -> Float[Tensor, "10 6 batch"]:
         A[k + 1 :, k + 1 :].addcmul_(A[k + 1 :, k, None], A[k, k + 1 :] / A[k, k], value=-1)
     for k in range(9, 4, -1):
         A[10:, 4:k].addcmul_(A[10:, k, None], A[k, 4:k] / A[k, k], value=-1)
-    return A[10:, 4:] / torch.stack([A[k, k] for k in range(4, 10)])
+    return A[10:, 4:] / A[4:10, 4:].diagonal().mT
 
 
 def back_substitute(rows: Float[Tensor, "13 3 roots"], s: Tensor, c: Tensor) -> Float[Tensor, "4 roots"]:

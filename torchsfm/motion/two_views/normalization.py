@@ -51,13 +51,14 @@ def common_scale_of_views(
     batch = broadcast_shapes(*(size.shape for size in sizes))
     centre = torch.stack([middle.expand(*batch, 2) for middle in middles], -2)
     size = torch.stack([own.expand(batch) for own in sizes]).amax(0)
-    s = 1 / size[..., None, None]
+    scale = size.reciprocal()
+    s = scale[..., None, None]
     similarities = s.new_zeros(*centre.shape[:-1], 3, 3)
     similarities.diagonal(dim1=-2, dim2=-1)[..., :2] = s
     similarities[..., :2, 2] = -s * centre
     similarities[..., 2, 2] = 1
     points = [moved_and_scaled(view, c, size) for view, c in zip(x, centre.unbind(-2), strict=True)]
-    return points, list(similarities.unbind(-3)), 1 / size
+    return points, list(similarities.unbind(-3)), scale
 
 
 def largest_positive(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -78,15 +78,15 @@ def _forms(
     along2 = apply_rows(t[..., None, :], h2)[..., 0, :]
     p0, p1, p2 = p.unbind(-2)
     q0, q1, q2 = h2.unbind(-2)
-    cosine = torch.addcmul(torch.addcmul(p0 * q0, p1, q1), p2, q2)
-    c0, c1, c2 = (torch.addcmul(a * d, b, c, value=-1) for a, d, b, c in ((p1, q2, p2, q1), (p2, q0, p0, q2), (p0, q1, p1, q0)))
-    t0, t1, t2 = t[..., None].unbind(-2)
-    e = torch.addcmul(torch.addcmul(t0 * c0, t1, c1), t2, c2)
+    cosine = (p * h2).sum(-2)
+    pairs = ((p1, q2, p2, q1), (p2, q0, p0, q2), (p0, q1, p1, q0))
+    normal = torch.stack([torch.addcmul(a * d, b, c, value=-1) for a, d, b, c in pairs], -2)
+    e = (t[..., None] * normal).sum(-2)
     square = e * e
     size = torch.addcmul(torch.addcmul(2 * square, along1, along1), along2, along2)
     size = (2 - size).clamp(min=_TINY)
-    least = torch.minimum(along2 * cosine - along1, along2 - along1 * cosine)
-    return square / size, -slack[..., None] - least, e, size, along1, along2, cosine, p, torch.stack((c0, c1, c2), -2)
+    missed = torch.maximum(torch.addcmul(along1, along2, cosine, value=-1), along1 * cosine - along2)
+    return square / size, missed - slack[..., None], e, size, along1, along2, cosine, p, normal
 
 
 def step_equations(
