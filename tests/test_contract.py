@@ -300,6 +300,25 @@ def test_ransac_follows_the_dtype(kind: type, generator: torch.Generator) -> Non
     assert (scene.error(result.model.double(), scene.model) < 0.1).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_default_dtype_changes_nothing(kind: type, dtype: torch.dtype, generator: torch.Generator) -> None:
+    scene, data, _ = spoiled(kind, (3,), 100, generator)
+    estimator, data = tensor_map(lambda t: t.to(dtype), (scene.estimator, data))
+
+    def found() -> Any:
+        return ransac(estimator, *data, threshold=3 * scene.noise, scoring_dtype=torch.float32, generator=seeded(3))
+
+    usual, by_default = found(), torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        other = found()
+    finally:
+        torch.set_default_dtype(by_default)
+    assert other.model.dtype == usual.model.dtype == dtype
+    assert torch.equal(other.model, usual.model)
+    assert torch.equal(other.support, usual.support)
+
+
 def test_ragged_extremes_in_one_batch(kind: type, generator: torch.Generator) -> None:
     scene, data, _ = spoiled(kind, (8,), 400, generator)
     data = [d.clone() for d in data]

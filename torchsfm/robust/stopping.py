@@ -46,7 +46,8 @@ def around_model(
         codimension: The number of dimensions across the model.
     """
     between = ((ratio > 4) & (ratio < 36)).mul(counts).sum(-1)
-    expected: Tensor = (between + 0.5) / (6**codimension - 2**codimension)
+    # Cast: a count plus a half would have the default dtype, whatever the data's.
+    expected: Tensor = (between.to(ratio.dtype) + 0.5) / (6**codimension - 2**codimension)
     return expected
 
 
