@@ -1,20 +1,27 @@
 """Targets tried at random in several processes, with a limit on the time of each trial, and the table of what went wrong.
 
-A trial is made by its target's name and a seed alone, so that each failure can be seen again by itself.
+A trial is made by its target's name and a seed alone, so that each failure can be seen again by itself. Its time is that of the
+processor, for on a busy machine the clock says nothing.
 """
 
 import argparse
 import importlib
 import multiprocessing
+import signal
 import sys
 import time
 import traceback
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, NamedTuple
+
+ASLEEP = 20
+"""After so many times its limit by the clock a trial hangs though it takes no time of the processor."""
+CHECKPOINT = 60.0
+"""Seconds after which what is known is written down."""
 
 
 class Trial(NamedTuple):
@@ -76,37 +83,43 @@ def targets_of(modules: Sequence[str]) -> dict[str, Target]:
     return {target.name: target for module in modules for target in importlib.import_module(module).load()}
 
 
-def _work(modules: Sequence[str], names: list[str], first: int, step: int, pipe: Connection) -> None:
-    """Try the targets by turns; tell before and after each trial.
+def _work(modules: Sequence[str], known: dict[str, Tally], first: int, step: int, limit: float, pipe: Connection) -> None:
+    """Try the targets by turns; tell before and after each trial, which ends the process if it takes too long.
 
-    Next is the one of which inputs times seconds so far are least: slow ones get fewer inputs, fast ones less time.
+    Next is the one of which inputs times seconds so far are least, those of workers before it too: slow ones get fewer inputs,
+    fast ones less time. A trial counts as one input at least, or one that never finds anything to try would be next for ever.
     """
     import torch
 
     torch.set_num_threads(1)
     targets = targets_of(modules)
-    spent, inputs = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0)
-    seeds = dict.fromkeys(names, first)
+    spent, inputs = ({name: one(tally) for name, tally in known.items()} for one in (lambda t: t.seconds, lambda t: t.inputs))
+    timed = hasattr(signal, "setitimer")
+    seeds = dict.fromkeys(known, first)
     while True:
-        name = min(names, key=lambda name: (1 + inputs[name]) * spent[name])
+        name = min(known, key=lambda name: (1 + inputs[name]) * spent[name])
         seed = seeds[name]
         seeds[name] += step
         pipe.send((name, seed, None, 0.0))
-        start = time.perf_counter()
+        if timed:
+            signal.setitimer(signal.ITIMER_PROF, limit)  # SIGPROF ends the process also within one long call
+        start = time.process_time()
         trial = attempt(targets[name], seed)
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
+        if timed:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
         spent[name] += seconds
-        inputs[name] += trial.inputs
+        inputs[name] += max(trial.inputs, 1)
         pipe.send((name, seed, trial, seconds))
 
 
 class _Worker:
     """A process, and what it is at."""
 
-    def __init__(self, modules: Sequence[str], names: list[str], first: int, step: int) -> None:
+    def __init__(self, modules: Sequence[str], known: dict[str, Tally], first: int, step: int, limit: float) -> None:
         self.pipe, other = multiprocessing.Pipe()
         context: Any = multiprocessing.get_context("spawn")
-        self.process = context.Process(target=_work, args=(modules, names, first, step, other), daemon=True)
+        self.process = context.Process(target=_work, args=(modules, known, first, step, limit, other), daemon=True)
         self.process.start()
         other.close()
         self.at: tuple[str, int] | None = None
@@ -128,6 +141,7 @@ def run(
     inputs: int | None,
     seconds: float | None,
     limit: float,
+    checkpoint: Callable[[dict[str, Tally]], object] = lambda tallies: None,
 ) -> dict[str, Tally]:
     """Try the targets of these names until there were enough inputs or the time is over.
 
@@ -138,11 +152,13 @@ def run(
         seed: The first seed of every target.
         inputs: After how many bad inputs to stop.
         seconds: After what time to stop.
-        limit: The seconds after which a trial counts as hanging; its process is killed, and another goes on.
+        limit: The seconds of the processor after which a trial counts as hanging; its process is killed, and another goes on.
+        checkpoint: Called now and then with what is known.
     """
-    tallies: dict[str, Tally] = defaultdict(Tally)
-    crew = [_Worker(modules, names, seed + i, workers) for i in range(workers)]
+    tallies = {name: Tally() for name in names}
+    crew = [_Worker(modules, tallies, seed + i, workers, limit) for i in range(workers)]
     start, total, restarts = time.perf_counter(), 0, 0
+    written = start
     try:
         while (inputs is None or total < inputs) and (seconds is None or time.perf_counter() - start < seconds):
             for ready in wait([worker.pipe for worker in crew], timeout=1.0):
@@ -159,15 +175,19 @@ def run(
             for i, worker in enumerate(crew):
                 took = time.perf_counter() - worker.since
                 dead = not worker.process.is_alive() and not worker.pipe.poll()
-                if worker.at is not None and (dead or took > limit):
+                if worker.at is not None and (dead or took > ASLEEP * limit):
                     name, at = worker.at
-                    what = f"crashed: exit code {worker.process.exitcode}" if dead else f"hung: more than {limit:.0f} s"
+                    crashed = dead and worker.process.exitcode != -getattr(signal, "SIGPROF", 0)
+                    what = f"crashed: exit code {worker.process.exitcode}" if crashed else f"hung: more than {limit:.0f} s"
                     tallies[name].add(at, Trial(1, (what,)), took)
                     worker.stop()
                     restarts += 1
-                    crew[i] = _Worker(modules, names, seed + i + 1_000_003 * restarts, workers)
+                    crew[i] = _Worker(modules, tallies, seed + i + 1_000_003 * restarts, workers, limit)
                 elif dead:
                     raise RuntimeError(f"a worker ended before its first trial, with exit code {worker.process.exitcode}")
+            if time.perf_counter() - written > CHECKPOINT:
+                written = time.perf_counter()
+                checkpoint(tallies)
     finally:
         for worker in crew:
             worker.stop()
@@ -201,10 +221,10 @@ def main(modules: Sequence[str], description: str | None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--rooms", nargs="*", help="rooms or formats; all by default")
-    parser.add_argument("--limit", type=float, default=60.0, help="seconds after which a trial hangs")
+    parser.add_argument("--limit", type=float, default=60.0, help="seconds of the processor after which a trial hangs")
     parser.add_argument("--only", help="try one target once, with this seed, and say what breaks")
     parser.add_argument("--list", action="store_true", help="names of the targets")
-    parser.add_argument("--out", type=Path, help="write the table here too")
+    parser.add_argument("--out", type=Path, help="write the table here too, each minute")
     options = parser.parse_args()
     targets = targets_of(modules)
     rooms = {name.partition(".")[0] for name in targets}
@@ -221,11 +241,16 @@ def main(modules: Sequence[str], description: str | None) -> None:
         print("\n".join(targets[options.only].attempt(options.seed).broken) or "nothing broken")
         return
     inputs = options.inputs if options.inputs or options.seconds else 100_000
+
+    def write(tallies: dict[str, Tally]) -> str:
+        text = report(tallies)
+        if options.out:
+            options.out.write_text(text + "\n")
+        return text
+
     tallies = run(
-        modules, names, workers=options.workers, seed=options.seed, inputs=inputs, seconds=options.seconds, limit=options.limit
-    )
-    text = report(tallies)
-    print(text)
-    if options.out:
-        options.out.write_text(text + "\n")
+        modules, names, workers=options.workers, seed=options.seed, inputs=inputs, seconds=options.seconds, limit=options.limit,
+        checkpoint=write,
+    )  # fmt: skip
+    print(write(tallies))
     sys.exit(any(tally.kinds for tally in tallies.values()))
