@@ -154,7 +154,7 @@ def dual_quadric_linear(
         weight = (w.sqrt() / scale)[..., None, None]
         equations = A * weight
         values, _ = svdvals(torch.nn.functional.pad(equations.flatten(-3, -2), (0, 0, 0, 10)))
-        noise = torch.maximum(values[..., -1] / (count * known - 9).clamp_min(1).sqrt(), rounding * values[..., 0])
+        noise = torch.maximum(values[..., -1] / (count * known - 9).clamp_min(1).to(w.dtype).sqrt(), rounding * values[..., 0])
         whole = equations
         if expected_focal is not None:
             whole = torch.cat((equations, noise[..., None, None, None] * prior * weight), -2)
@@ -224,7 +224,7 @@ def _jackknife(equations: Tensor, S: Tensor, q: Tensor, good: Tensor) -> Tensor:
 
     whole = focal(solved(normal / unit), S)
     told = torch.zeros_like(whole)
-    number = good.sum(-1)
+    number = good.sum(-1).to(whole.dtype)
     for left_out, each in ((outer.sum(-3), 1), (outer.flatten(-4, -3), known)):
         rest = focal(solved((normal[..., None, :, :] - left_out) / unit[..., None, :, :]), S[..., None, :, :, :])
         counted = good.repeat_interleave(each, -1)[..., None]

@@ -36,9 +36,7 @@ def expected_variation(
         present: 1 for views that take part.
     """
     information = torch.diag_embed(precision.square())
-    log_density = torch.where(precision > 0, precision, 1.0).log().sum(-1) - 0.5 * math.log(2 * math.pi) * (precision > 0).sum(
-        -1
-    )
+    log_density = (torch.where(precision > 0, precision / math.sqrt(2 * math.pi), 1.0)).log().sum(-1)
     columns = assumption.columns(present.shape[-1])
     number = present.sum(-1).clamp_min(1)
     for parameter in {p for p, view in columns if view is not None}:

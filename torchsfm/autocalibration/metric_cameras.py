@@ -43,5 +43,5 @@ def metric_cameras(ready: PreparedCameras, K: Tensor, p: Tensor) -> MetricCamera
     X = torch.where(finite[..., None], Y[..., :3], 0.0) / torch.where(finite, Y[..., 3], 1.0)[..., None]
     depth = (R @ X[:, None, :, :].mT)[..., 2, :] + t[..., 2:]
     front = (depth > 0) & ready.visible & finite[:, None]
-    in_front = front.sum((-2, -1)) / ready.visible.sum((-2, -1)).clamp_min(1)
-    return MetricCameras(R, t, X, torch.nan_to_num(ready.frame @ H), in_front.to(p.dtype))
+    in_front = front.sum((-2, -1)).to(p.dtype) / ready.visible.sum((-2, -1)).clamp_min(1)
+    return MetricCameras(R, t, X, torch.nan_to_num(ready.frame @ H), in_front)

@@ -90,5 +90,5 @@ def orient_projective(
         camera, point = torch.where(camera == 0, 1.0, camera), torch.where(point == 0, 1.0, point)
         agreed = ((vote * camera[..., None] * point[..., None, :]) > 0).sum((-2, -1))
         total = (vote != 0).sum((-2, -1))
-        consistent = torch.where(total > 0, agreed / total.clamp_min(1), 1.0).to(w.dtype)
+        consistent = torch.where(total > 0, agreed.to(w.dtype) / total.clamp_min(1), 1.0)
     return Orientation(P * camera[..., None, None], X * point[..., None], consistent)

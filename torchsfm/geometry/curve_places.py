@@ -45,7 +45,7 @@ class CurvePlaces:
 
     def nearest(self, place: Float[Tensor, "*batch m"], y: Float[Tensor, "*batch m d"], steps: int = 4) -> Tensor:
         """The places of the points nearest to `y` that are reached from given places without leaving the curve."""
-        longest = _LONGEST * self.number[..., None]
+        longest = _LONGEST * self.number[..., None].to(place.dtype)
         for _ in range(steps):
             x, first, second = self.at(place)
             away, speed = x - y, first.square().sum(-1)

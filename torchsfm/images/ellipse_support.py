@@ -98,7 +98,7 @@ def find_support(ellipses: Ellipse, image: Int[Tensor, " n"], edges: EdgeMap, re
     steps = (2 * math.pi * axes[:, 0]).ceil().long().clamp_min(16)
     of = torch.repeat_interleave(torch.arange(len(steps), device=steps.device), steps)
     rank = torch.arange(len(of), device=of.device) - (steps.cumsum(0) - steps)[of]
-    t = rank * (2 * math.pi / steps[of])
+    t = rank * (2 * math.pi / steps[of].to(axes.dtype))
     x = Ellipse(ellipses.centre[of], axes[of], ellipses.angle[of]).points(t[:, None])[:, 0]
     weight = ((axes[of, 0] * t.sin()).square() + (axes[of, 1] * t.cos()).square()).sqrt()
     inside = ((x >= _BORDER) & (x <= x.new_tensor([w, h]) - 1 - _BORDER)).all(-1)
@@ -164,5 +164,5 @@ def keep_the_best(rank: Int[Tensor, " n"], support: Support, edgels: int, most: 
         undecided = undecided & ~best
         taken[support.edgel[best[support.ellipse]]] = True
         lost = torch.zeros(n, dtype=torch.long, device=rank.device).index_add(0, support.ellipse, taken[support.edgel].long())
-        undecided &= lost <= most * size
+        undecided &= lost <= most * size.double()
     return kept

@@ -241,7 +241,7 @@ def _refined(
     for wrong, most in ((~support.inner[rows], 0.5), (moved[edgel], _CROWDED)):
         bent = torch.zeros_like(weights, dtype=torch.bool)
         bent[of, slot] = wrong
-        some = (bent & (weights > 0)).sum(-1, keepdim=True) < most * (weights > 0).sum(-1, keepdim=True)
+        some = (bent & (weights > 0)).sum(-1, keepdim=True) < most * (weights > 0).sum(-1, keepdim=True, dtype=weights.dtype)
         weights = torch.where(bent & some, 0.0, weights)
     near = weights
     for _ in range(_ROUNDS):

@@ -204,7 +204,9 @@ def track_sequence(
         if progress is not None:
             progress(number + 1)
     if follower is None:
-        return Tracks(torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long), torch.zeros(0, 2))
+        return Tracks(
+            torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long), torch.zeros(0, 2, dtype=torch.float32)
+        )
     return follower.tracks(min_length)
 
 
@@ -229,8 +231,8 @@ class _Follower:
         self.radius = window // 2
         self.gray = gray
         self.bytes = _bytes(gray).numpy()
-        self.x = torch.zeros(0, 2)
-        self.motion = torch.zeros(0, 2)
+        self.x = torch.zeros(0, 2, dtype=torch.float32)
+        self.motion = torch.zeros_like(self.x)
         self.track = torch.zeros(0, dtype=torch.long)
         self.template = cut_templates(gray, self.x, self.radius)
         self.begun = 0
@@ -262,7 +264,7 @@ class _Follower:
         wanted = self.max_points - len(self.x)
         if wanted <= 0:
             return
-        taken = torch.zeros(self.gray.shape)
+        taken = torch.zeros_like(self.gray)
         place = self.x.round().long()
         taken[place[:, 1].clamp(0, taken.shape[0] - 1), place[:, 0].clamp(0, taken.shape[1] - 1)] = 1
         free = box_maximum(taken, self.min_distance) == 0
@@ -302,7 +304,7 @@ def _there_and_back(
     height, width = first.shape
     inside = (x.isfinite() & start.isfinite()).all(-1) & (x >= 0).all(-1) & (x[:, 0] <= width - 1) & (x[:, 1] <= height - 1)
     index = inside.nonzero()[:, 0]
-    out, error = torch.where(x.isfinite(), x, 0.0).float(), torch.full(x.shape[:1], torch.inf)
+    out, error = torch.where(x.isfinite(), x, 0.0).float(), torch.full(x.shape[:1], torch.inf, dtype=torch.float32)
     if len(index) == 0:
         return out, error
     p1, p2 = (p.detach().to("cpu", torch.float32)[index.cpu()].numpy()[:, None] for p in (x, start))

@@ -106,7 +106,7 @@ def _pairs(point: Tensor, slots: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 def estimate_pairs(family: Family) -> float:
     """Seconds that a reduction pair by pair takes, about."""
-    count = torch.zeros(family.points, device=family.pieces[0].slots.device)
+    count = torch.zeros(family.points, dtype=torch.float64, device=family.pieces[0].slots.device)
     rows = 0
     for piece in family.pieces:
         if piece.coupled and piece.point is not None:

@@ -124,4 +124,4 @@ def _focals_of_graph(
 def _telling(graph: ViewGraph) -> Bool[Tensor, "q"]:
     """Pairs that determine F: neither a plane nor a rotation explains most of what they have in common."""
     several = graph.fundamental_inliers >= 2 * MIN_INLIERS
-    return several & (graph.homography_inliers < 0.7 * graph.fundamental_inliers)
+    return several & (graph.homography_inliers < 0.7 * graph.fundamental_inliers.double())

@@ -53,7 +53,7 @@ def starting_pairs(
     verdict = graph.verdicts(K, unknown_focal)
     free = ~mapping.registered[graph.pairs].any(-1)
     usable = free & ((verdict == Verdict.GENERAL) | (verdict == Verdict.PLANAR))
-    ratio = graph.homography_inliers / graph.fundamental_inliers.clamp(min=1)
+    ratio = graph.homography_inliers.double() / graph.fundamental_inliers.clamp(min=1)
     merit = graph.fundamental_inliers * (1.05 - ratio.clamp(max=1))
     order = torch.argsort(torch.where(usable, merit, -1.0), descending=True, stable=True)
     order = order[usable[order]][:candidates]

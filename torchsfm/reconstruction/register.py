@@ -91,7 +91,7 @@ def register_images(
         best_scale, K = scale[best], K_try[torch.arange(k), best]
     result = estimate_camera(x, X, K, threshold=threshold, mask=mask, generator=generator)
     count, inliers = mask.sum(-1), result.inliers.sum(-1)
-    good = (result.status == Status.OK) & (inliers >= MIN_INLIERS) & (inliers >= MIN_INLIER_RATIO * count)
+    good = (result.status == Status.OK) & (inliers >= MIN_INLIERS) & (inliers >= MIN_INLIER_RATIO * count.double())
     R, t, registered = mapping.poses.R.clone(), mapping.poses.t.clone(), mapping.registered.clone()
     accepted = images[good]
     R[accepted], t[accepted] = result.model[good][..., :3], result.model[good][..., 3]

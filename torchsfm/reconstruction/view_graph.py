@@ -112,7 +112,7 @@ class ViewGraph:
         focal length is a guess, equal at any focal length will do.
         """
         related = torch.maximum(self.fundamental_inliers, self.homography_inliers) >= MIN_INLIERS
-        flat = self.homography_inliers >= 0.8 * self.fundamental_inliers
+        flat = self.homography_inliers >= 0.8 * self.fundamental_inliers.double()
         scales = torch.logspace(-0.5, 0.5, 21, dtype=K.dtype)[:, None]
         scales = torch.where(unknown_focal, scales, 1.0)
         tried = K.repeat(len(scales), 1, 1, 1)

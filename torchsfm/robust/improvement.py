@@ -255,7 +255,7 @@ def _refined(some: Problems, old: Best, model: Any, reach: Float[Tensor, "g"]) -
     within, within_before = ((ratio < 1) * counts[:, None]).sum(-1).unbind(1)
     support, support_before = ((1 - ratio).clamp(min=0) * counts[:, None]).nan_to_num(0).sum(-1).unbind(1)
     chance = some.estimator.sample_size + _CHANCE * support_before.sqrt()
-    won &= (within >= _SUPPORT * within_before) & (support >= support_before - chance)
+    won &= (within >= _SUPPORT * within_before.to(loss.dtype)) & (support >= support_before - chance)
     found = replace(
         old,
         model=select(won, model, old.model),

@@ -176,7 +176,7 @@ def compact(usable: Bool[Tensor, "p n"], count: Int[Tensor, "p"], width: int) ->
     packed = torch.zeros(p, width + 1, dtype=torch.long, device=device)
     packed.scatter_(1, position, torch.arange(n, device=device).expand(p, n))
     # Among 40 consecutive integers one is coprime to any number below 10^12.
-    step = (count * 0.6180339887498949).long()[:, None] + torch.arange(40, device=device)
+    step = (count.double() * 0.6180339887498949).long()[:, None] + torch.arange(40, device=device)
     step = step.clamp(min=1)
     coprime = torch.gcd(step, count[:, None]) == 1
     step = step.gather(1, coprime.to(torch.int8).argmax(1, keepdim=True))

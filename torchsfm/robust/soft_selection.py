@@ -201,7 +201,7 @@ def soft_ransac(
     count = torch.sigmoid(sharpness * (1 - torch.where(near, ratio, _FAR)))
     support = torch.where(valid, (count * usable[:, None]).sum(-1).reshape(p, hypotheses, k), 0)
     # A softmax in which empty slots take no part.
-    number = usable.sum(-1).clamp(min=1)[:, None]
+    number = usable.sum(-1).clamp(min=1)[:, None].to(support.dtype)
     energy = torch.where(valid, support, -torch.inf).flatten(1) / (temperature * number)
     some = valid.flatten(1).any(-1, keepdim=True)
     probability = torch.where(some, torch.softmax(torch.where(some, energy, 0), -1), 0).reshape(support.shape)

@@ -87,4 +87,5 @@ def _board(X: Tensor, columns: int, rows: int, radius: float | None) -> Tensor:
         ink = inside & (X.floor().sum(-1).remainder(2) == 0)
     else:
         ink = torch.linalg.vector_norm(X - torch.minimum(X.round().clamp_min(0), last), dim=-1) < radius
-    return torch.where(paper, torch.where(ink, _INK, _PAPER), _ROOM).to(X.dtype)
+    grey = torch.full_like(X[..., 0], _PAPER).masked_fill(ink, _INK)
+    return grey.masked_fill(~paper, _ROOM)

@@ -123,7 +123,7 @@ def _normal(generator: torch.Generator | None, *shape: int) -> Tensor:
 def _path(count: int, generator: torch.Generator | None) -> Pose:
     """One unit forward from camera to camera, the heading a slow random walk, the view ahead with some sway."""
     turn = 0.02 * _normal(generator, count).cumsum(0)
-    heading = 0.3 * torch.sin(2 * math.pi * torch.arange(count) / 80) + turn
+    heading = 0.3 * torch.sin(2 * math.pi * torch.arange(count, dtype=torch.float64) / 80) + turn
     step = torch.stack((heading.cos(), heading.sin(), torch.zeros(count, dtype=torch.float64)), -1)
     centre = step.cumsum(0) + 0.05 * _normal(generator, count, 3)
     return look_at(centre, centre + step + 0.05 * _normal(generator, count, 3))

@@ -235,7 +235,7 @@ def _highest(T: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
     for _ in range(8):
         e2, e3 = _newton(slices, e2, e3, shifted=True)
     # The first start is the true one if there is no noise.
-    advantage = 1 + 1e-9 * (torch.arange(4, device=T.device) == 0)
+    advantage = 1 + 1e-9 * (torch.arange(4, device=T.device) == 0).to(T.dtype)
     e2, e3 = chosen((advantage * height(e2, e3)).argmax(-1, keepdim=True))
     return e2[..., 0, :], e3[..., 0, :]
 

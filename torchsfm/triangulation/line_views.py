@@ -147,7 +147,7 @@ def one_plane(views: LineViews) -> Tensor:
     away = away / line[..., None, :2].square().sum(-1).clamp_min(1e-300)
     square = torch.where(finite, views.w * away.mean(-1), 0.0).sum(-1)
     number = (views.used & finite).sum(-1)
-    return (square <= _NOISE**2 * number) & (views.used <= finite).all(-1)
+    return (square <= _NOISE**2 * number.to(square.dtype)) & (views.used <= finite).all(-1)
 
 
 def frame_of_line(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor]:

@@ -178,6 +178,6 @@ def _bridged(X: Float[Tensor, "p m 3"], measured: Bool[Tensor, "p m"]) -> Float[
     slots = torch.arange(m, device=X.device)
     before = torch.where(measured, slots, 0).cummax(-1).values
     after = torch.where(measured, slots, m - 1).flip(-1).cummin(-1).values.flip(-1)
-    t = ((slots - before) / (after - before).clamp(min=1)).to(X.dtype)[..., None]
+    t = ((slots - before).to(X.dtype) / (after - before).clamp(min=1))[..., None]
     place = torch.arange(len(X), device=X.device)[:, None]
     return torch.where(measured[..., None], X, X[place, before] * (1 - t) + X[place, after] * t)

@@ -133,7 +133,7 @@ def _between(plain: CurveDistances, x: Scene, bad: Bool[Tensor, "p c m"]) -> tup
     after = torch.where(good, ring, 4 * m).flip(-1).cummin(-1).values.flip(-1)[..., m : 2 * m]
     possible = bad & (before > -4 * m) & (after < 4 * m)
     before, after = torch.where(possible, before, slot), torch.where(possible, after, slot)
-    share = torch.where(possible, (slot - before) / (after - before).clamp(min=1), 0).to(x.u.dtype)[:, None]
+    share = torch.where(possible, (slot - before).to(x.u.dtype) / (after - before).clamp(min=1), 0)[:, None]
 
     def of(t: Tensor, index: Tensor) -> Tensor:
         return t.gather(-1, (index % m)[:, None].expand_as(t))

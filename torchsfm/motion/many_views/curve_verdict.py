@@ -76,7 +76,7 @@ def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor) -> B
     n = seen.sum((-2, -1)).double()
     flat_redundancy = (redundancy + n + 3 * v - 7).clamp(min=1)
     redundancy = redundancy.clamp(min=0).double()
-    beyond = ((3 * v).sqrt() + n.sqrt()).square() - (3 * v + n - 7)
+    beyond = ((3 * v).double().sqrt() + n.sqrt()).square() - (3 * v + n - 7)
     of_noise = redundancy * redundancy / (redundancy + beyond).clamp(min=1) / flat_redundancy
     cost: Tensor = end.cost
     return cost > of_noise / 3 * left

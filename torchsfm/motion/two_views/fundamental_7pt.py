@@ -106,7 +106,7 @@ def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tup
     # False for NaN; an empty slot holds diag(1, 1, 0).
     valid = real & (torch.minimum(pivot, some) > _INDEPENDENT) & (square > 0) & (square < torch.inf)
     scale = torch.where(valid, square.rsqrt(), 0.0)
-    empty = torch.where(valid, 0.0, 0.5**0.5)
+    empty = torch.where(valid, torch.zeros_like(square), 0.5**0.5)
     F = torch.stack(rows).mul_(scale).nan_to_num_(0.0, 0.0, 0.0)
     F[0:5:4] += empty
     return F, valid

@@ -201,7 +201,7 @@ def fundamental_from_conics(
     )  # fmt: skip
     with torch.no_grad():
         state = tensor_map(torch.Tensor.detach, final.x)
-        rows = 2 * seen.sum(-1) + count
+        rows = (2 * seen.sum(-1) + count).to(final.cost.dtype)
         freedom = (rows - 7).clamp_min(1)
         noise = 2 * final.cost / freedom
         # An estimate from few residuals may be too small by much.

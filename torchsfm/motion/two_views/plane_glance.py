@@ -42,7 +42,7 @@ def plane_suspected(
     _, least = best_triple(plane_errors(A, e, h1, h2, limit), inliers)
     count = inliers.sum(-1)
     off: Tensor = least - (inliers.shape[-1] - count)
-    return (off < (1 - _SHARE) * count) | (off <= spare)
+    return (off < (1 - _SHARE) * count.double()) | (off <= spare)
 
 
 def plane_errors(
