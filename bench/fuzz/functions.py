@@ -291,7 +291,8 @@ def _between(s: Scene) -> Similarity:
 
 
 def _fit(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    return torch.stack((x[..., 0, None] * a - b, x[..., 1, None] * a.exp() - 1), -1)
+    # Of any number of parameters: what a function of the user raises is the user's.
+    return torch.stack((x[..., :1] * a - b, x[..., -1:] * a.exp() - 1), -1)
 
 
 def _terms(s: Scene) -> list[Term]:

@@ -103,6 +103,9 @@ def test_points_come_back_from_their_images(generator: torch.Generator) -> None:
     for away in (0.0, 5.0):
         back = unproject_onto_lines(x + away * normal, P, L)
         torch.testing.assert_close(back[..., :3] / back[..., 3:], X1, rtol=1e-6, atol=1e-7)
+    # Batches broadcast, also those of the points alone.
+    several = unproject_onto_lines(torch.stack((x, x)), P, L)
+    torch.testing.assert_close(several, unproject_onto_lines(x, P, L).expand_as(several))
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -158,6 +158,16 @@ def test_no_edges() -> None:
     assert track_curves(detect_edges(torch.zeros(0, 1, 20, 30))).chain.shape == (0, 0)
 
 
+def test_an_edge_point_far_beyond_any_image_is_none() -> None:
+    place = Ellipse(torch.tensor([24.0, 22.0]), torch.tensor([11.0, 8.0]), torch.tensor(0.3))
+    image = paint_shapes([place], torch.tensor([0.2, 0.9]), width=48, height=44)
+    edges = detect_edges(torch.stack((image, image, image)))
+    far = edges.x.clone()
+    far[1, 0] = torch.tensor([1e30, 3.0])
+    found = track_curves(Edges(**{**vars(edges), "x": far}))
+    assert bool((found.chain[:, 0] >= 0).all())
+
+
 def test_wrong_input(unchecked: None) -> None:
     edges = detect_edges(torch.zeros(3, 1, 20, 30))
     with pytest.raises(ValueError, match="start: wanted one of 3 images"):

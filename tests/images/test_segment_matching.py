@@ -116,3 +116,9 @@ def test_errors_name_the_argument() -> None:
         match_segments(segments, segments, image, image, ratio=0.0)
     with pytest.raises(ValueError, match="F: wanted"):
         match_segments(segments, segments, image, image, F=torch.zeros(3))
+    with pytest.raises(ValueError, match="F: wanted one matrix"):
+        match_segments(segments, segments, image, image, F=torch.zeros(2, 3, 3))
+    with pytest.raises(ValueError, match="image2: wanted one image"):
+        match_segments(segments, segments, image, image[None])
+    with pytest.raises(ValueError, match="image2: wanted h2 >= 8"):
+        match_segments(segments, segments, image, image[:, :1])

@@ -136,6 +136,8 @@ def test_wrong_arguments_are_named() -> None:
         undistorted_cameras(lens, size(), alpha=2.0)
     with pytest.raises(ValueError, match="size: wanted"):
         undistort_images(torch.ones(1, 4, 4), lens, lens, (0, 3))
+    with pytest.raises(ValueError, match="images: wanted"):
+        undistort_images(torch.ones(2, 0, 4, 4), Camera(lens.K.expand(2, 3, 3)), lens, (4, 3))
     with pytest.raises(ValueError, match="cameras: wanted batch"):
         undistort_images(torch.ones(1, 4, 4), Camera(lens.K.expand(2, 3, 3)), lens, (4, 3))
 

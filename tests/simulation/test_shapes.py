@@ -64,3 +64,16 @@ def test_errors_name_the_argument() -> None:
             render_shapes((), **{name: wrong})
     with pytest.raises(ValueError, match="levels"):
         paint_shapes([], torch.zeros(3), width=8, height=8)
+
+
+def test_shapes_that_are_nowhere_cover_nothing() -> None:
+    square = torch.tensor([[2.0, 2.0], [6.0, 2.0], [6.0, 6.0], [2.0, 6.0]])
+    levels = torch.tensor([0.2, 0.9])
+    for wrong in (torch.nan, torch.inf, -torch.inf, 1e30):
+        corners = square.clone()
+        corners[1, 0] = wrong
+        image = paint_shapes([corners], levels, width=8, height=8)
+        assert bool(image.isfinite().all())
+        assert wrong > 0 or bool((image <= 0.9 + 1e-6).all())
+    far = paint_shapes([square + 1e3, square - 1e3], torch.tensor([0.2, 0.9, 0.9]), width=8, height=8)
+    torch.testing.assert_close(far, torch.full_like(far, 0.2))

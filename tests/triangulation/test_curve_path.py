@@ -61,3 +61,8 @@ def test_candidates_that_views_cannot_tell_apart_are_no_rivals(generator: torch.
     votes = torch.ones_like(depth)
     for blur, sure in ((0.0, False), (0.3, True)):
         assert bool(best_path(depth, votes, torch.full_like(depth, blur), rays(1, 30), 2).sure.all()) == sure
+
+
+def test_no_curves() -> None:
+    none = torch.zeros(0, 12, 3, dtype=F64)
+    assert best_path(none, none, none, torch.zeros(0, 12, 3, dtype=F64), 2).sure.shape == (0, 12)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import check_tensors
+from torchsfm._types import broadcast_shapes, check_tensors
 from torchsfm.geometry.homogeneous import normalize_sphere, to_homogeneous
 from torchsfm.geometry.rotations import cross_matrix
 from torchsfm.linalg import cross
@@ -291,7 +291,7 @@ def unproject_onto_lines(
     """
     check_tensors(x=(x, "n 2"), P=(P, "3 4"), L=(L, "n 6"))
     l = project_lines(P, L)  # noqa: E741
-    h = to_homogeneous(x).expand(*l.shape[:-1], 3)
+    h = to_homogeneous(x).expand(*broadcast_shapes(l.shape[:-1], x.shape[:-1]), 3)
     # The line through the image point and the normal's direction.
     across = cross(h, torch.cat((l[..., :2], torch.zeros_like(l[..., :1])), -1))
     return intersect_line_plane(L, viewing_planes(P, across))

@@ -21,6 +21,8 @@ from torchsfm.images.edge_field import EdgeField, edge_field
 from torchsfm.images.edges import Edges
 from torchsfm.linalg import solve
 
+_LARGEST = 2**20
+"""Sides of images, in pixels: an edge point farther away is none, whatever it says."""
 _SAMPLES = 48
 """Of a piece that are moved."""
 _STRIDE = 2.0
@@ -163,7 +165,8 @@ def track_curves(
 
 def _fields(edges: Edges) -> tuple[list[EdgeField], list[Int[Tensor, " k"]]]:
     """The edge points of each image, and the numbers of their chains."""
-    good = edges.valid & torch.isfinite(edges.x).all(-1) & torch.isfinite(edges.gradient).all(-1) & (edges.x >= 0).all(-1)
+    inside = ((edges.x >= 0) & (edges.x < _LARGEST)).all(-1)
+    good = edges.valid & inside & torch.isfinite(edges.gradient).all(-1)
     reach = torch.where(good[..., None], edges.x, 0).flatten(0, 1)
     # What is beyond the last edge of any image holds none.
     width, height = (int(t) + 3 for t in (reach.amax(0) if len(reach) else reach.new_zeros(2)).ceil())

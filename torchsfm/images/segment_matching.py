@@ -108,10 +108,15 @@ def match_segments(
         segments1=(segments1, Segments), segments2=(segments2, Segments), min_overlap=(min_overlap, "0 <= float <= 1"),
         min_similarity=(min_similarity, "-1 <= float <= 1"), ratio=(ratio, "0 < float <= 1"),
     )  # fmt: skip
-    check_tensors(image1=(image1, "c h w"), image2=(image2, "c h2 w2"), F=(F, "?3 3"))
+    check_tensors(image1=(image1, "c h>=8 w>=8"), image2=(image2, "c h2>=8 w2>=8"), F=(F, "?3 3"))
     for name, segments in (("segments1", segments1), ("segments2", segments2)):
         if segments.valid.ndim != 1:
             raise ValueError(f"{name}: wanted segments of one image, got batch dimensions {tuple(segments.valid.shape[:-1])}")
+    if F is not None and F.ndim != 2:
+        raise ValueError(f"F: wanted one matrix (3, 3), got batch dimensions {tuple(F.shape[:-2])}")
+    for name, image in (("image1", image1), ("image2", image2)):
+        if image.ndim != 3:
+            raise ValueError(f"{name}: wanted one image (c, h, w), got batch dimensions {tuple(image.shape[:-3])}")
     pairs = segments1.valid[:, None] & segments2.valid
     similarity = describe_segments(image1, segments1.ends) @ describe_segments(image2, segments2.ends).mT
     if F is not None:

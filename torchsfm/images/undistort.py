@@ -123,7 +123,7 @@ def undistort_images(
         >>> torchsfm.images.undistort_images(image, camera, pinholes.cameras, (width, height)).shape == (3, height, width)
         True
     """
-    check_tensors(images=(images, "c h>=1 w>=1"))
+    check_tensors(images=(images, "c>=1 h>=1 w>=1"))
     check_options(cameras=(cameras, Camera), pinholes=(pinholes, Camera), size=(size, "2 int >= 1"))
     check_tensors(cameras=(cameras.K, "3 3"), pinholes=(pinholes.K, "3 3"))
     batch = images.shape[:-3]

@@ -134,7 +134,7 @@ def levenberg_marquardt(
     with torch.no_grad():
         shape = _residual_shape(residual, x0, data)
         batch = shape[:-2]
-        if weights is not None and weights.shape[-1:] != shape[-2:-1]:
+        if weights is not None and (weights.ndim != len(batch) + 1 or weights.shape[-1:] != shape[-2:-1]):
             raise ValueError(f"weights: wanted shape (*batch, {shape[-2]}) of the residuals, got {tuple(weights.shape)}")
         start = flatten(tensor_map(torch.Tensor.detach, x0), batch)
         flat_data = flatten(tensor_map(torch.Tensor.detach, data), batch, "data")

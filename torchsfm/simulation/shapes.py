@@ -204,14 +204,15 @@ def paint_shapes(
     along = [fine_samples(n, blur, fine, levels) for n in (width, height)]
     maps = levels[:1, None].repeat(len(along[1]), len(along[0]))
     for thing, level in zip(shapes, levels[1:], strict=True):
-        low, high = (v.tolist() for v in _box(thing))
+        # Nothing is covered by what is nowhere; what is endless ends beyond the image.
+        low, high = (v.nan_to_num(nan=0.0).clamp(-2.0, 2.0 + max(width, height)).tolist() for v in _box(thing))
         # What is more than a pixel outside is not covered.
         columns, rows = (
             slice(max(0, int((low[k] - 1) * fine) + reach), max(0, int((high[k] + 2) * fine) + reach)) for k in (0, 1)
         )
         y, x = torch.meshgrid(along[1][rows], along[0][columns], indexing="ij")
         part = maps[rows, columns]
-        covered = (_depth(thing, torch.stack((x, y), -1)) * fine + 0.5).clamp(0, 1)
+        covered = (_depth(thing, torch.stack((x, y), -1)) * fine + 0.5).clamp(0, 1).nan_to_num(nan=0.0)
         part += (level - part) * covered
     return photograph(maps, width, height, blur, fine)
 

@@ -66,7 +66,8 @@ def best_path(
     through = torch.stack(forth, 1) + torch.stack(back[::-1], 1)
     own = depth.gather(-1, slot)
     # The longer of the steps before and after.
-    step = torch.nn.functional.max_pool1d(torch.nn.functional.pad(stride, (1, 1)), 2, 1)
+    padded = torch.nn.functional.pad(stride, (1, 1))
+    step = torch.maximum(padded[:, :-1], padded[:, 1:])
     linked = known & (_leap(own[:, :-1], own[:, 1:], stride[..., None])[..., 0] < 1)
     near = torch.maximum(_APART * step[..., None] * own, blur.gather(-1, slot))
     apart = (depth - own).abs() > near
