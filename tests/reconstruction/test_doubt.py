@@ -18,6 +18,7 @@ from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.models import matches_across
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at
@@ -323,3 +324,20 @@ def test_what_was_held_is_still_uncertain(generator: torch.Generator) -> None:
     mapping = scene(generator)
     known, guessed = stand(mapping, 1e-6), stand(mapping, 0.5)
     assert (known.rotation_sigma < guessed.rotation_sigma).all()
+
+
+def test_a_model_of_images_that_have_more_in_common_with_another(generator: torch.Generator) -> None:
+    mapping = scene(generator)
+    own = torch.arange(8) < 4
+    across = matches_across(mapping.graph, own, ~own)
+    pairs, count = mapping.graph.pairs, mapping.graph.fundamental_inliers
+    between = own[pairs].sum(1) == 1
+    assert int(across.sum()) == int(count[between].sum())
+    assert not across[~own].any()
+    prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), 0.5, dtype=torch.float64))
+    known = {"open_numbers": ("focal", "k1"), "prior": prior, "threshold": 4.0}
+    matches = torch.zeros(8, dtype=torch.long).index_add_(0, pairs.flatten(), count.repeat_interleave(2))
+    for more, doubtful in ((-1, 0), (1, 3)):
+        elsewhere = torch.where(torch.arange(8) < 3, matches + more, 0)
+        doubt = examine(mapping, elsewhere=elsewhere, **known).doubt  # type: ignore[arg-type]
+        assert [("another model" in reason) for reason in doubt] == [i < doubtful for i in range(8)]

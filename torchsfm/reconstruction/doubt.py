@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
@@ -51,6 +51,7 @@ def examine(
     threshold: float,
     uncertain: Bool[Tensor, "v"] | None = None,
     conflicts: Conflicts | None = None,
+    elsewhere: Int[Tensor, "v"] | None = None,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
@@ -61,6 +62,7 @@ def examine(
         threshold: Largest reprojection error of an observation, in pixels.
         uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
         conflicts: What missing correspondences say of this model where that is known; else it is found.
+        elsewhere: How many verified matches each image has with images of other models.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -91,6 +93,8 @@ def examine(
             return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
         if int(agreeing[i]) < EXPLAINED * int(matches[i]):
             return f"{int(agreeing[i])} of the {int(matches[i])} matches of its pairs agree with its place, the others do not"
+        if elsewhere is not None and int(elsewhere[i]) > int(matches[i]):
+            return f"has {int(elsewhere[i])} matches with images of another model and {int(matches[i])} with those of its own"
         if explained < EXPLAINED * verified:
             return f"{explained} of the {verified} matches of all pairs agree with the model, the others do not"
         if count >= 3 and int(supporting[i]) < 2:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
@@ -162,8 +162,9 @@ def build_models(
             if uncertain is not None and bool(given_up.any()):
                 uncertain = uncertain | hanging_on_copies(graph, model, taken & ~model.registered, threshold=threshold)
             standing = examine(
-                model, open_numbers=free, prior=prior, threshold=threshold, uncertain=uncertain, conflicts=conflicts
-            )
+                model, open_numbers=free, prior=prior, threshold=threshold, uncertain=uncertain, conflicts=conflicts,
+                elsewhere=matches_across(graph, model.registered, taken & ~model.registered),
+            )  # fmt: skip
             found.append((finished, standing, calibration_of(model, prior, loss=LOSS)))
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", len(graph.names), len(graph.names))
@@ -181,6 +182,15 @@ def build_models(
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
     (folder / "stages").mkdir(parents=True, exist_ok=True)
     model.save(folder / "stages" / f"model-{number}.npz")
+
+
+def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:
+    """How many verified matches each image of a model has with images of others."""
+    total = torch.zeros(len(registered), dtype=torch.long)
+    for own, other in (graph.pairs.unbind(1), graph.pairs.flip(1).unbind(1)):
+        across = registered[own] & others[other]
+        total.index_add_(0, own[across], graph.fundamental_inliers[across])
+    return total
 
 
 def image_reports(
