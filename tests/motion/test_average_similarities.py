@@ -143,3 +143,12 @@ def test_wrong_arguments_are_named(unchecked: None, generator: torch.Generator) 
         average_similarities(w.between, w.edges, models=6, places=w.places[:, :2])
     with pytest.raises(ValueError, match="deviation"):
         average_similarities(w.between, w.edges, models=6, deviation=w.deviation[:3])
+
+
+def test_scales_beyond_all_numbers_are_told() -> None:
+    R, t = torch.eye(3, dtype=torch.float64).expand(6, 3, 3), torch.zeros(6, 3, dtype=torch.float64)
+    ratio = torch.tensor([1e-66, 1e223, 1e270, 1e-210, 1e-186, 1e-284], dtype=torch.float64)
+    found = average_similarities(Similarity(ratio, R, t), torch.combinations(torch.arange(4)), models=4)
+    good = found.status == Status.OK
+    assert bool((found.model.scale[good].isfinite() & (found.model.scale[good] > 0)).all())
+    assert not bool(good.all())

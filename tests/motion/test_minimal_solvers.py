@@ -375,3 +375,10 @@ def test_fundamental_and_homography_against_opencv(generator: torch.Generator) -
         gaps.append(distance(found.model[i], found.valid[i], torch.from_numpy(H)))
     # OpenCV computes in single precision, which badly placed points do not bear.
     assert_share(torch.stack(gaps) < 1e-3, 0.98)
+
+
+def test_a_homography_of_which_rounding_leaves_no_digits_is_none() -> None:
+    """Two points a hundred pixels apart, seen from two that are 5e14 away."""
+    x1 = torch.tensor([[585.85, 208.76], [551.40, 327.53], [5.48622403e14, 4.32709795e14], [4.73781626e14, 4.8768918e14]])
+    x2 = torch.tensor([[438.5, 120.5], [417.0, 217.3], [419.9, 303.3], [359.9, 355.6]])
+    assert not homography_4pt(x1.double(), x2.double()).valid.any()

@@ -4,13 +4,21 @@ import math
 
 import pytest
 import torch
+from chance import seeded
 from robust_doors import DOORS, F64, Door, Scene, rays
 from scenes import make_scene
 
 from torchsfm import motion, resection
 from torchsfm._types import Status, tensor_map
+from torchsfm.geometry import transform_points
 from torchsfm.linalg import damped_solve
-from torchsfm.motion import estimate_essential, estimate_fundamental, estimate_homography, estimate_upright
+from torchsfm.motion import (
+    HomographyEstimator,
+    estimate_essential,
+    estimate_fundamental,
+    estimate_homography,
+    estimate_upright,
+)
 from torchsfm.resection import estimate_camera
 from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac, NeverZero
 from torchsfm.robust.hypotheses import losses, squared_residual
@@ -187,3 +195,18 @@ def test_weights_near_the_largest_number_leave_a_finite_score(dtype: torch.dtype
     found = estimate_homography(x, x + 1, threshold=1.0, weights=weights, max_iterations=64, generator=generator)
     assert found.status == Status.OK
     assert torch.isfinite(found.support)
+
+
+def test_more_than_half_absurdly_far_cost_the_others_nothing(generator: torch.Generator) -> None:
+    plane = torch.tensor([[0.9, 0.1, 30.0], [-0.05, 1.1, 20.0], [1e-4, -2e-4, 1.0]], dtype=torch.float64)
+    x1 = 1000 * torch.rand(20, 60, 2, generator=generator, dtype=torch.float64)
+    x2 = transform_points(plane, x1) + 0.3 * torch.randn(x1.shape, generator=generator, dtype=torch.float64)
+    # Of three fifths either coordinate, so that the median of each is still right.
+    slot = torch.arange(60)
+    x2[:, slot % 5 == 0, 0] = x2[:, (slot % 5 == 1) | (slot % 10 == 2), 1] = 1e12
+    x2[:, slot % 10 == 7, 0] = 1e12
+    found = estimate_homography(x1, x2, threshold=2.0, generator=seeded(1))
+    distance = HomographyEstimator().squared_residual(found.model, x1, x2).sqrt()
+    assert bool((found.status == Status.OK).all())
+    assert bool((distance[found.inliers] <= 2.0).all())
+    assert bool((found.inliers.sum(-1) >= 20).all())

@@ -13,6 +13,9 @@ _MANY = 128
 _FAR = 1e5
 """How many times as far as the median a point may be: fourth powers of that fit float32, and none is farther in earnest."""
 
+_ABSURD = 1e8
+"""How many times farther than others a half of all points must be to be no measure."""
+
 
 def present(mask: Tensor | None, *data: Tensor) -> Tensor | None:
     """Which data exist and are finite; None for all."""
@@ -75,5 +78,12 @@ def _medians(X: Tensor, usable: Tensor | None) -> tuple[Tensor, Tensor]:
     if usable is not None:
         centre = torch.where(usable.any(-1)[..., None], centre, 0)
     distance = (rows - centre[..., None]).abs_().amax(-2)
-    size = torch.where(distance > 0, distance, torch.nan).nanmedian(dim=-1).values
+    distance = torch.where(distance > 0, distance, torch.nan)
+    size = distance.nanmedian(dim=-1).values
+    # More than half may be absurdly far: the others are the measure, or nothing would be left of their digits.
+    absurd = size > _ABSURD * distance.nan_to_num(nan=torch.inf).amin(-1)
+    if bool(absurd.any()):
+        low = torch.where(distance <= size[..., None], distance, torch.nan).nanmedian(dim=-1).values
+        rest = torch.where(distance <= _ABSURD * low[..., None], distance, torch.nan).nanmedian(dim=-1).values
+        size = torch.where(absurd, rest, size)
     return centre, torch.where((size > 0) & (size < torch.inf), size, 1)

@@ -162,6 +162,9 @@ def average_similarities(
     R0 = R[first].mT
     t = (R0 @ (t - t[first])[..., None])[..., 0] / scale[first, None]
     found = Similarity((scale / scale[first]).to(dtype), (R0 @ R).to(dtype), t.to(dtype))
+    # A chain of scales may end beyond all numbers.
+    lost = ~(found.scale.isfinite() & (found.scale > 0) & found.t.isfinite().all(-1))
+    status = torch.where(lost & (status == Status.OK), int(Status.NOT_FINITE), status)
     return AveragedSimilarities(found, status, component, distance, inliers, between.t.new_tensor(scatter))
 
 

@@ -16,6 +16,9 @@ from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.vectors import fma, fms
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
+_DIGITS = 2**20
+"""Areas of triangles are at least so many times larger than what rounding may make of them."""
+
 
 def equations(
     H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]
@@ -73,8 +76,8 @@ def _solve(x: Float[Tensor, "16 batch"]) -> tuple[Tensor, Tensor]:
     k0, k1, k2 = fms(u2, v1, u1 * v2), fms(u0, v2, u2 * v0), fms(u1, v0, u0 * v1)
     areas = torch.stack((k0, k1, k2, k0 + k1 + k2), 1)
     size = d.abs().amax((1, 2))
-    # False for NaN.
-    valid = (areas.abs().amin(1) > 64 * torch.finfo(x.dtype).eps * size * size).all(0)
+    # Rounding leaves areas six digits at least. False for NaN.
+    valid = (areas.abs().amin(1) > _DIGITS * torch.finfo(x.dtype).eps * size * size).all(0)
     k, m = areas.unbind(0)
     w = m / k
     p0, p1, _ = d[0, :, :, None].unbind(0)
