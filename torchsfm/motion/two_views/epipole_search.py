@@ -42,12 +42,18 @@ class _Forms:
         return cls(own, mixed)
 
     def invariants(self, e: Tensor) -> tuple[Tensor, Tensor]:
-        """Asinh of those of pairs, and the signs of the determinants: whether tangents are real."""
-        v = e[..., None, None, :]
-        own, mixed = ((v @ form @ v.mT)[..., 0, 0] for form in (self.own, self.mixed))
-        i, j = torch.triu_indices(own.shape[-1], own.shape[-1], 1, device=own.device)
-        size = own.abs().clamp_min(1e-30).sqrt()
-        return torch.asinh(0.5 * mixed / (size[..., i] * size[..., j])), own.detach() > 0
+        """Asinh of those of pairs (*batch, p), and their derivatives by e (*batch, p, 3)."""
+        own, mixed = ((form @ e[..., None, :, None])[..., 0] for form in (self.own, self.mixed))
+        i, j = torch.triu_indices(own.shape[-2], own.shape[-2], 1, device=own.device)
+        det = (own * e[..., None, :]).sum(-1)
+        det = torch.where(det.abs() < 1e-30, 1e-30, det)
+        size = det.abs().sqrt()
+        over = 1 / (size[..., i] * size[..., j])
+        value = 0.5 * (mixed * e[..., None, :]).sum(-1) * over
+        # A form and its size are of the second degree.
+        own = own / det[..., None]
+        slope = mixed * over[..., None] - value[..., None] * (own[..., i, :] + own[..., j, :])
+        return torch.asinh(value), slope * (1 + value.square()).rsqrt()[..., None]
 
 
 def frame(e: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -80,12 +86,18 @@ def search_epipoles(
         return start.e1, start.e2
     forms = tensor_map(lambda t: t.unsqueeze(len(batch)), (_Forms.of(dual1), _Forms.of(dual2)))
 
-    def residual(x: _Epipoles, one: _Forms, two: _Forms) -> Tensor:
-        return (one.invariants(x.e1)[0] - two.invariants(x.e2)[0])[..., None]
+    def linearize(x: _Epipoles, one: _Forms, two: _Forms) -> tuple[Tensor, Tensor]:
+        (r1, J1), (r2, J2) = one.invariants(x.e1), two.invariants(x.e2)
+        J = torch.cat((J1 @ frame(x.e1)[..., :2], -J2 @ frame(x.e2)[..., :2]), -1)
+        return (r1 - r2)[..., None], J[..., None, :]
 
+    def residual(x: _Epipoles, one: _Forms, two: _Forms) -> Tensor:
+        return linearize(x, one, two)[0]
+
+    # Most starts lead nowhere, and those that do are refined.
     found = levenberg_marquardt(
-        residual, start, *forms, retract=_Epipoles.moved, size=4, weights=weights[..., None, :], max_iterations=max_iterations,
-        function_tolerance=1e-6, initial_damping=1e-2,
+        residual, start, *forms, retract=_Epipoles.moved, size=4, weights=weights[..., None, :], linearize=linearize,
+        max_iterations=max_iterations, function_tolerance=1e-3, initial_damping=1e-2,
     ).x  # fmt: skip
     return found.e1, found.e2
 

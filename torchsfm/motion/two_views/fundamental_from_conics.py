@@ -190,7 +190,7 @@ def fundamental_from_conics(
         few = (seen.sum(-1) < 4) & (count < 8)
         tried = levenberg_marquardt(
             _residual, start, _beside(fixed, len(batch)), retract=_Epipolar.moved, size=7, weights=weights[..., None, :],
-            linearize=_linearize, max_iterations=max_iterations, function_tolerance=1e-6,
+            linearize=_linearize, max_iterations=max_iterations, function_tolerance=1e-3,
         )  # fmt: skip
         proper = _proper(tried.x, _beside(fixed, len(batch)), seen[..., None, :]) & torch.isfinite(tried.cost)
         cost = torch.where(proper, tried.cost, torch.inf)
