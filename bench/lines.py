@@ -1,14 +1,12 @@
-"""Lines from pixels to poses: accuracy against the bounds, recall against PoseLib, segments against OpenCV's LSD.
+"""Lines and poses from lines: accuracy against the bounds, recall against PoseLib.
 
 `python -m bench.lines` prints the tables; one thread, seconds of the processor. Real lines are those of the Oxford sequences,
 of the folder that TORCHSFM_DATA names.
 """
 
 import argparse
-import math
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +24,6 @@ from torchsfm.geometry import (
     random_rotation,
     rotvec_from_rotation,
 )
-from torchsfm.images import detect_segments, hough_lines
 from torchsfm.resection import camera_1p2l, camera_2p1l, camera_3l
 from torchsfm.triangulation import triangulate_lines
 
@@ -178,81 +175,10 @@ def _poselib(
     return hits / len(arrays[0]), seconds / len(arrays[0])
 
 
-def segments(count: int, generator: torch.Generator) -> None:
-    """Worst and median angle and offset of the sides of rendered squares."""
-    import cv2
-
-    lsd = cv2.createLineSegmentDetector()
-
-    def opencv(image: Tensor) -> Tensor:
-        found = lsd.detect((image[0] * 255).round().clamp(0, 255).to(torch.uint8).numpy())[0]
-        return torch.zeros(0, 2, 2, dtype=F64) if found is None else torch.tensor(found, dtype=F64).reshape(-1, 2, 2)
-
-    def ours(image: Tensor) -> Tensor:
-        found = detect_segments(image, 20)
-        return found.ends[found.valid]
-
-    def hough(image: Tensor) -> Tensor:
-        found = hough_lines(image, 8)
-        return found.ends[found.valid]
-
-    methods: dict[str, Callable[[Tensor], Tensor]] = {"detect_segments": ours, "hough_lines": hough, "OpenCV LSD": opencv}
-    print("\nrendered squares  noise  angle deg: median  worst   offset px: median  worst   found")
-    for noise in (0.0, 0.02):
-        sides = [_square(generator) for _ in range(count)]
-        images = [image + noise * torch.randn(image.shape, generator=generator, dtype=F64) for image, _ in sides]
-        for name, detect in methods.items():
-            errors, found = [], 0
-            for image, (_, corners) in zip(images, sides, strict=True):
-                best = _sides(detect(image), corners)
-                errors += best
-                found += len(best)
-            angle, offset = (np.array(errors).T if errors else np.full((2, 1), np.nan)).tolist()
-            print(
-                f"{name:16}  {noise:5}  {np.median(angle):17.4f}  {max(angle):6.4f}  {np.median(offset):17.4f}  "
-                f"{max(offset):6.4f}  {found}/{4 * count}"
-            )
-
-
-def _square(generator: torch.Generator, size: int = 96, fine: int = 6, blur: float = 0.6) -> tuple[Tensor, Tensor]:
-    """A turned bright square with blurred sides, and its corners."""
-    angle, *shift = torch.rand(3, generator=generator, dtype=F64).tolist()
-    middle = torch.tensor([(size - 1) / 2 + 4 * s - 2 for s in shift], dtype=F64)
-    along = (torch.arange(size * fine, dtype=F64) + 0.5) / fine - 0.5
-    y, x = torch.meshgrid(along, along, indexing="ij")
-    c, s = math.cos(2 * math.pi * angle), math.sin(2 * math.pi * angle)
-    u, v = c * (x - middle[0]) + s * (y - middle[1]), -s * (x - middle[0]) + c * (y - middle[1])
-
-    def slab(w: Tensor) -> Tensor:
-        return 0.5 * (torch.erf((w + 26) / (blur * 2**0.5)) - torch.erf((w - 26) / (blur * 2**0.5)))
-
-    image = (slab(u) * slab(v)).reshape(size, fine, size, fine).mean((1, 3))[None]
-    square = 26 * torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=F64)
-    turn = torch.tensor([[c, s], [-s, c]], dtype=F64)
-    return 0.1 + 0.8 * image, middle + square @ turn
-
-
-def _sides(found: Tensor, corners: Tensor) -> list[tuple[float, float]]:
-    """Angle in degrees and offset of the middle of the longest segment on each side."""
-    errors = []
-    for p, q in zip(corners, corners.roll(-1, 0), strict=True):
-        d = torch.nn.functional.normalize(q - p, dim=-1)
-        normal = torch.stack((-d[1], d[0]))
-        away = ((found - p) * normal).sum(-1)
-        e = torch.nn.functional.normalize(found[:, 1] - found[:, 0], dim=-1)
-        length = torch.where((away.abs() < 2).all(-1), (found[:, 1] - found[:, 0]).norm(dim=-1), 0.0)
-        if len(length) and float(length.max()) > 20:
-            i = int(length.argmax())
-            angle = math.degrees(math.asin(min(1.0, abs(float((e[i] * normal).sum())))))
-            errors.append((angle, abs(float(away[i].mean()))))
-    return errors
-
-
 def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--poses", type=int, default=20_000)
-    parser.add_argument("--squares", type=int, default=30)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -262,7 +188,6 @@ def main() -> None:
     if folder:
         oxford(Path(folder))
     poses(options.poses, generator)
-    segments(options.squares, generator)
 
 
 if __name__ == "__main__":
