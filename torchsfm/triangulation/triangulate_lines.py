@@ -16,6 +16,7 @@ from torchsfm.optim import Loss, levenberg_marquardt
 from torchsfm.triangulation.line_views import (
     SAME,
     LineViews,
+    SeenParts,
     frame_of_centres,
     frame_of_line,
     in_frame,
@@ -23,9 +24,10 @@ from torchsfm.triangulation.line_views import (
     linear_lines,
     linearize,
     observe,
+    one_centre,
     one_plane,
     residuals,
-    seen_points,
+    seen_parts,
 )
 
 PIECE = 1 << 17
@@ -181,30 +183,30 @@ def _solve(views: LineViews, segments: bool, loss: Loss | None, max_iterations: 
         fixed = LineViews(*(t.detach() for t in views))
         origin, unit, start, fault, angle = _start(fixed)
     inner = views.moved(origin, unit)
-    data = inner.projections(), inner.homogeneous_ends()
+    rows = inner.rows()
     found = levenberg_marquardt(
-        residuals, start, *data, retract=Line3D().retract, size=4, weights=views.w, loss=loss, linearize=linearize,
+        residuals, start, rows, retract=Line3D().retract, size=4, weights=views.w, loss=loss, linearize=linearize,
         max_iterations=max_iterations,
     )  # fmt: skip
-    r = residuals(found.x, *data)
+    r = residuals(found.x, rows)
     square = (views.w[..., None] * r.square()).sum((1, 2))
     number = views.used.sum(1)
     error = (torch.where(square > 0, square, 1.0) / (2 * number.clamp_min(1))).sqrt() * (square > 0)
     model = in_world(found.x, origin, unit)
     line = found.x.detach()
     with torch.no_grad():
-        seen = LineViews(*(t.detach() for t in inner))
-        turned, points, ends = _extent(seen, line)
+        seen = seen_parts(LineViews(*(t.detach() for t in inner)), line)
+        turned, ends = _extent(fixed, seen)
     model = model * turned[:, None]
     with torch.no_grad():
-        in_front = _in_front(seen, points) if segments else torch.ones_like(views.broken)
-        local, determined = _covariance(seen, line)
+        in_front = _in_front(fixed, seen) if segments else torch.ones_like(views.broken)
+        local, determined = _covariance(line, rows.detach(), fixed.w)
         end_covariance = _across(line, ends, local) * (unit.square())[:, None, None, None]
         distance = (1 + ends.square().sum(-1)).sqrt() * unit[:, None]
         blurred = end_covariance.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt() > _UNSURE * distance
         # The weights say what noise is; without any it is a unit.
         lost = ~determined | blurred.any(-1) | one_plane(fixed)
-        fault = torch.where((fault == 0) & lost, _why(fixed), fault)
+        fault = torch.where(fault == 0, _faults(fixed, lost & (fault == 0)), fault)
         # What is exact but for rounding is a minimum, whatever steps promise.
         exact = error <= _EXACT * (views.w * fixed.ends.square().sum((-2, -1))).sum(1).sqrt()
         status = _status(views, fault, in_front, (found.status == Status.NOT_CONVERGED) & ~exact)
@@ -222,19 +224,16 @@ def _start(views: LineViews) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     outer = views.moved(mean, spread)
     line, _ = linear_lines(outer, views.w)
     # A plane misses a point by more where it is farther away: once more, with what is known now.
-    points, finite = seen_points(outer, line)
-    centre, near, _ = outer.centres()
-    square = (points - centre[..., None, :]).square().sum(-1)
-    counted = finite & near[..., None] & (square > 0)
+    seen = seen_parts(outer, line)
+    square = (seen.points() - outer.centre[..., None, :]).square().sum(-1)
+    counted = seen.finite & outer.near[..., None] & (square > 0)
     depth = torch.where(counted, square, 0.0).sum(-1) / counted.sum(-1).clamp_min(1)
     line, singular = linear_lines(outer, views.w / torch.where(counted.any(-1), depth, 1.0).clamp_min(1e-12))
     largest = singular[:, 3].clamp_min(1e-300)
     # Planes of one centre may well meet in different lines, but only through it.
-    why = _why(views)
-    lost = (singular[:, 2] <= SAME * largest) | (why == LineFault.ONE_CENTRE)
-    fault = torch.where(lost, why, int(LineFault.NONE))
+    fault = _faults(views, (singular[:, 2] <= SAME * largest) | one_centre(views))
     angle = 2 * torch.atan(singular[:, 2] / largest)
-    inner_origin, inner_unit = frame_of_line(outer, line)
+    inner_origin, inner_unit = frame_of_line(outer, seen_parts(outer, line))
     line = in_frame(line, inner_origin, inner_unit)
     line = line / torch.linalg.vector_norm(line, dim=-1, keepdim=True).clamp_min(1e-300)
     sound = line.isfinite().all(-1, keepdim=True) & (line != 0).any(-1, keepdim=True)
@@ -242,9 +241,16 @@ def _start(views: LineViews) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     return mean + spread[:, None] * inner_origin, spread * inner_unit, line, fault, angle
 
 
+def _faults(views: LineViews, lost: Tensor) -> Tensor:
+    """The fault of lines that are lost, 0 elsewhere (n)."""
+    fault = torch.zeros_like(lost, dtype=torch.int64)
+    (at,) = lost.nonzero(as_tuple=True)
+    return fault.index_put((at,), _why(LineViews(*(t[at] for t in views)))) if len(at) else fault
+
+
 def _why(views: LineViews) -> Tensor:
     """The fault of lines whose planes of sight are one, from the centres of the views (n)."""
-    centre, finite, _ = views.centres()
+    centre, finite = views.centre, views.near
     counted = (finite & views.used)[..., None]
     number = counted.sum(1).clamp_min(1)
     mean = torch.where(counted, centre, 0.0).sum(1) / number
@@ -270,45 +276,35 @@ def _number_of_centres(centre: Tensor, used: Tensor, size: Tensor) -> Tensor:
     return (used & ~repeated).sum(-1)
 
 
-def _extent(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The sign that turns d along the segments (n), where their ends are seen (n, v, 2, 3), and the ends of all (n, 2, 3)."""
-    points, finite = seen_points(views, line)
-    finite = finite & views.used[..., None]
-    d = line[:, :3] / torch.linalg.vector_norm(line[:, :3], dim=-1, keepdim=True).clamp_min(1e-300)
-    along = (points * d[:, None, None]).sum(-1)
-    votes = torch.where(finite.all(-1), torch.sign(along[..., 1] - along[..., 0]), 0.0).sum(1)
-    turned = torch.where(votes < 0, -1.0, 1.0).to(d.dtype)
+def _extent(views: LineViews, seen: SeenParts) -> tuple[Tensor, Tensor]:
+    """The sign that turns d along the segments (n), and the ends of all that is seen (n, 2, 3)."""
+    along = seen.along
+    both = (seen.finite & views.used[..., None]).all(-1)
+    votes = torch.where(both, torch.sign(along[..., 1] - along[..., 0]), 0.0).sum(1)
+    turned = torch.where(votes < 0, -1.0, 1.0).to(along.dtype)
     along = along * turned[:, None, None]
     low, high = along.amin(-1), along.amax(-1)
-    both = finite.all(-1)
     drop = both.sum(1) // 4
     rank = drop.clamp_max((both.shape[1] - 1) if both.shape[1] else 0)[:, None]
     if both.shape[1]:
         low = torch.where(both, low, torch.inf).sort(1).values.gather(1, rank)[:, 0]
         high = torch.where(both, high, -torch.inf).sort(1, descending=True).values.gather(1, rank)[:, 0]
     else:
-        low = high = d.new_zeros(len(d))
-    seen = both.any(1)
-    span = torch.stack((torch.where(seen, low, 0.0), torch.where(seen, high, 0.0)), -1)
-    d = d * turned[:, None]
-    size = line[:, :3].square().sum(-1, keepdim=True).clamp_min(1e-300)
-    foot = cross(line[:, :3], line[:, 3:]) / size
-    return turned, points, foot[:, None] + span[..., None] * d[:, None]
+        low = high = along.new_zeros(len(along))
+    span = torch.where(both.any(1)[:, None], torch.stack((low, high), -1), 0.0)
+    return turned, seen.foot[:, None] + (span * turned[:, None])[..., None] * seen.d[:, None]
 
 
-def _in_front(views: LineViews, points: Tensor) -> Tensor:
+def _in_front(views: LineViews, seen: SeenParts) -> Tensor:
     """Whether the middles of all segments are in front of the cameras that see them (n)."""
-    _, _, handed = views.centres()
-    middle = points.mean(-2)
-    depth = (views.P[..., 2, :3] * middle).sum(-1) + views.P[..., 2, 3]
     # A camera at infinity has no front.
-    return ((depth * handed > 0) | (handed == 0) | ~views.used).all(1)
+    return ((seen.depth * views.handed > 0) | (views.handed == 0) | ~views.used).all(1)
 
 
-def _covariance(views: LineViews, line: Tensor) -> tuple[Tensor, Tensor]:
+def _covariance(line: Tensor, rows: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """The inverse (n, 4, 4) of the normal matrix in the line's frame, and where it exists."""
-    _, J = linearize(line, views.projections(), views.homogeneous_ends())
-    J = (J * views.w.sqrt()[..., None, None]).flatten(1, 2)
+    _, J = linearize(line, rows)
+    J = (J * w.sqrt()[..., None, None]).flatten(1, 2)
     N = J.mT @ J
     scale = N.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
     unit = N * scale[:, :, None] * scale[:, None]

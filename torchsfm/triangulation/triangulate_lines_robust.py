@@ -12,7 +12,15 @@ from torchsfm.geometry import to_homogeneous
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.linalg import cross, damped_solve, determinant_3x3
 from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
-from torchsfm.triangulation.line_views import frame_of_centres, in_world, line_forms, observe, slopes_along, through_centre
+from torchsfm.triangulation.line_views import (
+    frame_of_centres,
+    image_rows,
+    in_world,
+    line_forms,
+    observe,
+    slopes_along,
+    through_centre,
+)
 from torchsfm.triangulation.triangulate_lines import triangulate_lines
 
 _PARALLEL = 1e-12
@@ -103,7 +111,7 @@ class LineEstimator:
         # Moves of (d, m): shifts by the two vectors across change m, new directions both.
         shift = torch.cat((torch.zeros_like(across), cross(across, d[..., None, :])), -1)
         turn = torch.cat((across, cross(foot[..., None, :], across)), -1)
-        r, J = slopes_along(torch.cat((d, cross(foot, d)), -1), torch.cat((shift, turn), -2).mT, forms, ends)
+        r, J = slopes_along(torch.cat((d, cross(foot, d)), -1), torch.cat((shift, turn), -2).mT, image_rows(forms, ends))
         N = (J * curvature).flatten(-3, -2).mT @ J.flatten(-3, -2)
         g = (J * (weights * r[..., None])).sum((-3, -2))
         batch = broadcast_shapes(N.shape[:-2], g.shape[:-1])
