@@ -140,6 +140,23 @@ def test_bad_conics_are_told_and_change_no_others(generator):
     torch.testing.assert_close(found.model[3], alone.model[3], rtol=0, atol=0)
 
 
+def test_projective_maps_of_the_images_map_the_matrix(generator):
+    scene = simulate_conics((4,), conics=6, views=2, generator=generator)
+    middle = ellipse_from_conic(scene.C)[0].centre.mean((0, 1, 2))
+    # Of pixels, seen from a little aside.
+    H = torch.eye(3, dtype=F64) + 0.1 * torch.randn(2, 3, 3, generator=generator, dtype=F64)
+    H[:, 2] = torch.cat((1e-4 * torch.randn(2, 2, generator=generator, dtype=F64), torch.ones(2, 1, dtype=F64)), -1)
+    shift = torch.eye(3, dtype=F64)
+    shift[:2, 2] = -middle
+    back = torch.linalg.inv(H @ shift)
+    moved = [back[i].T @ scene.C[:, i] @ back[i] for i in (0, 1)]
+    assert all(ellipse_from_conic(C)[1].all() for C in moved)
+    found = fundamental_from_conics(*moved, starts=40, generator=generator)
+    F = (H[1] @ shift).T @ found.model @ (H[0] @ shift)
+    assert (found.status == Status.OK).all()
+    assert (off(F / F.norm(dim=(-2, -1), keepdim=True), truth(scene)) < 1e-6).all()
+
+
 @pytest.mark.parametrize("batch", [(2, 1), (0,)])
 def test_shapes(batch, generator):
     scene = simulate_conics(batch, conics=5, views=2, generator=generator)

@@ -19,6 +19,7 @@ from torchsfm.geometry import (
     ellipse_from_conic,
     plane_conic_from_dual_quadric,
     project_quadric,
+    random_rotation,
     rotation_from_rotvec,
 )
 from torchsfm.images import fit_ellipse
@@ -207,6 +208,26 @@ def test_the_world_may_move_and_cameras_have_any_scale(generator):
     order = torch.tensor([2, 0, 1])
     again = triangulate_conics(scene.C[:, order], scene.P[:, order], x=scene.x[:, order])
     torch.testing.assert_close(again.Q_dual, found.Q_dual, rtol=1e-6, atol=1e-7)
+
+
+def test_projective_maps_of_the_world_map_the_conics(generator):
+    """Distances in images do not know of the world's frame, not even of its plane at infinity."""
+    scene = simulate_conics((20,), views=3, noise=0.3, points=20, generator=generator)
+    found = triangulate_conics(scene.C, scene.P, x=scene.x)
+    H = torch.eye(4, dtype=F64)
+    H[:3, :3] = (
+        random_rotation(generator=generator, dtype=F64) @ (0.3 * torch.randn(3, generator=generator, dtype=F64)).exp().diag()
+    )
+    H[:3, 3] = torch.randn(3, generator=generator, dtype=F64)
+    # Ellipses and cameras stay on one side of the plane that goes to infinity.
+    H[3, :3] = 0.02 * torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=F64), dim=0)
+    moved = triangulate_conics(scene.C, scene.P @ torch.linalg.inv(H), x=scene.x)
+    good = (found.status == Status.OK) & (moved.status == Status.OK)
+    assert_share(good, 0.9)
+    Q = H @ found.Q_dual @ H.T
+    a, b = (q / torch.linalg.matrix_norm(q, keepdim=True) * -q[..., 3:, 3:].sign() for q in (moved.Q_dual, Q))
+    assert (torch.linalg.matrix_norm(a - b) < 1e-6)[good].all()
+    torch.testing.assert_close(moved.error[good], found.error[good], rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("given", ["x", "C"])

@@ -9,7 +9,9 @@ from torchsfm.geometry import (
     pluecker_from_points,
     point_line_distance,
     project_lines,
+    random_rotation,
     rotvec_from_rotation,
+    to_homogeneous,
     transform_lines,
 )
 from torchsfm.optim import Cauchy
@@ -207,6 +209,28 @@ def test_the_world_may_move_and_views_change_places(make_scene, image_of, genera
     turned = triangulate_lines(l.flip(-2)[[2, 0, 3, 1]], P[[2, 0, 3, 1]])
     torch.testing.assert_close(turned.model, -found.model, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(turned.ends, found.ends.flip(-2), rtol=1e-5, atol=1e-5)
+
+
+def test_projective_maps_of_the_world_map_the_lines(make_scene, image_of, generator):
+    """Distances in images do not know of the world's frame, not even of its plane at infinity."""
+    l, P, _ = segments(make_scene, image_of, v=4, n=40, noise=0.3)  # noqa: E741
+    found = triangulate_lines(l, P)
+    H = torch.eye(4, dtype=F64)
+    H[:3, :3] = (
+        random_rotation(generator=generator, dtype=F64) @ (0.3 * torch.randn(3, generator=generator, dtype=F64)).exp().diag()
+    )
+    H[:3, 3] = torch.randn(3, generator=generator, dtype=F64)
+    # Points and cameras stay on one side of the plane that goes to infinity.
+    H[3, :3] = 0.01 * torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=F64), dim=0)
+    moved = triangulate_lines(l, P @ torch.linalg.inv(H))
+    ends = to_homogeneous(found.ends) @ H.T
+    assert (ends[..., 3] > 0).all()
+    wanted = pluecker(ends[..., :3] / ends[..., 3:])
+    good = (found.status == Status.OK) & (moved.status == Status.OK)
+    assert_share(good, 0.8)
+    torch.testing.assert_close(moved.error[good], found.error[good], rtol=1e-7, atol=0)
+    apart = torch.minimum((moved.model - wanted).norm(dim=-1), (moved.model + wanted).norm(dim=-1))
+    assert (apart < 1e-5 * wanted.norm(dim=-1))[good].all()
 
 
 def test_a_loss_takes_the_weight_of_a_wrong_view(make_scene, image_of):
