@@ -86,13 +86,18 @@ def _candidates(s: Sample) -> tuple[Tensor, Tensor]:
     zero, one = torch.zeros_like(cos), torch.ones_like(cos)
     about_x = torch.stack((one, zero, zero, zero, cos, -sin, zero, sin, cos), -1).reshape(-1, 3, 3)
     about_z = torch.stack((cos_b, -sin_b, zero, sin_b, cos_b, zero, zero, zero, one), -1).reshape(-1, 3, 3)
-    R = l1.new_full((len(l1), 8, 3, 3), torch.nan)
-    R[item, slot] = camera[item] @ about_x @ about_z @ world.mT[item]
-    offset = (s.l[:, None] * (s.A[:, None] @ R.mT)).sum(-1)
-    volume = (l1 * cross(l2, l3)).sum(-1).abs()[:, None]
-    t = torch.linalg.solve_ex(s.l[:, None], -offset[..., None])[0][..., 0]
+    turn = camera[item] @ (about_x @ about_z @ world.mT[item])
     # Concurrent image lines: three planes of sight through one line, along which nothing is told.
-    return R, torch.where(volume[..., None] > CONCURRENT, t, torch.nan)
+    volume = (l1 * cross(l2, l3)).sum(-1)
+    told = (volume.abs() > CONCURRENT)[:, None]
+    edges = (
+        torch.stack((cross(l2, l3), cross(l3, l1), cross(l1, l2)), -1)
+        / torch.where(told, volume[:, None], torch.nan)[..., None]
+    )
+    offset = (s.l[item] * (s.A[item] @ turn.mT)).sum(-1, keepdim=True)
+    R, t = l1.new_full((len(l1), 8, 3, 3), torch.nan), l1.new_full((len(l1), 8, 3), torch.nan)
+    R[item, slot], t[item, slot] = turn, -(edges[item] @ offset)[..., 0]
+    return R, t
 
 
 def _circle_point(p: list[Tensor], q: list[Tensor], cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
