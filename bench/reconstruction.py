@@ -51,6 +51,7 @@ def run_torchsfm(photographs: PhotographSet, threads: int, seed: int, lines: boo
         "read": "extract",
         "features": "extract",
         "segments": "extract",
+        "look": "match",
         "match": "match",
         "track": "match",
         "verify": "verify",

@@ -61,9 +61,9 @@ class StageClock:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """What came since the last call belongs to this stage; before matching, pairs are chosen."""
+        """What came since the last call belongs to this stage; before they are looked at, pairs are chosen."""
         now = time.process_time()
-        name = "pairs" if (self.stage, stage) == ("features", "match") else stage
+        name = "pairs" if (self.stage, stage) in (("features", "look"), ("features", "match")) else stage
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self.last
         self.last, self.stage = now, stage
 
@@ -76,7 +76,7 @@ def photographs(views: int) -> Row:
         files = render(Path(folder), views)
         before, clock = memory(), StageClock()
         result = reconstruct(files, max_features=FEATURES, neighbours=NEIGHBOURS, out=Path(folder) / "out", progress=clock)
-    names, spent = ("features", "pairs", "match", "verify", "map"), clock.seconds
+    names, spent = ("features", "pairs", "look", "match", "verify", "map"), clock.seconds
     return {
         "pairs compared": len(result.report.pairs.pairs),
         "registered": result.models[0].num_registered if result.models else 0,

@@ -34,6 +34,7 @@ LABELS = {
     "pattern": "finding the pattern",
     "problem": "reading",
     "features": "finding features",
+    "look": "looking for pairs to match",
     "match": "matching pairs",
     "track": "tracking corners",
     "verify": "checking epipolar geometry",

@@ -13,6 +13,7 @@ from torchsfm.images.hough import HoughLines, hough_lines
 from torchsfm.images.learned import LearnedDetector, LearnedMatcher, load_detector, load_matcher
 from torchsfm.images.listing import FILMS, SUFFIXES, list_images, list_skipped
 from torchsfm.images.matching import match_descriptors, match_features
+from torchsfm.images.preemptive import preview_matches, promising_pairs
 from torchsfm.images.reading import MAX_PIXELS, ImageError, Photograph, read_image, save_image, scale_image
 from torchsfm.images.retrieval import describe_images, retrieve_pairs
 from torchsfm.images.segment_matching import describe_segments, match_segments
@@ -61,6 +62,8 @@ __all__ = [
     "match_features",
     "match_segments",
     "parse_exif",
+    "preview_matches",
+    "promising_pairs",
     "read_image",
     "retrieve_pairs",
     "save_image",

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchsfm.images import match_features, retrieve_pairs
-from torchsfm.reconstruction.image_points import SHARDS, ImagePoints
+from torchsfm.images import Features, match_features, preview_matches, promising_pairs, retrieve_pairs
+from torchsfm.images.preemptive import PARTNERS
+from torchsfm.reconstruction.image_points import SHARDS, ImagePoints, SavedFeatures
 from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.sequence import Corners, sequence_pairs, track_corners
@@ -17,7 +18,7 @@ from torchsfm.reconstruction.stages import Arrays, Stages, one_thread
 from torchsfm.reconstruction.view_graph import VerifiedPairs, ViewGraph, verify_pairs
 
 MAX_IMAGES_ALL_PAIRS = 80
-"""Up to this many images every pair is matched; beyond it, each image with those that look most alike."""
+"""Up to this many images all pairs are looked at; beyond it, each image with those that look most alike."""
 NEAR_IMAGES = 16
 """Pairs of one block of so many by so many images are matched one after the other, and so need few images at a time."""
 MATCHED_AT_ONCE = 128
@@ -110,17 +111,17 @@ def match_all(
         return {"pairs": retrieve_pairs(features, neighbours=neighbours)}
 
     pairs = stages.run("pairs", choose)["pairs"]
+    if not sequence:
+        pairs = _promising(pairs, features, stages, progress)
     work = PairShards.of(pairs)
     told = 0
 
     def match(shard: int) -> Arrays:
         nonlocal told
-        chosen, rows = pairs[work.matched(shard)], list[Tensor]()
-        for some in torch.split(chosen, MATCHED_AT_ONCE):
+        rows = list[Tensor]()
+        for some in torch.split(pairs[work.matched(shard)], MATCHED_AT_ONCE):
             progress("match", told, len(pairs))
-            # Only what these pairs need is read.
-            images, local = torch.unique(some, return_inverse=True)
-            rows += match_features([features[i] for i in images.tolist()], local)
+            rows += match_features(*_read(features, some))
             told += len(some)
         progress("match", told, len(pairs))
         return {"count": torch.tensor([len(m) for m in rows]).long(), "match": torch.cat(rows)}
@@ -158,3 +159,32 @@ def match_all(
     graph = verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
     # Corners that were tracked through a sequence have no descriptors.
     return graph if sequence else replace(graph, descriptors=lambda: torch.cat([f.descriptors for f in features]))
+
+
+def _promising(pairs: Int[Tensor, "q 2"], features: SavedFeatures, stages: Stages, progress: Progress) -> Int[Tensor, "_ 2"]:
+    """The pairs that are worth comparing in full, by a look at some features of all."""
+    if len(features) <= 2 * PARTNERS:
+        return pairs  # nearly all would be kept
+    work = PairShards.of(pairs)
+    told = 0
+
+    def look(shard: int) -> Arrays:
+        nonlocal told
+        found = list[Tensor]()
+        for some in torch.split(pairs[work.matched(shard)], MATCHED_AT_ONCE):
+            progress("look", told, len(pairs))
+            found.append(preview_matches(*_read(features, some)))
+            told += len(some)
+        progress("look", told, len(pairs))
+        return {"found": torch.cat(found)}
+
+    shards = stages.shards("look", work.match_shards, look, after=work.digest)
+    found = torch.empty(len(pairs), dtype=torch.float64)
+    found[work.order] = torch.cat([shard["found"] for shard in shards])
+    return pairs[promising_pairs(pairs, found)]
+
+
+def _read(features: SavedFeatures, pairs: Int[Tensor, "k 2"]) -> tuple[list[Features], Int[Tensor, "k 2"]]:
+    """The features that some pairs need, and the pairs as indices into these."""
+    images, local = torch.unique(pairs, return_inverse=True)
+    return [features[i] for i in images.tolist()], local
