@@ -4,7 +4,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsfm.optim import Block, SoftL1, Subset, Term, UnitSphere, sparse_covariance, sparse_levenberg_marquardt
+from torchsfm.optim import (
+    Block,
+    SoftL1,
+    Subset,
+    Term,
+    UnitSphere,
+    marginal_covariance,
+    sparse_covariance,
+    sparse_levenberg_marquardt,
+)
 
 F64 = torch.float64
 
@@ -223,3 +232,11 @@ class TestDerivative:
             return result.x["mean"][0] @ torch.tensor([1.0, 2.0, 3.0], dtype=F64) + result.x["line"][0, 1]
 
         self.compare(function, (directions, y), generator)
+
+
+def test_what_is_known_of_differences_alone_has_no_covariance() -> None:
+    """The information has a pivot that is exactly zero."""
+    index = torch.tensor([0]), torch.tensor([1])
+    term = Term(lambda a, b, z: b - a - z, ("p", "p"), index, (torch.ones(1, 1, dtype=F64),))
+    found = marginal_covariance({"p": Block(torch.zeros(2, 1, dtype=F64))}, [term], "p")
+    assert bool((found == torch.inf).all())

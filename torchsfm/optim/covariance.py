@@ -150,7 +150,9 @@ def marginal_covariance(
         held = information.diagonal() <= 0
         information.diagonal()[held] = 1.0
         factor, info = torch.linalg.cholesky_ex(information)
-        joint = torch.where(info == 0, torch.cholesky_inverse(factor), torch.inf)
+        # The inverse of half a factor raises.
+        whole = torch.where(info == 0, factor, torch.eye(len(factor), dtype=factor.dtype, device=factor.device))
+        joint = torch.where(info == 0, torch.cholesky_inverse(whole), torch.inf)
         joint.diagonal()[held] = 0.0
         places = torch.arange(free.numel() * width, device=free.device).view(-1, width)
         out[free] = joint[places[:, :, None], places[:, None]]
