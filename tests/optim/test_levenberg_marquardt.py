@@ -272,6 +272,8 @@ def test_wrong_shapes(unchecked: None) -> None:
         levenberg_marquardt(lambda x, t: x[..., :1, None] - t[:, None], torch.ones(4, 3), torch.ones(7))
     with pytest.raises(ValueError, match="weights: wanted shape"):
         levenberg_marquardt(lambda x: x[..., None], torch.ones(4, 3), weights=torch.ones(4, 2, 3))
+    with pytest.raises(ValueError, match="weights: wanted device"):
+        levenberg_marquardt(lambda x: x[..., None], torch.ones(4, 3), weights=torch.ones(4, 3, device="meta"))
 
 
 def test_pieces_change_nothing(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -126,6 +126,9 @@ def levenberg_marquardt(
             raise ValueError("size: wanted the number of tangent directions, since x0 is not one tensor")
         check_tensors(x0=(x0, "k>=1"))
         size = x0.shape[-1]
+    device = leaves(x0)[0].device
+    if weights is not None and weights.device != device:
+        raise ValueError(f"weights: wanted device {device} as x0 has, got {weights.device}")
     followed = leaves((data, weights))
     wanted = wants_derivative(*followed)
     if wanted:
