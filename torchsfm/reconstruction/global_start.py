@@ -15,7 +15,10 @@ from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
 from torchsfm.geometry import BundleProblem, Pose
 from torchsfm.motion import RelativePoseEstimator, average_rotations, position_globally
+from torchsfm.motion.many_views.triplets import turn_angle
 from torchsfm.optim import Cauchy
+from torchsfm.reconstruction.cameras import FOCAL_SIGMA
+from torchsfm.reconstruction.consistency import pair_agreement
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.initialize import MIN_POINTS
 from torchsfm.reconstruction.mapping import Mapping
@@ -34,26 +37,60 @@ ROUNDS = 3
 """Adjustments with poses and points alone, each with a loss half as wide as the last."""
 WIDEST = 16.0
 """Scale of the first of their losses in pixels, at most."""
+RETURNS, CHANGED = 3, 0.05
+"""Times that all is done again, where a focal length has changed by more than this part."""
 USABLE = (int(Status.OK), int(Status.NOT_CONVERGED))
 
 
 def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: MappingOptions) -> Mapping | None:
     """Poses and points of the largest set of images that their pairs hold together.
 
+    Relative rotations are in proportion to what the focal length is taken to be, more or less: with a wrong one, those along a
+    ring of images do not add up to a turn, and the ring is torn or folded where it is weakest. What fits together locally still
+    tells the focal length. All is then done again with that one, until it stays.
+
     Args:
-        mapping: An empty mapping; its cameras are taken as they are.
+        mapping: An empty mapping; its cameras are taken as they are at first.
         available: Images to consider.
         options: How models are made.
 
     Returns:
         The mapping with poses, points and tracks of the pairs that agree; None where too little does.
     """
+    sigma = options.focal_sigma
+    model = _at_once(mapping, available, sigma, options)
+    for _ in range(RETURNS):
+        if model is None:
+            break
+        used = torch.unique(model.camera_index[model.registered])
+        before, after = (m.cameras.K[used, 0, 0] for m in (mapping, model))
+        if not bool(((after / before).log().abs() > CHANGED).any()):
+            break
+        K = mapping.cameras.K.clone()
+        K[used, :2, :2] = model.cameras.K[used, :2, :2]
+        mapping = replace(mapping, cameras=replace(mapping.cameras, K=K))
+        sigma = sigma.index_put((used,), sigma[used].clamp(max=FOCAL_SIGMA["autocalibration"]))
+        again = _at_once(mapping, available, sigma, options)
+        if again is None or int(again.registered.sum()) < int(model.registered.sum()):
+            break
+        model = again
+    model = _complete(model, options) if model is not None else None
+    return model if model is not None and len(model.X) >= MIN_POINTS else None
+
+
+def _at_once(
+    mapping: Mapping, available: Bool[Tensor, "v"], focal_sigma: Float[Tensor, "g"], options: MappingOptions
+) -> Mapping | None:
+    """The start with the cameras as they are, and as uncertain as they are said to be."""
     graph, v = mapping.graph, len(mapping.registered)
     related = (graph.fundamental_inliers >= MIN_INLIERS) & available[graph.pairs].all(-1)
     chosen = related.nonzero()[:, 0]
     if not len(chosen):
         return None
     motion, deviation, good = relative_poses(mapping, chosen, options)
+    # No rotation is known to a smaller part of its angle than the focal length is.
+    part = focal_sigma[mapping.camera_index][graph.pairs[chosen]].amax(-1) * turn_angle(motion[..., :3])
+    deviation = deviation + torch.diag_embed(part.square()[:, None].expand(-1, 3))
     chosen, motion, deviation = chosen[good], motion[good], deviation[good]
     turned = average_rotations(motion[..., :3], graph.pairs[chosen], views=v, deviation=deviation)
     rotated = _largest(turned.component, torch.isin(turned.status, torch.tensor(USABLE)))
@@ -78,8 +115,7 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
     number = torch.full_like(graph.view, -1).index_copy_(0, node[sure], point[sure])
     start = replace(mapping, poses=Pose(R, t), registered=registered, X=placed.X, point=number).compacted()
     focal = mapping.cameras.K[mapping.camera_index[registered], 0, 0].median()
-    model = _tighten(start, track, min(float(placed.scale * focal), WIDEST), options)
-    return model if len(model.X) >= MIN_POINTS else None
+    return _tighten(start, min(float(placed.scale * focal), WIDEST), options)
 
 
 def relative_poses(
@@ -137,19 +173,30 @@ def _longest_tracks(track: Int[Tensor, "n"], view: Int[Tensor, "n"], views: int)
     return node[wanted[track[node]]]
 
 
-def _tighten(model: Mapping, track: Int[Tensor, "n"], width: float, options: MappingOptions) -> Mapping:
+def _tighten(model: Mapping, width: float, options: MappingOptions) -> Mapping:
     """Adjust poses and points with losses that become narrower, and triangulate all tracks with what has come out."""
-    model = replace(model, track=track)
     for k in range(ROUNDS):
         model = _adjust(model, max(width / 2**k, 1.0))
     reach = 2 * options.reprojection
-    model = replace(model, X=model.X[:0], point=torch.full_like(model.point, -1))
+    model = replace(model, track=_tracks(model, reach), X=model.X[:0], point=torch.full_like(model.point, -1))
     model = triangulate_tracks(model, threshold=reach, min_angle=options.min_angle)
-    model = options.adjust(model, max_iterations=20, tolerance=1e-3)
-    model = filter_points(model, threshold=reach, min_angle=options.min_angle)
+    return options.adjust(model, max_iterations=20, tolerance=1e-3)
+
+
+def _complete(model: Mapping, options: MappingOptions) -> Mapping:
+    """All observations that fit, and none that does not."""
+    model = filter_points(model, threshold=2 * options.reprojection, min_angle=options.min_angle)
     model = complete_tracks(model, threshold=options.reprojection)
     model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
     return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+
+
+def _tracks(model: Mapping, threshold: float) -> Int[Tensor, "n"]:
+    """Tracks of the pairs that agree with a model, and of those with images that have no place yet."""
+    graph, agreement = model.graph, pair_agreement(model, threshold=threshold)
+    kept = torch.ones(len(graph.pairs), dtype=torch.bool).index_copy_(0, agreement.index, agreement.supports)
+    own = kept[graph.match_pair]
+    return build_tracks(graph.view, graph.match[own], graph.fundamental_inliers[graph.match_pair[own]])
 
 
 def _adjust(model: Mapping, width: float) -> Mapping:
