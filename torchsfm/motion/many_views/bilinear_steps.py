@@ -51,7 +51,7 @@ class BilinearSystem:
         points = isinstance(self.x, tuple)
         S, right, F, rest = reduced(self.linear, damping, points)
         if points:
-            hold_frame(S, self.linear.P)
+            _hold_frame(S, self.linear.P)
         found = schur_step(S, right, F, rest, self.total)
         return found._replace(delta=(found.delta[0].reshape(self.linear.P.shape), found.delta[1]))
 
@@ -135,7 +135,7 @@ def schur_step(S: Tensor, right: Tensor, F: Tensor, rest: Tensor, total: Tensor)
     return Step((step[..., 0], back_substituted(F, rest, step)), promise, solved, torch.zeros_like(solved))
 
 
-def hold_frame(S: Tensor, P: Tensor) -> None:
+def _hold_frame(S: Tensor, P: Tensor) -> None:
     """No change of frame gains anything: what rounding leaves of its slope, over the damping, would be all that is promised."""
     p, v, _, r = P.shape
     Q = orthonormal(P)[0].reshape(p, 3 * v, r)

@@ -12,10 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm._types import Status
 from torchsfm.geometry.curve_places import CurvePlaces
 from torchsfm.motion.many_views.curve_fit import CurveDistances, Scene, Sights, pinned
-from torchsfm.motion.many_views.curve_refit import refit
 from torchsfm.optim.descent import Descent, Options, descend
 
 _ROUNDS = 6
@@ -68,26 +66,7 @@ def finish(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene, steps
     # Samples that did not count follow the cameras.
     x, seen = plain.settled(end.x, _OWN)
     misfit, right = _judged(plain, seen)
-    return _by_splines(images, Found(x, seen, plain.weight, misfit, measured & right, end), steps)
-
-
-def _by_splines(images: CurvePlaces, found: Found, steps: int) -> Found:
-    """What is found by all that was measured of the image curves, where splines follow that."""
-    counts = found.weight * found.measured[:, None]
-    free = 2 * found.measured.sum((-2, -1)) + 11 * (found.weight > 0).any(-1).any(-1).sum(-1) - 15
-    total = (counts.flatten(2) * found.seen.r.square()).sum((1, 2))
-    noise = (total / (counts.sum((1, 2, 3)) - free).clamp(min=1)).sqrt()
-    other = refit(images, counts, found.x, noise, steps)
-    if other is None:
-        return found
-    place = pinned(images, found.weight, other.x).sights(other.x).place
-    plain = pinned(images, found.weight, other.x._replace(place=place))
-    x, seen = plain.settled(other.x._replace(place=place), _OWN)
-    misfit, right = _judged(plain, seen)
-    measured = found.measured & right
-    here = replace(plain, weight=plain.weight * measured[:, None]).linearize(x)
-    status = torch.where(other.settled, int(Status.OK), int(Status.NOT_CONVERGED))
-    return Found(x, seen, plain.weight, misfit, measured, found.end._replace(end=here, status=status))
+    return Found(x, seen, plain.weight, misfit, measured & right, end)
 
 
 def typical_misfit(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene) -> Float[Tensor, "p"]:
