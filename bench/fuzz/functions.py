@@ -378,6 +378,11 @@ FUNCTIONS: dict[str, Function] = {
     ),
     "images.match_descriptors": Function({f"descriptors{i}": lambda s: s.rand(9, 16) for i in (1, 2)}, batched=False),
     "images.match_features": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),
+    "images.preview_matches": Function({"features": _features, "pairs": torch.tensor([[0, 1], [1, 2]])}, batched=False),
+    "images.promising_pairs": Function(
+        {"pairs": torch.tensor([[0, 1], [1, 2], [0, 2]]), "found": torch.tensor([9.0, 1.0, 0.5]).double(), "partners": 1},
+        batched=False,
+    ),
     "images.retrieve_pairs": Function(
         {"features": _features, "neighbours": 1, "words": 4, "generator": _generator}, batched=False
     ),

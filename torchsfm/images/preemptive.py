@@ -55,9 +55,10 @@ def preview_matches(features: Sequence[Features], pairs: Int[Tensor, "p 2"]) -> 
         Features(f.x[:k], f.scale[:k], f.angle[:k], f.response[:k], f.descriptors[:k])
         for f, k in zip(features, size, strict=True)
     ]
-    found = match_features([*best, *features], pairs + torch.tensor([0, len(features)]))
-    number = torch.tensor([len(m) for m in found], dtype=torch.float64)
-    tried = torch.tensor(size, dtype=torch.float64)[pairs[:, 0]]
+    whole = torch.stack((pairs[:, 0], pairs[:, 1] + len(features)), 1)
+    found = match_features([*best, *features], whole)
+    number = torch.tensor([len(m) for m in found], dtype=torch.float64, device=pairs.device)
+    tried = torch.tensor(size, dtype=torch.float64, device=pairs.device)[pairs[:, 0]]
     chance = BY_CHANCE * tried
     return (number - chance) / chance.sqrt().clamp(min=1)
 
