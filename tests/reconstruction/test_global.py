@@ -1,15 +1,17 @@
 """All images at once: rotations, centres, points, then the finish that all roads share."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from test_reconstruct_tracks import Scene, make_scene, run, turning
+from chance import seeded
+from test_reconstruct_tracks import SIZE, Scene, make_scene, run, turning
 
-from torchsfm.geometry import Pose
+from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.simulation import orbit_poses
+from torchsfm.simulation import orbit_poses, simulate_images
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -21,6 +23,23 @@ def test_poses_are_as_good_as_those_of_the_incremental_road(seed: int) -> None:
     # Both end in the same minimum, of points that may differ at the threshold.
     assert float(error.max()) < 1.2 * float(wanted.max()) + 0.05
     assert abs(float(found.residuals().mean()) - float(other.residuals().mean())) < 0.05
+
+
+@pytest.mark.parametrize("stream", [2, 3])
+def test_a_ring_seen_from_far_closes(stream: int) -> None:
+    """Only neighbours see the same side: what the focal length is off is off in all their turns, which add up."""
+    views, g = 40, seeded(stream)
+    poses = orbit_poses(views, radius=10.0, sweep=2 * math.pi * (1 - 1 / views))
+    out = torch.nn.functional.normalize(torch.randn(1500, 3, generator=g, dtype=torch.float64), dim=-1)
+    X = out * (1 + 0.3 * torch.rand(1500, 1, generator=g, dtype=torch.float64))
+    K = intrinsics(torch.tensor(2400.0), torch.tensor([499.5, 374.5])).double().expand(views, 3, 3)
+    seen = simulate_images(X, poses, Camera(K), image_size=SIZE, noise=0.5, outliers=0.05, dropout=0.2, generator=g)
+    towards = torch.nn.functional.normalize(poses.centre[:, None] - X, dim=-1)
+    view, track = (seen.visible & ((towards * out).sum(-1) > 0.8)).nonzero(as_tuple=True)
+    scene = Scene(seen.x[view, track], view, track, poses, torch.tensor([SIZE] * views), 2400.0)
+    model = run(scene, method="global", focal=2400.0).model
+    assert bool(model.registered.all())
+    assert float(pose_errors(model.poses, poses, model.registered).image_rotation.max()) < 3
 
 
 def test_two_unrelated_scenes_give_two_models() -> None:
