@@ -44,6 +44,40 @@ def test_wrong_edges_have_no_pull(stream: int) -> None:
     assert float(errors(graph, found.model).mean()) < 1.2 * float(errors(graph, alone.model).mean())
 
 
+def ring_with_false_claims(generator: torch.Generator) -> tuple[TrueGraph, torch.Tensor]:
+    """A ring, weak in one place, and wrong edges across it that claim to be a hundred times as exact as the right ones."""
+    views, wrong = 47, 20
+    base = ring(views, 7, 0.0, 0.0, generator)
+    # Of the 28 edges between the last and the first cameras five are left.
+    across = (base.edges[:, 1] < base.edges[:, 0]).nonzero()[:, 0]
+    across = across[torch.randperm(len(across), generator=generator)[5:]]
+    kept = torch.ones(len(base.edges), dtype=torch.bool).index_fill_(0, across, False)
+    first = torch.randint(views, (wrong,), generator=generator)
+    far = torch.stack((first, (first + torch.randint(10, views - 10, (wrong,), generator=generator)) % views), 1)
+    edges = torch.cat((base.edges[kept], far))
+    graph = with_edges(base.rotations, edges, 0.01, 0.0, generator)
+    false = torch.arange(len(edges)) >= len(edges) - wrong
+    R = torch.where(false[:, None, None], random_rotation(len(edges), generator=generator, dtype=torch.float64), graph.R)
+    variance = torch.where(false, 1e-8, 1e-4).double()
+    return replace(graph, R=R, wrong=false), variance[:, None, None] * torch.eye(3, dtype=torch.float64)
+
+
+def test_wrong_edges_that_claim_to_be_exact_have_no_pull(generator: torch.Generator) -> None:
+    for _ in range(6):
+        graph, spread = ring_with_false_claims(generator)
+        found = average_rotations(graph.R, graph.edges, views=graph.views, deviation=spread)
+        assert float(errors(graph, found.model).max()) < 0.1
+
+
+def test_each_component_takes_the_start_that_is_better_for_it(generator: torch.Generator) -> None:
+    (first, spread), second = ring_with_false_claims(generator), ring(60, 10, 0.02, 0.4, generator)
+    spread = torch.cat((spread, 4e-4 * torch.eye(3, dtype=torch.float64).repeat(len(second.R), 1, 1)))
+    edges = torch.cat((first.edges, second.edges + first.views))
+    found = average_rotations(torch.cat((first.R, second.R)), edges, views=first.views + 60, deviation=spread)
+    assert float(errors(first, found.model[: first.views]).max()) < 0.1
+    assert float(errors(second, found.model[first.views :]).max()) < 0.1
+
+
 def test_nothing_wrong_is_called_right() -> None:
     # Eight edges a camera, a quarter of them wrong: one camera now and then has no right answer.
     lost, good = [], []

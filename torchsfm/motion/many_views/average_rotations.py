@@ -149,7 +149,8 @@ def average_rotations(
         # A few wrong edges that claim to be very exact outweigh all right ones in a sum of lengths, but not in the tree.
         scale = min(graph.scale(start), graph.scale(tree))
         loss = GemanMcClure(REACH * scale)
-        start = graph.better(*(_rotations(graph.minimise(x, loss, max_iterations, ROUGH)) for x in (start, tree)), loss)
+        start, tree = (_rotations(graph.minimise(x, loss, max_iterations, ROUGH)) for x in (start, tree))
+        start = graph.better(start, tree, loss)
     found = graph.minimise(start, loss, max_iterations, 1e-6)
     model = _rotations(found)
     with torch.no_grad():
