@@ -52,8 +52,8 @@ def reconstruct(
 ) -> SfmResult:
     """Reconstruct cameras and 3D points from photographs, with nothing known of the camera.
 
-    The steps: SIFT features; matches between all pairs; epipolar geometry of all pairs in one batched call; focal length from
-    Exif, else from the fundamental matrices, else a default; incremental structure from motion with bundle adjustment over
+    The steps: SIFT features; matches between all pairs, of many images between those whose best features match (see
+    `preview_matches`); epipolar geometry of these pairs in one batched call; focal length from Exif, else from the fundamental matrices, else a default; incremental structure from motion with bundle adjustment over
     poses, points, focal length and distortion. Images that have nothing in common form several models.
 
     Args:
