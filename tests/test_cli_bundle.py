@@ -46,17 +46,17 @@ def bal(problem: BundleProblem, tmp_path: Path) -> Path:
 def as_model(problem: BundleProblem) -> Reconstruction:
     order = torch.argsort(problem.point * 6 + problem.view)
     return Reconstruction(
-        tuple(f"{k}.jpg" for k in range(6)),
-        torch.full((6, 2), 2000),
-        problem.cameras,
-        problem.camera_index,
-        problem.poses,
-        torch.ones(6, dtype=torch.bool),
-        problem.X,
-        torch.rand(len(problem.X), 3, dtype=F64),
-        problem.x[order],
-        problem.view[order],
-        problem.point[order],
+        names=tuple(f"{k}.jpg" for k in range(6)),
+        image_size=torch.full((6, 2), 2000),
+        cameras=problem.cameras,
+        camera_index=problem.camera_index,
+        poses=problem.poses,
+        registered=torch.ones(6, dtype=torch.bool),
+        X=problem.X,
+        color=torch.rand(len(problem.X), 3, dtype=F64),
+        x=problem.x[order],
+        view=problem.view[order],
+        point=problem.point[order],
     )
 
 

@@ -137,7 +137,7 @@ def _read(kind: Format, target: Path) -> list[tuple[str, str]]:
 def _faults(found: Any) -> list[str]:
     """What a result may not be."""
     match found:
-        case Reconstruction() | BundleProblem():
+        case BundleProblem():
             lens = found.cameras.distortion.parameters()
             tensors = {"K": found.cameras.K, "lens": lens, "R": found.poses.R, "t": found.poses.t}
             faults = [f"{name} is not finite" for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]
@@ -336,7 +336,11 @@ def _problem(g: torch.Generator) -> tuple[BundleProblem, Reconstruction]:
     names = ("a.jpg", "b c.jpg", "caf\udce9.jpg", "d.jpg")
     registered = torch.tensor([True, True, True, False])
     size = torch.tensor([[640, 480]]).repeat(4, 1)
-    return problem, Reconstruction(names, size, cameras, index, poses, registered, X, color, x, view, point)
+    model = Reconstruction(
+        names=names, image_size=size, cameras=cameras, camera_index=index, poses=poses, registered=registered,
+        X=X, color=color, x=x, view=view, point=point,
+    )  # fmt: skip
+    return problem, model
 
 
 def _hloc(matched: MatchedImages) -> Files:

@@ -54,8 +54,9 @@ def test_a_reconstruction_keeps_the_rest(problem: BundleProblem) -> None:
         torch.cat((problem.poses.t, torch.zeros(1, 3, dtype=F64))),
     )
     model = Reconstruction(
-        tuple("abcdefg"), torch.full((views, 2), 2000), problem.cameras, index, poses, torch.arange(views) < 6,
-        problem.X, torch.rand(80, 3, dtype=F64), problem.x, problem.view, problem.point,
+        names=tuple("abcdefg"), image_size=torch.full((views, 2), 2000), cameras=problem.cameras, camera_index=index,
+        poses=poses, registered=torch.arange(views) < 6, X=problem.X, color=torch.rand(80, 3, dtype=F64),
+        x=problem.x, view=problem.view, point=problem.point,
     )  # fmt: skip
     adjusted = bundle_adjust_model(model, free=("focal",))
     new = adjusted.model

@@ -13,9 +13,8 @@ from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, bundle_adjust_model
 from torchsfm.cli.job import INTERRUPTED, NOTHING, Job, UserError, told
 from torchsfm.formats import write_model
-from torchsfm.formats.problem import Model
 from torchsfm.formats.registry import format_for, read_model_or_problem
-from torchsfm.geometry import Radial
+from torchsfm.geometry import BundleProblem, Radial
 from torchsfm.geometry.intrinsic_parameters import INTRINSICS
 from torchsfm.optim import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey
 
@@ -119,7 +118,7 @@ def bundle(
             raise typer.Exit(INTERRUPTED)
 
 
-def load(path: Path) -> Model:
+def load(path: Path) -> BundleProblem:
     """Read whatever the path holds.
 
     Raises:
@@ -131,7 +130,7 @@ def load(path: Path) -> Model:
         raise UserError(" ".join(str(error).split())) from None
 
 
-def free_names(model: Model, wanted: str | None) -> tuple[str, ...]:
+def free_names(model: BundleProblem, wanted: str | None) -> tuple[str, ...]:
     """The intrinsics to adjust.
 
     Raises:
@@ -150,7 +149,7 @@ def free_names(model: Model, wanted: str | None) -> tuple[str, ...]:
     return names
 
 
-def describe(model: Model, names: tuple[str, ...]) -> str:
+def describe(model: BundleProblem, names: tuple[str, ...]) -> str:
     """What is adjusted, in one line."""
     kind = type(model.cameras.distortion).__name__
     return (
@@ -172,7 +171,7 @@ def compare_residuals(before: torch.Tensor, result: BundleResult) -> str:
     return "\n".join(lines)
 
 
-def check_output(model: Model, out: Path | None) -> None:
+def check_output(model: BundleProblem, out: Path | None) -> None:
     """See that the result can be written there, before the work.
 
     Raises:
@@ -190,7 +189,7 @@ def check_output(model: Model, out: Path | None) -> None:
         raise UserError(f"{out}: BAL holds two radial coefficients, not {type(model.cameras.distortion).__name__}")
 
 
-def save(model: Model, out: Path) -> None:
+def save(model: BundleProblem, out: Path) -> None:
     """Write in the format that the name says.
 
     Raises:

@@ -22,8 +22,9 @@ from torchsfm.formats.nvm import read_nvm, write_nvm
 from torchsfm.formats.openmvg import read_openmvg, write_openmvg
 from torchsfm.formats.opensfm import read_opensfm, write_opensfm
 from torchsfm.formats.ply import write_ply
-from torchsfm.formats.problem import Model, as_problem, as_reconstruction
+from torchsfm.formats.problem import as_reconstruction
 from torchsfm.formats.trajectory import write_kitti, write_tum
+from torchsfm.geometry import BundleProblem
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 HEAD = 2**20
@@ -39,7 +40,7 @@ class Format:
     """In a few words."""
     files: tuple[str, ...]
     """Names of files, or endings of names, under which it is written, and looked for in folders; none for a folder."""
-    read: Callable[[Path], Model] | None = None
+    read: Callable[[Path], BundleProblem] | None = None
     write: Callable[[Reconstruction, Path], None] | None = None
     marks: re.Pattern[bytes] | None = None
     """What the first bytes of a file match that is of this format."""
@@ -49,10 +50,6 @@ class Format:
     def named(self, path: Path) -> bool:
         """Whether a file of this name is of the format."""
         return any(path.name == file or (file.startswith(".") and path.name.endswith(file)) for file in self.files)
-
-
-def _bal(model: Reconstruction, path: Path) -> None:
-    write_bal(as_problem(model), path)
 
 
 FORMATS: tuple[Format, ...] = (
@@ -74,8 +71,8 @@ FORMATS: tuple[Format, ...] = (
     Format("kitti", "camera poses in the form of KITTI", (".kitti",), None, write_kitti),
     Format("libmv", "a libmv problem", (".bin",), read_libmv, None, re.compile(rb"[vV][PN]")),
     Format("ply", "points and cameras for viewers", (".ply",), None, write_ply),
-    Format("bal", "a problem of Bundle Adjustment in the Large", (".txt", ".txt.gz", ".txt.bz2", ".gz", ".bz2"), read_bal, _bal,
-           re.compile(rb"\s*\d+\s+\d+\s+\d+\s|\x1f\x8b|BZh")),
+    Format("bal", "a problem of Bundle Adjustment in the Large", (".txt", ".txt.gz", ".txt.bz2", ".gz", ".bz2"), read_bal,
+           write_bal, re.compile(rb"\s*\d+\s+\d+\s+\d+\s|\x1f\x8b|BZh")),
 )  # fmt: skip
 
 
@@ -130,7 +127,7 @@ def _readable() -> list[str]:
     return [kind.name for kind in FORMATS if kind.read is not None]
 
 
-def read_model_or_problem(path: str | Path) -> Model:
+def read_model_or_problem(path: str | Path) -> BundleProblem:
     """Read the model, or the problem of bundle adjustment, that a file or folder is or holds; of several the first.
 
     Raises:
@@ -186,7 +183,7 @@ def format_for(path: str | Path, name: str | None = None) -> Format:
     return chosen
 
 
-def write_model(model: Model, path: str | Path, format: str | None = None) -> None:
+def write_model(model: BundleProblem, path: str | Path, format: str | None = None) -> None:
     """Write a model in the format that is asked for, or that the name of the file tells.
 
     Args:

@@ -15,7 +15,7 @@ from torchsfm.geometry.poses import Pose
 class BundleProblem:
     """Views of points, with estimates of everything; the smallest thing that can be adjusted.
 
-    A `Reconstruction` has the same members and more (names, sizes, colours).
+    A `Reconstruction` is one, and has more (names, sizes, colours).
 
     Example:
         >>> import torchsfm

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
-from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.calibration import (
     CameraPrior,
@@ -51,16 +50,15 @@ def adjust(
         tolerance: Relative decrease of the cost at which it stops.
     """
     node = mapping.observations()
-    view, point = mapping.graph.view[node], mapping.point[node]
     fixed_poses = fixed_points = None
     if moving is not None:
+        point = mapping.point[node]
         touched = torch.zeros(len(mapping.X), dtype=torch.bool)
-        touched[point[moving[view]]] = True
-        keep = touched[point]
-        node, view, point = node[keep], view[keep], point[keep]
+        touched[point[moving[mapping.graph.view[node]]]] = True
+        node = node[touched[point]]
         fixed_poses, fixed_points, free = ~moving, ~touched, None
     result = bundle_adjust(
-        BundleProblem(mapping.poses, mapping.cameras, mapping.camera_index, mapping.X, mapping.graph.x[node], view, point),
+        mapping.problem(node),
         fixed_poses=fixed_poses,
         fixed_points=fixed_points,
         loss=LOSS,

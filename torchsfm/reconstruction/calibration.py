@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.bundle import intrinsics_covariance
 from torchsfm.bundle.intrinsics import free_columns
-from torchsfm.geometry import BundleProblem, Camera, Distortion
+from torchsfm.geometry import Camera, Distortion
 from torchsfm.geometry.intrinsic_parameters import camera_from_row, intrinsic_labels, row_from_camera
 from torchsfm.optim import Cauchy, loss_slope
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
@@ -198,20 +198,11 @@ class _Information:
 
 def _information(mapping: Mapping, names: Sequence[str], prior: CameraPrior, loss: Cauchy) -> _Information:
     used = images_of_cameras(mapping) > 0
-    node = mapping.observations()
     noise = measure_noise(mapping, loss)
     model = type(mapping.cameras.distortion)
     columns = free_columns(names, model)
     covariance = noise**2 * intrinsics_covariance(
-        BundleProblem(
-            mapping.poses,
-            mapping.cameras,
-            mapping.camera_index,
-            mapping.X,
-            mapping.graph.x[node],
-            mapping.graph.view[node],
-            mapping.point[node],
-        ),
+        mapping.problem(),
         free=names,
         loss=loss,
         intrinsics_sigma=prior.in_units_of(noise, names),

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options
 from torchsfm.bundle import BundleCovariance, PointPrior, bundle_adjust_model, bundle_covariance
-from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Cauchy, Loss
 from torchsfm.reconstruction.alignment import Alignment, ControlPoints, align_to_points
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -35,8 +34,7 @@ class ControlledModel:
         deviation: The same, and how far its image points are from its projections, together in standard deviations (RMS).
         status: Of the adjustment.
         why: Why the model is not to be trusted; empty where it is.
-        problem: The adjusted bundle, and
-        terms: what of it was adjusted, held and known, for its covariance; None where there was no adjustment.
+        terms: What was adjusted, held and known, for the covariance; None where there was no adjustment.
         sigma: Standard deviation of the model's image points, pixels.
 
     Example:
@@ -62,7 +60,6 @@ class ControlledModel:
     deviation: Float[Tensor, "n"]
     status: Status
     why: str
-    problem: BundleProblem | None = None
     terms: dict[str, Any] | None = None
     sigma: float = 1.0
 
@@ -72,9 +69,9 @@ class ControlledModel:
         Raises:
             ValueError: There was no adjustment.
         """
-        if self.problem is None or self.terms is None:
+        if self.terms is None:
             raise ValueError(f"covariance: wanted an adjusted model, got none ({self.why})")
-        return bundle_covariance(self.problem, sigma=self.sigma, **self.terms)
+        return bundle_covariance(self.model, sigma=self.sigma, **self.terms)
 
     def summary(self) -> str:
         """One line for people."""
@@ -167,12 +164,9 @@ def adjust_to_points(
     squared = squared.index_add(0, result.point[len(moved.x) :] - n, pixels)
     numbers = 3 + 2 * torch.bincount(chosen.point, minlength=k)
     deviation = (squared / numbers).sqrt()
-    problem = BundleProblem(
-        result.poses, result.cameras, result.camera_index, result.X, result.x, result.view, result.point
-    )  # fmt: skip
     return ControlledModel(
         result, alignment, chosen, off, deviation, adjusted.result.status,
-        _contradiction(alignment, chosen.names, deviation, adjusted.result.status), problem, terms, noise,
+        _contradiction(alignment, chosen.names, deviation, adjusted.result.status), terms, noise,
     )  # fmt: skip
 
 

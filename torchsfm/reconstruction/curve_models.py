@@ -110,8 +110,9 @@ def _model(
     curves = all_curves(mapping, progress).in_images(torch.arange(v), zoom.expand(v, 2)).detached()
     X = mapping.poses.t[:0]
     return Reconstruction(
-        tuple(names), size, scaled(mapping.camera[(None,)], zoom[None]), torch.zeros(v, dtype=torch.long), mapping.poses,
-        mapping.registered, X, X, x, none, none, curves=curves,
+        names=tuple(names), image_size=size, cameras=scaled(mapping.camera[(None,)], zoom[None]),
+        camera_index=torch.zeros(v, dtype=torch.long), poses=mapping.poses, registered=mapping.registered,
+        X=X, color=X, x=x, view=none, point=none, curves=curves,
     )  # fmt: skip
 
 

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
-from torchsfm.geometry import BundleProblem
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
@@ -119,17 +118,16 @@ def pose_deviations(
     mapping: Mapping, open_numbers: Sequence[str], prior: CameraPrior
 ) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"]]:
     """Standard deviations of rotations (degrees) and of places (over the median depth), as in `Standing`."""
-    node = mapping.observations()
-    view, point = mapping.graph.view[node], mapping.point[node]
+    problem = mapping.problem()
     # A number that was held where it was expected is as uncertain as it was expected to be.
     uncertain = {name: torch.ones(len(mapping.cameras.K), dtype=torch.bool) for name in open_numbers}
     covariance = bundle_covariance(
-        BundleProblem(mapping.poses, mapping.cameras, mapping.camera_index, mapping.X, mapping.graph.x[node], view, point),
+        problem,
         loss=LOSS,
         sigma=measure_noise(mapping, LOSS),
         **about_cameras(mapping, uncertain, prior),
     )
-    depth = mapping.project(point, view)[1]
+    view, depth = problem.view, problem.depths()
     seen = torch.bincount(view, minlength=len(mapping.registered))
     # The depths of each image in ascending order, those of one image together: the middle one of each.
     order = torch.argsort(depth, stable=True)

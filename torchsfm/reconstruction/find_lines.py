@@ -10,7 +10,6 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.bundle import BundleLines, bundle_adjust
 from torchsfm.bundle.lines import segment_distances
-from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
@@ -87,10 +86,8 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
     Segments count by their own variances and that of points, all scaled so that their distances from the lines are as large as
     these say.
     """
-    node = mapping.observations()
-    view, point = mapping.graph.view[node], mapping.point[node]
     free = None if mapping.adjustment is None else mapping.adjustment.free
-    problem = BundleProblem(mapping.poses, mapping.cameras, mapping.camera_index, mapping.X, mapping.graph.x[node], view, point)
+    problem = mapping.problem()
     noise = measure_noise(mapping, LOSS)
     apart = segment_distances(mapping.poses, mapping.cameras[mapping.camera_index], lines.bundle())
     # Of robust mean size: two distances a segment, less the four numbers of each line.

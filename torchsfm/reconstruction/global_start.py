@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
-from torchsfm.geometry import BundleProblem, Pose
+from torchsfm.geometry import Pose
 from torchsfm.motion import RelativePoseEstimator, average_rotations, position_globally
 from torchsfm.motion.many_views.triplets import turn_angle
 from torchsfm.optim import Cauchy
@@ -202,10 +202,9 @@ def _tracks(model: Mapping, threshold: float) -> Int[Tensor, "n"]:
 def _adjust(model: Mapping, width: float) -> Mapping:
     """The minimum of reprojection errors, without what then lies behind a camera or far off."""
     node = model.observations()
-    view, point = model.graph.view[node], model.point[node]
-    problem = BundleProblem(model.poses, model.cameras, model.camera_index, model.X, model.graph.x[node], view, point)
+    problem = model.problem(node)
     result = bundle_adjust(problem, loss=Cauchy(width), free=(), max_iterations=20, tolerance=1e-3)
     if result.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
     moved = replace(model, poses=result.poses, X=result.X)
-    return moved.without(node[moved.errors(point, node) > 8 * width])
+    return moved.without(node[moved.errors(problem.point, node) > 8 * width])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
-from torchsfm.geometry import DISTORTION_MODELS, BundleProblem, Camera, Pose, similarity_from_points
+from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, similarity_from_points
 from torchsfm.images import MAX_PIXELS
 from torchsfm.reconstruction.adjust import LOSS, about_cameras, adjust
 from torchsfm.reconstruction.calibration import choose_free
@@ -241,10 +241,7 @@ def _adjust(
         free = {name: mask & own for name, mask in choose_free(mapping, names, prior, loss=LOSS).items()}
         cameras = about_cameras(mapping, free, prior)
     result = bundle_adjust(
-        BundleProblem(
-            mapping.poses, mapping.cameras, mapping.camera_index, mapping.X, mapping.graph.x[node], mapping.graph.view[node],
-            mapping.point[node],
-        ),
+        mapping.problem(),
         fixed_poses=~moving,
         loss=LOSS,
         max_iterations=LAST_ITERATIONS,

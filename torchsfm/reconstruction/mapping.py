@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.view_graph import ViewGraph
 
@@ -90,6 +90,13 @@ class Mapping:
         """Image points that have a 3D point, sorted by it."""
         node = (self.point >= 0).nonzero()[:, 0]
         return node[torch.argsort(self.point[node], stable=True)]
+
+    def problem(self, node: Int[Tensor, "m"] | None = None) -> BundleProblem:
+        """What bundle adjustment starts from: all observations, or those of some image points that have a 3D point."""
+        if node is None:
+            node = self.observations()
+        x, view, point = self.graph.x[node], self.graph.view[node], self.point[node]
+        return BundleProblem(self.poses, self.cameras, self.camera_index, self.X, x, view, point)
 
     def assign(self, node: Int[Tensor, "k"], point: Int[Tensor, "k"], error: Float[Tensor, "k"]) -> "Mapping":
         """Give image points to 3D points where that leaves each point one observation per image and each node one point.

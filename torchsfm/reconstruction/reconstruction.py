@@ -14,15 +14,15 @@ from torchsfm._types import tensor_map
 from torchsfm.bundle.conics import ellipse_distances
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.bundle.lines import segment_distances
-from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, Similarity
+from torchsfm.geometry import DISTORTION_MODELS, BundleProblem, Camera, Pose, Similarity
 from torchsfm.reconstruction.conics import Conics
 from torchsfm.reconstruction.files import load_arrays, whole_file
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.model_curves import Curves
 
 
-@dataclass(frozen=True)
-class Reconstruction:
+@dataclass(frozen=True, kw_only=True)
+class Reconstruction(BundleProblem):
     """Cameras and 3D points in one world frame, whose scale is arbitrary unless it was aligned to known positions.
 
     Images that could not be placed stay in the list with `registered` False and the identity as pose, so that indices mean the
@@ -57,15 +57,8 @@ class Reconstruction:
 
     names: tuple[str, ...]
     image_size: Int[Tensor, "v 2"]
-    cameras: Camera
-    camera_index: Int[Tensor, "v"]
-    poses: Pose
     registered: Bool[Tensor, "v"]
-    X: Float[Tensor, "n 3"]
     color: Float[Tensor, "n 3"]
-    x: Float[Tensor, "m 2"]
-    view: Int[Tensor, "m"]
-    point: Int[Tensor, "m"]
     lines: Lines | None = None
     conics: Conics | None = None
     curves: Curves | None = None
@@ -93,16 +86,6 @@ class Reconstruction:
             return moved if tensor.is_floating_point() else moved.to(tensor.dtype)
 
         return tensor_map(move, self)
-
-    def projections(self) -> Float[Tensor, "m 2"]:
-        """Where each observation's point projects, in pixels; finite but meaningless behind the camera."""
-        X_cam = self.poses[self.view].transform(self.X[self.point, None])
-        return self.cameras[self.camera_index[self.view]].project(X_cam)[:, 0]
-
-    def residuals(self) -> Float[Tensor, "m"]:
-        """Distance of each observation from its point's projection, in pixels."""
-        distance: Tensor = torch.linalg.vector_norm(self.projections() - self.x, dim=-1)
-        return distance
 
     def track_lengths(self) -> Int[Tensor, "n"]:
         """Number of observations of each point."""
