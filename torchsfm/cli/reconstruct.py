@@ -32,6 +32,7 @@ class Method(StrEnum):
     incremental = "incremental"
     projective = "projective"
     all_at_once = "global"
+    windows = "windows"
     auto = "auto"
     curves = "curves"
 

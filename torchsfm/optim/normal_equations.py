@@ -20,7 +20,7 @@ from torchsfm.optim.schur_pairwise import PairCoupling
 NULL = 1e-11
 """Eigenvalues of the reduced system, scaled to unit diagonal of U, that count as zero: directions of gauge."""
 
-LARGEST_BENT = 2000
+LARGEST_BENT = 500
 """Columns of the largest reduced system whose eigenvalues are found where it is not positive."""
 
 

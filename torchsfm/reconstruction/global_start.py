@@ -74,7 +74,7 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
         if again is None or int(again.registered.sum()) < int(model.registered.sum()):
             break
         model = again
-    model = _complete(model, options) if model is not None else None
+    model = complete(model, options) if model is not None else None
     return model if model is not None and len(model.X) >= MIN_POINTS else None
 
 
@@ -93,7 +93,7 @@ def _at_once(
     deviation = deviation + torch.diag_embed(part.square()[:, None].expand(-1, 3))
     chosen, motion, deviation = chosen[good], motion[good], deviation[good]
     turned = average_rotations(motion[..., :3], graph.pairs[chosen], views=v, deviation=deviation)
-    rotated = _largest(turned.component, torch.isin(turned.status, torch.tensor(USABLE)))
+    rotated = largest(turned.component, torch.isin(turned.status, torch.tensor(USABLE)))
     if int(rotated.sum()) < 2:
         return None
     agreeing = chosen[turned.inliers & rotated[graph.pairs[chosen]].all(-1)]
@@ -106,7 +106,7 @@ def _at_once(
     _, point = torch.unique(track[node], return_inverse=True)
     count = int(point.max()) + 1 if len(point) else 0
     placed = position_globally(d, graph.view[node], point, turned.model, points=count)
-    registered = _largest(placed.component, torch.isin(placed.status, torch.tensor(USABLE)) & rotated)
+    registered = largest(placed.component, torch.isin(placed.status, torch.tensor(USABLE)) & rotated)
     if int(registered.sum()) < 2:
         return None
     R = torch.where(registered[:, None, None], turned.model, mapping.poses.R)
@@ -115,7 +115,7 @@ def _at_once(
     number = torch.full_like(graph.view, -1).index_copy_(0, node[sure], point[sure])
     start = replace(mapping, poses=Pose(R, t), registered=registered, X=placed.X, point=number).compacted()
     focal = mapping.cameras.K[mapping.camera_index[registered], 0, 0].median()
-    return _tighten(start, min(float(placed.scale * focal), WIDEST), options)
+    return tighten(start, min(float(placed.scale * focal), WIDEST), options)
 
 
 def relative_poses(
@@ -154,7 +154,7 @@ def relative_poses(
     return torch.cat(motions), torch.cat(deviations), torch.cat(good)
 
 
-def _largest(component: Int[Tensor, "v"], usable: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
+def largest(component: Int[Tensor, "v"], usable: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
     """The usable members of the component that has most of them."""
     number = torch.bincount(component[usable], minlength=len(component))
     return usable & (component == number.argmax())
@@ -173,7 +173,7 @@ def _longest_tracks(track: Int[Tensor, "n"], view: Int[Tensor, "n"], views: int)
     return node[wanted[track[node]]]
 
 
-def _tighten(model: Mapping, width: float, options: MappingOptions) -> Mapping:
+def tighten(model: Mapping, width: float, options: MappingOptions) -> Mapping:
     """Adjust poses and points with losses that become narrower, and triangulate all tracks with what has come out."""
     for k in range(ROUNDS):
         model = _adjust(model, max(width / 2**k, 1.0))
@@ -183,7 +183,7 @@ def _tighten(model: Mapping, width: float, options: MappingOptions) -> Mapping:
     return options.adjust(model, max_iterations=20, tolerance=1e-3)
 
 
-def _complete(model: Mapping, options: MappingOptions) -> Mapping:
+def complete(model: Mapping, options: MappingOptions) -> Mapping:
     """All observations that fit, and none that does not."""
     model = filter_points(model, threshold=2 * options.reprojection, min_angle=options.min_angle)
     model = complete_tracks(model, threshold=options.reprojection)

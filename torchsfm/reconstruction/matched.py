@@ -97,7 +97,7 @@ def reconstruct_matches(
         K: Known intrinsics of all images.
         focal: First guess of the focal length in pixels, of all images or of each, which is then adjusted.
         free_principal_point: Estimate the principal point too.
-        method: "incremental", "projective", "global" or "auto", see `reconstruct`.
+        method: "incremental", "projective", "global", "windows" or "auto", see `reconstruct`.
         threshold: Largest distance of a match from its epipolar lines in pixels, for images of up to 1600 pixels; it grows in
             proportion beyond that.
         seed: The same seed gives the same model.

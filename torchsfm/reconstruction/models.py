@@ -29,8 +29,9 @@ from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import Unfolded, hanging_on_copies, unfold
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
+from torchsfm.reconstruction.windows import window_start
 
-METHODS = ("incremental", "projective", "global", "auto")
+METHODS = ("incremental", "projective", "global", "windows", "auto")
 MIN_IMAGES = 2
 """Smallest number of images of a model."""
 FEW_IMAGES = 60
@@ -71,7 +72,7 @@ def build_models(
         shared_camera: See `reconstruct`.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
-        method: "incremental", "projective", "global", or "auto" for what `choose_mapper` says.
+        method: "incremental", "projective", "global", "windows", or "auto" for what `choose_mapper` says.
         generator: Source of randomness.
         stages: Timing and saving.
         progress: Called as images are registered.
@@ -119,8 +120,8 @@ def build_models(
                 source = tuple("autocalibration" for _ in start.focal_sigma)
                 metric = replace(options, expected=start.expected(), focal_sigma=start.focal_sigma)
                 mapped, known = extend_model(start.mapping, taken, metric, report), metric
-            elif method == "global":
-                placed = global_start(empty, ~taken, options)
+            elif method in ("global", "windows"):
+                placed = (global_start if method == "global" else window_start)(empty, ~taken, options)
                 if placed is None:
                     break
                 mapped, known = extend_model(placed, taken, options, report), options
@@ -266,7 +267,7 @@ def reconstruct_tracks(
         K: Known intrinsics of all images.
         focal: First guess of the focal length in pixels, which is then adjusted.
         free_principal_point: Estimate the principal point too.
-        method: "incremental", "projective", "global" or "auto", see `reconstruct`.
+        method: "incremental", "projective", "global", "windows" or "auto", see `reconstruct`.
         seed: The same seed gives the same model.
         progress: Called as images are registered.
 

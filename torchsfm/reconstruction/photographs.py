@@ -74,7 +74,8 @@ def reconstruct(
             without calibration, by factorisation of the longest tracks, and finds the camera by autocalibration. It refuses
             rather than guesses where the images do not determine the focal length (`report.autocalibration` says why);
             "global" finds the rotations of all images from those of pairs, then all centres and points at once, with a first
-            focal length; "auto" is "global" for 500 images or more that many pairs hold together and whose focal lengths are
+            focal length; "windows" is for films: models of forty frames at a time, joined over what they share, also where the
+            camera comes back, so that what each adds to the drift is spread over the loop; "auto" is "global" for 500 images or more that many pairs hold together and whose focal lengths are
             roughly known, else "incremental"; "curves" goes by edges alone, where points do not suffice: smooth things with
             painted curves. The images are consecutive frames of one camera that is a little elsewhere each time; its principal
             point is held centred. Curves are followed through a few frames at a time, which tells their cameras; these are

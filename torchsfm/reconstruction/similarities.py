@@ -46,7 +46,11 @@ class Certainty:
 
 
 def robust_similarity(
-    X: Float[Tensor, "n 3"], Y: Float[Tensor, "n 3"], generator: torch.Generator | None = None
+    X: Float[Tensor, "n 3"],
+    Y: Float[Tensor, "n 3"],
+    generator: torch.Generator | None = None,
+    *,
+    sigma: Float[Tensor, "n"] | None = None,
 ) -> tuple[Similarity, Bool[Tensor, "n"]]:
     """The similarity from X to Y that most pairs agree on, of least squares over those, and which they are.
 
@@ -57,10 +61,14 @@ def robust_similarity(
         X: Places in the one frame.
         Y: In the other, in whose unit distances are.
         generator: Source of the triples; the same ones each time if not given.
+        sigma: How uncertain each pair is, up to a factor; all alike if not given.
     """
     n = len(X)
     if n < 3:
         return similarity_from_points(X, Y), torch.ones(n, dtype=torch.bool)
+    # In units of the middle one, so that distances keep theirs.
+    spread = torch.ones_like(X[:, 0]) if sigma is None else sigma / sigma.median()
+    weights = spread.square().reciprocal()
     generator = generator or torch.Generator().manual_seed(0)
     if math.comb(n, 3) <= SAMPLES:
         triple = torch.combinations(torch.arange(n), 3)
@@ -69,10 +77,10 @@ def robust_similarity(
     kept = min(n, max(5, math.ceil(0.6 * n)))
     models = similarity_from_points(X[triple], Y[triple])
     for _ in range(2):
-        squared = (models.transform(X) - Y).square().sum(-1)
+        squared = (models.transform(X) - Y).square().sum(-1) * weights
         near = squared.topk(kept, dim=-1, largest=False).indices
-        models = similarity_from_points(X[near], Y[near])
-    squared = (models.transform(X) - Y).square().sum(-1)
+        models = similarity_from_points(X[near], Y[near], weights[near])
+    squared = (models.transform(X) - Y).square().sum(-1) * weights
     best = squared.topk(kept, dim=-1, largest=False).values.sum(-1).argmin()
     distance = squared[best].sqrt()
     # Exact places differ by rounding.
@@ -82,8 +90,8 @@ def robust_similarity(
     used = torch.ones(n, dtype=torch.bool)
     for _ in range(SETTLING):
         before, used = used, distance <= reach * distance.median() + floor
-        similarity = similarity_from_points(X, Y, used.to(X.dtype))
-        distance = (similarity.transform(X) - Y).norm(dim=-1)
+        similarity = similarity_from_points(X, Y, used * weights)
+        distance = (similarity.transform(X) - Y).norm(dim=-1) / spread
         if bool((used == before).all()):
             break
     return similarity, used

@@ -104,6 +104,33 @@ class ViewGraph:
             homography_inliers=torch.where(kept, self.homography_inliers, 0),
         )
 
+    def part(self, images: Int[Tensor, "k"]) -> tuple["ViewGraph", Int[Tensor, "m"]]:
+        """The graph of some images alone, given in ascending order, and the numbers of its image points."""
+        number = torch.full((len(self.names),), -1, dtype=torch.long)
+        number[images] = torch.arange(len(images))
+        node = (number[self.view] >= 0).nonzero()[:, 0]
+        place = torch.full((len(self.x),), -1, dtype=torch.long)
+        place[node] = torch.arange(len(node))
+        kept = (number[self.pairs] >= 0).all(1)
+        own = kept[self.match_pair]
+        part = replace(
+            self,
+            names=tuple(self.names[i] for i in images.tolist()),
+            image_size=self.image_size[images],
+            x=self.x[node],
+            view=number[self.view[node]],
+            color=self.color[node],
+            pairs=number[self.pairs[kept]],
+            **{
+                name: getattr(self, name)[kept]
+                for name in ("num_matches", "F", "H", "fundamental_inliers", "homography_inliers")
+            },
+            match=place[self.match[own]],
+            match_pair=(kept.cumsum(0) - 1)[self.match_pair[own]],
+            descriptors=None,
+        )
+        return part, node
+
     def verdicts(self, K: Float[Tensor, "v 3 3"], unknown_focal: Bool[Tensor, "v"]) -> Int[Tensor, "q"]:
         """The `Verdict` on each pair, given intrinsics of each image, and where their focal length is only a guess.
 
