@@ -18,25 +18,39 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+
+if TYPE_CHECKING:
+    from torchsfm.geometry import Pose
+    from torchsfm.simulation import TexturedScene
 
 Row = dict[str, float]
 WIDTH, HEIGHT, FEATURES, NEIGHBOURS = 480, 360, 1000, 20
 LARGE = (10**4, 10**5, 10**6)
 
 
-def render(folder: Path, views: int) -> list[Path]:
-    """Photographs on an arc around a courtyard, some at a time."""
-    from torchsfm.images import save_image
-    from torchsfm.simulation import courtyard_scene, orbit_poses, render_sequence
+def ring(views: int, generator: torch.Generator) -> tuple["TexturedScene", "Pose"]:
+    """The things of a courtyard and cameras on an arc around them, all of which see the same things."""
+    from torchsfm.simulation import courtyard_scene, orbit_poses
 
-    generator = torch.Generator().manual_seed(0)
     scene = courtyard_scene(texel=0.012, generator=generator)
     poses = orbit_poses(views, radius=5.2, height=(0.6, 2.2), sweep=math.radians(300), target=(0.0, 0.0, 0.7))
+    # Behind its two walls cameras see nothing of the court.
+    ground, _, _, *things = scene.objects
+    return replace(scene, objects=(ground, *things)), poses
+
+
+def render(folder: Path, views: int) -> list[Path]:
+    """Photographs of the ring, some at a time."""
+    from torchsfm.images import save_image
+    from torchsfm.simulation import render_sequence
+
+    generator = torch.Generator().manual_seed(0)
+    scene, poses = ring(views, generator)
     files = []
     for some in torch.split(torch.arange(views), 10):
         rendered = render_sequence(scene, poses=poses[some], width=WIDTH, height=HEIGHT, points=0, generator=generator)
