@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
-from torchsfm.geometry.rotations import random_rotation
+from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction.adjust import adjust
 from torchsfm.reconstruction.calibration import CameraPrior
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
@@ -26,19 +26,21 @@ from torchsfm.simulation import look_at
 SIZE = (640, 480)
 
 
-def cameras_on_an_arc(v: int, sweep: float) -> Pose:
-    """Cameras around the origin, ten away, looking at it."""
+def cameras_on_an_arc(v: int, sweep: float, distance: float = 10.0, swing: float = 0.5) -> Pose:
+    """Cameras around the origin, looking at it."""
     angle = torch.linspace(0, sweep, v, dtype=torch.float64)
-    centre = torch.stack((10 * angle.sin(), -10 * angle.cos(), 0.5 * (3 * angle).sin()), -1)
+    centre = torch.stack((distance * angle.sin(), -distance * angle.cos(), swing * (3 * angle).sin()), -1)
     return look_at(centre, torch.zeros(3, dtype=torch.float64))
 
 
-def mapping_of(poses: Pose, X: Tensor, sees: Tensor, generator: torch.Generator, noise: float = 0.5) -> Mapping:
+def mapping_of(
+    poses: Pose, X: Tensor, sees: Tensor, generator: torch.Generator, noise: float = 0.5, focal: float = 600.0
+) -> Mapping:
     """A model of the points that the views see inside their images, and every pair of views with its true matches."""
     v, n = sees.shape
     zero = torch.zeros(1, dtype=torch.float64)
     middle = torch.tensor([[SIZE[0] / 2, SIZE[1] / 2]], dtype=torch.float64)
-    camera = Camera(intrinsics(torch.full((1,), 600.0, dtype=torch.float64), middle), Radial(zero, zero))
+    camera = Camera(intrinsics(torch.full((1,), focal, dtype=torch.float64), middle), Radial(zero, zero))
     X_cam = poses.transform(X.expand(v, n, 3))
     x = camera[torch.zeros(v, dtype=torch.long)].project(X_cam)
     sees = sees & (x >= 1).all(-1) & (x < torch.tensor(SIZE) - 2).all(-1)
@@ -92,6 +94,23 @@ def folded(generator: torch.Generator, v: int = 12) -> Mapping:
     return mapping_of(cameras_on_an_arc(v, 0.6), torch.cat([thing, around]), sees, generator)
 
 
+def distant(generator: torch.Generator, v: int = 14) -> Mapping:
+    """Cameras with a narrow field of view that all look along one plane, each point seen by some next to each other."""
+    X = cloud(800, generator, (-3, -3, -2), (3, 3, 2))
+    near = (torch.arange(v)[:, None] - v * torch.rand(800, generator=generator)).abs() < 2.5
+    return mapping_of(cameras_on_an_arc(v, 1.2, 200.0, 0.0), X, near, generator, focal=12000.0)
+
+
+def hinged(model: Mapping, angle: float, first: int) -> Mapping:
+    """The model with the images from one on, and what they see, turned about the normal of the plane of the cameras."""
+    turn = rotation_from_rotvec(torch.tensor([0.0, 0.0, angle], dtype=torch.float64))
+    moved = torch.arange(len(model.registered)) >= first
+    poses = replace(model.poses, R=torch.where(moved[:, None, None], model.poses.R @ turn.mT, model.poses.R))
+    node = model.point >= 0
+    point = torch.where(node & moved[model.graph.view], model.point + len(model.X), model.point)
+    return replace(model, poses=poses, X=torch.cat([model.X, model.X @ turn.mT]), point=point).compacted()
+
+
 def stand(mapping: Mapping, focal_sigma: float = 0.5, uncertain: Tensor | None = None) -> Standing:
     """The standing of a model whose focal length was known so well, as a fraction, before it was made."""
     prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), focal_sigma, dtype=torch.float64))
@@ -119,6 +138,20 @@ def test_a_folded_model_is_doubted_whole(generator: torch.Generator) -> None:
         # Only cameras at different places miss what the others see.
         assert ((refuted[:, 0] + refuted[:, 1]) % 2 == 1).all()
         assert all("look alike" in reason for reason in judged(mapping))
+
+
+def test_images_beyond_a_hinge_are_doubted(generator: torch.Generator) -> None:
+    for _ in range(4):
+        mapping = distant(generator)
+        assert judged(mapping) == ("",) * 14
+        bent = hinged(mapping, 0.7, 9)
+        # No pair contradicts the poses: rays of distant cameras meet whatever the angle between these.
+        poses = pair_agreement(bent, threshold=4.0, poses_alone=True)
+        assert poses.agreeing.sum() > 0.95 * poses.matches.sum()
+        assert not poses.contradicts.any()
+        doubts = judged(bent)
+        assert all("contradict" in reason for reason in doubts[9:])
+        assert not any("to most others" in reason for reason in doubts[:9])
 
 
 def test_conflicts_that_are_known_are_those_that_are_found(generator: torch.Generator) -> None:

@@ -18,9 +18,14 @@ CONFIDENT = 2.33
 class PairAgreement:
     """Verified pairs of registered images: how many of their matches there are, and how many agree with the model.
 
-    A match agrees if its two rays meet in front of both cameras, up to the threshold. Wrong poses leave a pair a few matches
-    along the epipolar lines that the model and the pair have in common, right ones nearly all; the pair speaks for or against
-    the model where that is significantly more or less than a half of its matches.
+    A match agrees if its two rays meet in front of both cameras, up to the threshold, and if the points of the model that it
+    shows lie there in both images. Wrong poses leave a pair a few matches along the epipolar lines that the model and the pair
+    have in common, right ones nearly all; the pair speaks for or against the model where that is significantly more or less
+    than a half of its matches.
+
+    Epipolar lines alone tell little where the field of view is narrow: rays of two distant cameras meet whatever the angle
+    between them about the normal of the plane in which they look (Koenderink & van Doorn 1991), and a model that is bent about
+    it as about a hinge contradicts no pair. But it has two points, one on either side, where a match across shows one.
     """
 
     pairs: Int[Tensor, "q 2"]
@@ -56,18 +61,37 @@ class PairAgreement:
         return total
 
 
-def pair_agreement(mapping: Mapping, *, threshold: float) -> PairAgreement:
-    """Compare the poses of a model with the verified matches of all pairs of its images.
+def pair_agreement(mapping: Mapping, *, threshold: float, poses_alone: bool = False) -> PairAgreement:
+    """Compare a model with the verified matches of all pairs of its images.
 
     Args:
         mapping: The model.
-        threshold: Largest distance of a match from the epipolar line, in pixels.
+        threshold: Largest distance of a match from the epipolar line, in pixels; a point may be off in the one image and in
+            the other, twice as much together.
+        poses_alone: Leave the points aside, for a model whose points are not what they will be.
     """
     rays = _MatchedRays.of(mapping)
     matches = torch.bincount(rays.pair, minlength=len(mapping.graph.pairs))
-    agreeing = torch.bincount(rays.pair[rays.agree(threshold)], minlength=len(matches))
+    agree = rays.agree(threshold)
+    if not poses_alone:
+        agree &= _points_lie_there(mapping, rays.match, 2 * threshold)
+    agreeing = torch.bincount(rays.pair[agree], minlength=len(matches))
     compared = (matches > 0).nonzero()[:, 0]
     return PairAgreement(mapping.graph.pairs[compared], matches[compared], agreeing[compared], compared)
+
+
+def _points_lie_there(mapping: Mapping, match: Int[Tensor, "m 2"], threshold: float) -> Bool[Tensor, "m"]:
+    """Matches of which no image point shows a point that is elsewhere in the other image.
+
+    Points that two images alone see count as unknown: where these stand close to each other they may be far off.
+    """
+    fits = torch.ones(len(match), dtype=torch.bool)
+    known = torch.bincount(mapping.point[mapping.point >= 0], minlength=len(mapping.X)) >= 3
+    for own, other in (match.unbind(1), match.flip(1).unbind(1)):
+        shows = (mapping.point[own] >= 0).nonzero()[:, 0]
+        shows = shows[known[mapping.point[own[shows]]]]
+        fits[shows] &= mapping.errors(mapping.point[own[shows]], other[shows]) < threshold
+    return fits
 
 
 def excess_scatter(mapping: Mapping, *, threshold: float) -> float:
@@ -119,6 +143,7 @@ class _MatchedRays:
     """The verified matches of registered images as unit rays, with the poses of their pairs."""
 
     pair: Int[Tensor, "m"]
+    match: Int[Tensor, "m 2"]
     p: Float[Tensor, "m 3"]
     """Rays of the first camera, turned into the second."""
     d: Float[Tensor, "m 3"]
@@ -151,7 +176,7 @@ class _MatchedRays:
         scale = focal / (2 - tp.square() - td.square() - 2 * e.square()).clamp(min=1e-12).sqrt()
         ahead = focal * torch.minimum(td - tp * cosine, td * cosine - tp)
         distance = torch.where(valid1 & valid2, e * scale, torch.inf)
-        return cls(graph.match_pair[chosen], p, d, t, distance, scale, ahead)
+        return cls(graph.match_pair[chosen], graph.match[chosen], p, d, t, distance, scale, ahead)
 
     def agree(self, threshold: float) -> Bool[Tensor, "m"]:
         """Matches whose rays meet in front of both cameras, up to the threshold in pixels."""

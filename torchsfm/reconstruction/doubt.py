@@ -11,6 +11,7 @@ from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
+from torchsfm.reconstruction.groups import outvoted_groups
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
 
@@ -74,6 +75,7 @@ def examine(
     matches, agreeing = (agreement.per_view(one > 0, n, v) for n in (agreement.matches, agreement.agreeing))
     explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
     outvoted = agreement.balance(v) < 0
+    hinged = outvoted_groups(agreement, mapping.registered)
     conflicts = conflicts or missing_correspondences(mapping)
     refuted = conflicts.refuted
     guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL
@@ -90,6 +92,10 @@ def examine(
             )
         if bool(outvoted[i]):
             return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
+        if bool(hinged[i]):
+            return (
+                f"pairs of images contradict how it stands to most others, with {int(hinged.sum())} images of which this is so"
+            )
         if int(agreeing[i]) < EXPLAINED * int(matches[i]):
             return f"{int(agreeing[i])} of the {int(matches[i])} matches of its pairs agree with its place, the others do not"
         if elsewhere is not None and int(elsewhere[i]) > int(matches[i]):

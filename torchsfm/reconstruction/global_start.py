@@ -193,7 +193,7 @@ def complete(model: Mapping, options: MappingOptions) -> Mapping:
 
 def _tracks(model: Mapping, threshold: float) -> Int[Tensor, "n"]:
     """Tracks of the pairs that agree with a model, and of those with images that have no place yet."""
-    graph, agreement = model.graph, pair_agreement(model, threshold=threshold)
+    graph, agreement = model.graph, pair_agreement(model, threshold=threshold, poses_alone=True)
     kept = torch.ones(len(graph.pairs), dtype=torch.bool).index_copy_(0, agreement.index, agreement.supports)
     own = kept[graph.match_pair]
     return build_tracks(graph.view, graph.match[own], graph.fundamental_inliers[graph.match_pair[own]])
