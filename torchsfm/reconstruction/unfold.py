@@ -62,7 +62,7 @@ def unfold(
     graph, v = empty.graph, len(empty.graph.names)
     distinct = Distinctiveness.of(graph)
     backbone = Backbone.of(graph.pairs, torch.where(elsewhere[graph.pairs].any(1), 0.0, distinct.weight), v)
-    agreement = pair_agreement(replace(model, graph=graph), threshold=options.reprojection)
+    agreement = pair_agreement(replace(model, graph=graph), threshold=options.reprojection, poses_alone=True)
     contradicted = agreement.index[agreement.contradicts & backbone.chosen[agreement.index]]
     uncertain = _hanging_on(backbone, contradicted, model.registered)
     first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, distinct.weight))
@@ -91,7 +91,7 @@ def hanging_on_copies(graph: ViewGraph, model: Mapping, others: Bool[Tensor, "v"
         threshold: Largest reprojection error of an observation, in pixels.
     """
     distinct = Distinctiveness.of(graph)
-    agreement = pair_agreement(replace(model, graph=graph), threshold=threshold)
+    agreement = pair_agreement(replace(model, graph=graph), threshold=threshold, poses_alone=True)
     supports = torch.zeros(len(graph.pairs), dtype=torch.bool)
     supports[agreement.index] = agreement.supports
     backbone = Backbone.of(graph.pairs, torch.where(supports, distinct.weight, 0.0), len(graph.names))
@@ -143,7 +143,7 @@ def _trials(
         if grown is None:
             return
         conflicts = missing_correspondences(grown)
-        agreement = pair_agreement(replace(grown, graph=graph), threshold=options.reprojection)
+        agreement = pair_agreement(replace(grown, graph=graph), threshold=options.reprojection, poses_alone=True)
         ways = [backbone.way(i, j) for i, j in conflicts.refuted.tolist()]
         suspected[[q for way in ways for q in way]] = True
         false = refuted.clone()
@@ -169,7 +169,7 @@ def _from_backbone(
     if grown is None:
         return None
     model = replace(grown[0], graph=empty.graph)
-    agreement = pair_agreement(model, threshold=options.reprojection)
+    agreement = pair_agreement(model, threshold=options.reprojection, poses_alone=True)
     return extend_model(_with_pairs(model, empty.graph, _agreeing(agreement, backbone.chosen)), elsewhere, options, progress)[0]
 
 
