@@ -1,5 +1,6 @@
 """First guesses for cameras of which nothing, or little, is known."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -25,6 +26,9 @@ FOCAL_SIGMA = {
     "default": 0.5,
 }
 """How far a focal length may be off, as a fraction, by where it comes from."""
+REFUTED = 3.0
+"""A stated focal length that is off from that of the pairs by so many standard deviations of both is not that of the images:
+they were cropped, or scaled, or what was stated is that of another film format."""
 
 
 def focal_uncertainty(source: Sequence[str]) -> Float[Tensor, "g"]:
@@ -62,7 +66,7 @@ def guess_cameras(
         camera_index: Which camera took each image.
         model: Name of the distortion model.
         K: Known intrinsics.
-        exif_focal: Focal length in pixels that each file states.
+        exif_focal: Focal length in pixels that each file states; it counts unless the pairs refute it.
 
     Returns:
         The cameras, and where each focal length comes from, a key of `FOCAL_SIGMA`.
@@ -78,7 +82,8 @@ def guess_cameras(
         value, word = float(size[k].max()) * DEFAULT_FOCAL, "default"
         if stated:
             value, word = float(torch.tensor(stated, dtype=dtype).median()), "exif"
-        elif (found := _focal_of_pairs(graph, camera_index == k, c[k], size[k])) is not None:
+        found = None if K is not None else _focal_of_pairs(graph, camera_index == k, c[k], size[k])
+        if found is not None and (not stated or _refutes(found, value)):
             value, word = found, "fundamental matrices"
         focal.append(value)
         source.append(word)
@@ -104,6 +109,12 @@ def _focal_of_pairs(
     count = int(good.sum())
     found = focal_from_fundamentals(graph.F[good], c.expand(count, 2), c.expand(count, 2), weights=weights, image_size=size)
     return float(found.model) if found.status == Status.OK else None
+
+
+def _refutes(found: float, stated: float) -> bool:
+    """Whether the focal length of many pairs and one that a file states cannot both be right."""
+    sigma = math.hypot(FOCAL_SIGMA["fundamental matrices"], FOCAL_SIGMA["exif"])
+    return abs(math.log(found / stated)) > REFUTED * sigma
 
 
 def _focals_of_graph(

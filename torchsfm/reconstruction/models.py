@@ -265,7 +265,7 @@ def reconstruct_tracks(
         camera: Distortion model, see `reconstruct`.
         shared_camera: Whether all images of one size share a camera, as they do by default.
         K: Known intrinsics of all images.
-        focal: First guess of the focal length in pixels, which is then adjusted.
+        focal: First guess of the focal length in pixels, which is then adjusted; one that the images refute is not used.
         free_principal_point: Estimate the principal point too.
         method: "incremental", "projective", "global", "windows" or "auto", see `reconstruct`.
         seed: The same seed gives the same model.

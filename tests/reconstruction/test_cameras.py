@@ -1,0 +1,43 @@
+"""Which word on the focal length counts: that of the file, or that of the pairs."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Camera, intrinsics
+from torchsfm.reconstruction.cameras import guess_cameras
+from torchsfm.reconstruction.view_graph import ViewGraph, graph_from_tracks
+from torchsfm.simulation import random_points, random_poses, simulate_images
+
+SIZE, FOCAL = (1000, 750), 1000.0
+
+
+def photographs(X: Tensor, generator: torch.Generator) -> ViewGraph:
+    """Verified pairs of eight photographs of points, half a pixel off."""
+    poses = random_poses(8, distance=(5.0, 7.0), wobble=1.0, generator=generator)
+    K = intrinsics(torch.tensor(FOCAL), torch.tensor([499.5, 374.5])).double().expand(8, 3, 3)
+    seen = simulate_images(X, poses, Camera(K), image_size=SIZE, noise=0.5, generator=generator)
+    view, track = seen.visible.nonzero(as_tuple=True)
+    names, color = [f"{i}.png" for i in range(8)], torch.zeros(len(view), 3).double()
+    size = torch.tensor([SIZE] * 8)
+    return graph_from_tracks(names, size, seen.x[view, track], view, track, color, generator=generator)[0]
+
+
+def guess(graph: ViewGraph, stated: float) -> tuple[float, str]:
+    cameras, source = guess_cameras(graph, torch.zeros(8).long(), model="radial", K=None, exif_focal=[stated] * 8)
+    return float(cameras.K[0, 0, 0]), source[0]
+
+
+@pytest.mark.parametrize("stated", [0.5 * FOCAL, 2.2 * FOCAL])
+def test_a_stated_focal_length_that_the_pairs_refute_is_not_taken(stated: float, generator: torch.Generator) -> None:
+    focal, source = guess(photographs(random_points(300, generator=generator), generator), stated)
+    assert source == "fundamental matrices"
+    assert abs(focal / FOCAL - 1) < 0.2
+
+
+def test_a_stated_focal_length_counts_where_the_pairs_do_not_refute_it(generator: torch.Generator) -> None:
+    X = random_points(300, generator=generator)
+    assert guess(photographs(X, generator), 1.2 * FOCAL) == (1.2 * FOCAL, "exif")
+    # What is flat says nothing of the focal length.
+    flat = X * X.new_tensor([1.0, 1.0, 0.0])
+    assert guess(photographs(flat, generator), 0.5 * FOCAL) == (0.5 * FOCAL, "exif")
