@@ -33,6 +33,9 @@ from torchsfm.motion.many_views.bilinear_steps import (
 from torchsfm.optim.descent import Options, Problem, Step, descend
 from torchsfm.optim.pytree import Places, pick
 
+_FRAMES = 60
+"""Steps to the frame in which cameras of norm 1 have orthonormal joint columns: each leaves a fraction of what is missing."""
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -230,3 +233,20 @@ def unit_frame(P: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     u = R @ u
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-100)
     return P, torch.nn.functional.normalize(u, dim=1)
+
+
+def in_own_frame(fit: Fit, used: Bool[Tensor, "p n"]) -> Fit:
+    """The same cameras and points, each of norm 1, in a frame of their own.
+
+    A fit determines them up to a change of space and to scales. A frame that is carried along the search is changed by its way,
+    on which rounding grows. Cameras of norm 1 have orthonormal joint columns in one frame and those turned against it (Tyler
+    1987 for vectors); of these it is the one whose axes are the principal axes of the points that are used.
+    """
+    P, u = fit.P, fit.u
+    for _ in range(_FRAMES):
+        P, u = unit_frame(P, u)
+    _, axes, _ = eigh((u * used[:, None]) @ u.mT)
+    # Their senses by a moment that no symmetry of the points makes zero.
+    moment = axes.mT @ (u * used[:, None]) @ (1 + torch.arange(u.shape[-1], dtype=u.dtype, device=u.device)).reciprocal()
+    axes = axes * torch.where(moment < 0, -1.0, 1.0).to(u.dtype)[:, None]
+    return Fit(P @ axes[:, None], axes.mT @ u, fit.cost)

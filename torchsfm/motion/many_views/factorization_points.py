@@ -29,6 +29,7 @@ from torchsfm.motion.many_views.bilinear_fit import (
     core,
     fit_angles,
     fit_with_prior,
+    in_own_frame,
     information,
     of_rank,
     squared_sines,
@@ -159,6 +160,9 @@ def _factorize(x: Tensor, w: Tensor, robust: bool, steps: int) -> tuple[Tensor, 
         frame, balanced = balanced_frame(x, w * counts)
         rays = _rays(x, w * counts, frame)
         fit, costs, done, trust = _search(rays, robust, steps)
+        # Depths positive as often as can be, and then a frame: a camera that changes its sign changes the joint columns.
+        side, turn = signs_of_depths((rays.a * (fit.P @ fit.u[:, None])).sum(2))
+        fit = in_own_frame(Fit(fit.P * (side * view)[..., None, None], fit.u * turn[:, None], fit.cost), point)
         proximity = torch.stack(costs + [costs[-1]] * (steps + 1 - len(costs)), -1).sqrt()
         unknowns = 11 * view.sum(-1) + 3 * point.sum(-1) - 15
         enough = (view.sum(-1) >= 2) & (point.sum(-1) >= _ENOUGH) & (2 * counts.sum((-2, -1)) >= unknowns)
@@ -171,12 +175,10 @@ def _factorize(x: Tensor, w: Tensor, robust: bool, steps: int) -> tuple[Tensor, 
     P, u = fit.P, fit.u
     if wants_derivative(x, w):
         P, u = with_derivative(_rays(x, w * counts * trust, frame), fit)
-    # Back to the coordinates that came, each camera and point of norm 1, depths positive as often as can be.
+    # Back to the coordinates that came, each camera and point of norm 1.
     P, _ = solve(frame, P)
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-300)
-    side, turn = signs_of_depths((P.detach() @ u.detach()[:, None])[:, :, 2] * counts)
-    P = P * (side * view)[..., None, None]
-    X = u.mT * (turn * point)[..., None]
+    X = u.mT * point[..., None]
     y = (P.detach() @ X.detach().mT[:, None]).mT
     error = torch.linalg.vector_norm(divide_safely(y[..., :2], y[..., 2]) - x.detach(), dim=-1)
     return P, X, y[..., 2] * counts, proximity, torch.where(counts, error, torch.inf), rays.w * trust, view, point, status
