@@ -12,6 +12,7 @@ from torchsfm.bundle import BundleResult, bundle_adjust, bundle_adjust_model
 from torchsfm.bundle.rays import RayPoint, ray_points
 from torchsfm.geometry import BundleProblem, Camera, Pose, Radial
 from torchsfm.optim import Cauchy, descent
+from torchsfm.optim.settling import Settling
 from torchsfm.simulation import random_bundle_problem
 
 F64 = torch.float64
@@ -44,13 +45,13 @@ def check_convergence(outliers: float, loss: Cauchy | None, count: int, share: f
     assert fast >= share * count
 
 
-@pytest.mark.parametrize(("outliers", "loss", "share"), [(0.0, None, 1.0), (0.0, Cauchy(1.0), 1.0), (0.1, Cauchy(1.0), 0.6)])
+@pytest.mark.parametrize(("outliers", "loss", "share"), [(0.0, None, 1.0), (0.0, Cauchy(1.0), 1.0), (0.1, Cauchy(1.0), 0.8)])
 def test_forty_steps_to_the_minimum(outliers: float, loss: Cauchy | None, share: float) -> None:
     check_convergence(outliers, loss, 6, share)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("outliers", "loss", "share"), [(0.0, None, 1.0), (0.0, Cauchy(1.0), 1.0), (0.1, Cauchy(1.0), 0.86)])
+@pytest.mark.parametrize(("outliers", "loss", "share"), [(0.0, None, 1.0), (0.0, Cauchy(1.0), 1.0), (0.1, Cauchy(1.0), 0.94)])
 def test_forty_steps_to_the_minimum_in_fifty_problems(outliers: float, loss: Cauchy | None, share: float) -> None:
     check_convergence(outliers, loss, 50, share)
 
@@ -65,6 +66,17 @@ def test_conjugate_gradients_end_with_newton_steps(outliers: float, monkeypatch:
     monkeypatch.setattr(descent, "SLOW", torch.inf)
     plain = [bundle_adjust_model(problem, linear_solver="pcg", **options).result for problem in made]
     assert sum(result.iterations for result in found) < sum(result.iterations for result in plain)
+
+
+def test_points_settle_between_newton_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points that wrong data pull about do not hold back cameras: fewer steps to the same minima."""
+    options = {"free": FREE, "loss": Cauchy(1.0), "tolerance": 1e-13, "max_iterations": 200}
+    made = problems(25, 0.1)
+    found = [bundle_adjust_model(problem, **options).result for problem in made]
+    monkeypatch.setattr(Settling, "settle", lambda self, x, *_: x)
+    plain = [bundle_adjust_model(problem, **options).result for problem in made]
+    assert sum(result.iterations for result in found) < 0.95 * sum(result.iterations for result in plain)
+    assert sum(abs(a.cost / b.cost - 1) < 1e-9 for a, b in zip(found, plain, strict=True)) >= 20
 
 
 @pytest.mark.parametrize(("outliers", "loss"), [(0.0, None), (0.0, Cauchy(1.0)), (0.1, Cauchy(1.0))])

@@ -94,8 +94,24 @@ def test_a_few_bad_steps_do_not_hold_back_the_others(generator: torch.Generator)
     factor = torch.where(torch.arange(40) % 2 == 0, 1.0, 4.0).double()[:, None]
     step = {"c": torch.zeros(1, 1, dtype=F64), "p": (offset * factor)[order]}
     trial = schur.move(blocks, engine.layout, x, step)
-    better = engine.shorten(x, step, trial)["p"]
+    better = engine.settling.shorten(x, step, trial)["p"]
     torch.testing.assert_close(better, offset)
+
+
+def test_eliminated_variables_settle_each_at_its_own_minimum(generator: torch.Generator) -> None:
+    """Gauss-Newton steps overshoot from afar, for ever where they are not damped, and for each variable as it needs."""
+    offset = 3 * torch.randn(40, 1, generator=generator, dtype=F64)
+    index = torch.arange(40)
+    term = Term(lambda c, p, o: torch.atan(p - o) + 0 * c, ("c", "p"), (index * 0, index), (offset,))
+    blocks = {"c": Block(torch.zeros(1, 1, dtype=F64)), "p": Block(torch.zeros(40, 1, dtype=F64))}
+    x = {name: b.x for name, b in blocks.items()}
+    settling = schur.Elimination(blocks, lay_out(blocks, [term], "p"), "dense").settling
+    once, often = settling.settle(x)["p"], settling.settle(x, 60, 1e-20)["p"]
+    torch.testing.assert_close(often, offset, rtol=0, atol=1e-8)
+    better = torch.atan(once - offset).square() < torch.atan(offset).square()
+    assert torch.equal(once[~better], x["p"][~better])
+    assert not bool(better.all())
+    assert torch.equal(settling.settle(x, 40, torch.inf)["p"], once)
 
 
 @pytest.mark.parametrize("eliminate", ["p", None])

@@ -18,7 +18,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsfm.optim.batched_cholesky import backward, factor, forward, hold, measure, place
+from torchsfm.optim.batched_cholesky import factor, hold, measure, place
 from torchsfm.optim.curvature import curvature
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.multigrid import PairGraph
@@ -27,6 +27,7 @@ from torchsfm.optim.retained_blocks import RetainedBlocks, Runs, find_runs
 from torchsfm.optim.schur_grouped import GroupCoupling, plan_groups
 from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, find_clusters
 from torchsfm.optim.schur_pairwise import PairCoupling, estimate_pairs
+from torchsfm.optim.settling import Seen, Settling, add_squares
 from torchsfm.optim.terms import (
     Block,
     Term,
@@ -34,7 +35,6 @@ from torchsfm.optim.terms import (
     gather,
     lift_of,
     linearize,
-    residual_costs,
     term_cost,
     term_residual,
 )
@@ -45,12 +45,8 @@ FLOP = 1.3e-11
 """Seconds per column cubed of a Cholesky factorisation, on a usual core."""
 PASS = 4e-6
 """Seconds per residual of a solution by conjugate gradients, of some 100 iterations."""
-SETTLING = 1e-6
-"""Damping of the steps of eliminated variables by themselves."""
 BENT = 1e-3
 """Exact blocks of eliminated variables that exceed no more than this part of the Gauss-Newton ones give way to these."""
-PARTS = (0.25, 0.0625, 0.0)
-"""Of a step that eliminated variables may take instead of a whole one that leads them up."""
 Solver = Literal["auto", "dense", "pcg"]
 """How the reduced system is solved: by a dense Cholesky factor, or by conjugate gradients without forming it."""
 
@@ -94,6 +90,11 @@ class Elimination:
         some = next(iter(blocks.values())).x
         self.squares = RetainedBlocks(layout, some)
         self.work = Workspace(some)
+        seen = [
+            [Seen(p.term, p.components, p.point) for p in self.parts if p.family == k and p.point is not None]
+            for k in range(len(layout.families))
+        ]
+        self.settling = Settling(blocks, layout, seen, self.work)
         self.plan: Plan | None = None
         self.eliminated: list[Eliminated] = []
         self.current: NormalEquations | None = None
@@ -175,64 +176,16 @@ class Elimination:
         costs = [term_cost(part.term, term_residual(part.term, x, self.work)) for part in self.parts]
         return self.ranks.sum(torch.stack(costs).sum() if costs else next(iter(x.values())).new_zeros(()))
 
-    def shorten(self, x: dict[str, Tensor], step: dict[str, Tensor], trial: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The `trial` that `step` leads to from `x`, where each eliminated variable takes the part of its step that is best.
-
-        They do not depend on each other once the retained ones have moved; a few that go astray need not hold back all.
-        """
-        found = dict(trial)
-        for k, family in enumerate(self.layout.families):
-            name = family.name
-            free, best, least = self.layout.free[name], trial[name], self._point_costs(trial, k)
-            for share in PARTS:
-                other = move(self.blocks, self.layout, x, {name: share * step[name]})[name]
-                cost = self._point_costs(trial | {name: other}, k)
-                better = free[cost < least]
-                best = best.index_copy(0, better, other[better])
-                least = torch.minimum(cost, least)
-            found[name] = best.mT.contiguous().mT
-        return found
-
     def linearize(self, x: dict[str, Tensor]) -> "NormalEquations":
         """The blocks of the normal equations at `x`; they are overwritten by the next call."""
         self.current = None
         lifts = self._lifts(x)
         self._clear()
         for part in self.parts:
-            self._add(part, x, lifts, None if part.family is None else self.eliminated[part.family].V)
+            self._add(part, x, lifts)
         diagonal, slope = self.ranks.sum(torch.stack((self.squares.diagonal(), self.squares.gradient())))
         self.current = NormalEquations(self.layout, self.eliminated, self.squares, self.plan, diagonal, slope)
         return self.current
-
-    def settle(self, x: dict[str, Tensor]) -> dict[str, Tensor]:
-        """`x` with every eliminated variable one Gauss-Newton step of its own further where that lowers its cost.
-
-        A long step along a curved valley of the cost (focal length against depth) leaves it sideways; with the points brought
-        back to where the moved cameras want them it stays inside (embedded point iterations, Jeong et al. 2012).
-        """
-        lifts, found = self._lifts(x), dict(x)
-        for k, part in enumerate(self.eliminated):
-            q, name = part.q, part.family.name
-            V = self.work.get("settled", *part.V.shape).zero_()
-            for some in self.parts:
-                if some.family == k:
-                    self._add(some, x, lifts, V, held=True)
-            L, _ = factor(V + SETTLING * measure(V, q), q)
-            step = -backward(L, forward(L, V[[place(a, q, q) for a in range(q)]]))
-            moved = move(self.blocks, self.layout, x, {name: step.mT})
-            before, after = self._point_costs(x, k), self._point_costs(moved, k)
-            better = torch.zeros(x[name].shape[0], dtype=torch.bool, device=V.device)
-            better[self.layout.free[name]] = after < before
-            found[name] = torch.where(better, moved[name].mT, x[name].mT).mT
-        return found
-
-    def _point_costs(self, x: dict[str, Tensor], family: int) -> Tensor:
-        """The cost of the residuals of each eliminated variable of a family, inf where it is not a number."""
-        total = self.eliminated[family].V.new_zeros(self.layout.families[family].points)
-        for part in self.parts:
-            if part.family == family and part.point is not None:
-                total.index_add_(0, part.point, residual_costs(part.term, term_residual(part.term, x, self.work)))
-        return total.nan_to_num(nan=torch.inf)
 
     def _lifts(self, x: dict[str, Tensor]) -> dict[str, Tensor | None]:
         """Derivatives of the retractions that derivatives of terms are multiplied by."""
@@ -245,21 +198,19 @@ class Elimination:
         }
         return {name: lift_of(b, x[name]) if name in needed else None for name, b in self.blocks.items()}
 
-    def _add(
-        self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None], V: Tensor | None, *, held: bool = False
-    ) -> None:
-        """Add squares and products of a part's Jacobians to the system, or with the retained variables held to V alone."""
+    def _add(self, part: _Part, x: dict[str, Tensor], lifts: dict[str, Tensor | None]) -> None:
+        """Add squares and products of a part's Jacobians to the system."""
         family = None if part.family is None else self.eliminated[part.family]
-        q, c, d, m = 0 if family is None else family.q, 0 if held else part.width, part.components, part.term.index[0].shape[0]
+        q, c, d, m = 0 if family is None else family.q, part.width, part.components, part.term.index[0].shape[0]
         # Both with the residual as one more column, which gives the gradients.
         J, P = self.work.get("J", d, c + 1, m), self.work.get("P", d, q + 1, m)
         out: list[Tensor | None] = []
         start = 0
         for name, wanted in zip(part.term.blocks, part.wanted, strict=True):
-            if wanted and family is not None and name == family.family.name:
-                out.append(P[:, :q].permute(2, 0, 1))
-            elif held or not wanted:
+            if not wanted:
                 out.append(None)
+            elif family is not None and name == family.family.name:
+                out.append(P[:, :q].permute(2, 0, 1))
             else:
                 end = start + self.blocks[name].tangent
                 out.append(J[:, start:end].permute(2, 0, 1))
@@ -270,20 +221,12 @@ class Elimination:
             J *= scale
         if c:
             self.squares.values[part.piece].index_add_(0, part.runs.slots, part.runs.squares(J))
-        if family is None or part.point is None or V is None:
+        if family is None or part.point is None:
             return
         if scale is not None:
             P[:, :q] *= scale
         P[:, q] = J[:, c]
-        squares = self.work.get("V", V.shape[0], m)
-        row = 0
-        for a in range(q):
-            rows = squares[row : row + q + 1 - a]
-            torch.mul(P[0, a], P[0, a:], out=rows)
-            for k in range(1, d):
-                rows.addcmul_(P[k, a], P[k, a:])
-            row += q + 1 - a
-        V.index_add_(1, part.point, squares)
+        add_squares(family.V, P, part.point, self.work)
         if c and family.coupling is not None:
             family.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
 

@@ -24,6 +24,10 @@ STRAIGHT = 0.75
 TELLING = 1e4
 """Comparing costs still checks a promise of this many of their rounding errors. Down to there, steps are shortened point by
 point: a single one in a bent valley would hold all others back."""
+ROUNDS = 10
+"""Most steps that eliminated variables take by themselves after a step with the exact Hessian,"""
+WORTH = 1e-2
+"""and the part of what such a step promises, divided by their number, for which they take one."""
 POOR = 0.25
 """Of a step that gains less than this fraction of its promise, each eliminated variable takes only what is good for it."""
 
@@ -155,7 +159,8 @@ def sparse_levenberg_marquardt(
         if not math.isfinite(constant) or (there and not count):
             status = Status.NOT_FINITE
         elif pieces:
-            problem = _SparseProblem(Elimination(double, layout, linear_solver), size)
+            points = ranks.sum(some.new_tensor(sum(family.points for family in layout.families)))
+            problem = _SparseProblem(Elimination(double, layout, linear_solver), size, points)
             limits = (max_iterations, function_tolerance, step_tolerance, gradient_tolerance, initial_damping)
             tell = None if progress is None and ranks.size == 1 else _shared(progress, constant, ranks)
             found = descend(problem, x, Options(*limits, progress=tell, interruptible=ranks.size == 1))
@@ -222,6 +227,8 @@ class _SparseProblem:
     engine: Elimination
     size: float
     """What the cost would be if residuals were as large as data are."""
+    points: Tensor
+    """How many eliminated variables there are."""
     epsilon: float = torch.finfo(torch.float64).eps
     patience: int = 5
 
@@ -244,11 +251,14 @@ class _SparseProblem:
             # So near the minimum costs do not tell what is good for a variable.
             return _Place(engine, x, cost)
         if not bool(here.cost - cost > POOR * step.promise):
-            x = engine.shorten(here.x, step.delta, x)
+            x = engine.settling.shorten(here.x, step.delta, x)
             cost = engine.cost(x)
-        if bool(cost.isfinite()) and bool(here.cost - cost < STRAIGHT * step.promise):
+        if here.exact is not None:
+            x = engine.settling.settle(x, ROUNDS, WORTH * step.promise / self.points)
+            cost = engine.cost(x)
+        elif bool(cost.isfinite()) and bool(here.cost - cost < STRAIGHT * step.promise):
             # The linear model reaches no farther than this, but with the eliminated variables settled it may.
-            x = engine.settle(x)
+            x = engine.settling.settle(x)
             cost = engine.cost(x)
         return _Place(engine, x, cost)
 
