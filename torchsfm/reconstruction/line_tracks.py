@@ -1,6 +1,7 @@
 """Which segments of several views show one line? Lines of two views are proposed; further views bear them out or not."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,6 +11,7 @@ from torchsfm._types import Status
 from torchsfm.geometry import Pose, camera_from_krt
 from torchsfm.images.segment_matching import epipolar_overlap
 from torchsfm.optim import Cauchy
+from torchsfm.reconstruction.line_stretch import places_on_lines, shared_stretch
 from torchsfm.reconstruction.lines import fit_points
 from torchsfm.tensors import fundamental_from_cameras
 from torchsfm.triangulation import triangulate_lines
@@ -24,6 +26,10 @@ MIN_ANGLE = 0.02
 """Least angle of planes of sight, radians."""
 VAGUE, UNSURE = 0.05, 0.01
 """Largest standard deviation of an end across its line, over its distance from the cameras: of proposed and of final lines."""
+IMPROBABLE = 1e-3
+"""Segments, and lines, that are farther off each other than this share by noise alone do not belong together."""
+ROUNDS = 4
+"""Times that lines are fitted and segments left out."""
 STEPS = 15
 """Most steps of the least squares of a line."""
 CHUNK = 1 << 20
@@ -116,18 +122,19 @@ def link_lines(
     number, member = _share(line, segment, segments)
     if not len(member):
         return LineTracks(ends[:0], member, number)
-    for _ in range(2):
+    for _ in range(ROUNDS):
         found = _fit(number, member, segments, cameras)
         good = (found.good & (found.spread < VAGUE))[number] & (found.distance <= tolerance)
+        good &= _consistent(found, number) & _shared(found, number, member, segments, cameras).within
         number, member = _of_enough_views(number[good], member[good], segments)
         if not len(member):
-            break
-    else:
-        found = _fit(number, member, segments, cameras)
-        keep = found.good & (found.spread < UNSURE) & _every_view_in_front(found.ends, number, segments.view[member], cameras)
-        rows = keep[number]
-        return LineTracks(found.ends[keep], member[rows], (keep.cumsum(0) - 1)[number[rows]])
-    return LineTracks(ends[:0], member, number)
+            return LineTracks(ends[:0], member, number)
+    found = _fit(number, member, segments, cameras)
+    shared = _shared(found, number, member, segments, cameras)
+    keep = found.good & (found.spread < UNSURE) & shared.together & (_misfit(found, number)[0] >= IMPROBABLE)
+    keep &= _every_view_in_front(shared.ends, number, segments.view[member], cameras)
+    rows = keep[number]
+    return LineTracks(shared.ends[keep], member[rows], (keep.cumsum(0) - 1)[number[rows]])
 
 
 @dataclass(frozen=True)
@@ -138,6 +145,18 @@ class _Fit:
     """Standard deviation of the ends across the line, over their distance from the first camera."""
     distance: Tensor
     """Of each segment from the image of its line, pixels."""
+    square: Tensor
+    """The squared distances of its two points together, over their variance."""
+
+
+@dataclass(frozen=True)
+class _Shared:
+    ends: Tensor
+    """Of the stretch that enough views show."""
+    together: Tensor
+    """Whether that is most of what all show."""
+    within: Tensor
+    """Whether most of each segment, or of the stretch, is part of the other."""
 
 
 def _match(segments: ViewSegments, i: int, j: int, F: Tensor) -> Tensor:
@@ -173,8 +192,10 @@ def _triangulate(
     good = ((status == Status.OK) | (status == Status.NOT_CONVERGED)) & (found.angle[:, 0] > MIN_ANGLE)
     good = good & ends.isfinite().all(-1).all(-1) & ((ends[:, 1] - ends[:, 0]).norm(dim=-1) > 0)
     h = torch.nn.functional.pad(ends, (0, 1), value=1.0)[:, None] @ P.mT
-    away = _distance(segments.ends[members], torch.linalg.cross(h[:, :, 0], h[:, :, 1])[:, :, None]).abs().amax(-1)
-    return _Fit(ends, good, spread / distance, torch.where(visible, away, torch.inf))
+    image = torch.linalg.cross(h[:, :, 0], h[:, :, 1])[:, :, None]
+    away = _distance(segments.ends[members], image).abs().amax(-1)
+    square = _distance(x, image).square().sum(-1) * weights
+    return _Fit(ends, good, spread / distance, torch.where(visible, away, torch.inf), square)
 
 
 def _fit(number: Tensor, member: Tensor, segments: ViewSegments, cameras: Cameras) -> _Fit:
@@ -186,7 +207,41 @@ def _fit(number: Tensor, member: Tensor, segments: ViewSegments, cameras: Camera
     table[number, place], there[number, place] = member, True
     # What is not there stands for any.
     found = _triangulate(segments, cameras, table, there, STEPS)
-    return _Fit(found.ends, found.good, found.spread, found.distance[number, place])
+    return replace(found, distance=found.distance[number, place], square=found.square[number, place])
+
+
+def _misfit(found: _Fit, number: Tensor) -> tuple[Tensor, Tensor]:
+    """How probable it is that segments of one line are as far off it as they are, and the squares over those of the noise.
+
+    Where cameras are less certain than segments the noise is what the distances say.
+    """
+    size = torch.bincount(number, minlength=len(found.ends))
+    freedom = 2.0 * (size - 2).clamp_min(1)
+    total = found.square.new_zeros(len(size)).index_add(0, number, found.square)
+    # The median of chi-square, nearly.
+    noise = (total / (freedom * (1 - 2 / (9 * freedom)) ** 3)).median().clamp_min(1.0)
+    return torch.special.gammaincc(freedom.to(total.dtype) / 2, total / (2 * noise)), found.square / noise
+
+
+def _consistent(found: _Fit, number: Tensor) -> Tensor:
+    """Which segments may well be of their lines; of lines that are improbable not the one farthest off."""
+    chance, square = _misfit(found, number)
+    worst = square.new_zeros(len(chance)).scatter_reduce(0, number, square, "amax")
+    keep: Tensor = (square <= -2 * math.log(IMPROBABLE)) & ~((chance < IMPROBABLE)[number] & (square == worst[number]))
+    return keep
+
+
+def _shared(found: _Fit, number: Tensor, member: Tensor, segments: ViewSegments, cameras: Cameras) -> _Shared:
+    """The stretches of lines that enough views show."""
+    view = segments.view[member]
+    span = places_on_lines(segments.ends[member], cameras.P[view], found.ends[number])
+    stretch, there = shared_stretch(number, view, span, MIN_VIEWS)
+    length = (stretch[:, 1] - stretch[:, 0])[number]
+    common = span[:, 1].minimum(stretch[number, 1]) - span[:, 0].maximum(stretch[number, 0])
+    within = there[number] & (common >= OVERLAP * length.minimum(span[:, 1] - span[:, 0]))
+    together = there & (stretch[:, 1] - stretch[:, 0] >= OVERLAP)
+    first, last = found.ends[:, :1], found.ends[:, 1:]
+    return _Shared(first + stretch[..., None] * (last - first), together, within)
 
 
 def _distance(x: Float[Tensor, "*#n 2"], line: Float[Tensor, "*#n 3"]) -> Float[Tensor, "*n"]:
