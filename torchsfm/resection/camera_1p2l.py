@@ -13,7 +13,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import cross
 from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.resection.points_and_lines import Sample, frame, solve_poses
+from torchsfm.resection.points_and_lines import Candidates, Sample, frame, solve_poses
 
 
 def camera_1p2l(
@@ -54,13 +54,14 @@ def camera_1p2l(
     return solve_poses(_candidates, 4, batch, d, X, l, L)
 
 
-def _candidates(s: Sample) -> tuple[Tensor, Tensor]:
-    x, (l1, l2) = s.d[:, 0], s.l.unbind(1)
+def _candidates(s: Sample) -> Candidates:
+    d, _, l, V, A = (v.permute(2, 1, 0).contiguous() for v in s[:5])  # noqa: E741
+    x, (l1, l2) = d[:, 0], l.unbind(1)
     # The point is the origin.
-    distance = s.A.square().sum(-1).sqrt()
-    w = s.A / distance[..., None]
-    u = cross(s.V, w)
-    a1, a2 = (-(s.l * x[:, None]).sum(-1) / distance).unbind(-1)
+    distance = A.square().sum(-1).sqrt()
+    w = A / distance[..., None]
+    u = cross(V, w)
+    a1, a2 = (-(l * x[:, None]).sum(-1) / distance).unbind(-1)
     (w1, w2), (u1, u2) = w.unbind(1), u.unbind(1)
     k = (l1 * l2).sum(-1)
     ww, uu = (w1 * w2).sum(-1), (u1 * u2).sum(-1)
@@ -92,4 +93,4 @@ def _candidates(s: Sample) -> tuple[Tensor, Tensor]:
     g1 = depth.T[..., None] * (a1[:, None, None] * w1[:, None] + b1.T[..., None] * u1[:, None])
     g2 = depth.T[..., None] * (a2[:, None, None] * w2[:, None] + b2.T[..., None] * u2[:, None])
     R = frame(l1, l2)[:, None] @ frame(g1, g2).mT
-    return R, (depth / size).T[..., None] * x[:, None]
+    return Candidates.of_slots(R, (depth / size).T[..., None] * x[:, None])

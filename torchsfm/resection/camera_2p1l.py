@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.nullspace import nullspace_rows
-from torchsfm.resection.points_and_lines import Sample, frame, solve_poses
+from torchsfm.resection.points_and_lines import Candidates, Sample, frame, solve_poses
 
 
 def camera_2p1l(
@@ -52,9 +52,10 @@ def camera_2p1l(
     return solve_poses(_candidates, 2, batch, d, X, l, L)
 
 
-def _candidates(s: Sample) -> tuple[Tensor, Tensor]:
-    (x1, x2), l, V, A = s.d.unbind(1), s.l[:, 0], s.V[:, 0], s.A[:, 0]  # noqa: E741
-    D = s.X[:, 1]
+def _candidates(s: Sample) -> Candidates:
+    d, X, l, V, A = (v.permute(2, 1, 0).contiguous() for v in s[:5])  # noqa: E741
+    (x1, x2), l, V, A = d.unbind(1), l[:, 0], V[:, 0], A[:, 0]  # noqa: E741
+    D = X[:, 1]
     length = D.square().sum(-1).sqrt()
     # The first point is the origin; lengths in units of D.
     A = A / length[:, None]
@@ -97,4 +98,4 @@ def _candidates(s: Sample) -> tuple[Tensor, Tensor]:
     g = (world[:, None] @ g[..., None])[..., 0]
     y = a2[..., None] * x2[:, None] - a1[..., None] * x1[:, None]
     R = frame(y, l[:, None].expand_as(y)) @ frame(D[:, None].expand_as(g), g).mT
-    return R, (a1 * length[:, None])[..., None] * x1[:, None]
+    return Candidates.of_slots(R, (a1 * length[:, None])[..., None] * x1[:, None])

@@ -6,28 +6,18 @@ as a cross product; that it is a point of the unit circle is of degree four in c
 half.
 """
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg import cross, inverse
-from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.resection.points_and_lines import Sample, frame, solve_poses
+from torchsfm.linalg.rows import add_rows, take_columns
+from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
+from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, turned
 
 CONCURRENT = 1e-7
 """Volume that the unit normals of three planes of sight span, at which they meet in a line but for rounding."""
-_DEGREE = 8
-_ANGLES = 2 * math.pi * torch.arange(_DEGREE + 1, dtype=torch.float64) / (_DEGREE + 1) + 0.3
-_POWERS = torch.arange(_DEGREE + 1)
-_NODES = Constant(torch.stack((_ANGLES.cos(), _ANGLES.sin())))
-_TO_COEFFICIENTS = Constant(
-    inverse((0.5 * _ANGLES).sin()[:, None] ** _POWERS * (0.5 * _ANGLES).cos()[:, None] ** (_DEGREE - _POWERS))[0]
-)
-"""From values at the angles to coefficients of sin^k cos^(8 - k) of the half angle."""
 
 
 def camera_3l(
@@ -64,61 +54,98 @@ def camera_3l(
     return solve_poses(_candidates, 8, batch, none, none, l, L)
 
 
-def _candidates(s: Sample) -> tuple[Tensor, Tensor]:
-    s = _ordered(s)
-    (l1, l2, l3), (V1, V2, V3) = s.l.unbind(1), s.V.unbind(1)
-    camera = frame(l1, l2)
-    # Columns 2, 3, 1 of the world's frame, so that V1 is the third axis.
-    world = frame(V1, V2).roll(-1, -1)
-    p = [(camera.mT @ l[..., None])[..., 0] for l in (l2, l3)]  # noqa: E741
-    q = [(world.mT @ V[..., None])[..., 0] for V in (V2, V3)]
-    cos, sin = _NODES.on(l1.device)[:, :, None]
-    w = _circle_point(p, q, cos, sin)
-    c = _TO_COEFFICIENTS.on(l1.device) @ (w[1].square() + w[2].square() - w[0].square())
-    roots = real_root_list(torch.where(c.isfinite().all(0), c, torch.nan))
-    slot, item = roots.slot().clamp_max(7), roots.item
+def _candidates(s: Sample) -> Candidates:
+    l, V, A = _ordered(s)  # noqa: E741
+    (l1, l2, l3), (V1, V2, V3) = l.unbind(1), V.unbind(1)
+    # The world's frame has the columns 2, 3, 1 of this one, so that V1 is the third axis.
+    camera, (f1, f2, f3) = frame_rows(l1, l2), frame_rows(V1, V2)
+    p = [dot_rows(c, l2) for c in camera[:2]], [dot_rows(c, l3) for c in camera]
+    q = [dot_rows(f2, V2), dot_rows(f1, V2)], [dot_rows(f, V3) for f in (f2, f3, f1)]
+    quartics = _circle_point(p, q)
+    roots = real_root_list(_on_circle(quartics))
+    slot, item = roots.slot(), roots.item
+    w = [_at(form, roots.s, roots.t) for form in take_columns(quartics, item).unbind(0)]
     # tan(alpha / 2) = s / t.
     size = 1 / (roots.s.square() + roots.t.square())
-    cos, sin = (roots.t.square() - roots.s.square()) * size, 2 * roots.s * roots.t * size
-    w = _circle_point([v[item] for v in p], [v[item] for v in q], cos, sin)
+    cos, sin = (roots.t - roots.s) * (roots.t + roots.s) * size, 2 * roots.s * roots.t * size
     length = torch.copysign((w[1].square() + w[2].square()).sqrt(), w[0])
     cos_b, sin_b = w[1] / length, w[2] / length
-    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
-    about_x = torch.stack((one, zero, zero, zero, cos, -sin, zero, sin, cos), -1).reshape(-1, 3, 3)
-    about_z = torch.stack((cos_b, -sin_b, zero, sin_b, cos_b, zero, zero, zero, one), -1).reshape(-1, 3, 3)
-    turn = camera[item] @ (about_x @ about_z @ world.mT[item])
+    zero = torch.zeros_like(cos)
+    # Rx(alpha) Rz(beta), column by column.
+    turns = torch.stack(
+        (cos_b, cos * sin_b, sin * sin_b, -sin_b, cos * cos_b, sin * cos_b, zero, -sin, cos)
+    ).view(3, 3, -1).transpose(0, 1)  # fmt: skip
+    turns = turned(take_columns(torch.stack(camera, 1), item), turns)
+    # Rows of the world's frame: turns world'.
+    R = turned(turns, take_columns(torch.stack((f2, f3, f1)), item))
     # Concurrent image lines: three planes of sight through one line, along which nothing is told.
-    volume = (l1 * cross(l2, l3)).sum(-1)
-    told = (volume.abs() > CONCURRENT)[:, None]
-    edges = (
-        torch.stack((cross(l2, l3), cross(l3, l1), cross(l1, l2)), -1)
-        / torch.where(told, volume[:, None], torch.nan)[..., None]
+    e1 = cross_rows(l2, l3)
+    volume = dot_rows(l1, e1)
+    edges = torch.stack((e1, cross_rows(l3, l1), cross_rows(l1, l2)), 1)
+    edges = edges / torch.where(volume.abs() > CONCURRENT, volume, torch.nan)
+    offset = dot_rows(take_columns(l, item), turned(R, take_columns(A, item)))
+    t = -turned(take_columns(edges, item), offset[:, None])[:, 0]
+    return Candidates(item, slot, R, t)
+
+
+def _circle_point(p: tuple[list[Tensor], list[Tensor]], q: tuple[list[Tensor], list[Tensor]]) -> Tensor:
+    """The vector along (1, cos beta, sin beta): three forms of degree four in sin and cos of half alpha, as (3, 5, n).
+
+    It is the cross product of two rows (z q3, p1 q1 + y q2, y q1 - p1 q2) with y = p2 cos + p3 sin, z = p3 cos - p2 sin, of
+    the second line, whose p3 and q2 are zero, and of the third.
+    """
+    (p1, p2), (q1, q3) = p[0], q[0]
+    a0, a1, a2 = -p2 * q3, p1 * q1, p2 * q1
+    (p1, p2, p3), (q1, q2, q3) = p[1], q[1]
+    # Rows of the third line: z q3; constant, cos and sin of the other two.
+    zc, zs = p3 * q3, -p2 * q3
+    u, uc, us = p1 * q1, p2 * q2, p3 * q2
+    v, vc, vs = -p1 * q2, p2 * q1, p3 * q1
+    zero = torch.zeros_like(a0)
+    forms = (
+        # 1, cos, sin, cos^2, cos sin, sin^2
+        (a1 * v, a1 * vc - a2 * u, a1 * vs, -a2 * uc, -a2 * us, zero),
+        (zero, zero, -a0 * v, a2 * zc, a2 * zs - a0 * vc, -a0 * vs),
+        (zero, -a1 * zc, a0 * u - a1 * zs, zero, a0 * uc, a0 * us),
     )
-    offset = (s.l[item] * (s.A[item] @ turn.mT)).sum(-1, keepdim=True)
-    R, t = l1.new_full((len(l1), 8, 3, 3), torch.nan), l1.new_full((len(l1), 8, 3), torch.nan)
-    R[item, slot], t[item, slot] = turn, -(edges[item] @ offset)[..., 0]
-    return R, t
-
-
-def _circle_point(p: list[Tensor], q: list[Tensor], cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The vector along (1, cos beta, sin beta) for alpha, as three tensors."""
     rows = []
-    for normal, direction in zip(p, q, strict=True):
-        p1, p2, p3 = normal.unbind(-1)
-        q1, q2, q3 = direction.unbind(-1)
-        y = p2 * cos + p3 * sin
-        rows.append(((p3 * cos - p2 * sin) * q3, p1 * q1 + y * q2, y * q1 - p1 * q2))
-    (a0, a1, a2), (b0, b1, b2) = rows
-    return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+    for one, c, s, cc, cs, ss in forms:
+        even = one + cc
+        rows += [even + c, 2 * (s + cs), 2 * (one - cc) + 4 * ss, 2 * (s - cs), even - c]
+    return torch.stack(rows).view(3, 5, -1)
 
 
-def _ordered(s: Sample) -> Sample:
-    """The line whose direction is least like another one's first: two of the lines may be parallel."""
-    sine = cross(s.V[:, [0, 0, 1]], s.V[:, [1, 2, 2]]).square().sum(-1)
-    least = torch.stack([sine[:, [0, 1]].amin(-1), sine[:, [0, 2]].amin(-1), sine[:, [1, 2]].amin(-1)], -1)
-    order = (least.argmax(-1, keepdim=True) + torch.arange(3, device=sine.device)) % 3
+def _on_circle(w: Float[Tensor, "3 5 n"]) -> Float[Tensor, "9 n"]:
+    """The form of degree eight that is zero where w is along a point of the unit circle: w1^2 + w2^2 - w0^2."""
+    sign = w.new_tensor([-1.0, 1.0, 1.0])[:, None]
+    rows = []
+    for power in range(9):
+        low = max(0, power - 4)
+        total = sum(2 * (w[:, i] * w[:, power - i]) for i in range(low, (power + 1) // 2))
+        if power % 2 == 0:
+            total = total + w[:, power // 2].square()
+        rows.append(add_rows(sign * total))
+    c = torch.stack(rows)
+    return torch.where(c.isfinite().all(0), c, torch.nan)
 
-    def taken(v: Tensor) -> Tensor:
-        return v.gather(1, order[..., None].expand_as(v))
 
-    return s._replace(l=taken(s.l), V=taken(s.V), A=taken(s.A))
+def _at(form: Float[Tensor, "5 m"], s: Tensor, t: Tensor) -> Tensor:
+    """A form of degree four where the sine is to the cosine of a half angle as s to t; over its size."""
+    size = (s.square() + t.square()).square()
+    value = form[4]
+    power = t
+    for k in (3, 2, 1, 0):
+        value = (value * s).addcmul(form[k], power)
+        power = power * t
+    return value / size
+
+
+def _ordered(s: Sample) -> tuple[Tensor, Tensor, Tensor]:
+    """Lines in the order in which that whose direction is least like another one's is first: two of them may be parallel."""
+    (a, b), (c, d), (e, f) = [(s.V[:, i], s.V[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))]
+    across = [cross_rows(*pair) for pair in ((a, b), (c, d), (e, f))]
+    sines = [dot_rows(v, v) for v in across]
+    least = torch.stack((sines[0].minimum(sines[1]), sines[0].minimum(sines[2]), sines[1].minimum(sines[2])))
+    order = (least.argmax(0) + torch.arange(3, device=least.device)[:, None]) % 3
+    l, V, A = (v.gather(1, order.expand_as(v)) for v in (s.l, s.V, s.A))  # noqa: E741
+    return l, V, A
