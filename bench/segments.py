@@ -29,6 +29,8 @@ PHOTOGRAPHS = (
 WIDTH = 768
 SHORTEST = 20.0
 """Pixels."""
+SIDE, CONTRAST, BLUR = 52.0, 0.8, 0.6
+"""Of rendered squares: their sides, and the standard deviation of the blur, in pixels."""
 SHIFTS = {"OpenCV LSD": 0.125, "pytlsd": -0.625}
 """What takes their coordinates to ours, in which the centre of the first pixel is (0, 0): measured on the rendered squares. The
 image that LSD looks at is smaller by a fifth."""
@@ -99,6 +101,24 @@ def squares(count: int, generator: torch.Generator) -> None:
                 f"{max(offset):6.4f}  {found}/{4 * count}"
             )
 
+        if noise:
+            angle, offset = _bounds(noise)
+            # Of normal errors: the median, and what one of all is expected to exceed.
+            middle, most = 0.6745, float(torch.special.ndtri(torch.tensor(1 - 1 / (8 * count), dtype=F64)))
+            row = f"{middle * angle:17.4f}  {most * angle:6.4f}  {middle * offset:17.4f}  {most * offset:6.4f}"
+            print(f"{'Cramer-Rao':16}  {noise:5}  {row}")
+
+
+def _bounds(noise: float) -> tuple[float, float]:
+    """The Cramer-Rao bound of a whole side's angle, in degrees, and of the offset of its middle, in pixels.
+
+    A pixel at distance d from an edge of contrast h tells h N(d) of its place, N the density of the blur of lens and pixel: per
+    pixel of length that is h^2 / (2 sqrt(pi) blur noise^2).
+    """
+    blur = (BLUR**2 + 1 / 12) ** 0.5
+    information = CONTRAST**2 / (2 * math.sqrt(math.pi) * blur * noise**2)
+    return math.degrees((12 / (information * SIDE**3)) ** 0.5), (information * SIDE) ** -0.5
+
 
 def repeated(folder: Path, count: int, generator: torch.Generator) -> None:
     """Share of the segments of a photograph and of it under a homography that are found in the other one, and how near."""
@@ -165,7 +185,7 @@ def _apart(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(torch.minimum(common, other) >= 0.5 * shorter, (one + two) / 2, torch.inf)
 
 
-def _square(generator: torch.Generator, size: int = 96, fine: int = 6, blur: float = 0.6) -> tuple[Tensor, Tensor]:
+def _square(generator: torch.Generator, size: int = 96, fine: int = 6) -> tuple[Tensor, Tensor]:
     """A turned bright square with blurred sides, and its corners."""
     angle, *shift = torch.rand(3, generator=generator, dtype=F64).tolist()
     middle = torch.tensor([(size - 1) / 2 + 4 * s - 2 for s in shift], dtype=F64)
@@ -175,12 +195,12 @@ def _square(generator: torch.Generator, size: int = 96, fine: int = 6, blur: flo
     u, v = c * (x - middle[0]) + s * (y - middle[1]), -s * (x - middle[0]) + c * (y - middle[1])
 
     def slab(w: Tensor) -> Tensor:
-        return 0.5 * (torch.erf((w + 26) / (blur * 2**0.5)) - torch.erf((w - 26) / (blur * 2**0.5)))
+        return 0.5 * (torch.erf((w + SIDE / 2) / (BLUR * 2**0.5)) - torch.erf((w - SIDE / 2) / (BLUR * 2**0.5)))
 
     image = (slab(u) * slab(v)).reshape(size, fine, size, fine).mean((1, 3))[None]
-    square = 26 * torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=F64)
+    square = SIDE / 2 * torch.tensor([[-1.0, -1], [1, -1], [1, 1], [-1, 1]], dtype=F64)
     turn = torch.tensor([[c, s], [-s, c]], dtype=F64)
-    return 0.1 + 0.8 * image, middle + square @ turn
+    return 0.1 + CONTRAST * image, middle + square @ turn
 
 
 def _sides(found: Tensor, corners: Tensor) -> list[tuple[float, float]]:
