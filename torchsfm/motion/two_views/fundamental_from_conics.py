@@ -25,8 +25,9 @@ _SEARCH = 15
 """Steps of a start, most of which lead nowhere."""
 _LAST = 12
 """Steps from the best of the refined starts."""
-_KEPT = 8
-"""Best starts that are refined."""
+_KEPT, _KEPT_OF_FOUR = 8, 16
+"""Best different starts that are refined, of more than four conics and of four: these leave one number over, which says little,
+so that what starts cost tells less of where they lead, and several answers are likely."""
 _UNSURE = 0.2
 """The standard deviation of a parameter (epipoles in radians, as seen in normalised images) that is none."""
 _RIVAL = 9.0
@@ -281,7 +282,7 @@ def _starts(
     )
     F = _signed(state.F())
     kept = []
-    for _ in range(_KEPT):
+    for _ in range(_KEPT if seen.shape[-1] > 4 else _KEPT_OF_FOUR):
         index = cost.argmin(-1, keepdim=True)
         kept.append(index)
         chosen = F.gather(dim, index[..., None, None].expand(*index.shape, 3, 3))
