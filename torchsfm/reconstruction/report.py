@@ -122,7 +122,8 @@ class Report:
         autocalibration: For each set of images that was autocalibrated what was assumed, found and determined, or why not.
         skipped: Files and folders in the input folder that may hold photographs but were passed over, each with the reason.
         calibrations: For each model how its cameras were found, and how well they are known.
-        method: How the models were made: "incremental", "projective", "global", "windows" or "curves"; empty where the cameras were given.
+        method: How the models were made: "incremental", "projective", "global", "windows" or "curves"; empty where the cameras
+            were given.
         refusal: Why there is no model, where the method can tell; empty else.
 
     Example:
