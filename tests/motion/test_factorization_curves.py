@@ -8,7 +8,16 @@ from chance import assert_share
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import Curve, camera_from_krt, curve_from_samples, from_homogeneous, project_points, rotation_from_rotvec
+from torchsfm.autocalibration.camera_information import camera_information
+from torchsfm.geometry import (
+    Curve,
+    camera_from_krt,
+    curve_from_samples,
+    from_homogeneous,
+    project_points,
+    rotation_from_rotvec,
+    to_homogeneous,
+)
 from torchsfm.motion import CurveFactorization, factorize_curves
 from torchsfm.triangulation import triangulate_points_dlt
 
@@ -101,6 +110,49 @@ def test_noise(noise: float, generator: torch.Generator) -> None:
     assert (error[found.status == Status.OK] < max(3 * noise, 0.5)).all()
     seen = torch.where(torch.isfinite(found.error), found.error, torch.nan)
     assert (seen.square().flatten(1).nanmean(-1).sqrt()[found.status == Status.OK] < noise).all()
+
+
+def least_error(P: Tensor, X: Tensor, x: Tensor, points: Tensor) -> Tensor:
+    """The least expected mean square of `camera_error`, for unit noise of normal distances of samples X seen at x.
+
+    Cramer and Rao's bound, for samples that are unknown across their curves.
+    """
+    P = P / torch.linalg.matrix_norm(P)[..., None, None]
+    along = torch.nn.functional.normalize(x.roll(-1, -2) - x.roll(1, -2), dim=-1).flatten(2, 3)
+    v = P.shape[1]
+
+    def information(Y: Tensor, normal: Tensor | None) -> Tensor:
+        ones = torch.ones(*P.shape[:2], Y.shape[1], dtype=F64)
+        return camera_information(P, to_homogeneous(Y), ones, torch.zeros(*ones.shape, 2, 1, dtype=F64), normal=normal).matrix
+
+    values, vectors = torch.linalg.eigh(information(X.flatten(1, 2), torch.stack((-along[..., 1], along[..., 0]), -1)))
+    # Scales of cameras and the frame are free.
+    values, vectors = values[:, v + 15 :], vectors[..., v + 15 :]
+    lost = (vectors * (information(points, None) @ vectors)).sum(1) / values
+    return lost.sum(-1) / (v * points.shape[1])
+
+
+def test_all_that_is_measured_counts(generator: torch.Generator) -> None:
+    """Eight times as many measured points as samples: these alone leave five times the least mean square error and more."""
+    P, X = cameras(4, 6, generator), space_curves(4, 3, 320, generator)
+    x, noise = images(X, P), 0.1
+    found = factorize_curves(curve_from_samples(x + noise * torch.randn(x.shape, generator=generator, dtype=F64), closed=True),
+        aligned=True)  # fmt: skip
+    assert (found.status == Status.OK).all()
+    least = noise**2 * least_error(P, X, x, X[:, :, ::20].flatten(1, 2))
+    # Of one scene the mean square has a standard deviation of less than half of itself: several numbers of cameras make it.
+    assert float((camera_error(found, x).square() / least).mean()) < 1.2 + 3 * 0.5 / len(P) ** 0.5
+
+
+def test_more_samples_than_were_measured(generator: torch.Generator) -> None:
+    """What noise makes of a curve that is drawn from one measured point to the next is smooth, and no sign of wrong cameras."""
+    P, X = cameras(4, 6, generator), space_curves(4, 3, 400, generator)
+    x, noise = images(X, P), 0.3
+    apart = x[..., ::10, :]
+    apart = apart + noise * torch.randn(apart.shape, generator=generator, dtype=F64)
+    found = factorize_curves(curve_from_samples(apart, closed=True), samples=80, aligned=True)
+    assert_share(found.status == Status.OK, 0.97)
+    assert (camera_error(found, x)[found.status == Status.OK] < 3 * noise).all()
 
 
 def test_what_curves_do_not_determine(generator: torch.Generator) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsfm.geometry.curve_places import CurvePlaces
 from torchsfm.motion.many_views.curve_fit import CurveDistances, Scene, Sights, pinned
+from torchsfm.motion.many_views.curve_refit import refit
 from torchsfm.optim.descent import Descent, Options, descend
 
 _ROUNDS = 6
@@ -32,6 +33,8 @@ _TOLERANCE = 1e-6
 """End when no more than this part of the cost is left to gain."""
 _OWN = 6
 """Steps of a sample by itself after it was put anew."""
+_MENDED = 0.1
+"""Of all samples, that splines have put right: more may have held the cameras at a wrong place."""
 
 
 class Found(NamedTuple):
@@ -59,7 +62,23 @@ def approach(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene) -> 
 
 
 def finish(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene, steps: int) -> Found:
-    """The least squares over the samples that are right."""
+    """The least squares over the samples that are right; of all that was measured, where splines follow that.
+
+    Where splines have led many samples out of wrong places these have another try: they may fit exactly now.
+    """
+    found = _by_samples(images, shown, x, steps)
+    for again in (True, False):
+        now = _by_splines(images, found, steps)
+        if now is None:
+            break
+        mended = (now.measured & ~found.measured).sum((-2, -1))
+        if not (again and bool((mended > _MENDED * now.measured.sum((-2, -1))).any())):
+            return now
+        found = _by_samples(images, shown, now.x, steps)
+    return found
+
+
+def _by_samples(images: CurvePlaces, shown: Tensor, x: Scene, steps: int) -> Found:
     plain, x = _mended(_inside(images, shown, x), x)
     _, measured = _judged(plain, plain.sights(x))
     end = descend(replace(plain, weight=plain.weight * measured[:, None]), x, Options(steps, _TOLERANCE))
@@ -67,6 +86,29 @@ def finish(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene, steps
     x, seen = plain.settled(end.x, _OWN)
     misfit, right = _judged(plain, seen)
     return Found(x, seen, plain.weight, misfit, measured & right, end)
+
+
+def _by_splines(images: CurvePlaces, found: Found, steps: int) -> Found | None:
+    """What is found by all that was measured of the image curves, where splines follow that."""
+    counts = found.weight * found.measured[:, None]
+    free = 2 * found.measured.sum((-2, -1)) + 11 * (found.weight > 0).any(-1).any(-1).sum(-1) - 15
+    total = (counts.flatten(2) * found.seen.r.square()).sum((1, 2))
+    noise = (total / (counts.sum((1, 2, 3)) - free).clamp(min=1)).sqrt()
+    other = refit(images, counts, found.x, noise, steps)
+    if other is None:
+        return None
+    place = pinned(images, found.weight, other.x).sights(other.x).place
+    x = other.x._replace(place=place)
+    plain = pinned(images, found.weight, x)
+    own, seen = plain.settled(x, _OWN)
+    # Where noise draws a sample to the wrong side of a bend it stays on the spline.
+    _, right = _judged(plain, seen)
+    u = torch.where(right.flatten(1)[:, None], own.u, x.u)
+    x = Scene(x.P, u, torch.where(right[:, None], own.place, x.place))
+    seen = plain.sights(x)
+    misfit, measured = _judged(plain, seen)
+    here = replace(plain, weight=plain.weight * measured[:, None]).linearize(x)
+    return Found(x, seen, plain.weight, misfit, measured, found.end._replace(end=here, status=other.status))
 
 
 def typical_misfit(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene) -> Float[Tensor, "p"]:

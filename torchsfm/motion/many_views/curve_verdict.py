@@ -52,7 +52,7 @@ def judge(images: CurvePlaces, found: Found, view: Bool[Tensor, "p v"], threshol
     loose = (least <= 1e-11 * values[:, -1]) | (variance > _UNDETERMINED**2 * least) | ~torch.isfinite(least)
     loose = loose | _flat(images, found, v, redundancy)
     agreed = points >= _RIGHT * (shown > 0).sum((-2, -1))
-    smooth = (_roughness(found, counts) < _WHITE) & (rms > _EXACT)
+    smooth = (_roughness(images, found, counts) < _WHITE) & (rms > _EXACT)
     wrong = ~agreed | smooth | (rms > threshold) | (redundancy < 0)
     status = torch.where(found.end.status == Status.OK, int(Status.OK), int(Status.NOT_CONVERGED))
     status = torch.where(wrong, int(Status.NO_CONSENSUS), status)
@@ -82,11 +82,19 @@ def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor) -> B
     return cost > of_noise / 3 * left
 
 
-def _roughness(found: Found, counts: Tensor) -> Float[Tensor, "p"]:
-    """The mean square of the difference of neighbouring samples' distances over that of the distances."""
+def _roughness(images: CurvePlaces, found: Found, counts: Tensor) -> Float[Tensor, "p"]:
+    """The mean square of the difference of neighbouring samples' distances over that of the distances.
+
+    Neighbours have a measured point between them, at least: what is drawn from one point to the next is smooth, noise or not.
+    """
     r = found.seen.r.reshape(found.weight.shape)
-    pair = counts[..., 1:] * counts[..., :-1]
-    step = (pair * (r[..., 1:] - r[..., :-1]).square()).sum((1, 2, 3))
-    size = (pair * (r[..., 1:].square() + r[..., :-1].square())).sum((1, 2, 3)) / 2
+    m = r.shape[-1]
+    apart = (m / images.number.clamp(min=1)).ceil().long().clamp(min=1)[..., None]
+    ahead = torch.arange(m, device=r.device) + apart
+    there, ahead = ahead < m, ahead.clamp(max=m - 1)
+    pair = counts * counts.gather(-1, ahead) * there
+    other = r.gather(-1, ahead)
+    step = (pair * (other - r).square()).sum((1, 2, 3))
+    size = (pair * (other.square() + r.square())).sum((1, 2, 3)) / 2
     share: Tensor = step / size.clamp_min(1e-300)
     return share

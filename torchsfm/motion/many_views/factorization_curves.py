@@ -87,8 +87,9 @@ def factorize_curves(
     anywhere and run in any direction in each image. Of an open curve all images show about the same piece. Bent curves in
     general position are needed: two that do not lie in one plane, and three where there are three views only.
 
-    What counts is where smooth curves through the samples go, so these must be exact to what is asked of the cameras: samples
-    of edges, nearer to each other than their noise is small, are smoothed first (`fit_spline`).
+    The search goes by where smooth curves through the image samples go; samples of edges, nearer to each other than their noise
+    is small, are smoothed first (`fit_spline`). In the end all image samples count, by their distances from images of splines
+    in space, unless they are so exact that no spline of `samples` control points follows them.
 
     The search ends at a wrong place now and then, more often the farther views are apart (`status` then says `NO_CONSENSUS`).
 

@@ -1,0 +1,69 @@
+"""Cameras and splines at measured points: derivatives of what is minimised."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchsfm.motion.many_views.curve_spline_fit import SplineDistances, SplineSystem, directions, held_directions
+from torchsfm.motion.many_views.curve_splines import Splines, see
+
+F64 = torch.float64
+
+
+def problem(generator: torch.Generator) -> tuple[SplineDistances, Splines]:
+    """A closed spline and an open one in three views, with noise."""
+    k, n = 7, 12
+    kind = {"generator": generator, "dtype": F64}
+    turn = torch.arange(k, dtype=F64) * (2 * math.pi / k)
+    ring = torch.stack((turn.cos(), turn.sin(), 0.3 * (2 * turn).cos()), -1)
+    control = ring + 0.1 * torch.randn(1, 2, k, 3, **kind)
+    M = torch.eye(3, dtype=F64) + 0.1 * torch.randn(1, 3, 3, 3, **kind)
+    a = torch.tensor([0.0, 0.0, 5.0], dtype=F64) + 0.1 * torch.randn(1, 3, 3, **kind)
+    P = torch.cat((M, a[..., None]), -1)
+    P = P / torch.linalg.matrix_norm(P)[..., None, None]
+    closed = torch.tensor([[True, False]])
+    x = Splines(P, control, torch.linspace(0.3, 3.7, n, dtype=F64).expand(1, 3, 2, n).clone())
+    seen = see(x, closed, torch.zeros(1, 3, 2, n, 2, dtype=F64)).points
+    measured = seen + 0.01 * torch.randn(seen.shape, **kind)
+    weight = 0.5 + torch.rand(1, 3, 2, n, **kind)
+    stiffness = torch.full((1, 2), 0.01, dtype=F64)
+    return SplineDistances(measured, weight, closed, stiffness, directions(control, closed), held_directions(P)), x
+
+
+def settled(terms: SplineDistances, x: Splines) -> SplineSystem:
+    """With the nearest points to all digits."""
+    here = terms.linearize(x)
+    for _ in range(4):
+        here = terms.linearize(here.x)
+    return here
+
+
+def moved(here: SplineSystem, delta: tuple[Tensor, Tensor], t: float) -> Splines:
+    """Some of the way along a step."""
+    return here.x._replace(P=here.x.P + t * delta[0], control=here.x.control + t * delta[1])
+
+
+def test_derivatives(generator: torch.Generator) -> None:
+    """Along random steps, against differences: nearest points are found anew at their ends."""
+    terms, x = problem(generator)
+    here = settled(terms, x)
+    assert not here.seen.held.any()
+    here = terms.curve(here, torch.ones(1, dtype=torch.bool))
+    z = torch.randn(1, 2, 7, 2, generator=generator, dtype=F64)
+    delta = (torch.randn(x.P.shape, generator=generator, dtype=F64), (z[..., None] * terms.across).sum(-2))
+    ahead, behind = (settled(terms, moved(here, delta, t)) for t in (1e-5, -1e-5))
+    torch.testing.assert_close(here.along(delta), (ahead.cost - behind.cost) / 2e-5, rtol=1e-6, atol=0)
+    by = here.exact
+    cameras, control = delta[0].flatten(1)[..., None], z.flatten(2)[..., None]
+    want = [(getattr(ahead.normal, s) - getattr(behind.normal, s)) / 2e-5 for s in ("by_cameras", "by_control")]
+    torch.testing.assert_close((by.A @ cameras + (by.W @ control).sum(1))[..., 0], want[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close((by.W.mT @ cameras[:, None] + by.G @ control)[..., 0], want[1], rtol=1e-5, atol=1e-6)
+
+
+def test_nothing_that_is_held_moves(generator: torch.Generator) -> None:
+    """Frames and scales of cameras change nothing: fifteen and one for each view."""
+    terms, x = problem(generator)
+    step = terms.linearize(x).step(torch.full((1,), 1e-6, dtype=F64))
+    assert int(torch.linalg.matrix_rank(terms.held[0])) == 18
+    torch.testing.assert_close(terms.held[0].mT @ step.delta[0].flatten(), torch.zeros(18, dtype=F64), rtol=0, atol=1e-12)
