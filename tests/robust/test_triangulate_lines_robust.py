@@ -6,7 +6,14 @@ from chance import assert_share, seeded
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import line_from_points, pluecker_from_points, project_points, rotation_from_rotvec
+from torchsfm.geometry import (
+    line_from_points,
+    pluecker_from_points,
+    point_line_distance,
+    project_lines,
+    project_points,
+    rotation_from_rotvec,
+)
 from torchsfm.triangulation import LineFault, triangulate_lines, triangulate_lines_robust
 
 F64 = torch.float64
@@ -192,3 +199,14 @@ def test_wrong_arguments(generator: torch.Generator) -> None:
     ):  # fmt: skip
         with pytest.raises(ValueError, match=name):
             triangulate_lines_robust(*arguments, **{"threshold": 1.0} | options)
+
+
+def test_lines_that_single_precision_does_not_hold(generator: torch.Generator) -> None:
+    """A million units from the origin, where numbers are a sixteenth of a unit apart."""
+    l, P, _, _ = ring(6, 50, 0.0, generator)  # noqa: E741
+    P = torch.cat((P[..., :3], P[..., 3:] - 1e6 * P[..., :3].sum(-1, keepdim=True)), -1)
+    found = triangulate_lines_robust(l.float(), P.float(), threshold=2.5, generator=seeded())
+    image = project_lines(P.float().double(), found.model.double()[None])
+    off = point_line_distance(l, image[..., None, :]).amax(-1)
+    assert not ((found.status == Status.OK) & found.inliers & (off > 2.1 * 2.5)).any()
+    assert_share(triangulate_lines_robust(l, P, threshold=2.5, generator=seeded()).status == Status.OK, 0.98)

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from torchsfm._types import Solutions, Status, broadcast_shapes
-from torchsfm.geometry import to_homogeneous
+from torchsfm.geometry import point_line_distance, project_lines, to_homogeneous
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.linalg import cross, damped_solve, determinant_3x3
 from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
@@ -23,6 +23,8 @@ from torchsfm.triangulation.line_views import (
 )
 from torchsfm.triangulation.triangulate_lines import triangulate_lines
 
+_ROUNDED = 2.0
+"""Thresholds that an inlier may be off the line that is returned: the least squares of all of them moves it."""
 _PARALLEL = 1e-12
 """Squared sine of the angle of two planes that are one."""
 
@@ -173,8 +175,8 @@ class RobustLineTriangulation:
     """Number of pairs of views tried."""
     status: Int[Tensor, "*batch n"]
     """OK; TOO_FEW: fewer than two observations; NOT_FINITE: fewer than two finite ones; DEGENERATE: no two planes of sight meet
-    at an angle; NO_CONSENSUS: of three views and more no three agree on a line; else what `triangulate_lines` says of the
-    inliers."""
+    at an angle; NO_CONSENSUS: of three views and more no three agree on a line, or not on it as it is rounded; else what
+    `triangulate_lines` says of the inliers."""
     fault: Int8[Tensor, "*batch n"]
     """Why the inliers determine no line where the status is DEGENERATE for that reason, a `LineFault`."""
     angle: Float[Tensor, "*batch n"]
@@ -274,6 +276,12 @@ def triangulate_lines_robust(
     inliers = by_problem(found.inliers).mT
     final = triangulate_lines(l, P, visible=inliers, weights=weights)
     status = torch.where(status == Status.OK, final.status, status)
+    if segments:
+        # In single precision a line far from the origin may be rounded to one that its segments do not support.
+        image = project_lines(P.detach().double(), final.model.detach().double()[..., None, :, :])
+        distance = point_line_distance(l.detach().double(), image[..., None, :]).amax(-1)
+        lost = (inliers & ~(distance <= _ROUNDED * by_problem(found.threshold)[..., None, :])).any(-2)
+        status = torch.where((status == Status.OK) & lost, int(Status.NO_CONSENSUS), status)
     settled = status == Status.OK
     rough = by_problem(in_world(found.model, origin, unit)).to(dtype)
 
