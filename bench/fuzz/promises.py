@@ -73,8 +73,11 @@ def zero_models(result: Any) -> Iterator[str]:
 def changed(result: Any, reference: Any, kept: Tensor) -> Iterator[str]:
     """Elements of the batch, those of a mask, that are not what they are in a reference.
 
-    `Solutions` are to be the same bit for bit, other results to rounding, which iterations stretch to their tolerance.
+    `Solutions` are to be the same bit for bit, other results to rounding, which iterations stretch to their tolerance. Of what
+    a result does not call good only the status, and whether numbers are finite, is promised: rounding moves an estimate freely
+    along what its data leave open.
     """
+    good = None if isinstance(result, Solutions) else verdict(reference)
     for (name, value), (_, wanted) in zip(tensors(result), tensors(reference), strict=True):
         if value.shape != wanted.shape:
             yield f"neighbour changed: shape of {name or 'the value'}"
@@ -86,6 +89,9 @@ def changed(result: Any, reference: Any, kept: Tensor) -> Iterator[str]:
                 eps = torch.finfo(a.dtype).eps
                 # What rounding leaves of zero has no digits in common.
                 same |= (a - b).abs() <= 64 * eps**0.5 * size + eps**1.5
+                if good is not None and good.shape == kept.shape:
+                    open_ = ~good[kept].reshape(-1, *[1] * (a.ndim - 1))
+                    same |= open_ & (a.isfinite() == b.isfinite())
             if not bool(same.all()):
                 most = (a.double() - b.double()).abs().nan_to_num(torch.inf).max() if value.is_floating_point() else torch.inf
                 yield f"neighbour changed: {name or 'the value'} by {float(most):.1e}"
