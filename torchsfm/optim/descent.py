@@ -267,7 +267,8 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     done = active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
     dull, slow, curved = state.dull, state.slow, state.curved
     if problem.patience is not None and options.function_tolerance <= LOOSE:
-        crawls, slow = plain & (rate > SLOW) & (gain <= NEAR * cost), exact
+        # Steps that gain ever more are on their way along a valley.
+        crawls, slow = plain & (rate > SLOW) & (gain <= torch.minimum(NEAR * cost, state.last)), exact
         dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
         if bool(crawls.any()):
             far = gain * rate ** (problem.patience + 1) > least * (1 - rate)

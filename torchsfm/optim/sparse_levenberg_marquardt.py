@@ -28,6 +28,8 @@ ROUNDS = 10
 """Most steps that eliminated variables take by themselves after a step with the exact Hessian,"""
 WORTH = 1e-2
 """and the part of what such a step promises, divided by their number, for which they take one."""
+SMALL = 0.75
+"""Most that an acceleration changes a step by, relative to it: beyond, the third derivatives matter."""
 POOR = 0.25
 """Of a step that gains less than this fraction of its promise, each eliminated variable takes only what is good for it."""
 
@@ -194,6 +196,10 @@ class _Place:
     def __init__(self, engine: Elimination, x: dict[str, Tensor], cost: Tensor) -> None:
         self.engine, self.x, self.cost = engine, x, cost
         self.exact: NormalEquations | None = None
+        self.strayed = False
+        """Whether the step that led here left the linear model's reach."""
+        self.damping = 0.0
+        """Of the last step asked for."""
         self._system: NormalEquations | None = None
 
     @property
@@ -217,7 +223,8 @@ class _Place:
         if exact is not None and bool(exact):
             assert self.exact is not None, "curved before"
             system = self.exact
-        return system.step(float(damping))
+        self.damping = float(damping)
+        return system.step(self.damping)
 
 
 @dataclass(frozen=True)
@@ -241,7 +248,10 @@ class _SparseProblem:
         return _Place(self.engine, x, self.engine.cost(x))
 
     def advance(self, here: _Place, step: Step) -> _Place:
-        """Where a step leads; where the model was good for a part of it only, eliminated variables take that part."""
+        """Where a step leads; where the model was good for a part of it only, eliminated variables take that part.
+
+        After two such steps in a row the cost has a curved valley, and the step is bent to stay in it.
+        """
         if not bool(step.solved):
             return here
         engine = self.engine
@@ -250,17 +260,33 @@ class _SparseProblem:
         if bool(step.promise <= TELLING * self.epsilon * here.cost):
             # So near the minimum costs do not tell what is good for a variable.
             return _Place(engine, x, cost)
+        strays = not bool(here.cost - cost >= STRAIGHT * step.promise)
         if not bool(here.cost - cost > POOR * step.promise):
             x = engine.settling.shorten(here.x, step.delta, x)
             cost = engine.cost(x)
         if here.exact is not None:
             x = engine.settling.settle(x, ROUNDS, WORTH * step.promise / self.points)
             cost = engine.cost(x)
-        elif bool(cost.isfinite()) and bool(here.cost - cost < STRAIGHT * step.promise):
+        elif strays and bool(cost.isfinite()):
             # The linear model reaches no farther than this, but with the eliminated variables settled it may.
             x = engine.settling.settle(x)
             cost = engine.cost(x)
-        return _Place(engine, x, cost)
+        there = _Place(engine, x, cost)
+        there.strayed = strays and not bool(here.cost - cost >= STRAIGHT * step.promise)
+        return self._bent(here, there, step) if here.strayed and strays and here.exact is None else there
+
+    def _bent(self, here: _Place, there: _Place, step: Step) -> _Place:
+        """Where a step leads that follows a curved valley, if the cost is less there."""
+        engine = self.engine
+        change = engine.accelerate(here.x, step.delta, here.damping)
+        (straight, _), (aside, _) = here.system.join(step.delta), here.system.join(change)
+        measure = here.system.diagonal.sqrt()
+        if not bool((measure * aside).norm() <= SMALL / 2 * (measure * straight).norm()):
+            return there
+        x = move(engine.blocks, engine.layout, here.x, {name: step.delta[name] + change[name] for name in change})
+        bent = _Place(engine, x, engine.cost(x))
+        bent.strayed = True
+        return bent if bool(bent.cost < there.cost) else there
 
     def curve(self, here: _Place, where: Tensor) -> _Place:
         """The system with exact second derivatives."""
