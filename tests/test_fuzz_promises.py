@@ -48,3 +48,9 @@ def test_solutions_stay_bit_for_bit() -> None:
     moved = Solutions(model + torch.tensor([0, 1e-15, 0])[:, None, None], reference.valid)
     assert list(changed(moved, reference, KEPT))
     assert not list(changed(Solutions(model.clone(), reference.valid), reference, KEPT))
+
+
+def test_only_homogeneous_models_may_turn_their_sign() -> None:
+    turned = replace(REFERENCE, model=-REFERENCE.model)
+    assert list(changed(turned, REFERENCE, KEPT))
+    assert not list(changed(turned, REFERENCE, KEPT, homogeneous=True))

@@ -159,7 +159,7 @@ def _bad_values(name: str, call: Call, seed: int) -> Trial:
     if name in JUDGES:
         broken += JUDGES[name](result, _cast(bad, torch.float64))
     if how.batched:
-        broken += changed(result, apply(call, arguments), kept)
+        broken += changed(result, apply(call, arguments), kept, homogeneous=how.homogeneous)
     return Trial(int((~kept).sum()) if how.batched else 1, tuple(broken))
 
 

@@ -62,6 +62,8 @@ class Function:
     """Whether single precision is tried too."""
     slow: bool = False
     """Whether a problem takes a good part of a second, so that batches are to be small."""
+    homogeneous: bool = False
+    """Whether rounding may choose the sign of its models."""
 
 
 def _generator(_: Scene) -> torch.Generator:
@@ -511,7 +513,7 @@ FUNCTIONS: dict[str, Function] = {
         {"n": 30},
         planar=True,
     ),
-    "robust.ransac": Function(TWO_VIEWS | ROBUST, {"n": 30}),
+    "robust.ransac": Function(TWO_VIEWS | ROBUST, {"n": 30}, homogeneous=True),
     "robust.soft_ransac": Function(TWO_VIEWS | {"threshold": 2.0, "generator": _generator}, {"n": 30}),
     "simulation.look_at": Function(),
     "simulation.orbit_poses": Function({"views": 3}),

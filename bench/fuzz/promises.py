@@ -70,12 +70,12 @@ def zero_models(result: Any) -> Iterator[str]:
         yield f"zero model: of {type(result).__name__} is called good"
 
 
-def changed(result: Any, reference: Any, kept: Tensor) -> Iterator[str]:
+def changed(result: Any, reference: Any, kept: Tensor, *, homogeneous: bool = False) -> Iterator[str]:
     """Elements of the batch, those of a mask, that are not what they are in a reference.
 
     `Solutions` are to be the same bit for bit, other results to rounding, which iterations stretch to their tolerance. Of what
     a result does not call good only the status, and whether numbers are finite, is promised: rounding moves an estimate freely
-    along what its data leave open.
+    along what its data leave open. The sign of a `homogeneous` model, too, is its own to choose.
     """
     good = None if isinstance(result, Solutions) else verdict(reference)
     for (name, value), (_, wanted) in zip(tensors(result), tensors(reference), strict=True):
@@ -83,6 +83,8 @@ def changed(result: Any, reference: Any, kept: Tensor) -> Iterator[str]:
             yield f"neighbour changed: shape of {name or 'the value'}"
         elif value.shape[: kept.ndim] == kept.shape:
             a, b = value[kept], wanted[kept]
+            if homogeneous and name == ".model":
+                a = torch.where((a * b).flatten(1).sum(-1).reshape(-1, *[1] * (a.ndim - 1)) < 0, -a, a)
             same = (a == b) | ((a != a) & (b != b))
             if value.is_floating_point() and not isinstance(result, Solutions):
                 size = b.abs().nan_to_num(0, 0, 0).amax() if b.numel() else 0

@@ -129,6 +129,8 @@ def levenberg_marquardt(
     device = leaves(x0)[0].device
     if weights is not None and weights.device != device:
         raise ValueError(f"weights: wanted device {device} as x0 has, got {weights.device}")
+    if weights is not None and weights.dtype not in (torch.float32, torch.float64, torch.bool):
+        raise ValueError(f"weights: wanted a float32, float64 or bool tensor, got {weights.dtype}")
     followed = leaves((data, weights))
     wanted = wants_derivative(*followed)
     if wanted:
