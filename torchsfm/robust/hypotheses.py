@@ -18,9 +18,9 @@ M = TypeVar("M")
 
 NUMBERS = {True: 1 << 17, False: 1 << 24}
 """How many distances to compute at a time, on a CPU and elsewhere."""
-PREFIXES = (64, 256, 1024)
-"""Numbers of data on which hypotheses are judged before all data are looked at."""
-KEPT = (16, 8, 4)
+PREFIXES = (64, 512)
+"""Numbers of data on which hypotheses are judged before all data are looked at, where these are four times as many."""
+KEPT = (16, 4)
 """The fewest hypotheses that are kept after each."""
 SHARE = 64
 """Of how many hypotheses one is kept after the first."""
@@ -91,7 +91,7 @@ def stages(width: int, slots: int) -> list[tuple[int, int]]:
     plan = []
     for level, (prefix, fewest) in enumerate(zip(PREFIXES, KEPT, strict=True)):
         keep = max(fewest, slots // SHARE) if level == 0 else fewest
-        if 2 * prefix <= width and keep < slots:
+        if 4 * prefix <= width and keep < slots:
             plan.append((prefix, keep))
             slots = keep
     return [*plan, (width, KEPT[-1])]

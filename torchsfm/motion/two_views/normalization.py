@@ -44,21 +44,21 @@ def common_scale_of_views(
     x: Sequence[Float[Tensor, "*#batch n 2"]], mask: Bool[Tensor, "*#batch n"] | None
 ) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """The same for any number of images: the points, the similarities, the common factor."""
+    batch = broadcast_shapes(*(view.shape[:-2] for view in x), () if mask is None else mask.shape[:-1])
+    n = x[0].shape[-2]
+    views = torch.stack([view.expand(*batch, n, 2) for view in x])
     # The similarity is held when the points move.
-    fixed = [view.detach() for view in x]
-    usable = present(mask, *fixed)
-    middles, sizes = zip(*(middle_and_size(view, usable) for view in fixed), strict=True)
-    batch = broadcast_shapes(*(size.shape for size in sizes))
-    centre = torch.stack([middle.expand(*batch, 2) for middle in middles], -2)
-    size = torch.stack([own.expand(batch) for own in sizes]).amax(0)
+    fixed = views.detach()
+    centre, sizes = middle_and_size(fixed, present(mask, *fixed))
+    size = sizes.amax(0)
     scale = size.reciprocal()
     s = scale[..., None, None]
     similarities = s.new_zeros(*centre.shape[:-1], 3, 3)
-    similarities.diagonal(dim1=-2, dim2=-1)[..., :2] = s
-    similarities[..., :2, 2] = -s * centre
+    similarities.diagonal(dim1=-2, dim2=-1)[..., :2] = s[..., 0]
+    similarities[..., :2, 2] = -s[..., 0] * centre
     similarities[..., 2, 2] = 1
-    points = [moved_and_scaled(view, c, size) for view, c in zip(x, centre.unbind(-2), strict=True)]
-    return points, list(similarities.unbind(-3)), scale
+    points = list(moved_and_scaled(views, centre, size))
+    return points, list(similarities), scale
 
 
 def largest_positive(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
