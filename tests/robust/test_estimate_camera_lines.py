@@ -1,6 +1,7 @@
 """The door for calibrated cameras with lines: mixtures with points, units, worlds, degenerate structure, PoseLib."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -287,3 +288,14 @@ def test_as_good_as_poselib(generator: torch.Generator) -> None:
         )  # fmt: skip
         theirs.append(turn(torch.tensor(np.asarray(pose.Rt)), scene.pose[i]))
     assert ours.median() <= 1.1 * torch.stack(theirs).median()
+
+
+def test_one_answer_where_noise_hides_which_minimum_is_the_lowest(data: Path, generator: torch.Generator) -> None:
+    """A staircase: the pose one step away has as many inliers, and costs of samples that lead to both are alike."""
+    file = np.load(data / "absolute_pose" / "stairs_points_lines" / "localization_test_data_stairs_1.npz")
+    x, X, l, intrinsics = (torch.tensor(file[name].astype(np.float64)) for name in ("p2ds", "p3ds", "l2ds", "K"))  # noqa: E741
+    ends = torch.tensor(file["l3ds"].astype(np.float64))[torch.tensor(file["l3d_ids"].astype(np.int64))]
+    L = pluecker_from_points(ends[:, 0], ends[:, 1])
+    i, j = (torch.rand(300, len(rows), generator=generator).argsort(1) for rows in (x, l))
+    found = estimate_camera(x[i], X[i], intrinsics, l[j], L[j], threshold=12.0, generator=generator)
+    assert_share(found.support > found.support.max() - 8, 0.97)

@@ -20,7 +20,7 @@ NUMBERS = {True: 1 << 17, False: 1 << 24}
 """How many distances to compute at a time, on a CPU and elsewhere."""
 PREFIXES = (64, 512)
 """Numbers of data on which hypotheses are judged before all data are looked at, where these are four times as many."""
-KEPT = (16, 4)
+KEPT = (16, 8)
 """The fewest hypotheses that are kept after each."""
 SHARE = 64
 """Of how many hypotheses one is kept after the first."""

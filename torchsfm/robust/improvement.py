@@ -15,7 +15,7 @@ from torchsfm._types import tensor_map
 from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
-from torchsfm.robust.local_optimisation import LOCAL_DATA, optimise_fully, optimise_locally
+from torchsfm.robust.local_optimisation import LOCAL_DATA, LOCAL_STEPS, RIVAL_STEPS, optimise_fully, optimise_locally
 from torchsfm.robust.models import cast, join, put, select, take_slots, zip_map
 from torchsfm.robust.noise import scale_of_noise
 from torchsfm.robust.problems import Problems
@@ -23,14 +23,15 @@ from torchsfm.robust.samplers import Among, Sampler, draws
 from torchsfm.robust.scoring import Msac, Scoring, limits
 from torchsfm.robust.stopping import around_model
 
-OPTIMISED = 2
-"""Hypotheses of a round that are optimised locally."""
+OPTIMISED, RIVALS = 2, 8
+"""Hypotheses of a round that are optimised locally; and where wrong data pass for inliers."""
 STARTS = (2, 4, 8, 16, 32, 64)
 """From how many samples of the inliers the best model may be sought once more."""
 EXPLORED_DATA = 512
 """How many data that looks at."""
-_PER_START, _AMBIGUOUS = 128, 0.5
-"""One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers."""
+_PER_START, _AMBIGUOUS, _CROWDED = 128, 0.5, 0.01
+"""One such start for so many samples of the search; none where chance puts fewer wrong data than this among the inliers; what
+share of wrong data among them lets minima compete."""
 _SUPPORT, _CHANCE = 0.6, 1.5
 """How much of what is within the threshold a model may lose by refinement, and how many standard deviations of its support: the
 one before was chosen for it."""
@@ -107,7 +108,7 @@ def propose(
     for some in _portions(part, number, _SAMPLES):
         models, valid = solve_samples(fine, some, best.iterations[some], number, options.seed, options.sampler)
         plan = stages(coarse.width, number * valid.shape[-1])
-        parts.append(sift(coarse.take(some), models, valid, options.scoring, plan, OPTIMISED))
+        parts.append(sift(coarse.take(some), models, valid, options.scoring, plan, RIVALS))
     models = join([one[0] for one in parts])
     loss, solved = (torch.cat([one[i] for one in parts]) if len(parts) > 1 else parts[0][i] for i in (1, 2))
     if best.model is None:
@@ -121,15 +122,35 @@ def propose(
 
 
 def optimise(coarse: Problems, best: Best, part: Int[Tensor, "g"], models: Any, loss: Tensor, options: Options) -> Best:
-    """Optimise the proposed hypotheses locally where one of them is better than all before."""
+    """Optimise the proposed hypotheses locally where one of them is better than all before, or wrong data pass for inliers.
+
+    There models through samples of right data are so far from their minima that their costs do not tell which is the lowest:
+    the best of each round are optimised, whether better than those before or not. Models that are curves for each datum, as
+    fundamental matrices, gain nothing by it on real images.
+    """
     improved = (loss[:, 0] < best.minimal_loss[part]).nonzero()[:, 0]
+    first, first_loss = tensor_map(lambda t: t[:, :OPTIMISED], models), loss[:, :OPTIMISED]
     for row in _portions(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), _NUMBERS):
-        best = _optimised(coarse.take(part[row]), best, part[row], _rows(models, row), loss[row], options)
+        best = _optimised(coarse.take(part[row]), best, part[row], _rows(first, row), first_loss[row], options)
+    if coarse.estimator.codimension == 1:
+        return best
+    wrong = best.chance[part]
+    crowded = ((wrong >= _AMBIGUOUS) & (wrong >= _CROWDED * best.near[part].sum(-1))).nonzero()[:, 0]
+    for row in _portions(crowded, RIVALS * min(coarse.width, LOCAL_DATA), _NUMBERS):
+        some = coarse.take(part[row])
+        best = _optimised(some, best, part[row], _rows(models, row), loss[row], options, steps=RIVAL_STEPS)
     return best
 
 
 def _optimised(
-    coarse: Problems, best: Best, index: Int[Tensor, "g"], top: Any, loss: Tensor, options: Options, looked_at: int = LOCAL_DATA
+    coarse: Problems,
+    best: Best,
+    index: Int[Tensor, "g"],
+    top: Any,
+    loss: Tensor,
+    options: Options,
+    looked_at: int = LOCAL_DATA,
+    steps: tuple[float, ...] = LOCAL_STEPS,
 ) -> Best:
     """Update the best models of some problems with what local optimisation makes of hypotheses.
 
@@ -141,12 +162,13 @@ def _optimised(
         loss: The costs of the hypotheses.
         options: How to compare.
         looked_at: How many data to optimise on.
+        steps: The squared thresholds of the steps.
     """
     wide, size, k = coarse.spread(), coarse.estimator.sample_size, coarse.estimator.codimension
     scoring, counts = options.scoring, coarse.counts
     prefix = [d[:, :, :looked_at] for d in wide.data]
     limit = limits(scoring, loss, coarse.limit, coarse.count, size, k)
-    better = optimise_locally(wide.estimator, top, prefix, limit, counts[:, :looked_at], scoring)
+    better = optimise_locally(wide.estimator, top, prefix, limit, counts[:, :looked_at], scoring, steps)
     candidates = join([better, tensor_map(lambda t: t[:, :1], top)], 1)
     squared = squared_residual(wide.estimator, candidates, *wide.data)
     candidate_loss = scoring.cost(squared, coarse.limit, counts, k)

@@ -14,8 +14,8 @@ from torchsfm.robust.scoring import Scoring
 
 M = TypeVar("M")
 
-LOCAL_STEPS = (9.0, 1.0)
-"""Squared thresholds of the steps of local optimisation, in units of the squared threshold."""
+LOCAL_STEPS, RIVAL_STEPS = (9.0, 1.0), (9.0, 4.0, 1.0, 1.0)
+"""Squared thresholds of the steps of local optimisation, in units of the squared threshold; and where many minima compete."""
 LOCAL_DATA = 256
 """How many data local optimisation looks at."""
 _LAST_STEPS, _MOST_STEPS = 2, 64
@@ -36,6 +36,7 @@ def optimise_locally(
     limit: Float[Tensor, "g k"],
     counts: Tensor,
     scoring: Scoring,
+    steps: tuple[float, ...] = LOCAL_STEPS,
 ) -> M:
     """Gauss-Newton on the scoring's own weights with a shrinking threshold (Chum, Matas & Kittler 2003).
 
@@ -46,8 +47,9 @@ def optimise_locally(
         limit: Squared thresholds.
         counts: What the data count, `(g, n)`: a boolean or a weight.
         scoring: How models are compared.
+        steps: Squared thresholds of the steps, in units of the squared threshold.
     """
-    for factor in LOCAL_STEPS:
+    for factor in steps:
         model = _local_step(estimator, model, data, factor * limit, counts, scoring)
     return model
 
