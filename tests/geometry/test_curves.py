@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Curve, curve_crossings, curve_from_samples, foot_points
+from torchsfm.geometry.curve_places import curve_places
 
 F64 = torch.float64
 
@@ -150,3 +151,18 @@ def test_wrong_arguments(unchecked: None) -> None:
         curve_crossings(curve, torch.zeros(3, 2, dtype=F64), 2)
     with pytest.raises(ValueError, match="most"):
         curve_crossings(curve, torch.zeros(3, 3, dtype=F64), 0)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7])
+def test_slopes_of_exact_samples_are_of_fourth_order(share: float) -> None:
+    """Closed curves, and open ones up to their ends."""
+    error = []
+    for n in (64, 128, 256):
+        places = curve_places(curve_from_samples(ellipse(n, share), closed=share == 1))
+        finer = places.through_exact_samples()
+        at = places.spread(1000)
+        error.append(float(off(finer.at(at)[0]).max()))
+        assert error[-1] < float(off(places.at(at)[0]).max()) / 2
+    assert error[0] > 10 * error[1] > 100 * error[2]
+    few = curve_places(curve_from_samples(ellipse(4), closed=True))
+    torch.testing.assert_close(few.through_exact_samples().segments.slope, few.segments.slope)

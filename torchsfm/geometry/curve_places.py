@@ -3,7 +3,7 @@
 Beyond its open ends a curve goes on straight, so that a point that moves along a curve moves smoothly past its end.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,6 +13,9 @@ from torchsfm.geometry.curves import Curve, Segments, segments_of
 
 _LONGEST = 1 / 40
 """Of a curve, by which a place moves at most in one step to a nearer one."""
+
+_ACROSS = 5
+"""Samples that tell the slope at the middle one where they are exact."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,41 @@ class CurvePlaces:
         length = self.segments.length.gather(-1, index)
         on = (way - end.gather(-1, index) + length) / torch.where(length > 0, length, 1)
         return index + on + turns * self.number[..., None]
+
+    def through_exact_samples(self) -> "CurvePlaces":
+        """The same places on cubics whose slopes are those of polynomials through five samples, by chord length.
+
+        They leave a smooth curve by the fourth power of the spacing, and enlarge noise by a third more. Curves of fewer than
+        five samples stay as they are.
+        """
+        s, number = self.segments, self.number[..., None]
+        n = s.start.shape[-2]
+        ring = self.closed[..., None]
+        last = torch.where(ring, number - 1, number)
+        slot = torch.arange(n, device=number.device).expand_as(s.length)
+        first = torch.where(ring, slot - _ACROSS // 2, torch.minimum(slot - _ACROSS // 2, last + 1 - _ACROSS).clamp(min=0))
+        index = first[..., None] + torch.arange(_ACROSS, device=number.device)
+        own = (slot - first)[..., None]
+        turns = torch.where(ring[..., None], index.div(number.clamp(min=1)[..., None], rounding_mode="floor"), 0)
+        index = (index - turns * number[..., None]).clamp(0, n - 1).flatten(-2)
+        far = s.length.cumsum(-1)
+        way = (far - s.length).gather(-1, index).view(*slot.shape, _ACROSS) + turns * far[..., -1:, None]
+        x = s.start.gather(-2, index[..., None].expand(*index.shape, s.start.shape[-1]))
+        x = x.view(*slot.shape, _ACROSS, s.start.shape[-1])
+        gap = way - way.gather(-1, own)
+        slope = torch.zeros_like(s.slope)
+        for j in range(_ACROSS):
+            # The derivative of Lagrange's polynomial that is 1 at sample j and 0 at the others, at the own one.
+            others = torch.arange(_ACROSS, device=gap.device) != j
+            part = torch.where(others & (gap != 0), -gap / (gap[..., j : j + 1] - gap), 1).prod(-1)
+            part = torch.where(gap[..., j] != 0, part / gap[..., j], 0)
+            slope = slope + part[..., None] * (x[..., j, :] - s.start)
+        enough = (number >= _ACROSS) & (slot <= last)
+        slope = torch.where(enough[..., None] & torch.isfinite(slope), slope, s.slope)
+        after = torch.where(ring, (slot + 1) % number.clamp(min=1), (slot + 1).clamp(max=n - 1))
+        ahead = slope.gather(-2, after[..., None].expand_as(slope))
+        ahead = torch.where((enough & s.there)[..., None], ahead, s.next_slope)
+        return replace(self, segments=s._replace(slope=slope, next_slope=ahead))
 
 
 def curve_places(curve: Curve) -> CurvePlaces:

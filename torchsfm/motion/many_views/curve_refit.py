@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm.geometry.curve_places import CurvePlaces
-from torchsfm.linalg import eigh, qr, solve
+from torchsfm.linalg import determinant_3x3, eigh, qr, solve
 from torchsfm.motion.many_views.bilinear_fit import unit_frame
 from torchsfm.motion.many_views.curve_fit import Scene
 from torchsfm.motion.many_views.curve_spline_fit import (
@@ -33,6 +33,8 @@ _STIFF = 1e-3
 """Weight of second differences of control points, of a sample's, at the start."""
 _FINITE = 0.02
 """Sine of the angle between a sample and the plane at infinity, at least."""
+_TURNS = 100
+"""Of a plane away from what is nearest to it."""
 _ROUNDS = 3
 """Of weights by distances and of stiffness."""
 _STIFFER = 2.0
@@ -67,7 +69,7 @@ def refit(
     points = images.number + ~images.closed
     m = x.place.shape[-1]
     k = min(m, int(torch.where(shown, points, 0).amax() / _POINTS))
-    frame = _finite_frame(x, counts)
+    frame = finite_frame(x, counts)
     if k < _FEWEST or frame is None:
         return None
     P, X = frame
@@ -99,13 +101,18 @@ def refit(
     return Refit(Scene(P, u, torch.where(shown[..., None], middle, x.place)), end.status)
 
 
-def _finite_frame(x: Scene, counts: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Cameras and samples (p, n, 3) in a frame in which the samples are finite and spread alike in all directions."""
+def finite_frame(x: Scene, counts: Tensor, *, cameras: bool = False) -> tuple[Tensor, Tensor] | None:
+    """Cameras and samples (p, n, 3) in a frame in which the samples are finite and spread alike in all directions.
+
+    With `cameras` these are finite too, all before or all behind the samples where that may be (Hartley & Zisserman, 21.7).
+    """
     seen = counts.flatten(2)
-    turn = signs_of_depths((x.P @ x.u[:, None])[:, :, 2] * seen)[1]
+    side, turn = signs_of_depths((x.P @ x.u[:, None])[:, :, 2] * seen)
     right = (seen > 0).any(1)
     u = (x.u * turn[:, None]).mT
     w = torch.nn.functional.normalize((u * right[..., None]).sum(1), dim=-1)
+    if cameras:
+        w = _between(u * right[..., None], _centres(x.P * side[..., None, None]), w)
     depth = (u @ w[..., None])[..., 0]
     if bool((right & (depth < _FINITE)).any()):
         return None
@@ -120,6 +127,29 @@ def _finite_frame(x: Scene, counts: Tensor) -> tuple[Tensor, Tensor] | None:
     M = x.P @ Q[:, None]
     P = torch.cat((M @ E[:, None], M @ mean[:, None, :, None] + x.P @ w[:, None, :, None]), -1)
     return P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-100), solve(E, X.mT)[0].mT
+
+
+def _centres(P: Float[Tensor, "p v 3 4"]) -> Float[Tensor, "p v 4"]:
+    """Centres of cameras, by minors: their signs go with those of the cameras."""
+    minors = [determinant_3x3(P[..., [j for j in range(4) if j != i]]) * (-1) ** (i + 1) for i in range(4)]
+    return torch.nn.functional.normalize(torch.stack(minors, -1), dim=-1)
+
+
+def _between(u: Float[Tensor, "p n 4"], centres: Float[Tensor, "p v 4"], w: Float[Tensor, "p 4"]) -> Float[Tensor, "p 4"]:
+    """A plane with all samples on its positive side, and all centres on one, near `w` (Rosenblatt's perceptron)."""
+    best, gap = w, torch.full_like(w[:, 0], -torch.inf)
+    for sign in (1.0, -1.0):
+        z = torch.cat((u, sign * centres), 1)
+        there = (z != 0).any(-1)
+        v, total = w, w
+        for _ in range(_TURNS):
+            inside = torch.where(there, (z @ v[..., None])[..., 0], torch.inf)
+            least, worst = inside.min(-1)
+            better = least > gap
+            best, gap = torch.where(better[:, None], v, best), torch.where(better, least, gap)
+            total = total + z.gather(1, worst[:, None, None].expand(-1, 1, 4))[:, 0]
+            v = torch.nn.functional.normalize(total, dim=-1)
+    return best
 
 
 def _shares(images: CurvePlaces, place: Tensor, right: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:

@@ -36,6 +36,9 @@ _OWN = 6
 _MENDED = 0.1
 """Of all samples, that splines have put right: more may have held the cameras at a wrong place."""
 
+_FINER = 0.5
+"""Part of the distances that smoother image curves must take away where samples are exact; noise they enlarge."""
+
 
 class Found(NamedTuple):
     """Where the search ended."""
@@ -61,10 +64,11 @@ def approach(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene) -> 
     return x
 
 
-def finish(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene, steps: int) -> Found:
+def finish(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene, steps: int) -> tuple[CurvePlaces, Found]:
     """The least squares over the samples that are right; of all that was measured, where splines follow that.
 
-    Where splines have led many samples out of wrong places these have another try: they may fit exactly now.
+    Where splines have led many samples out of wrong places these have another try: they may fit exactly now. Where splines are
+    too stiff, what was measured may be so exact that image curves tell more of the way between their samples.
     """
     found = _by_samples(images, shown, x, steps)
     for again in (True, False):
@@ -73,9 +77,13 @@ def finish(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene, steps
             break
         mended = (now.measured & ~found.measured).sum((-2, -1))
         if not (again and bool((mended > _MENDED * now.measured.sum((-2, -1))).any())):
-            return now
+            return images, now
         found = _by_samples(images, shown, now.x, steps)
-    return found
+    finer = images.through_exact_samples()
+    other = _by_samples(finer, shown, found.x, steps)
+    if bool((other.end.cost < _FINER**2 * found.end.cost).all()):
+        return finer, other
+    return images, found
 
 
 def _by_samples(images: CurvePlaces, shown: Tensor, x: Scene, steps: int) -> Found:
@@ -115,6 +123,13 @@ def typical_misfit(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scen
     """The median of samples' distances."""
     plain = _inside(images, shown, x)
     return _median(plain.misfit(plain.sights(x)).sqrt(), plain)[:, 0]
+
+
+def agreement(images: CurvePlaces, shown: Float[Tensor, "p v c m"], x: Scene) -> Float[Tensor, "p"]:
+    """Which part of the samples is right."""
+    plain = _inside(images, shown, x)
+    there = (shown.sum(1) > 0).sum((-2, -1)).clamp(min=1)
+    return (_judged(plain, plain.sights(x))[1] & (shown.sum(1) > 0)).sum((-2, -1)) / there
 
 
 def _judged(plain: CurveDistances, seen: Sights) -> tuple[Tensor, Tensor]:

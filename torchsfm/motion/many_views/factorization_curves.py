@@ -16,8 +16,9 @@ from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.geometry.curve_places import CurvePlaces, curve_places
 from torchsfm.geometry.curves import Curve
 from torchsfm.motion.many_views.bilinear_fit import unit_frame
+from torchsfm.motion.many_views.curve_anew import put_together
 from torchsfm.motion.many_views.curve_fit import Scene
-from torchsfm.motion.many_views.curve_search import Found, approach, finish, typical_misfit
+from torchsfm.motion.many_views.curve_search import Found, agreement, approach, finish, typical_misfit
 from torchsfm.motion.many_views.curve_starts import Runs, guess_runs
 from torchsfm.motion.many_views.curve_verdict import judge
 from torchsfm.motion.many_views.factorization_points import factorize_points, signs_of_depths
@@ -25,6 +26,18 @@ from torchsfm.optim.pytree import cut, join, pick
 
 _GUESSES = 8
 """Ways in which the image curves may run alike that are tried."""
+_OTHERS = 2
+"""Of the ways in which all curves but one may run alike."""
+_AGAIN = 3
+"""Most times that image curves are put together anew,"""
+_FALLS = 0.7
+"""as long as that leaves so much of the misfit at most."""
+_AGREED = 0.9
+"""Part of the samples that must be right for that."""
+_KEPT = 3
+"""Of what was found the time before, for the next."""
+_FINE = 1e-6
+"""Misfits below, in parts of the curves' extent, are those of the right cameras."""
 _GRID = 60
 """Starts of closed curves that are tried."""
 _POINT_STEPS = 30
@@ -161,8 +174,12 @@ def _factorize(
     x = torch.where(curves.valid[..., None], (curves.x - centre[:, :, None, None]) / scale[:, None, None, None, None], 0)
     moved = Curve(torch.where(there[..., None, None], x, 0), curves.valid & there[..., None], curves.closed)
     ways = _ways(moved, there, oriented, aligned)
-    images, found = _search(moved, there, ways, m, max_iterations)
+    turned, images, found = _search(moved, there, ways, m, max_iterations)
     status = judge(images, found, view, threshold / scale)
+    if int(status) not in (Status.OK, Status.TOO_FEW):
+        other = _search_anew(moved, turned, there, found, aligned, oriented, max_iterations)
+        if other is not None and int(again := judge(*other[1:], view, threshold / scale)) == Status.OK:
+            (turned, images, found), status = other, again
     rows = scale[:, None, None, None] * found.x.P[:, :, :2] + centre[..., None] * found.x.P[:, :, 2:]
     P = torch.cat((rows, found.x.P[:, :, 2:]), 2)
     P = P / torch.linalg.matrix_norm(P)[..., None, None].clamp_min(1e-300)
@@ -195,28 +212,94 @@ def _frames(places: CurvePlaces, there: Bool[Tensor, "p v c"]) -> tuple[Tensor, 
     return centre, torch.where((scale > 0) & (scale < torch.inf), scale, 1)
 
 
-def _ways(curves: Curve, there: Tensor, oriented: bool, aligned: bool) -> Runs:
+def _ways(curves: Curve, there: Tensor, oriented: bool, aligned: bool, most: int = _GUESSES) -> Runs:
     if aligned:
         none = torch.zeros(there[:, None].shape, dtype=curves.x.dtype, device=there.device)
         return Runs(none > 0, none)
     places = curve_places(curves)
-    return guess_runs(places.at(places.spread(_GRID))[0], there, curves.closed & there, oriented, _GUESSES)
+    return guess_runs(places.at(places.spread(_GRID))[0], there, curves.closed & there, oriented, most)
 
 
-def _search(curves: Curve, there: Tensor, ways: Runs, m: int, steps: int) -> tuple[CurvePlaces, Found]:
-    """The image curves as they run alike, and the best that was found for any guess."""
+def _approached(curves: Curve, there: Tensor, ways: Runs, m: int) -> tuple[Curve, Scene, Tensor]:
+    """The image curves as they run alike, cameras and samples, and the median misfit, for all guesses."""
     p, g = ways.back.shape[:2]
     each = torch.arange(p, device=there.device).repeat_interleave(g)
     curves, there = pick((each,), curves), there[each]
     back = ways.back.flatten(0, 1)
     other = curves.reversed()
-    images = curve_places(Curve(torch.where(back[..., None, None], other.x, curves.x), curves.valid, curves.closed))
+    curves = Curve(torch.where(back[..., None, None], other.x, curves.x), curves.valid, curves.closed)
+    images = curve_places(curves)
     place = images.spread(m, ways.start.flatten(0, 1))
     visible = there[..., None].expand(-1, -1, -1, m)
     start = factorize_points(images.at(place)[0].flatten(2, 3), visible=visible.flatten(2), max_iterations=_POINT_STEPS)
     P, u = unit_frame(start.P, start.X.mT)
     shown = visible.to(u.dtype)
     x = approach(images, shown, Scene(P, u, place))
-    best = typical_misfit(images, shown, x).view(p, g).argmin(-1) + g * torch.arange(p, device=there.device)
-    images, shown, x = pick((best,), (images, shown, x))
-    return images, finish(images, shown, x, steps)
+    return curves, x, typical_misfit(images, shown, x)
+
+
+def _search(curves: Curve, there: Tensor, ways: Runs, m: int, steps: int) -> tuple[Curve, CurvePlaces, Found]:
+    """The image curves as they run alike, and the best that was found for any guess."""
+    curves, x, misfit = _approached(curves, there, ways, m)
+    best = misfit.argmin(-1, keepdim=True)
+    curves, x = pick((best,), (curves, x))
+    return curves, *finish(curve_places(curves), there[..., None].to(misfit.dtype).expand(-1, -1, -1, m), x, steps)
+
+
+def _search_anew(
+    curves: Curve, turned: Curve, there: Tensor, found: Found, aligned: bool, oriented: bool, steps: int
+) -> tuple[Curve, CurvePlaces, Found] | None:
+    """What comes of image curves that are put together anew, by the cameras found, and by those of all curves but one."""
+    m = found.measured.shape[-1]
+    shown = there[..., None].to(found.weight.dtype).expand(-1, -1, -1, m)
+    usual = typical_misfit(curve_places(turned), shown, found.x)
+    tries = [(turned, found.weight * found.measured[:, None], found.x, usual)]
+    some = there.any(1)[0].nonzero()[:, 0].tolist()
+    if not aligned and len(some) >= 3:
+        tries += _all_but_one(curves, there, some, m, oriented)
+    least, best = torch.inf, None
+    for _ in range(_AGAIN):
+        parts = [put_together(own, there, right, x, float(misfit)) for own, right, x, misfit in tries]
+        starts = [part for part in parts if part is not None]
+        if not starts:
+            break
+        turned, x = join([own for own, _ in starts]), join([scene for _, scene in starts])
+        every = shown.expand(len(starts), -1, -1, -1)
+        x = approach(curve_places(turned), every, x)
+        misfit = typical_misfit(curve_places(turned), every, x)
+        agreed = agreement(curve_places(turned), every, x) >= _AGREED
+        # Where few samples are right their median says little.
+        order = torch.where(agreed, misfit, misfit + 1).argsort()[:_KEPT]
+        tries = [(cut(turned, i, i + 1), shown, cut(x, i, i + 1), misfit[i]) for i in order.tolist()]
+        now = float(misfit[order[0]]) + float(~agreed[order[0]])
+        if now < least:
+            best = tries[0]
+        if now < _FINE or (agreed[order[0]] and now > _FALLS * least):
+            break
+        least = min(now, least)
+    if best is None:
+        return None
+    return best[0], *finish(curve_places(best[0]), shown, best[2], steps)
+
+
+def _all_but_one(
+    curves: Curve, there: Tensor, some: list[int], m: int, oriented: bool
+) -> list[tuple[Curve, Tensor, Scene, Tensor]]:
+    """Cameras by all curves but one, whichever that is: how they run, what counts, cameras and samples, and the misfit."""
+    c = there.shape[2]
+    none = torch.zeros(1, _OTHERS, *there.shape[1:], dtype=curves.x.dtype, device=there.device)
+    backs, starts, fewer = [], [], []
+    for k in some:
+        rest = torch.tensor([i for i in range(c) if i != k], device=there.device)
+        own = Curve(*(t.index_select(2, rest) for t in (curves.x, curves.valid, curves.closed)))
+        ways = _ways(own, there.index_select(2, rest), oriented, False, _OTHERS)
+        g = ways.back.shape[1]
+        backs.append((none[:, :g] > 0).index_copy(3, rest, ways.back))
+        starts.append(none[:, :g].index_copy(3, rest, ways.start))
+        fewer.append((there & (torch.arange(c, device=there.device) != k)).expand(g, -1, -1))
+    seen = torch.cat(fewer)
+    every = pick((torch.zeros(len(seen), dtype=torch.long, device=seen.device),), curves)
+    ways = Runs(*(torch.cat(t, 1).transpose(0, 1) for t in (backs, starts)))
+    turned, x, misfit = _approached(every, seen, ways, m)
+    right = seen[..., None].to(misfit.dtype).expand(-1, -1, -1, m)
+    return [(cut(turned, i, i + 1), right[i : i + 1], cut(x, i, i + 1), misfit[i]) for i in range(len(seen))]
