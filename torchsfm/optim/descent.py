@@ -26,6 +26,8 @@ NEAR = 1e-2
 """They do so only once they gain less than this fraction of the cost: before, the exact Hessian is rarely positive."""
 LOOSE = 1e-4
 """And only where no more than this fraction of the cost may be left: Newton steps are for the last digits."""
+GROWTH = 2.0
+"""Nor where a step gains more than so many times what the last one gained: they are under way along a valley."""
 MINIMUM = 1e-13
 """Relative decrease still promised at which a place is the minimum that a derivative belongs to."""
 LIGHT = 1e-6
@@ -267,8 +269,8 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     done = active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
     dull, slow, curved = state.dull, state.slow, state.curved
     if problem.patience is not None and options.function_tolerance <= LOOSE:
-        # Steps that gain ever more are on their way along a valley.
-        crawls, slow = plain & (rate > SLOW) & (gain <= torch.minimum(NEAR * cost, state.last)), exact
+        grows = (gain > GROWTH * state.last) & (gain > 100 * least)
+        crawls, slow = plain & (rate > SLOW) & (gain <= NEAR * cost) & ~grows, exact
         dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
         if bool(crawls.any()):
             far = gain * rate ** (problem.patience + 1) > least * (1 - rate)
