@@ -86,7 +86,7 @@ class CurvePlaces:
         slot = torch.arange(n, device=number.device).expand_as(s.length)
         first = torch.where(ring, slot - _ACROSS // 2, torch.minimum(slot - _ACROSS // 2, last + 1 - _ACROSS).clamp(min=0))
         index = first[..., None] + torch.arange(_ACROSS, device=number.device)
-        own = (slot - first)[..., None]
+        own = (slot - first).clamp(max=_ACROSS - 1)[..., None]  # beyond the last sample there is nothing to find
         turns = torch.where(ring[..., None], index.div(number.clamp(min=1)[..., None], rounding_mode="floor"), 0)
         index = (index - turns * number[..., None]).clamp(0, n - 1).flatten(-2)
         far = s.length.cumsum(-1)

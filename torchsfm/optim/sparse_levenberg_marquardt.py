@@ -83,8 +83,9 @@ def sparse_levenberg_marquardt(
 
     Gauss-Newton steps at first. Where these become slow, as with robust losses and large residuals, Newton steps with the
     exact Hessian in the same sparse form take over wherever it is positive (dense systems only), so that the last digits cost
-    a few steps. Of a step that turns out bad each eliminated variable takes the part that is good for it. Everything is
-    computed in float64; variables come back in the dtype they had. A gauge freedom needs no care: the damping
+    a few steps. Of a step that turns out bad each eliminated variable takes the part that is good for it; after two such steps
+    the next ones bend with the valley of the cost (geodesic acceleration, Transtrum & Sethna 2012). Everything is computed in
+    float64; variables come back in the dtype they had. A gauge freedom needs no care: the damping
     takes the shortest step. Fixed and unobserved variables come back bit for bit.
 
     Args:
