@@ -28,18 +28,19 @@ def rings(number: int, generator: torch.Generator) -> Tensor:
     return flat @ turn.mT + place
 
 
-def arc(frames: int, generator: torch.Generator, step: float = 3.0) -> Pose:
+def arc(frames: int, generator: torch.Generator, step: float = 3.0, away: float = 6.0) -> Pose:
     """Cameras around the origin, six units away, a little shaken."""
     at = torch.arange(frames, dtype=F64) - frames // 2
     axis = torch.tensor([0.2, 1.0, 0.1], dtype=F64)
     shaken = 0.005 * torch.randn(frames, 3, dtype=F64, generator=generator)
     R = rotation_from_rotvec(math.radians(step) * at[:, None] * axis + shaken)
-    t = torch.tensor([0.0, 0.0, 6.0], dtype=F64) + 0.03 * torch.randn(frames, 3, dtype=F64, generator=generator)
+    t = torch.tensor([0.0, 0.0, away], dtype=F64) + 0.03 * torch.randn(frames, 3, dtype=F64, generator=generator)
     return Pose(R, t)
 
 
-def images(X: Tensor, poses: Pose, generator: torch.Generator, noise: float = 0.03) -> Curve:
-    x = project_points((K @ poses.matrix())[:, None], X)
+def images(X: Tensor, poses: Pose, generator: torch.Generator, noise: float = 0.03, zoom: float = 1.0) -> Curve:
+    longer = intrinsics(zoom * K[0, 0], CENTRE)
+    x = project_points((longer @ poses.matrix())[:, None], X)
     return curve_from_samples(x + noise * torch.randn(x.shape, dtype=F64, generator=generator), closed=True)
 
 
@@ -57,6 +58,16 @@ def test_first_cameras(expected: float, generator: torch.Generator) -> None:
     assert found.refusal == ""
     assert turned(found.poses, poses).max() < 1.0
     assert abs(math.log(float(found.focal) / FOCAL)) < 0.15
+
+
+def test_a_focal_length_twice_the_expected_one(generator: torch.Generator) -> None:
+    # Far away, depths and turns trade against the focal length: what is expected of it must count no more than is measured.
+    poses = arc(FRAMES, generator, step=7.0, away=12.0)
+    curves = images(rings(20, generator), poses, generator, zoom=2.0)
+    found = first_cameras(curves, FRAMES // 2, K[0, 0], CENTRE, 0.5)
+    assert found.refusal == ""
+    assert turned(found.poses, poses).max() < 1.0
+    assert abs(math.log(float(found.focal) / (2 * FOCAL))) < 0.04
 
 
 def test_curves_that_move_each_by_itself_are_not_followed(generator: torch.Generator) -> None:

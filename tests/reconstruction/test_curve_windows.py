@@ -2,17 +2,20 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchsfm.geometry import Camera, Pose, Similarity, intrinsics, rotation_from_rotvec
+from torchsfm.geometry import Camera, Pose, Similarity, intrinsics, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
+from torchsfm.images import read_image
 from torchsfm.reconstruction.curve_mapping import CurveMapping
 from torchsfm.reconstruction.curve_sequence import Expected, Settled
 from torchsfm.reconstruction.curve_start import FirstCameras
-from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of
+from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of, window_at
+from torchsfm.reconstruction.image_edges import ImageEdges
 
 F64 = torch.float64
 FRAMES = 13
@@ -110,3 +113,18 @@ def test_a_focal_length_that_windows_contradict_is_told(ratio: float, said: floa
     assert settled.zoomed() == (said and pytest.approx(said))
     given = replace(expected, free=())
     assert settled._replace(told=given).zoomed() is None
+
+
+def test_a_window_of_a_real_turntable_by_a_long_lens(data: Path) -> None:
+    folder = data / "images" / "temple_ring"
+    rows = {name: numbers for name, *numbers in map(str.split, (folder / "templeR_par.txt").read_text().splitlines()[1:])}
+    names = [f"templeR{k:04d}.png" for k in range(23, 28)]
+    numbers = torch.tensor([[float(n) for n in rows[name]] for name in names], dtype=F64)
+    R = numbers[:, 9:18].unflatten(1, (3, 3))
+    edges = [ImageEdges.of(read_image(folder / name).pixels) for name in names]
+    guess = intrinsics(torch.tensor(768.0, dtype=F64), torch.tensor([319.5, 239.5], dtype=F64))
+    # The focal length is twice the expected one; in a short window all that is far is almost seen in parallel.
+    found = window_at(edges, 0, guess, 0.5).found
+    assert found.refusal == ""
+    assert rotation_angle(found.poses.R @ (R @ R[2].mT).mT).rad2deg().max() < 1.0
+    assert abs(math.log(float(found.focal / numbers[0, 0]))) < 0.1

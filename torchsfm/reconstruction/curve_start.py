@@ -25,6 +25,7 @@ from torchsfm.motion.many_views.curve_fit import near_curves
 from torchsfm.optim import GemanMcClure
 from torchsfm.optim.descent import Options, Problem, Step, descend
 from torchsfm.optim.pytree import Places, pick
+from torchsfm.reconstruction.similarities import DEVIATION
 
 _DIRECTIONS = 8
 """Axes of rotation that are tried, parallel to the first image."""
@@ -42,6 +43,10 @@ _BEST = 5
 """Guesses that are followed to the end,"""
 _LAST = 3
 """in so many descents, where the loss lets go at"""
+_LONGER = 8
+"""More of them, the most, while what would be another motion still changes:"""
+_ARRIVED = 0.99
+"""its cost falls to less than so much of what it was."""
 _TRUSTED = 4.5
 """medians of the distances, and no less than"""
 _FINEST = 0.05
@@ -54,10 +59,10 @@ _AGREE = 0.7
 """what share of all."""
 _PARALLAX = 2.0
 """Pixels, at least, by which near samples move more than far ones."""
-_RIVAL = 1.5
-"""A motion is not told from another whose cost is no more than so many times as large,"""
+_UNLIKELY = 3.0
+"""Standard deviations by which a motion must be less likely than the best one,"""
 _APART = 4.0
-"""when these differ by so many degrees."""
+"""from which it differs by so many degrees, not to be told as another explanation."""
 
 
 class Motion(NamedTuple):
@@ -86,13 +91,14 @@ class MotionSystem:
     by_zoom: Float[Tensor, "h v n"]
     by_depth: Float[Tensor, "h v n"]
     sigma: float
+    flat: float
 
     def gradient(self) -> tuple[Tensor, Tensor]:
         """Of half the cost's sum by cameras (with the focal length last) and by depths."""
         wr = self.w * self.r
         cameras = (wr[..., None] * self.by_camera).sum(2).flatten(1)
         zoom = (wr * self.by_zoom).sum((1, 2)) + self.x.zoom / self.sigma**2
-        return torch.cat((cameras, zoom[:, None]), 1), (wr * self.by_depth).sum(1) + _FLAT * (self.x.rho - 1)
+        return torch.cat((cameras, zoom[:, None]), 1), (wr * self.by_depth).sum(1) + self.flat * (self.x.rho - 1)
 
     def steepest(self) -> Tensor:
         """The largest derivative."""
@@ -112,7 +118,7 @@ class MotionSystem:
         A[:, :-1, -1] = A[:, -1, :-1] = (w * J * self.by_zoom[..., None]).sum(2).flatten(1)
         A[:, -1, -1] = (self.w * self.by_zoom.square()).sum((1, 2)) + 1 / self.sigma**2
         A.diagonal(dim1=1, dim2=2).mul_(1 + damping[:, None]).add_(1e-12)
-        C = ((self.w * self.by_depth.square()).sum(1) + _FLAT) * (1 + damping[:, None])
+        C = ((self.w * self.by_depth.square()).sum(1) + self.flat) * (1 + damping[:, None])
         a, b = self.gradient()
         inverse = C.rsqrt()[:, None]
         E = (w * J * self.by_depth[..., None]).transpose(2, 3).flatten(1, 2)
@@ -133,6 +139,7 @@ class MotionDistances(Problem[MotionSystem]):
     focal: Float[Tensor, "h"]
     weight: Float[Tensor, "h v n"]
     sigma: float
+    flat: float
     scale: float
 
     def pick(self, at: Places) -> "MotionDistances":
@@ -154,12 +161,12 @@ class MotionDistances(Problem[MotionSystem]):
         by_camera = torch.cat((torch.linalg.cross(turned, slope), x.rho[:, None, :, None] * slope), -1)
         loss = GemanMcClure(self.scale)
         total = self.weight.sum((1, 2)).clamp_min(1)
-        prior = _FLAT * (x.rho - 1).square().sum(-1) + x.zoom.square() / self.sigma**2
+        prior = self.flat * (x.rho - 1).square().sum(-1) + x.zoom.square() / self.sigma**2
         cost = ((self.weight * loss(r.square())).sum((1, 2)) + prior) / total
         cost = torch.where(cost.isfinite(), cost, torch.inf)
         x = x._replace(place=torch.where(shown.view(x.place.shape), near.place, x.place))
         w, by_depth = self.weight * loss.slope(r.square()), (slope * x.t[:, :, None]).sum(-1)
-        return MotionSystem(x, cost, total, r, w, by_camera, by_zoom, by_depth, self.sigma)
+        return MotionSystem(x, cost, total, r, w, by_camera, by_zoom, by_depth, self.sigma, self.flat)
 
     def advance(self, here: MotionSystem, step: Step) -> MotionSystem:
         """The system where a step leads."""
@@ -225,25 +232,38 @@ def first_cameras(
     f = focal.expand(h)
     t = _translations(R, samples[reference], samples[others], shown, f)
     motion = Motion(R, t, t.new_ones(h, c * _SAMPLES), torch.zeros_like(f), spread[others].expand(h, -1, -1, -1))
-    problem = MotionDistances(images, samples[reference], centre, f, shown.expand(h, -1, -1), sigma, 1.0)
+    problem = MotionDistances(images, samples[reference], centre, f, shown.expand(h, -1, -1), sigma, _FLAT, 1.0)
 
-    def descent(scale: float, steps: int) -> tuple[Motion, Tensor]:
+    def descent(scale: float, steps: int, noise: float = 1.0) -> tuple[Motion, Tensor]:
         weight = problem.inside(motion.place).to(problem.weight)
-        found = descend(replace(problem, weight=weight, scale=scale), motion, Options(steps, 1e-4))
+        # What is expected counts as much as distances do, that are so large, in pixels.
+        now = replace(problem, weight=weight, scale=scale, sigma=sigma / noise, flat=_FLAT * noise**2)
+        found = descend(now, motion, Options(steps, 1e-4))
         return found.x, found.cost
 
     for scale in _SCALES:
         motion, cost = descent(scale, _STEPS)
     best = (cost.argsort()[:_BEST],)
     motion, problem = pick(best, motion), problem.pick(best)
-    for _ in range(_LAST):
-        r = problem.linearize(motion).r[0][problem.weight[0] > 0].abs()
+    k, rivals, last = 0, torch.empty(0), torch.full_like(cost[best], torch.inf)
+    for turn in range(_LAST + _LONGER):
+        r = problem.linearize(motion).r[k][problem.weight[k] > 0].abs()
         scale = max(_FINEST, _TRUSTED * float(r.median()))
-        motion, cost = descent(scale, 2 * _STEPS)
-    k = int(cost.argmin())
+        motion, cost = descent(scale, 2 * _STEPS, min(1.0, DEVIATION * scale / _TRUSTED))
+        k = int(cost.argmin())
+        apart = rotation_angle(motion.R @ motion.R[k].mT).rad2deg().amax(-1)
+        rivals = (cost < cost[k] * _equal(shown)) & (apart > _APART)
+        if turn + 1 >= _LAST:
+            # What still descends is no other minimum: focal lengths and turns are found slowly, together.
+            if not bool((rivals & (cost < _ARRIVED * last)).any()):
+                break
+            going = rivals.index_fill(0, torch.tensor([k]), True)
+            some = (going.nonzero()[:, 0],)
+            k = int(going[:k].sum())
+            motion, problem, cost = pick(some, motion), problem.pick(some), cost[some]
+        last = cost
     counts = problem.inside(motion.place)[k]
     good = (problem.linearize(motion).r[k].abs() < scale) & counts
-    apart = rotation_angle(motion.R @ motion.R[k].mT).rad2deg().amax(-1)
     depths = motion.rho[k].quantile(motion.rho.new_tensor([0.1, 0.9]))
     refusal = ""
     if int(good.sum()) < _FEWEST * (v - 1):
@@ -252,7 +272,7 @@ def first_cameras(
         refusal = f"only {int(good.sum())} of {int(counts.sum())} samples of curves agree with one motion"
     elif float((depths[1] - depths[0]) * motion.t[k].norm(dim=-1).amax() * focal) < _PARALLAX:
         refusal = "the camera hardly moved, or only turned, which gives no depth"
-    elif bool(((cost < _RIVAL * cost[k]) & (apart > _APART)).any()):
+    elif bool(rivals.any()):
         refusal = "several motions explain the curves as well"
     elif not bool(torch.isfinite(cost[k]) & (motion.rho[k].median() > 0)):
         refusal = "no motion explains the curves"
@@ -263,6 +283,16 @@ def first_cameras(
     sure = 2 * good.sum(0) >= v - 1
     rays = torch.cat((samples[reference] / found, torch.ones_like(samples[reference][:, :1])), -1)
     return FirstCameras(poses, found, (rays / motion.rho[k][:, None])[sure & (motion.rho[k] > 0)], refusal)
+
+
+def _equal(shown: Float[Tensor, "w n"]) -> float:
+    """How many times as large the cost of a motion may be that is about as likely as another.
+
+    What a frame shows of a curve is wrong as a whole, and counts as one distance: of so many, the logarithm of the likelihood
+    is half the number times that of the cost.
+    """
+    number = float(shown.sum()) / _SAMPLES - 6 * len(shown)
+    return math.exp(_UNLIKELY**2 / max(number, _UNLIKELY**2))
 
 
 def _refused(v: int, focal: Tensor, why: str) -> FirstCameras:
