@@ -8,9 +8,6 @@ from torchsfm.linalg.decompositions import eigh, qr
 from torchsfm.linalg.magnitude import unit_scale
 from torchsfm.linalg.rows import combine_rows
 
-_FEW = 128
-"""So many matrices LAPACK decomposes sooner than so many small operations begin."""
-
 
 def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
     """An orthonormal basis of the null space of wide matrices of full row rank, as columns, by QR of the transpose.
@@ -47,23 +44,12 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
         >>> basis[..., 0].abs()
         tensor([[0., 0., 1.]], dtype=torch.float64)
     """
-    basis, smallest = _by_reflections(a.transpose(0, 1).contiguous())
+    basis, smallest = nullspace_columns(a.transpose(0, 1).contiguous())
     return basis.transpose(0, 1), smallest
 
 
 def nullspace_columns(a: Float[Tensor, "n m batch"]) -> tuple[Float[Tensor, "n k batch"], Float[Tensor, " batch"]]:
-    """`nullspace_rows` with the matrices and the basis transposed, which is faster; what is in `a` is lost.
-
-    Few matrices are decomposed by LAPACK, by the same reflections: rounding may depend on the number of matrices.
-    """
-    m, batch = a.shape[1:]
-    if batch > _FEW:
-        return _by_reflections(a)
-    Q, R, _ = qr(a.permute(2, 0, 1), complete=True)
-    return Q[..., m:].permute(1, 2, 0), R.diagonal(dim1=-2, dim2=-1).abs().amin(-1)
-
-
-def _by_reflections(a: Tensor) -> tuple[Tensor, Tensor]:
+    """`nullspace_rows` with the matrices and the basis transposed, which is faster; what is in `a` is lost."""
     n, m, batch = a.shape
     reflections: list[tuple[list[Tensor], Tensor, Tensor]] = []
     smallest = None
