@@ -44,6 +44,7 @@ from torchsfm.bundle import (
     PosePrior as PosePrior,
     Prior as Prior,
     ProjectiveBundleResult as ProjectiveBundleResult,
+    RelativePosePrior as RelativePosePrior,
     Rig as Rig,
     bundle_adjust as bundle_adjust,
     bundle_adjust_model as bundle_adjust_model,

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsfm.bundle import CentrePrior, PointPrior, PosePrior, Prior, Rig, bundle_adjust, bundle_covariance
+from torchsfm.bundle import CentrePrior, PointPrior, PosePrior, Prior, RelativePosePrior, Rig, bundle_adjust, bundle_covariance
 from torchsfm.geometry import (
     BundleProblem,
     Camera,
@@ -66,6 +66,52 @@ def test_positions_hold_the_world(scene: Scene, generator: torch.Generator) -> N
         free = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), free=())
         held = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), free=(), priors=[prior], sigma=0.5)
         assert (free.nullity, held.nullity) == (7, 0)
+
+
+def test_motions_from_pose_to_pose_bend_no_more_than_they_are_sure(scene: Scene, generator: torch.Generator) -> None:
+    """Exact motions, and points that see noise: rotations come from the motions, the world stays free."""
+    poses, camera, X, x, view, point = scene
+    pairs = torch.tensor([[0, 1], [1, 2], [2, 3], [5, 3], [4, 3]])
+    motions = poses[pairs[:, 1]] @ poses[pairs[:, 0]].inverse()
+    problem = BundleProblem.of(poses, camera, X, x, view, point)
+    free = bundle_adjust(problem, free=(), tolerance=1e-12, max_iterations=100).poses
+    turned = torch.tensor([1e-6] * 3 + [torch.inf] * 3, dtype=F64)
+
+    def off(found: Pose) -> tuple[float, float]:
+        error = (found[pairs[:, 1]] @ found[pairs[:, 0]].inverse()) @ motions.inverse()
+        return float(rotation_angle(error.R).max()), float(error.t.norm(dim=-1).max())
+
+    for solver in ("dense", "pcg"):
+        prior = RelativePosePrior(pairs, motions, turned)
+        found = bundle_adjust(problem, free=(), priors=[prior], tolerance=1e-12, max_iterations=100, linear_solver=solver)
+        # Where images know to a thousandth, motions are believed; translations, of which nothing is said, follow the images.
+        assert off(free)[0] > 1e-4 > 1e-6 > off(found.poses)[0]
+        assert off(found.poses)[1] > 1e-4
+        whole = bundle_adjust(problem, free=(), priors=[RelativePosePrior(pairs, motions, 1e-6)], linear_solver=solver)
+        assert max(off(whole.poses)) < 1e-5
+    # All but the place and the direction of the world are known, its size from the motions.
+    assert bundle_covariance(problem, free=(), priors=[prior]).nullity == 7
+    assert bundle_covariance(problem, free=(), priors=[RelativePosePrior(pairs, motions, 0.01)]).nullity == 6
+    with pytest.raises(ValueError, match="two different poses"):
+        RelativePosePrior(pairs[:, :1].expand(-1, 2), motions, 1.0)
+
+
+def test_poses_bound_to_each_other_are_not_eliminated(scene: Scene, generator: torch.Generator) -> None:
+    """A film of few points, of which poses are eliminated otherwise."""
+    poses, camera, X, _, _, _ = scene
+    many = poses[torch.arange(48) % 6]
+    view, point = torch.arange(48).repeat_interleave(4), torch.arange(4).repeat(48)
+    x = camera[torch.zeros_like(view)].project(many[view].transform(X[point, None]))[:, 0]
+    pairs = torch.stack((torch.arange(47), torch.arange(1, 48)), -1)
+    prior = RelativePosePrior(pairs, many[1:] @ many[:-1].inverse(), 0.1)
+    noisy = many.retract(0.01 * torch.randn(48, 6, generator=generator, dtype=F64))
+    found = bundle_adjust(
+        BundleProblem.of(noisy, camera, X[:4], x, view, point),
+        free=(),
+        priors=[prior],
+        fixed_points=torch.ones(4, dtype=torch.bool),
+    )
+    assert rotation_angle(found.poses.R @ many.R.mT).max() < 1e-5
 
 
 def test_information_adds_up(scene: Scene, generator: torch.Generator) -> None:

@@ -10,7 +10,7 @@ from torchsfm.bundle.curves import BundleCurves
 from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.intrinsics_covariance import intrinsics_covariance
 from torchsfm.bundle.lines import BundleLines
-from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior
+from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior, RelativePosePrior
 from torchsfm.bundle.rig import Rig
 from torchsfm.bundle.structure import Structure
 
@@ -29,6 +29,7 @@ __all__ = [
     "PosePrior",
     "Prior",
     "ProjectiveBundleResult",
+    "RelativePosePrior",
     "Rig",
     "Structure",
     "bundle_adjust",

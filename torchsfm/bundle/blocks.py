@@ -38,7 +38,7 @@ class BundleTerms(TypedDict, total=False):
             frame is then the rig's own (else damping decides that, too).
         weights: Weight of each observation's squared distance, `(m)`; 0 leaves it out.
         loss: Robust loss of the squared distance (see `torchsfm.optim`), squares if not given.
-        priors: What is known of poses and points: `CentrePrior`, `PosePrior`, `PointPrior`.
+        priors: What is known of poses and points: `CentrePrior`, `PosePrior`, `RelativePosePrior`, `PointPrior`.
         intrinsics_sigma: Standard deviations of Gaussian priors on free intrinsics, by the names in `free`, as a fraction of
             the mean for "focal" and absolute otherwise, for all cameras or (g,) for each. An observation's distance counts in
             units of 1 pixel.
@@ -200,12 +200,18 @@ class Bundle:
         return blocks, terms
 
 
-def cheapest_elimination(blocks: Mapping[str, Block], structure: tuple[str, ...] = ("point",)) -> tuple[str, ...]:
-    """Points and other structure, unless eliminating poses leaves a system of less than half the size: film of few points."""
+def cheapest_elimination(
+    blocks: Mapping[str, Block], terms: Sequence[Term], structure: tuple[str, ...] = ("point",)
+) -> tuple[str, ...]:
+    """Points and other structure, unless eliminating poses leaves a system of less than half the size: film of few points.
+
+    Poses that something binds to each other cannot be eliminated one by one.
+    """
     sizes = {name: block.x.shape[0] * block.tangent for name, block in blocks.items()}
     seen = sum(sizes[name] for name in structure)
     rest = sum(size for name, size in sizes.items() if name not in ("pose", *structure))
-    return ("pose",) if 2 * (seen + rest) < sizes["pose"] + rest else structure
+    bound = any(term.blocks.count("pose") > 1 for term in terms)
+    return ("pose",) if 2 * (seen + rest) < sizes["pose"] + rest and not bound else structure
 
 
 def structure_blocks(bundle: Bundle) -> tuple[str, ...]:

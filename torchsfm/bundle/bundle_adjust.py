@@ -131,7 +131,7 @@ def bundle_adjust(
     result = sparse_levenberg_marquardt(
         blocks,
         residuals,
-        eliminate=cheapest_elimination(blocks, structure_blocks(bundle)),
+        eliminate=cheapest_elimination(blocks, residuals, structure_blocks(bundle)),
         max_iterations=max_iterations,
         function_tolerance=tolerance,
         linear_solver=linear_solver,

@@ -1,4 +1,4 @@
-"""What is known beforehand of poses and points: positions of camera centres (GPS), whole poses, control points.
+"""What is known beforehand of poses and points: positions of camera centres (GPS), poses, motions between two, control points.
 
 A prior adds `(v - v0)' C^-1 (v - v0) / 2` to the cost, C the covariance given. An observation's squared distance counts in
 units of 1 pixel there: where image points have a standard deviation s other than 1 pixel, give observations the weight 1 / s^2.
@@ -87,7 +87,7 @@ class CentrePrior:
 
         def residual(pose: Tensor, centre: Tensor, white: Tensor) -> Tensor:
             R, t = _split(pose)
-            return _apply(white, -(R.mT @ t[:, :, None])[:, :, 0] - centre)
+            return _apply(white, -_apply(R.mT, t) - centre)
 
         white = _whitener(self.sigma, self.covariance, self.centre)
         return Term(residual, ("pose",), (self.index,), (self.centre, white), self.loss)
@@ -127,12 +127,61 @@ class PosePrior:
         def residual(pose: Tensor, known: Tensor, white: Tensor) -> Tensor:
             (R, t), (R0, t0) = _split(pose), _split(known)
             turn = R @ R0.mT
-            v = t - (turn @ t0[:, :, None])[:, :, 0]
+            v = t - _apply(turn, t0)
             return _apply(white, torch.cat((rotvec_from_rotation(turn), v), -1))
 
         known = torch.cat((self.poses.R.flatten(1), self.poses.t), 1)
         white = _whitener(self.sigma, self.covariance, known[:, :6])
         return Term(residual, ("pose",), (self.index,), (known, white), self.loss)
+
+
+@dataclass(frozen=True)
+class RelativePosePrior:
+    """Known motions from one camera to another: wheels or an inertial unit between frames, pairs and models of a few images.
+
+    The world as a whole stays free, so a gauge must be held elsewhere or left free. Where only rotations are known, let the
+    standard deviations of the translation be infinite: `sigma=torch.tensor([s, s, s, inf, inf, inf])`.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> simulated = torchsfm.random_bundle_problem(4, 50, 150, generator=torch.Generator().manual_seed(0))
+        >>> pairs, truth = torch.tensor([[0, 1], [1, 2], [2, 3]]), simulated.truth.poses
+        >>> moved = truth[pairs[:, 1]] @ truth[pairs[:, 0]].inverse()
+        >>> known = torchsfm.RelativePosePrior(pairs, moved, sigma=1e-6)
+        >>> found = torchsfm.bundle_adjust(simulated.problem, priors=(known,)).poses
+        >>> bool(((found[pairs[:, 1]] @ found[pairs[:, 0]].inverse()).t - moved.t).norm(dim=-1).max() < 1e-3)
+        True
+    """
+
+    index: Int[Tensor, "k 2"]
+    """The two poses of each motion, no two the same: from the first one's camera to the second one's."""
+    poses: Pose
+    """The motions, `poses[second] @ poses[first].inverse()`, batch (k,)."""
+    sigma: Sigma
+    """Standard deviations of (w, v) as in `Pose.retract`, radians and the unit of the world: one number, (6,) or (k, 6)."""
+    covariance: Float[Tensor, "k 6 6"] | None = None
+    """Whole covariances of (w, v), instead of `sigma`."""
+    loss: Loss | None = None
+    """Robust loss of the squared, whitened error."""
+    block = "pose"
+
+    def __post_init__(self) -> None:
+        check_tensors(index=(self.index, "k 2: int"), poses=(self.poses.R, "k 3 3"), covariance=(self.covariance, "?k 6 6"))
+        if bool((self.index[:, 0] == self.index[:, 1]).any()):
+            raise ValueError("index: wanted two different poses in each row")
+
+    def term(self) -> Term:
+        """The prior as a term of the optimiser."""
+
+        def residual(first: Tensor, second: Tensor, known: Tensor, white: Tensor) -> Tensor:
+            (A, a), (B, b), (R, t) = _split(first), _split(second), _split(known)
+            turn = B @ (R @ A).mT
+            v = b - _apply(turn, _apply(R, a) + t)
+            return _apply(white, torch.cat((rotvec_from_rotation(turn), v), -1))
+
+        known = torch.cat((self.poses.R.flatten(1), self.poses.t), 1)
+        white = _whitener(self.sigma, self.covariance, known[:, :6])
+        return Term(residual, ("pose", "pose"), (self.index[:, 0], self.index[:, 1]), (known, white), self.loss)
 
 
 @dataclass(frozen=True)
@@ -183,8 +232,8 @@ def _whitener(sigma: Sigma, covariance: Tensor | None, like: Tensor) -> Tensor:
     return torch.where((info == 0)[:, None, None], torch.linalg.solve_triangular(lower, eye, upper=False), torch.nan)
 
 
-def _apply(white: Tensor, error: Tensor) -> Tensor:
-    return (white @ error[:, :, None])[:, :, 0]
+def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
+    return (matrix @ vector[:, :, None])[:, :, 0]
 
 
 def _split(pose: Tensor) -> tuple[Tensor, Tensor]:
