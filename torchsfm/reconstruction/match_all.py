@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -14,7 +15,7 @@ from torchsfm.reconstruction.image_points import SHARDS, ImagePoints, SavedFeatu
 from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.sequence import Corners, sequence_pairs, track_corners
-from torchsfm.reconstruction.stages import Arrays, Stages, one_thread
+from torchsfm.reconstruction.stages import Arrays, Shards, Stages, one_thread
 from torchsfm.reconstruction.view_graph import VerifiedPairs, ViewGraph, verify_pairs
 
 MAX_IMAGES_ALL_PAIRS = 80
@@ -114,19 +115,7 @@ def match_all(
     if not sequence:
         pairs = _promising(pairs, features, stages, progress)
     work = PairShards.of(pairs)
-    told = 0
-
-    def match(shard: int) -> Arrays:
-        nonlocal told
-        rows = list[Tensor]()
-        for some in torch.split(pairs[work.matched(shard)], MATCHED_AT_ONCE):
-            progress("match", told, len(pairs))
-            rows += match_features(*_read(features, some))
-            told += len(some)
-        progress("match", told, len(pairs))
-        return {"count": torch.tensor([len(m) for m in rows]).long(), "match": torch.cat(rows)}
-
-    matched = stages.shards("match", work.match_shards, match, after=work.digest)
+    matched = _compared("match", _matches, pairs, features, stages, progress)
     x, color, corners = points.x, points.color, None
     if sequence:
         found = stages.run("track", lambda: track_corners(points, max_pixels, progress, masks))
@@ -165,26 +154,39 @@ def _promising(pairs: Int[Tensor, "q 2"], features: SavedFeatures, stages: Stage
     """The pairs that are worth comparing in full, by a look at some features of all."""
     if len(features) <= 2 * PARTNERS:
         return pairs  # nearly all would be kept
-    work = PairShards.of(pairs)
-    told = 0
-
-    def look(shard: int) -> Arrays:
-        nonlocal told
-        found = list[Tensor]()
-        for some in torch.split(pairs[work.matched(shard)], MATCHED_AT_ONCE):
-            progress("look", told, len(pairs))
-            found.append(preview_matches(*_read(features, some)))
-            told += len(some)
-        progress("look", told, len(pairs))
-        return {"found": torch.cat(found)}
-
-    shards = stages.shards("look", work.match_shards, look, after=work.digest)
+    shards = _compared("look", lambda some, local: {"found": preview_matches(some, local)}, pairs, features, stages, progress)
     found = torch.empty(len(pairs), dtype=torch.float64)
-    found[work.order] = torch.cat([shard["found"] for shard in shards])
+    found[PairShards.of(pairs).order] = torch.cat([shard["found"] for shard in shards])
     return pairs[promising_pairs(pairs, found)]
 
 
-def _read(features: SavedFeatures, pairs: Int[Tensor, "k 2"]) -> tuple[list[Features], Int[Tensor, "k 2"]]:
-    """The features that some pairs need, and the pairs as indices into these."""
-    images, local = torch.unique(pairs, return_inverse=True)
-    return [features[i] for i in images.tolist()], local
+def _matches(features: list[Features], pairs: Int[Tensor, "k 2"]) -> Arrays:
+    """The matches of pairs one after the other, and how many each has."""
+    rows = match_features(features, pairs)
+    return {"count": torch.tensor([len(m) for m in rows]).long(), "match": torch.cat(rows)}
+
+
+def _compared(
+    stage: str,
+    compare: Callable[[list[Features], Int[Tensor, "k 2"]], Arrays],
+    pairs: Int[Tensor, "q 2"],
+    features: SavedFeatures,
+    stages: Stages,
+    progress: Progress,
+) -> Shards:
+    """What features say of all pairs, shard by shard, with the images of a few pairs in the memory at a time."""
+    work = PairShards.of(pairs)
+    told = 0
+
+    def shard(number: int) -> Arrays:
+        nonlocal told
+        parts = list[Arrays]()
+        for some in torch.split(pairs[work.matched(number)], MATCHED_AT_ONCE):
+            progress(stage, told, len(pairs))
+            images, local = torch.unique(some, return_inverse=True)
+            parts.append(compare([features[i] for i in images.tolist()], local))
+            told += len(some)
+        progress(stage, told, len(pairs))
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    return stages.shards(stage, work.match_shards, shard, after=work.digest)
