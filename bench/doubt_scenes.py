@@ -16,9 +16,10 @@ from torchsfm.geometry import Camera, Pose
 from torchsfm.geometry.cameras import intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.simulation import look_at, render_sequence
+from torchsfm.simulation.patterns import add_spots
 from torchsfm.simulation.surfaces import Box, Cylinder, Ellipsoid, Rectangle, Surface
 from torchsfm.simulation.textured_scene import Textured, TexturedScene, texture_surface
-from torchsfm.simulation.textures import add_spots, mip_pyramid, paint
+from torchsfm.simulation.textures import mip_pyramid, paint
 
 WIDTH, HEIGHT = 480, 360
 TEXEL = 0.012

@@ -3,7 +3,8 @@ import torch
 from chance import assert_share
 
 from torchsfm.linalg.elimination import least_squares_rows
-from torchsfm.linalg.quadric_intersection import CUBIC, QUADRATIC, cubic_of_forms, intersect_quadrics, product_of_forms
+from torchsfm.linalg.quadric_intersection import intersect_quadrics
+from torchsfm.linalg.quaternary_forms import CUBIC, QUADRATIC, cubic_of_forms, product_of_forms
 
 F64 = torch.float64
 

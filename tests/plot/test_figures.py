@@ -28,7 +28,7 @@ from torchsfm.plot import (
 from torchsfm.plot.flat import clip_lines
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.simulation import look_at
-from torchsfm.tensors.bifocal import fundamental_from_pose
+from torchsfm.tensors import fundamental_from_pose
 
 
 def draw(ax: Any) -> None:

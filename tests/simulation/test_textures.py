@@ -4,7 +4,8 @@ import pytest
 import torch
 from chance import seeded
 
-from torchsfm.simulation.textures import STYLES, fractal_noise, mip_pyramid, paint
+from torchsfm.simulation.patterns import fractal_noise
+from torchsfm.simulation.textures import STYLES, mip_pyramid, paint
 
 
 @pytest.mark.parametrize("style", sorted(STYLES))

@@ -11,7 +11,8 @@ from torchsfm._types import check_options, check_tensors
 from torchsfm.autocalibration.intrinsics_model import CONSTANT, VARYING_FOCAL, Assumption
 from torchsfm.autocalibration.projective_input import Sightings
 from torchsfm.autocalibration.upgrade_cameras import Autocalibration, sizes_of, upgrade_cameras, upgrade_options
-from torchsfm.geometry.curves import Curve, foot_points
+from torchsfm.geometry.curves import Curve
+from torchsfm.geometry.foot_points import foot_points
 from torchsfm.geometry.homogeneous import divide_safely
 
 _ALONG = 0.7

@@ -14,25 +14,21 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.autocalibration.circle_outlines import centre_weights, circle_points, outline_centres
+from torchsfm.autocalibration.plane_start import CameraAndPoses, start_from_homographies
 from torchsfm.geometry import Camera, Distortion, Pose, Radial
 from torchsfm.geometry.intrinsic_parameters import (
     ASPECT,
-    CX,
     FOCAL,
     HEAD,
     SKEW,
     camera_from_row,
     intrinsic_columns,
     intrinsic_labels,
-    intrinsic_matrix,
 )
 from torchsfm.geometry.projection import PixelProjection, turn_slopes
-from torchsfm.linalg import cross, eigvalsh, nearest_rotation, null_vector, usable
-from torchsfm.motion import homography_dlt
+from torchsfm.linalg import eigvalsh, usable
 from torchsfm.optim import Loss, levenberg_marquardt, loss_slope, rotation_exponential
 
-_PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
-"""Order of the six entries of a conic."""
 MAX_DEVIATION = 0.3
 """Standard deviation of the logarithm of the focal length beyond which the views do not determine it."""
 
@@ -82,14 +78,6 @@ class PlaneCalibration:
     def deviation(self) -> Float[Tensor, "*batch q"]:
         """Standard deviations of the free parameters."""
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-
-
-@dataclass(frozen=True)
-class _Unknowns:
-    row: Tensor
-    """Of the camera, see `intrinsic_parameters`."""
-    R: Tensor
-    t: Tensor
 
 
 def calibrate_planes(
@@ -156,7 +144,7 @@ def calibrate_planes(
     with torch.no_grad():
         used = (seen.sum(-1) >= 4) & _spread_out(X64, seen)
         seen = seen & used[..., None]
-        start = _start(x64, X64, seen, used, image_size, columns, distortion.num_parameters)
+        start = start_from_homographies(x64, X64, seen, used, image_size, columns, distortion.num_parameters)
     columns += tuple(range(HEAD, HEAD + distortion.num_parameters))
     q = len(columns)
     weights = seen.double().flatten(-2)
@@ -227,7 +215,7 @@ class _Problem:
     projection: PixelProjection
     radius: float | None
 
-    def retract(self, u: _Unknowns, delta: Tensor) -> _Unknowns:
+    def retract(self, u: CameraAndPoses, delta: Tensor) -> CameraAndPoses:
         free = self.projection.free
         q = len(free)
         pose = delta[..., q:].reshape(*u.t.shape[:-1], 6)
@@ -235,9 +223,9 @@ class _Problem:
         moved = (turn @ u.t[..., None])[..., 0] + pose[..., 3:]
         place = torch.tensor(free, device=delta.device)
         row = u.row + torch.zeros_like(u.row).index_add(-1, place, delta[..., :q])
-        return _Unknowns(row, turn @ u.R, moved)
+        return CameraAndPoses(row, turn @ u.R, moved)
 
-    def residual(self, u: _Unknowns, x: Tensor, X: Tensor) -> Tensor:
+    def residual(self, u: CameraAndPoses, x: Tensor, X: Tensor) -> Tensor:
         pixels = self.projection.pixels(*_seen(u, self._outlined(X)))
         if self.radius is not None:
             pixels = outline_centres(centre_weights(pixels), pixels)
@@ -246,7 +234,7 @@ class _Problem:
     def _outlined(self, X: Tensor) -> Tensor:
         return X if self.radius is None else circle_points(X, self.radius)
 
-    def linearize(self, u: _Unknowns, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
+    def linearize(self, u: CameraAndPoses, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
         """Residuals and Jacobian; every view depends on its own pose alone, so that all poses are differentiated at once."""
         b, v, n = x.shape[:3]
         q = len(self.projection.free)
@@ -263,7 +251,7 @@ class _Problem:
         return (pixels.movedim(0, -1) - x).flatten(1, 2), J.flatten(1, 2)
 
 
-def _seen(u: _Unknowns, X: Tensor) -> tuple[Tensor, Tensor]:
+def _seen(u: CameraAndPoses, X: Tensor) -> tuple[Tensor, Tensor]:
     """The plane's points in the frames of the views (3, *batch, v, n), and the rows of the cameras (k, *batch, 1, 1)."""
     Y = u.R[..., :2] @ X.mT[..., None, :, :] + u.t[..., None]
     return Y.movedim(-2, 0), u.row.movedim(-1, 0)[..., None, None]
@@ -277,87 +265,6 @@ def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
     values, _ = eigvalsh(D.mT @ D)
     spans: Tensor = values[..., 0] > 1e-10 * values[..., 1].clamp_min(1e-300)
     return spans
-
-
-def _start(
-    x: Tensor,
-    X: Tensor,
-    seen: Tensor,
-    used: Tensor,
-    size: tuple[float, float] | None,
-    columns: Sequence[int],
-    lens: int,
-) -> _Unknowns:
-    """The better of two: Zhang's linear intrinsics, and a focal length alone with the principal point in the middle."""
-    w = seen.to(x.dtype)
-    low = torch.where(seen[..., None], x, torch.inf).flatten(-3, -2).amin(-2)
-    high = torch.where(seen[..., None], x, -torch.inf).flatten(-3, -2).amax(-2)
-    some = seen.flatten(-2).any(-1)[..., None]
-    low, high = torch.where(some, low, 0.0), torch.where(some, high, 1.0)
-    middle = (low + high) / 2 if size is None else (torch.tensor(size, dtype=x.dtype, device=x.device) - 1) / 2 + 0 * low
-    scale = (high - low).amax(-1).clamp_min(1e-9)
-    y = (x - middle[..., None, None, :]) / scale[..., None, None, None]
-    H = homography_dlt(X[..., None, :, :].expand(*x.shape[:-3], x.shape[-3], *X.shape[-2:]), y, w)
-    H = torch.where(used[..., None, None], H, torch.eye(3, dtype=x.dtype, device=x.device))
-    # Columns of one size, so that no view outweighs the others.
-    H = H / H[..., :2].flatten(-2).norm(dim=-1)[..., None, None].clamp_min(1e-300)
-    h1, h2 = H[..., 0], H[..., 1]
-
-    def row(a: Tensor, b: Tensor) -> Tensor:
-        terms = [a[..., i] * b[..., j] + (a[..., j] * b[..., i] if i != j else 0) for i, j in _PAIRS]
-        return torch.stack(terms, -1) * used[..., None]
-
-    rows = torch.cat((row(h1, h2), row(h1, h1) - row(h2, h2)), -2)
-    # Square pixels and a centred principal point: w = diag(a, a, 1).
-    A, r = rows[..., 0] + rows[..., 2], -rows[..., 5]
-    a = (A * r).sum(-1) / A.square().sum(-1).clamp_min(1e-300)
-    f = torch.where(a > 1e-4, a, 1.0).rsqrt()
-    zero = torch.zeros_like(f)
-    simple = torch.stack((f, torch.ones_like(f), zero, zero, zero), -1)
-    # Without skew: w12 = 0.
-    b, _ = null_vector(torch.nn.functional.pad(rows[..., [0, 2, 3, 4, 5]], (0, 0, 0, 5)))
-    b = b * torch.where(b[..., :1] < 0, -1.0, 1.0)
-    w11, w22, w13, w23, w33 = b.unbind(-1)
-    fine = (w11 > 1e-9) & (w22 > 1e-9)
-    d1, d2 = torch.where(fine, w11, 1.0), torch.where(fine, w22, 1.0)
-    cx, cy = -w13 / d1, -w23 / d2
-    rest = w33 - w13**2 / d1 - w23**2 / d2
-    fine = fine & (rest > 0)
-    rest = torch.where(fine, rest, 1.0)
-    lengths = torch.stack(((rest / d1).sqrt(), (rest / d2).sqrt()), -1)
-    full = torch.stack((lengths[..., 0], (d1 / d2).sqrt(), zero, cx, cy), -1)
-    fine = fine & ((lengths > 0.05) & (lengths < 200)).all(-1) & (full[..., CX:].abs() < 5).all(-1)
-    # What is not free stays where it is known to be.
-    free = torch.zeros(HEAD, dtype=torch.bool, device=x.device).index_fill(0, torch.tensor(columns, device=x.device), True)
-    full = torch.where(fine[..., None] & free, full, simple)
-
-    candidates = []
-    for intrinsics in (simple, full):
-        K = intrinsic_matrix(intrinsics)
-        R, t = _poses(K, H)
-        image = (X[..., None, :, :] @ R[..., :2].mT + t[..., None, :]) @ K[..., None, :, :].mT
-        error = ((image[..., :2] / image[..., 2:] - y).square().sum(-1).clamp_max(1.0) * w).sum((-2, -1))
-        candidates.append((torch.nan_to_num(error, torch.inf), intrinsics, R, t))
-    (first, *one), (second, *two) = candidates
-    better = second < first
-    chosen, R, t = (
-        torch.where(better.reshape(*better.shape, *[1] * (a.ndim - better.ndim)), b, a) for a, b in zip(one, two, strict=True)
-    )
-    pixel, ratio = scale[..., None], torch.ones_like(scale[..., None])
-    first_row = chosen * torch.cat((pixel, ratio, pixel, pixel, pixel), -1)
-    none = pixel.new_zeros(*pixel.shape[:-1], lens)
-    return _Unknowns(torch.cat((first_row[..., :CX], first_row[..., CX:] + middle, none), -1), R, t)
-
-
-def _poses(K: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses of the plane whose homographies are H."""
-    M = torch.linalg.solve_ex(K[..., None, :, :].expand_as(H), H).result
-    # In front of the camera.
-    M = M * torch.where(M[..., 2, 2] < 0, -1.0, 1.0)[..., None, None]
-    size = 0.5 * (M[..., 0].norm(dim=-1) + M[..., 1].norm(dim=-1)).clamp_min(1e-300)
-    M = torch.nan_to_num(M / size[..., None, None])
-    r1, r2 = M[..., 0], M[..., 1]
-    return nearest_rotation(torch.stack((r1, r2, cross(r1, r2)), -1)), M[..., 2]
 
 
 def _covariance(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, used: Tensor) -> tuple[Tensor, Tensor]:

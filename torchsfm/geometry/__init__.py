@@ -20,7 +20,8 @@ from torchsfm.geometry.conics import (
     polar_lines,
     transform_conic,
 )
-from torchsfm.geometry.curves import Crossings, Curve, FootPoints, curve_crossings, curve_from_samples, foot_points
+from torchsfm.geometry.curve_crossings import Crossings, curve_crossings
+from torchsfm.geometry.curves import Curve, curve_from_samples
 from torchsfm.geometry.distortion import (
     DISTORTION_MODELS,
     BrownConrady,
@@ -31,6 +32,7 @@ from torchsfm.geometry.distortion import (
 )
 from torchsfm.geometry.distortion_model import Distortion
 from torchsfm.geometry.flatness import least_number_off, line_and_plane_distances
+from torchsfm.geometry.foot_points import FootPoints, foot_points
 from torchsfm.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
 from torchsfm.geometry.homogeneous import (
     from_homogeneous,

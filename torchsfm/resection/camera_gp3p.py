@@ -13,7 +13,8 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg import qr
 from torchsfm.linalg.constants import Constant
-from torchsfm.linalg.quadric_intersection import intersect_quadrics, product_of_forms
+from torchsfm.linalg.quadric_intersection import intersect_quadrics
+from torchsfm.linalg.quaternary_forms import product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.triangle import ASIDE, NEAREST

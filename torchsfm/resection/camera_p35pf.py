@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg.nullspace import nullspace_rows
-from torchsfm.linalg.quadric_intersection import cubic_of_forms, intersect_quadrics, product_of_forms
+from torchsfm.linalg.quadric_intersection import intersect_quadrics
+from torchsfm.linalg.quaternary_forms import cubic_of_forms, product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.focal import camera_of, incidence_rows, scaled, world_camera

@@ -1,19 +1,11 @@
 """What ties views together whatever the scene: bifocal, trifocal and quadrifocal tensors, from cameras and to cameras."""
 
 from torchsfm.tensors.bifocal import (
-    RelativePose,
     bifocal_tensors,
     cameras_from_fundamental,
     epipolar_lines,
     epipoles,
-    essential_from_fundamental,
-    essential_from_pose,
     fundamental_from_cameras,
-    fundamental_from_essential,
-    fundamental_from_pose,
-    pose_from_essential,
-    poses_from_essential,
-    poses_from_fundamental,
 )
 from torchsfm.tensors.canonical import (
     canonical_cameras,
@@ -39,6 +31,16 @@ from torchsfm.tensors.coordinates import (
     transform_fundamental,
     transform_quadrifocal,
     transform_trifocal,
+)
+from torchsfm.tensors.essential import (
+    RelativePose,
+    essential_from_fundamental,
+    essential_from_pose,
+    fundamental_from_essential,
+    fundamental_from_pose,
+    pose_from_essential,
+    poses_from_essential,
+    poses_from_fundamental,
 )
 from torchsfm.tensors.focals import (
     Focals,

@@ -13,13 +13,19 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
-from torchsfm.geometry.rotations import cross_matrix
-from torchsfm.linalg import eigh, null_vector, qr, unit_scale, usable
-from torchsfm.linalg.constants import Constant
+from torchsfm.linalg import eigh, null_vector, unit_scale, usable
+from torchsfm.motion.two_views.epipolar_tangents import (
+    ConicPairs,
+    EpipolarFrames,
+    carry_lines,
+    linearize,
+    residual,
+    two_by_two,
+)
 from torchsfm.motion.two_views.epipole_search import cofactors, frame, relate_tangents, search_epipoles
 from torchsfm.motion.two_views.fundamental_8pt import fundamental_8pt
 from torchsfm.motion.two_views.normalised_conics import conic_of_six, normalised_conics
-from torchsfm.optim import levenberg_marquardt, rotation_exponential
+from torchsfm.optim import levenberg_marquardt
 
 _SEARCH = 15
 """Steps of a start, most of which lead nowhere."""
@@ -34,18 +40,6 @@ _RIVAL = 9.0
 """In units of the noise: by how much more cost another answer must have."""
 _EXACT = 1e-14
 """The mean square of a residual that is rounding."""
-
-
-def _basis(size: int) -> Constant:
-    """Symmetric matrices by their entries in and above the diagonal, row by row."""
-    pairs = [(i, j) for i in range(size) for j in range(i, size)]
-    basis = torch.zeros(len(pairs), size, size, dtype=torch.float64)
-    for k, (i, j) in enumerate(pairs):
-        basis[k, i, j] = basis[k, j, i] = 1
-    return Constant(basis)
-
-
-_SIX, _THREE = _basis(3), _basis(2)
 
 
 @dataclass(frozen=True)
@@ -71,41 +65,6 @@ class ConicEpipolarFit:
     F explains them as well; NOT_CONVERGED."""
     error: Float[Tensor, "*batch"]
     """Root-mean-square residual, in standard deviations as given, or pixels where none are."""
-
-
-@dataclass(frozen=True)
-class _Epipolar:
-    """Frames whose last columns are the epipoles, and the 2x2 matrix that carries lines through them, as four numbers."""
-
-    R1: Float[Tensor, "*batch 3 3"]
-    R2: Float[Tensor, "*batch 3 3"]
-    N: Float[Tensor, "*batch 4"]
-
-    def moved(self, delta: Float[Tensor, "*batch 7"]) -> "_Epipolar":
-        zero = torch.zeros_like(delta[..., :1])
-        R1 = self.R1 @ rotation_exponential(torch.cat((delta[..., :2], zero), -1))
-        R2 = self.R2 @ rotation_exponential(torch.cat((delta[..., 2:4], zero), -1))
-        N = self.N + (_tangents(self.N.detach()) @ delta[..., 4:, None])[..., 0]
-        return _Epipolar(R1, R2, N / torch.linalg.vector_norm(N, dim=-1, keepdim=True))
-
-    def F(self) -> Tensor:
-        F: Tensor = self.R2[..., :2] @ _two_by_two(self.N) @ self.R1[..., :2].mT @ cross_matrix(self.R1[..., 2])
-        return F
-
-
-@dataclass(frozen=True)
-class _Data:
-    """Dual conics of both images as six numbers, their covariances, points, and what counts."""
-
-    c1: Float[Tensor, "*batch m 6"]
-    c2: Float[Tensor, "*batch m 6"]
-    S1: Float[Tensor, "*batch m 6 6"]
-    S2: Float[Tensor, "*batch m 6 6"]
-    x1: Float[Tensor, "*batch n 3"]
-    x2: Float[Tensor, "*batch n 3"]
-    sigma1: Float[Tensor, "*batch"]
-    """Of a pixel, in the normalised images."""
-    sigma2: Float[Tensor, "*batch"]
 
 
 def fundamental_from_conics(
@@ -183,21 +142,21 @@ def fundamental_from_conics(
     ]
     ellipses = (torch.stack([image.ellipse for image in images]).all(0) | ~seen).all(-1)
     one, two = images
-    data = _Data(one.c, two.c, one.S, two.S, one.x, two.x, one.T[..., 0, 0], two.T[..., 0, 0])
+    data = ConicPairs(one.c, two.c, one.S, two.S, one.x, two.x, one.T[..., 0, 0], two.T[..., 0, 0])
     with torch.no_grad():
         fixed = tensor_map(torch.Tensor.detach, data)
         weights = torch.cat((seen.to(one.c.dtype), (count > 0) * torch.ones_like(points[0][..., 0])), -1)
         start = _starts(fixed, seen, weights, starts, max_iterations, generator)
         few = (seen.sum(-1) < 4) & (count < 8)
         tried = levenberg_marquardt(
-            _residual, start, _beside(fixed, len(batch)), retract=_Epipolar.moved, size=7, weights=weights[..., None, :],
-            linearize=_linearize, max_iterations=max_iterations, function_tolerance=1e-3,
+            residual, start, _beside(fixed, len(batch)), retract=EpipolarFrames.moved, size=7, weights=weights[..., None, :],
+            linearize=linearize, max_iterations=max_iterations, function_tolerance=1e-3,
         )  # fmt: skip
-        proper = _proper(tried.x, _beside(fixed, len(batch)), seen[..., None, :]) & torch.isfinite(tried.cost)
+        proper = carry_lines(tried.x, _beside(fixed, len(batch)), seen[..., None, :]) & torch.isfinite(tried.cost)
         cost = torch.where(proper, tried.cost, torch.inf)
         best = _pick(tried.x, cost.argmin(-1, keepdim=True), squeeze=True)
     final = levenberg_marquardt(
-        _residual, best, data, retract=_Epipolar.moved, size=7, weights=weights, linearize=_linearize,
+        residual, best, data, retract=EpipolarFrames.moved, size=7, weights=weights, linearize=linearize,
         max_iterations=min(_LAST, max_iterations), function_tolerance=1e-10,
     )  # fmt: skip
     with torch.no_grad():
@@ -229,21 +188,12 @@ def fundamental_from_conics(
     return ConicEpipolarFit(F.to(dtype), status, error.to(dtype))
 
 
-def _two_by_two(v: Tensor) -> Tensor:
-    return v.reshape(*v.shape[:-1], 2, 2)
-
-
-def _tangents(N: Tensor) -> Tensor:
-    """An orthonormal basis of what is across unit 4-vectors."""
-    return qr(N[..., None], complete=True)[0][..., 1:]
-
-
-def _beside(data: _Data, dim: int) -> _Data:
+def _beside(data: ConicPairs, dim: int) -> ConicPairs:
     """For several states of one problem."""
     return tensor_map(lambda t: t.unsqueeze(dim), data)
 
 
-def _pick(state: _Epipolar, index: Tensor, *, squeeze: bool = False) -> _Epipolar:
+def _pick(state: EpipolarFrames, index: Tensor, *, squeeze: bool = False) -> EpipolarFrames:
     """Some of several states of each problem."""
     dim = index.ndim - 1
 
@@ -256,15 +206,15 @@ def _pick(state: _Epipolar, index: Tensor, *, squeeze: bool = False) -> _Epipola
 
 
 def _starts(
-    data: _Data, seen: Tensor, weights: Tensor, starts: int, max_iterations: int, generator: torch.Generator | None
-) -> _Epipolar:
+    data: ConicPairs, seen: Tensor, weights: Tensor, starts: int, max_iterations: int, generator: torch.Generator | None
+) -> EpipolarFrames:
     """The best different ones, (*batch, kept)."""
     dim = seen.ndim - 1
     duals = conic_of_six(data.c1), conic_of_six(data.c2)
     e1, e2 = search_epipoles(*duals, seen, starts, min(_SEARCH, max_iterations), generator)
     R1, R2 = frame(e1), frame(e2)
     forms = [R[..., None, :, :2].mT @ C.unsqueeze(dim) @ R[..., None, :, :2] for R, C in ((R1, duals[0]), (R2, duals[1]))]
-    N = cofactors(_two_by_two(relate_tangents(forms[0], forms[1], seen.unsqueeze(dim)))).flatten(-2)
+    N = cofactors(two_by_two(relate_tangents(forms[0], forms[1], seen.unsqueeze(dim)))).flatten(-2)
     R1, R2 = (R.repeat_interleave(2, dim) for R in (R1, R2))
     N = N.flatten(dim, dim + 1)
     if data.x1.shape[-2] >= 8:
@@ -273,11 +223,11 @@ def _starts(
         turn = torch.tensor([[0.0, 1.0], [-1.0, 0.0]], dtype=F.dtype, device=F.device)
         linear = (f2[..., :2].mT @ F @ f1[..., :2] @ turn).flatten(-2)
         R1, R2, N = (torch.cat((a.unsqueeze(dim), b), dim) for a, b in ((f1, R1), (f2, R2), (linear, N)))
-    state = _Epipolar(R1, R2, N / torch.linalg.vector_norm(N, dim=-1, keepdim=True).clamp_min(1e-300))
+    state = EpipolarFrames(R1, R2, N / torch.linalg.vector_norm(N, dim=-1, keepdim=True).clamp_min(1e-300))
     several = _beside(data, dim)
-    r = _residual(state, several)
+    r = residual(state, several)
     cost = (r.square().sum(-1) * weights.unsqueeze(dim)).sum(-1)
-    cost = torch.where(_proper(state, several, seen.unsqueeze(dim)), cost, cost + 1e30).nan_to_num(
+    cost = torch.where(carry_lines(state, several, seen.unsqueeze(dim)), cost, cost + 1e30).nan_to_num(
         torch.inf, torch.inf, torch.inf
     )
     F = _signed(state.F())
@@ -298,75 +248,11 @@ def _signed(F: Tensor) -> Tensor:
     return (flat * largest.sign() / length.clamp_min(1e-300)).reshape(F.shape)
 
 
-def _forms(state: _Epipolar, data: _Data) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Binary forms of the tangents in the second image, predicted and measured, and their derivatives by the six numbers."""
-    M = cofactors(_two_by_two(state.N))
-    first, second = _square(M) @ _restricted(state.R1[..., :2]), _restricted(state.R2[..., :2])
-    return data.c1 @ first.mT, data.c2 @ second.mT, first, second
-
-
-def _restricted(B: Tensor) -> Tensor:
-    """What makes the numbers 00, 01, 11 of B'CB of the six numbers of C."""
-    return _numbers(B.mT[..., None, :, :] @ _SIX.on(B.device, B.dtype) @ B[..., None, :, :])
-
-
-def _square(M: Tensor) -> Tensor:
-    """What makes the numbers 00, 01, 11 of MSM' of those of S."""
-    return _numbers(M[..., None, :, :] @ _THREE.on(M.device, M.dtype) @ M.mT[..., None, :, :])
-
-
-def _numbers(S: Tensor) -> Tensor:
-    """Symmetric 2x2 matrices, one for each number that they are made of, as columns of three."""
-    return S.flatten(-2)[..., [0, 1, 3]].mT
-
-
-def _residual(state: _Epipolar, data: _Data) -> Tensor:
-    """Two whitened numbers for each conic, Sampson's error for each point (and a zero)."""
-    p, s, first, second = _forms(state, data)
-    p_size, s_size = (torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(1e-300) for v in (p, s))
-    u = p / p_size
-    t1 = frame(u)[..., :2]
-    gap = (t1.mT @ (s / s_size - u)[..., None])[..., 0]
-    V1 = first[..., None, :, :] @ data.S1 @ first[..., None, :, :].mT / p_size[..., None].square()
-    V2 = second[..., None, :, :] @ data.S2 @ second[..., None, :, :].mT / s_size[..., None].square()
-    V = t1.mT @ (V1 + V2) @ t1
-    l11 = V[..., 0, 0].clamp_min(1e-300).sqrt()
-    l21 = V[..., 0, 1] / l11
-    l22 = (V[..., 1, 1] - l21.square()).clamp_min(1e-300).sqrt()
-    r1 = gap[..., 0] / l11
-    conics = torch.stack((r1, (gap[..., 1] - l21 * r1) / l22), -1)
-    F = state.F()
-    lines2, lines1 = data.x1 @ F.mT, data.x2 @ F
-    error = (lines2 * data.x2).sum(-1)
-    noise = (data.sigma2[..., None] * torch.linalg.vector_norm(lines2[..., :2], dim=-1)).square()
-    noise = noise + (data.sigma1[..., None] * torch.linalg.vector_norm(lines1[..., :2], dim=-1)).square()
-    points = error / noise.clamp_min(1e-300).sqrt()
-    return torch.cat((conics, torch.nn.functional.pad(points[..., None], (0, 1))), -2)
-
-
-def _linearize(state: _Epipolar, data: _Data) -> tuple[Tensor, Tensor]:
-    """Residuals and Jacobian, all columns at once: one of seven copies of each problem for each."""
-    with torch.enable_grad():
-        several = tensor_map(lambda t: t.detach()[:, None].expand(-1, 7, *t.shape[1:]), (state, data))
-        delta = data.c1.new_zeros((data.c1.shape[0], 7, 7)).requires_grad_()
-        value = _residual(several[0].moved(delta), several[1])
-        seed = torch.zeros_like(value).requires_grad_()
-        (pulled,) = torch.autograd.grad(value, delta, seed, create_graph=True)
-        (columns,) = torch.autograd.grad(pulled.diagonal(dim1=-2, dim2=-1).sum(), seed)
-    return value[:, 0].detach(), columns.movedim(1, -1)
-
-
-def _proper(state: _Epipolar, data: _Data, seen: Tensor) -> Tensor:
-    """Whether lines that cross a conic go to lines that cross its fellow, not to lines that miss it."""
-    p, s, _, _ = _forms(state, data)
-    return (((p * s).sum(-1) > 0) | ~seen).all(-1)
-
-
-def _uncertain(state: _Epipolar, data: _Data, weights: Tensor, noise: Tensor) -> Tensor:
+def _uncertain(state: EpipolarFrames, data: ConicPairs, weights: Tensor, noise: Tensor) -> Tensor:
     """Where a parameter has a large standard deviation."""
     batch = weights.shape[:-1]
     flat = tensor_map(lambda t: t.reshape(-1, *t.shape[len(batch) :]) if batch else t[None], (state, data))
-    J = _linearize(*flat)[1].reshape(*weights.shape, 2, 7)
+    J = linearize(*flat)[1].reshape(*weights.shape, 2, 7)
     J = torch.where((weights > 0)[..., None, None], J, 0.0).flatten(-3, -2)
     values, _, ok = eigh(J.mT @ J)
     return ~ok | (values[..., 0] <= 1e-11 * values[..., -1]) | (values[..., 0] * _UNSURE**2 < noise)

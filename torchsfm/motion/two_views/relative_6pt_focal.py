@@ -10,7 +10,6 @@ eigenvalues are looked for around a negative w, which no camera has. Every solut
 
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -19,8 +18,9 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import eigvals
 from torchsfm.linalg.nullspace import nullspace_rows
-from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
+from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.motion.two_views.epipolar_fit import matrices
+from torchsfm.motion.two_views.essential_newton import Roots, newton_step, with_focal
 from torchsfm.motion.two_views.sample_rows import rows_of
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
@@ -46,7 +46,6 @@ one of a family: rounding leaves up to 2e-11 there, and less than that is left o
 _SAME = 1e-6
 """Solutions nearer than this, in F of norm 1 and in log f, are one."""
 _SLOTS = 15
-
 _SQUARES = list(combinations_with_replacement(range(3), 2))
 _CUBICS: list[tuple[int, ...]] = list(combinations_with_replacement(range(3), 3))
 _LAST = [k for k, m in enumerate(_CUBICS) if 2 in m]
@@ -75,21 +74,6 @@ class FocalMotion:
 
     E: Float[Tensor, "*batch 3 3"]
     f: Float[Tensor, "*batch"]
-
-
-class _Roots(NamedTuple):
-    """Solutions one after the other, in the last dimension."""
-
-    u: Tensor
-    """(x, y, z), of length 1."""
-    g: Tensor
-    """1 / f."""
-    error: Tensor
-    """Distance from the essential matrices before the last Newton step."""
-    step: Tensor
-    """Length of that step, in u and in log g."""
-    slope: Tensor
-    """Of the three conditions, in the direction in which they change least."""
 
 
 def equations(
@@ -164,15 +148,15 @@ def _solve(x1: Float[Tensor, "6 2 batch"], x2: Float[Tensor, "6 2 batch"]) -> tu
     item, w = _eigenvalues(M, full[2], cubics, fine)
     if len(item):
         own = take_columns(basis, item)
-        u, g, *_ = _newton(_start(M, cubics, item, w), w.sqrt(), own)
-        state = _newton(u, g, own)
+        u, g, *_ = newton_step(_start(M, cubics, item, w), w.sqrt(), own)
+        state = newton_step(u, g, own)
         # The few that are not near yet.
         rest = (~(state.step < _NEAR)).nonzero()[:, 0]
-        few, later = take_columns(own, rest), _Roots(*(v.index_select(-1, rest) for v in state))
+        few, later = take_columns(own, rest), Roots(*(v.index_select(-1, rest) for v in state))
         for _ in range(_MORE):
-            later = _newton(later.u, later.g, few)
+            later = newton_step(later.u, later.g, few)
         u, g, error, _, slope = (v.index_copy(-1, rest, new) for v, new in zip(state, later, strict=True))
-        E = combine_rows(_with_focal(own, g), u)
+        E = combine_rows(with_focal(own, g), u)
         f = 1 / g
         keep = (error < _CONVERGED) & (slope > _ISOLATED) & torch.isfinite(E).all(0) & (f > _RANGE[0]) & (f < _RANGE[1])
         keep = keep & _first_of_its_kind(u, f, item, keep)
@@ -280,90 +264,6 @@ def _start(M: Tensor, basis: Tensor, item: Tensor, w: Float[Tensor, " roots"]) -
     rows = torch.stack([m[index] for index in _TIMES])
     square, best = combine_rows(rows.unbind(1), rows.unbind(1)).max(0)
     return rows.gather(0, best.expand(1, 3, -1))[0] * square.clamp_min(1e-280).rsqrt()
-
-
-def _with_focal(basis: Float[Tensor, "3 9 roots"], g: Float[Tensor, " roots"]) -> Float[Tensor, "3 9 roots"]:
-    """D F D with D = diag(1, 1, g): the matrices between rays (x / f, 1), times g, for g = 1 / f."""
-    one = torch.ones_like(g)
-    return basis * torch.stack((one, one, g, one, one, g, g, g, g * g))
-
-
-def _newton(u: Tensor, g: Tensor, basis: Tensor) -> _Roots:
-    """A Newton step on the three conditions of an essential matrix in (x, y, z) and log g.
-
-    Around E = U diag(1, 1, 0) V' the manifold's normal space is spanned by u3 v3', u1 v1' - u2 v2' and u1 v2' + u2 v1'. They
-    are linear in (x, y, z) and the change of log g: four homogeneous unknowns.
-    """
-    scaled = _with_focal(basis, g)
-    e = combine_rows(scaled, u)
-    f = combine_rows(basis, u)
-    zero = torch.zeros_like(g)
-    slope = g * torch.stack((zero, zero, f[2], zero, zero, f[5], f[6], f[7], 2 * g * f[8]))
-    size = combine_rows(e, e).rsqrt()
-    columns = (torch.cat((scaled, slope[None])) * size).view(4, 3, 3, -1)
-    p, q, r = _normal_products(e.view(3, 3, -1) * size, columns)
-    weights = (*u.unbind(0), zero)
-    error = torch.stack([combine_rows(row, weights).abs() for row in (p, q, r)]).amax(0)
-    p0, p1, p2, p3 = p
-    q0, q1, q2, q3 = q
-    r0, r1, r2, r3 = r
-    m01, m02, m03 = p0 * q1 - p1 * q0, p0 * q2 - p2 * q0, p0 * q3 - p3 * q0
-    m12, m13, m23 = p1 * q2 - p2 * q1, p1 * q3 - p3 * q1, p2 * q3 - p3 * q2
-    x, y, z = m12 * r3 - m13 * r2 + m23 * r1, m03 * r2 - m02 * r3 - m23 * r0, m01 * r3 - m03 * r1 + m13 * r0
-    change = m02 * r1 - m01 * r2 - m12 * r0
-    new = torch.stack((x, y, z))
-    square = combine_rows(new, new)
-    along = combine_rows(new, u)
-    ratio = change / along
-    # Never so far that the sign of f changes.
-    g = g * (1 + ratio.clamp(-0.6, 1.5))
-    new = new * square.rsqrt() * torch.sign(along)
-    step = torch.maximum(ratio.abs(), add_rows((new - u).abs().unbind(0)))
-    # The product of the three principal slopes is a volume; that of the greater two is about the largest area.
-    area = torch.stack([_area(a, b) for a, b in ((p, q), (q, r), (r, p))]).amax(0)
-    return _Roots(new, g, error, step, ((square + change * change) / area).sqrt())
-
-
-def _area(a: Tensor, b: Tensor) -> Tensor:
-    """The squared area between two vectors given by their coordinates; not less than rounding may make of 0."""
-    most = combine_rows(a, a) * combine_rows(b, b)
-    return torch.maximum(most - combine_rows(a, b) ** 2, 1e-15 * most)
-
-
-def _normal_products(e: Float[Tensor, "3 3 roots"], columns: Float[Tensor, "4 3 3 roots"]) -> tuple[Tensor, Tensor, Tensor]:
-    """The three normals of the essential manifold at the point nearest to e, times four matrices."""
-    cofactors = torch.stack((_cross(e[1], e[2]), _cross(e[2], e[0]), _cross(e[0], e[1])))
-    squares = cofactors * cofactors
-    i, j = add_rows(squares.unbind(1)).max(0).indices, add_rows(squares).max(0).indices
-    v3 = _normalised(cofactors.gather(0, i.expand(1, 3, -1))[0])
-    u3 = _normalised(cofactors.gather(1, j.expand(3, 1, -1))[:, 0])
-    # A frame around u3 without branches (Duff et al. 2017).
-    sign = torch.copysign(torch.ones_like(u3[2]), u3[2])
-    a = -1 / (sign + u3[2])
-    b = u3[0] * u3[1] * a
-    u1 = (1 + sign * u3[0] * u3[0] * a, sign * b, -sign * u3[0])
-    u2 = (b, sign + u3[1] * u3[1] * a, -u3[1])
-    v1 = combine_rows(e, u1)
-    v1 = _normalised(v1 - v3 * combine_rows(v1, v3))
-    v2 = _cross(v3, v1)
-    v2 = v2 * torch.copysign(torch.ones_like(sign), combine_rows(combine_rows(e, u2), v2))
-    by_column = columns.permute(2, 1, 0, 3)
-    Bv1, Bv2, Bv3 = (combine_rows(by_column, v) for v in (v1, v2, v3))
-    return (
-        combine_rows(Bv3, u3),
-        combine_rows(Bv1, u1) - combine_rows(Bv2, u2),
-        combine_rows(Bv2, u1) + combine_rows(Bv1, u2),
-    )
-
-
-def _normalised(v: Tensor) -> Tensor:
-    return v * combine_rows(v, v).rsqrt()
-
-
-def _cross(a: Tensor | tuple[Tensor, ...], b: Tensor | tuple[Tensor, ...]) -> Tensor:
-    a0, a1, a2 = a
-    b0, b1, b2 = b
-    return torch.stack((a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0))
 
 
 def _first_of_its_kind(u: Tensor, f: Tensor, item: Tensor, keep: Tensor) -> Tensor:
