@@ -14,10 +14,12 @@ from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.similarities import robust_similarity
 from torchsfm.reconstruction.view_graph import ViewGraph, graph_from_tracks
-from torchsfm.reconstruction.windows import FRAMES, NEXT, Window, join_windows, map_windows
+from torchsfm.reconstruction.windows import Window, join_windows, map_windows
 from torchsfm.simulation import orbit_poses
 
-VIEWS = 70
+FRAMES, NEXT = 20, 12
+"""Of windows smaller than those of films, which show the same in less time."""
+VIEWS = 2 * NEXT + FRAMES - 4
 """Three windows."""
 
 
@@ -38,7 +40,10 @@ def windows(graph: tuple[ViewGraph, torch.Tensor]) -> list[Window]:
     camera = Camera(intrinsics(torch.tensor([Scene.focal]), torch.tensor([[499.5, 374.5]])).double())
     options = MappingOptions(free=("focal",), expected=camera, focal_sigma=torch.tensor([0.1]).double(), generator=seeded(1))
     mapping = Mapping.start(*graph, camera, torch.zeros(VIEWS, dtype=torch.long))
-    return map_windows(mapping, torch.ones(VIEWS, dtype=torch.bool), options)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torchsfm.reconstruction.windows.FRAMES", FRAMES)
+        patch.setattr("torchsfm.reconstruction.windows.NEXT", NEXT)
+        return map_windows(mapping, torch.ones(VIEWS, dtype=torch.bool), options)
 
 
 @pytest.mark.slow
