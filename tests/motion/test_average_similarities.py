@@ -59,6 +59,18 @@ def answer(w: Windows) -> Similarity:
     return Similarity(s / s[0], R[0].mT @ R, ((t - t[0]) @ R[0]) / s[0])
 
 
+def test_a_chain_which_all_edges_fit_has_a_minimum(generator: torch.Generator) -> None:
+    """Nothing is left of the cost but rounding, that of places many deviations from each other."""
+    w = windows(8, 0, 0, 1e-3, generator)
+    row = (w.edges.diff(dim=1)[:, 0] == 1).nonzero()[:, 0]
+    found = average_similarities(
+        _part(w.between, row), w.edges[row], models=8, places=w.places[row], deviation=w.deviation[row]
+    )
+    assert (found.status == Status.OK).all()
+    assert found.inliers.all()
+    assert found.distance.max() < 1e-6
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_exact_edges_give_exact_similarities(dtype: torch.dtype, generator: torch.Generator) -> None:
     w = windows(20, 4, 3, 0.0, generator)

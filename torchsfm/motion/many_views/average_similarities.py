@@ -234,10 +234,15 @@ class _Graph:
             scale = max(float(off.median()), SHARPEST) if len(off) else scale
         return x
 
+    @property
+    def _data(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Places, and where they are in standard deviations: by these numbers rounding is told where edges fit exactly."""
+        return self.place, self.there / self.deviation[:, None, None], self.deviation
+
     def distance(self, x: Float[Tensor, "n 13"]) -> Float[Tensor, "e"]:
         """The root mean square residual of each edge's places."""
         i, j = self.edges.unbind(-1)
-        return _residual(x[i], x[j], self.place, self.there, self.deviation).square().mean(-1).sqrt()
+        return _residual(x[i], x[j], *self._data).square().mean(-1).sqrt()
 
     def scatter(self, x: Float[Tensor, "n 13"]) -> float:
         """The standard deviation of the right edges, if half of those that do not merely fix the models are right."""
@@ -251,7 +256,7 @@ class _Graph:
         self, x: Float[Tensor, "n 13"], loss: Loss, max_iterations: int, tolerance: float
     ) -> tuple[Float[Tensor, "n 13"], Status]:
         """The minimum nearest to a start."""
-        term = Term(_residual, ("S", "S"), self.edges.unbind(-1), (self.place, self.there, self.deviation), loss)
+        term = Term(_residual, ("S", "S"), self.edges.unbind(-1), self._data, loss)
         found = minimise({"S": Block(x, _Similar())}, [term], max_iterations=max_iterations, function_tolerance=tolerance)
         return found.x["S"], found.status
 
@@ -262,11 +267,11 @@ def _parts(x: Float[Tensor, "*b 13"]) -> tuple[Float[Tensor, "*b"], Float[Tensor
 
 
 def _residual(a: Tensor, b: Tensor, place: Tensor, there: Tensor, deviation: Tensor) -> Tensor:
-    """How far the places of a are in b from where they should be, in standard deviations."""
+    """How far the places of a are in b from `there`, where they should be, both in standard deviations."""
     (s, R, t), (s2, R2, t2) = _parts(a), _parts(b)
     world = s[..., None, None] * place @ R.mT + t[..., None, :]
-    back = (world - t2[..., None, :]) @ R2 / s2[..., None, None]
-    return ((back - there) / deviation[..., None, None]).flatten(-2)
+    back = (world - t2[..., None, :]) @ R2 / (s2 * deviation)[..., None, None]
+    return (back - there).flatten(-2)
 
 
 def _difference(a: Tensor, b: Tensor, difference: Tensor, deviation: Tensor) -> Tensor:
