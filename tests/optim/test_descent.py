@@ -136,3 +136,79 @@ def test_interrupts(generator: torch.Generator) -> None:
     found = descend(problem, x, replace(OPTIONS, progress=stop, interruptible=True))
     assert (found.status == Status.INTERRUPTED).all()
     assert (found.cost <= found.initial_cost).all()
+
+
+@dataclass(frozen=True)
+class Bent:
+    """A place of a cost whose exact Hessian is positive nowhere: only steps without it solve."""
+
+    x: Tensor
+    cost: Tensor
+    tried: list[float]
+    """Dampings tried with the exact Hessian."""
+
+    def steepest(self) -> Tensor:
+        return torch.ones_like(self.cost)
+
+    def along(self, delta: Tensor) -> Tensor:
+        return -torch.ones_like(self.cost)
+
+    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
+        bent = exact is not None and bool(exact)
+        if bent:
+            self.tried.append(float(damping))
+        # Each step gains half of what the last one gained.
+        promise = torch.full_like(self.cost, torch.inf) if bent else (self.cost - 1) / 2
+        return Step(
+            torch.zeros_like(self.x), promise, torch.full_like(self.cost, not bent) > 0, torch.zeros_like(self.cost) > 0
+        )
+
+
+@dataclass(frozen=True)
+class Crawling(Problem[Bent]):
+    """Steps that gain little by little, and variables that, moved by themselves, gain a part of what is left."""
+
+    part: float
+    relaxed: list[float]
+    """The costs from which they were moved."""
+
+    @property
+    def patience(self) -> int:
+        return 0
+
+    def pick(self, at: Places) -> "Crawling":
+        return self
+
+    def linearize(self, x: Tensor) -> Bent:
+        return Bent(x, 1 + 1e-3 * x, [])
+
+    def advance(self, here: Bent, step: Step) -> Bent:
+        return replace(here, cost=here.cost - step.promise)
+
+    def relax(self, there: Bent, step: Step, where: Tensor) -> Bent:
+        assert bool(where)
+        self.relaxed.append(float(there.cost))
+        return replace(there, cost=there.cost - self.part * (there.cost - 1))
+
+    def rounding(self, here: Bent) -> Tensor:
+        return torch.zeros_like(here.cost)
+
+
+def test_damping_that_was_too_weak_for_the_exact_hessian_is_not_tried_again() -> None:
+    found = descend(Crawling(0.0, []), torch.tensor(1.0, dtype=F64), Options(200, 1e-9))
+    tried = found.end.tried
+    assert found.status == Status.OK
+    assert len(tried) > 4
+    # Ever more of it until it is as much as may be, then that alone.
+    assert tried == sorted(tried)
+    most = tried[-1]
+    assert tried.index(most) < 6
+    assert set(tried[tried.index(most) :]) == {most}
+
+
+def test_where_steps_gain_little_by_little_variables_are_moved_by_themselves() -> None:
+    slow, fast = Crawling(0.0, []), Crawling(0.9, [])
+    steps = [int(descend(p, torch.tensor(1.0, dtype=F64), Options(200, 1e-9)).iterations) for p in (slow, fast)]
+    assert steps[1] < 0.6 * steps[0]
+    # Not before steps are seen to be slow.
+    assert max(fast.relaxed) < 1 + 0.3e-3

@@ -105,6 +105,13 @@ class Problem(Protocol[S]):
     def advance(self, here: S, step: Step) -> S:
         """The system where a step leads; a cost that is not finite where there is nowhere to go."""
 
+    def relax(self, there: S, step: Step, where: Tensor) -> S:
+        """What follows from a step that led `there`, in the elements `where` in which such steps gain little by little.
+
+        A problem may move some of its variables on by themselves, as long as the cost does not rise.
+        """
+        return there
+
     def curve(self, here: S, where: Tensor) -> S:
         """The system with the exact Hessian in the elements `where`."""
         return here
@@ -183,6 +190,8 @@ class _State:
     """Where Newton steps are wanted,"""
     curved: Tensor
     """and where the exact Hessian is there for them."""
+    weak: Tensor
+    """The most damping that left the exact Hessian indefinite when that was last tried; less is not tried again."""
 
     @property
     def active(self) -> Tensor:
@@ -210,7 +219,7 @@ def descend(problem: Problem[Any], x0: Any, options: Options, *, enough: Tensor 
     ones, none = torch.ones_like(cost), torch.zeros_like(status, dtype=torch.bool)
     count = torch.zeros_like(status, dtype=torch.int32)
     damping, growth, last = options.initial_damping * ones, 2 * ones, torch.inf * ones
-    state = _State((), here, status, count, damping, growth, last, dull=count, slow=none, curved=none)
+    state = _State((), here, status, count, damping, growth, last, dull=count, slow=none, curved=none, weak=0 * ones)
     found = Descent(here, cost, count, status)
     try:
         for iteration in range(1, options.max_iterations + 1):
@@ -257,6 +266,8 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     if options.step_tolerance > 0 and bool((still := near & (state.damping <= LIGHT) & ~step.bent & ~done).any()):
         done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
     there = problem.advance(here, step)
+    if bool((crawling := active & (state.dull > 0)).any()):
+        there = problem.relax(there, step, crawling)
     gain = cost - there.cost
     if bool(near.any()):
         slopes = -(here.along(step.delta) + there.along(step.delta)) / 2
@@ -268,11 +279,11 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     plain = accepted & ~exact
     done = active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
     dull, slow, curved = state.dull, state.slow, state.curved
-    if problem.patience is not None and options.function_tolerance <= LOOSE:
+    if problem.patience is not None:
         grows = (gain > GROWTH * state.last) & (gain > 100 * least)
         crawls, slow = plain & (rate > SLOW) & (gain <= NEAR * cost) & ~grows, exact
         dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
-        if bool(crawls.any()):
+        if options.function_tolerance <= LOOSE and bool(crawls.any()):
             far = gain * rate ** (problem.patience + 1) > least * (1 - rate)
             slow = slow | (crawls & far & ((dull > problem.patience) | (gain <= 100 * least)))
         slow, curved = slow & ~done, curved & ~accepted
@@ -310,7 +321,7 @@ def _next_step(problem: Problem[Any], state: _State) -> tuple[_State, Step, Tens
     wanted = slow & ~state.curved
     if bool(wanted.any()):
         state = replace(state, here=problem.curve(state.here, wanted), curved=state.curved | wanted)
-    damping = state.damping
+    damping = torch.where(slow, torch.maximum(state.damping, state.weak), state.damping)
     step = state.here.step(damping, slow)
     while bool((again := slow & ~step.solved & (10 * damping <= STEEPEST)).any()):
         damping = torch.where(again, 10 * damping, damping)
@@ -318,6 +329,7 @@ def _next_step(problem: Problem[Any], state: _State) -> tuple[_State, Step, Tens
         step = put(some, step, pick(some, state.here).step(pick(some, damping), pick(some, slow)))
     exact = slow & step.solved
     bent = slow & ~exact
+    state = replace(state, weak=torch.where(bent, damping, torch.where(exact, 0.0, state.weak)))
     if bool(bent.any()):
         damping = torch.where(bent, state.damping, damping)
         some = places(bent)
