@@ -42,6 +42,10 @@ BESIDE = ((7, 7), (-7, 7), (7, -7), (-7, -7))
 """Pixels by which places beside a predicted one are off, where an image point is found by chance alone."""
 SIGNIFICANCE = 0.01
 """Chance that a right model has a conflict anywhere, were all its points equally easy to find again."""
+SPARSE = 8
+"""Entries of a table of occupied pixels, at least, for each that is occupied."""
+ROWS = 2048
+"""Descriptors looked at together."""
 NEAREST = 48
 """Cameras with which each one is compared, the nearest, in large models."""
 
@@ -98,22 +102,29 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     own, other, open_ = (torch.zeros(3, len(directed), cells, dtype=torch.float64) for _ in range(3))
     node = mapping.observations()
     point, view = mapping.point[node], mapping.graph.view[node]
-    observed = Lookup(point * v + view)
+    sightings = torch.bincount(point, minlength=len(mapping.X))
+    first_sighting = sightings.cumsum(0) - sightings
     occupied = _Occupied.of(mapping)
     nearest, farthest = _DepthMap.of(mapping, FINE, "amin"), _DepthMap.of(mapping, FINER, "amax")
     beside = _DepthMap.of(mapping, FINER, "amin")
-    length = torch.bincount(point, minlength=len(mapping.X))
     for a in torch.unique(directed[:, 0]).tolist():
         rows = (directed[:, 0] == a).nonzero()[:, 0]
         b = directed[rows, 1]
         mine = node[view == a]
         p = mapping.point[mine]
         x, depth, near = _predicted(mapping, p, a, b)
-        seen = observed.has(p * v + b[:, None])
+        # Observations are sorted by point.
+        column = torch.arange(len(p)).repeat_interleave(sightings[p])
+        step = torch.arange(len(column)) - (sightings[p].cumsum(0) - sightings[p])[column]
+        row = torch.full((v,), -1).index_copy_(0, b, torch.arange(len(b)))[view[first_sighting[p][column] + step]]
+        seen = torch.zeros(len(b), len(p), dtype=torch.bool)
+        seen[row[row >= 0], column[row >= 0]] = True
         # Of the points that count, one row each: where the other camera should see them.
-        k, n = (near & (length[p] - seen.long() >= 2)).nonzero(as_tuple=True)
+        k, n = (near & (sightings[p] - seen.long() >= 2)).nonzero(as_tuple=True)
         image, like, x, depth = b[k], mine[n], x[k, n], depth[k, n]
-        found = seen[k, n] | occupied.at(image, x, like)
+        found = seen[k, n]
+        rest = (~found).nonzero()[:, 0]
+        found[rest] = occupied.at(image[rest], x[rest], like[rest])
         chance = occupied.at(image, x + x.new_tensor(BESIDE)[:, None], like).double().mean(0)
         bare = nearest.at(image, x) >= BEHIND * depth
         through = (farthest.at(image, x) > FARTHER * depth) & (beside.at(image, x) > BEHIND * depth)
@@ -153,29 +164,16 @@ class _Shares:
         return torch.where(dead < self.found, ratio, 0.0).clamp(min=0)
 
 
-class Lookup:
-    """A set of whole numbers that is asked for many at a time."""
-
-    def __init__(self, keys: Int[Tensor, "n"]) -> None:
-        self.keys = torch.unique(keys)
-
-    def has(self, key: Int[Tensor, "*k"]) -> Bool[Tensor, "*k"]:
-        """Which of the numbers are in the set."""
-        if not len(self.keys):
-            return torch.zeros_like(key, dtype=torch.bool)
-        at = torch.searchsorted(self.keys, key).clamp(max=len(self.keys) - 1)
-        found: Tensor = self.keys[at] == key
-        return found
-
-
 @dataclass(frozen=True)
 class _Occupied:
     """The image points at or beside each pixel of each image."""
 
     pixel: Int[Tensor, "m"]
     """Pixels that are occupied, in ascending order, one for each point there."""
+    some: Bool[Tensor, "s"]
+    """Whether any pixel is occupied whose last binary digits these are: nearly all places are empty, and known to be so."""
     point: Int[Tensor, "m"]
-    descriptors: UInt8[Tensor, "n d"] | None
+    looks: "_Looks | None"
     width: int
     height: int
 
@@ -188,25 +186,51 @@ class _Occupied:
         column, row = x[:, 0, None, None] + step, x[:, 1, None, None] + step[:, None]
         pixel = ((graph.view[:, None, None] * height + row) * width + column).flatten()
         order = pixel.argsort()
-        looks = None if graph.descriptors is None else graph.descriptors()
-        return cls(pixel[order], order // 9, looks, width, height)
+        some = torch.zeros(1 << (SPARSE * max(len(pixel), 1)).bit_length(), dtype=torch.bool)
+        some[pixel & (len(some) - 1)] = True
+        looks = None if graph.descriptors is None else _Looks.of(graph.descriptors())
+        return cls(pixel[order], some, order // 9, looks, width, height)
 
     def at(self, view: Int[Tensor, "n"], x: Float[Tensor, "*k n 2"], like: Int[Tensor, "n"]) -> Bool[Tensor, "*k n"]:
         """Whether an image has a point at a place, within a pixel or so, that looks like a given one where that is known."""
         place = x.nan_to_num(-9.0).clamp(-9, max(self.width, self.height) + 9).round().long() + 1
         inside = (place >= 0).all(-1) & (place[..., 0] < self.width) & (place[..., 1] < self.height)
         pixel = (view * self.height + place[..., 1]) * self.width + place[..., 0]
-        first, end = torch.searchsorted(self.pixel, pixel), torch.searchsorted(self.pixel, pixel, right=True)
-        end = torch.where(inside, end, first)
-        if self.descriptors is None:
-            return end > first
-        own = torch.nn.functional.normalize(self.descriptors[like].float(), dim=-1).expand(*pixel.shape, -1)
-        found = torch.zeros_like(inside)
-        for k in range(int((end - first).amax()) if end.numel() else 0):
-            rows = first + k < end
-            others = self.descriptors[self.point[(first + k)[rows]]].float()
-            found[rows] |= (torch.nn.functional.normalize(others, dim=-1) * own[rows]).sum(-1) > ALIKE
+        found = inside & self.some[pixel & (len(self.some) - 1)]
+        maybe = found.nonzero(as_tuple=True)
+        pixel, like = pixel[maybe], like[maybe[-1]]
+        last, there = len(self.pixel) - 1, torch.searchsorted(self.pixel, pixel)
+        own, alike = torch.arange(len(pixel)), torch.zeros_like(pixel, dtype=torch.bool)
+        while len(own):
+            # Of the points at a pixel one after the other, until one looks like it.
+            held = self.pixel[there.clamp(max=last)] == pixel[own]
+            own, there = own[held], there[held]
+            fits = self.looks.alike(like[own], self.point[there]) if self.looks is not None else torch.ones_like(there) > 0
+            alike[own[fits]] = True
+            own, there = own[~fits], there[~fits] + 1
+        found[maybe] = alike
         return found
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """What image points look like."""
+
+    descriptors: UInt8[Tensor, "n d"]
+    length: Float[Tensor, "n"]
+
+    @classmethod
+    def of(cls, descriptors: UInt8[Tensor, "n d"]) -> "_Looks":
+        lengths = [torch.linalg.vector_norm(some.float(), dim=1) for some in torch.split(descriptors, ROWS)]
+        return cls(descriptors, torch.cat(lengths).clamp(min=1e-12))
+
+    def alike(self, first: Int[Tensor, "k"], second: Int[Tensor, "k"]) -> Bool[Tensor, "k"]:
+        """Whether two image points look the same."""
+        products = [
+            (self.descriptors[a].float() * self.descriptors[b].float()).sum(-1)
+            for a, b in zip(torch.split(first, ROWS), torch.split(second, ROWS), strict=True)
+        ]
+        return torch.cat(products) > ALIKE * self.length[first] * self.length[second]
 
 
 @dataclass(frozen=True)
@@ -255,11 +279,11 @@ def _predicted(
     X_cam = poses.transform(X.expand(len(b), -1, -1))
     x = mapping.cameras[mapping.camera_index[b]].project(X_cam)
     from_a, from_b = X - mapping.poses.centre[a], X - poses.centre[:, None]
-    cosine = torch.nn.functional.cosine_similarity(from_a.expand_as(from_b), from_b, dim=-1)
-    zoom = (from_a.norm(dim=-1) / from_b.norm(dim=-1).clamp(min=1e-12)).clamp(min=1e-12).log().abs()
+    near, far = (torch.linalg.vector_norm(d, dim=-1).clamp(min=1e-12) for d in (from_a, from_b))
+    cosine, zoom = (from_a * from_b).sum(-1) / (near * far), near / far
     size = mapping.graph.image_size[b][:, None]
     inside = (X_cam[..., 2] > 0) & ((x >= 0) & (x <= size - 1)).all(-1)
-    return x, X_cam[..., 2], inside & (cosine > math.cos(MAX_ANGLE)) & (zoom < math.log(MAX_ZOOM))
+    return x, X_cam[..., 2], inside & (cosine > math.cos(MAX_ANGLE)) & (zoom > 1 / MAX_ZOOM) & (zoom < MAX_ZOOM)
 
 
 def _cell(x: Float[Tensor, "*batch 2"], size: Int[Tensor, "*#batch 2"], grid: tuple[int, int] = CELLS) -> Int[Tensor, "*batch"]:

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from torchsfm.motion.many_views.components import components
+
 
 def build_tracks(
     view: Int[Tensor, "n"], match: Int[Tensor, "k 2"], priority: Int[Tensor, "k"] | None = None
@@ -21,11 +23,32 @@ def build_tracks(
     Returns:
         Track of each image point, numbered by first point, or -1 where a point matches nothing.
     """
-    order = torch.arange(len(match)) if priority is None else torch.argsort(priority, descending=True, stable=True)
+    n, images = len(view), int(view.max()) + 1 if len(view) else 0
+    root = components(match, n)
+    # Where no image is met twice all matches hold. Elsewhere they are taken one after the other.
+    met = torch.unique(root * images + view)
+    clash = torch.bincount(root, minlength=n) > torch.bincount(met.div(max(images, 1), rounding_mode="floor"), minlength=n)
+    disputed = clash[root[match[:, 0]]].nonzero()[:, 0]
+    if len(disputed):
+        if priority is not None:
+            disputed = disputed[torch.argsort(priority[disputed], descending=True, stable=True)]
+        root = torch.where(clash[root], _by_priority(view, match[disputed]), root)
+    size = torch.bincount(root, minlength=len(view))
+    first = torch.full((len(view),), len(view), dtype=torch.long)
+    first = first.scatter_reduce(0, root, torch.arange(len(view)), "amin")
+    _, track = torch.unique(torch.where(size[root] > 1, first[root], -1), return_inverse=True)
+    unmatched = bool((size[root] == 1).any())
+    numbered: Tensor = track - int(unmatched)
+    return numbered
+
+
+def _by_priority(view: Int[Tensor, "n"], match: Int[Tensor, "k 2"]) -> Int[Tensor, "n"]:
+    """A point of its track for each point, of matches in order of priority."""
     parent = list(range(len(view)))
     # The images a track passes through, as the bits of one integer: disjointness is one operation at any number of images.
     images = [1 << v for v in view.tolist()]
-    for a, b in match[order].tolist():
+    # Two lists of numbers take a tenth of the time that a list of pairs does.
+    for a, b in zip(*match.mT.tolist(), strict=True):
         while parent[a] != a:
             parent[a] = parent[parent[a]]
             a = parent[a]
@@ -36,12 +59,6 @@ def build_tracks(
             parent[b] = a
             images[a] |= images[b]
     root = torch.tensor(parent, dtype=torch.long)
-    while not torch.equal(root, root[root]):
-        root = root[root]
-    size = torch.bincount(root, minlength=len(view))
-    first = torch.full((len(view),), len(view), dtype=torch.long)
-    first = first.scatter_reduce(0, root, torch.arange(len(view)), "amin")
-    _, track = torch.unique(torch.where(size[root] > 1, first[root], -1), return_inverse=True)
-    unmatched = bool((size[root] == 1).any())
-    numbered: Tensor = track - int(unmatched)
-    return numbered
+    while not torch.equal(root, further := root[root]):
+        root = further
+    return root

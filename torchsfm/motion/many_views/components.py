@@ -6,12 +6,19 @@ from torch import Tensor
 
 
 def components(pairs: Int[Tensor, "q 2"], count: int) -> Int[Tensor, "v"]:
-    """The smallest index that each vertex of a graph is connected to."""
+    """The smallest index that each vertex of a graph is connected to.
+
+    Every vertex points to one of its part with a smaller index, in the end to the smallest. In each round a part hangs itself
+    on the smallest of those it has edges to, and edges inside a part are laid aside.
+    """
     label = torch.arange(count, device=pairs.device)
+    a, b = pairs.unbind(1)
     while True:
-        least = label[pairs].amin(1)
-        new = label.scatter_reduce(0, pairs.mT.flatten(), least.repeat(2), "amin")
-        new = new[new]
-        if torch.equal(new, label):
+        first, second = label[a], label[b]
+        across = (first != second).nonzero()[:, 0]
+        if not len(across):
             return label
-        label = new
+        a, b, first, second = a[across], b[across], first[across], second[across]
+        label = label.scatter_reduce(0, torch.maximum(first, second), torch.minimum(first, second), "amin")
+        while not torch.equal(label, further := label[label]):
+            label = further
