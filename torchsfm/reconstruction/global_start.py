@@ -1,8 +1,9 @@
 """All images of a component at once: rotations from pairs, then centres and points from rotations and rays.
 
-Relative poses of all pairs -> `average_rotations`, weighted by how well each pair determines its rotation -> tracks of the
-pairs that agree -> `position_globally` -> a model that is adjusted, completed and finished like any other (Pan et al., "Global
-structure-from-motion revisited", ECCV 2024).
+Relative poses of the strongest pairs -> `average_rotations`, weighted by how well each pair determines its rotation -> tracks
+of the pairs that agree -> `position_globally` -> a model that is adjusted, completed and finished like any other (Pan et al.,
+"Global structure-from-motion revisited", ECCV 2024). Until cameras and focal lengths stand, this is the work of few pairs and
+few tracks of each image; all matches are looked at once, in the end.
 """
 
 from dataclasses import replace
@@ -14,7 +15,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
 from torchsfm.geometry import Pose
-from torchsfm.motion import RelativePoseEstimator, average_rotations, position_globally
+from torchsfm.motion import average_rotations, position_globally
 from torchsfm.motion.many_views.triplets import turn_angle
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA
@@ -22,21 +23,19 @@ from torchsfm.reconstruction.consistency import pair_agreement
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.initialize import MIN_POINTS
 from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.pair_poses import relative_poses, strongest_pairs
 from torchsfm.reconstruction.structure import complete_tracks, filter_points, triangulate_tracks
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import MIN_INLIERS
-from torchsfm.robust import ransac
 
-MATCHES = 200
-"""Matches of a pair that its relative pose is estimated from: those in excess say little more of it."""
-ROWS = 200_000
-"""Padded matches worked on at once."""
 TRACKS_PER_VIEW = 150
 """Longest tracks of each image that are positioned: enough for its centre."""
 ROUNDS = 3
-"""Adjustments with poses and points alone, each with a loss half as wide as the last."""
+"""Adjustments with poses and points alone, at most, each with a loss half as wide as the last, until that is a pixel."""
 WIDEST = 16.0
 """Scale of the first of their losses in pixels, at most."""
+ROUGH = 1e-3
+"""Part of the cost that is left to what comes after."""
 RETURNS, CHANGED = 3, 0.05
 """Times that all is done again, where a focal length has changed by more than this part."""
 USABLE = (int(Status.OK), int(Status.NOT_CONVERGED))
@@ -74,7 +73,7 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
         if again is None or int(again.registered.sum()) < int(model.registered.sum()):
             break
         model = again
-    model = complete(model, options) if model is not None else None
+    model = complete(fill(model, options), options) if model is not None else None
     return model if model is not None and len(model.X) >= MIN_POINTS else None
 
 
@@ -85,6 +84,7 @@ def _at_once(
     graph, v = mapping.graph, len(mapping.registered)
     related = (graph.fundamental_inliers >= MIN_INLIERS) & available[graph.pairs].all(-1)
     chosen = related.nonzero()[:, 0]
+    chosen = chosen[strongest_pairs(graph.pairs[chosen], graph.fundamental_inliers[chosen], v)]
     if not len(chosen):
         return None
     motion, deviation, good = relative_poses(mapping, chosen, options)
@@ -92,7 +92,7 @@ def _at_once(
     part = focal_sigma[mapping.camera_index][graph.pairs[chosen]].amax(-1) * turn_angle(motion[..., :3])
     deviation = deviation + torch.diag_embed(part.square()[:, None].expand(-1, 3))
     chosen, motion, deviation = chosen[good], motion[good], deviation[good]
-    turned = average_rotations(motion[..., :3], graph.pairs[chosen], views=v, deviation=deviation)
+    turned = average_rotations(motion[..., :3], graph.pairs[chosen], views=v, deviation=deviation, tolerance=ROUGH)
     rotated = largest(turned.component, torch.isin(turned.status, torch.tensor(USABLE)))
     if int(rotated.sum()) < 2:
         return None
@@ -105,7 +105,7 @@ def _at_once(
     node, d = node[valid], d[valid]
     _, point = torch.unique(track[node], return_inverse=True)
     count = int(point.max()) + 1 if len(point) else 0
-    placed = position_globally(d, graph.view[node], point, turned.model, points=count)
+    placed = position_globally(d, graph.view[node], point, turned.model, points=count, tolerance=ROUGH)
     registered = largest(placed.component, torch.isin(placed.status, torch.tensor(USABLE)) & rotated)
     if int(registered.sum()) < 2:
         return None
@@ -116,42 +116,6 @@ def _at_once(
     start = replace(mapping, poses=Pose(R, t), registered=registered, X=placed.X, point=number).compacted()
     focal = mapping.cameras.K[mapping.camera_index[registered], 0, 0].median()
     return tighten(start, min(float(placed.scale * focal), WIDEST), options)
-
-
-def relative_poses(
-    mapping: Mapping, chosen: Int[Tensor, "q"], options: MappingOptions
-) -> tuple[Float[Tensor, "q 3 4"], Float[Tensor, "q 3 3"], Bool[Tensor, "q"]]:
-    """The relative pose of pairs of images, the covariance of its rotation, and where there are both.
-
-    Args:
-        mapping: Cameras, and the view graph.
-        chosen: The pairs.
-        options: Largest distance of an inlier, and randomness.
-    """
-    graph = mapping.graph
-    order = torch.argsort(graph.match_pair, stable=True)
-    counts = torch.bincount(graph.match_pair, minlength=len(graph.pairs))
-    first = counts.cumsum(0) - counts
-    a, b = graph.match[order].unbind(1)
-    (d1, valid1), (d2, valid2) = mapping.rays(a), mapping.rays(b)
-    focal = mapping.cameras.K[mapping.camera_index, 0, 0][graph.pairs].mean(-1)
-    motions, deviations, good = [], [], []
-    for some in torch.split(chosen, max(1, ROWS // MATCHES)):
-        # Every so many-th of those in excess.
-        slots = torch.arange(MATCHES) * (counts[some, None] / MATCHES).clamp(min=1)
-        mask = slots.long() < counts[some, None]
-        place = torch.where(mask, first[some, None] + slots.long(), 0)
-        limit = (options.reprojection / focal[some]).clamp(max=0.1)
-        found = ransac(
-            RelativePoseEstimator(limit), d1[place], d2[place], threshold=limit, mask=mask & valid1[place] & valid2[place],
-            covariance=True, generator=options.generator,
-        )  # fmt: skip
-        assert found.covariance is not None, "asked for"
-        spread = found.covariance[..., :3, :3]
-        motions.append(found.model)
-        deviations.append(spread)
-        good.append((found.status == Status.OK) & (spread.diagonal(dim1=-2, dim2=-1) > 0).all(-1))
-    return torch.cat(motions), torch.cat(deviations), torch.cat(good)
 
 
 def largest(component: Int[Tensor, "v"], usable: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
@@ -174,13 +138,19 @@ def _longest_tracks(track: Int[Tensor, "n"], view: Int[Tensor, "n"], views: int)
 
 
 def tighten(model: Mapping, width: float, options: MappingOptions) -> Mapping:
-    """Adjust poses and points with losses that become narrower, and triangulate all tracks with what has come out."""
+    """Adjust poses and points with losses that become narrower, then the cameras, too."""
     for k in range(ROUNDS):
         model = _adjust(model, max(width / 2**k, 1.0))
+        if width / 2**k <= 1:
+            break
+    return options.adjust(model, max_iterations=20, tolerance=ROUGH)
+
+
+def fill(model: Mapping, options: MappingOptions) -> Mapping:
+    """Poses with the points of all tracks of the pairs that agree with them."""
     reach = 2 * options.reprojection
     model = replace(model, track=_tracks(model, reach), X=model.X[:0], point=torch.full_like(model.point, -1))
-    model = triangulate_tracks(model, threshold=reach, min_angle=options.min_angle)
-    return options.adjust(model, max_iterations=20, tolerance=1e-3)
+    return triangulate_tracks(model, threshold=reach, min_angle=options.min_angle)
 
 
 def complete(model: Mapping, options: MappingOptions) -> Mapping:
@@ -203,7 +173,7 @@ def _adjust(model: Mapping, width: float) -> Mapping:
     """The minimum of reprojection errors, without what then lies behind a camera or far off."""
     node = model.observations()
     problem = model.problem(node)
-    result = bundle_adjust(problem, loss=Cauchy(width), free=(), max_iterations=20, tolerance=1e-3)
+    result = bundle_adjust(problem, loss=Cauchy(width), free=(), max_iterations=20, tolerance=ROUGH)
     if result.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
     moved = replace(model, poses=result.poses, X=result.X)

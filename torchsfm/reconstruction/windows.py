@@ -17,7 +17,7 @@ from torchsfm.geometry import Camera, Pose, Similarity
 from torchsfm.geometry.intrinsic_parameters import camera_from_row, row_from_camera
 from torchsfm.motion import average_similarities
 from torchsfm.reconstruction.adjust import adjust
-from torchsfm.reconstruction.global_start import WIDEST, complete, largest, tighten
+from torchsfm.reconstruction.global_start import WIDEST, complete, fill, largest, tighten
 from torchsfm.reconstruction.incremental import MappingOptions, grow_model
 from torchsfm.reconstruction.initialize import MIN_POINTS
 from torchsfm.reconstruction.mapping import Mapping
@@ -68,7 +68,7 @@ def window_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
     windows = [_with_cameras(window, mapping.cameras) for window in windows]
     world, kept = join_windows(windows, len(mapping.track), mapping.graph.match)
     start = _in_one_world(mapping, windows, world, kept)
-    model = complete(tighten(start, WIDEST, options), options)
+    model = complete(fill(tighten(start, WIDEST, options), options), options)
     return model if len(model.X) >= MIN_POINTS else None
 
 

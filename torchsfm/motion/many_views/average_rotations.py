@@ -86,6 +86,7 @@ def average_rotations(
     weights: Float[Tensor, "e"] | None = None,
     covariance: bool = False,
     max_iterations: int = 100,
+    tolerance: float = 1e-6,
 ) -> AveragedRotations:
     """Rotations of all cameras of a view graph, robustly.
 
@@ -104,6 +105,7 @@ def average_rotations(
         weights: What each edge counts; 0 leaves it out.
         covariance: Compute the covariance of each rotation: dense, for up to some thousand cameras.
         max_iterations: Most steps of each of the minimisations.
+        tolerance: Part of the cost that the last of them may leave; where rotations are adjusted later, 1e-3 will do.
 
     Returns:
         Rotations, statuses, components, and what is thought of each edge. Edges that are not finite, whose R is no rotation,
@@ -127,6 +129,7 @@ def average_rotations(
         R=(R, "e 3 3"), edges=(edges, "e 2: int"), deviation=(deviation, "?e 3 3"), weights=(weights, "?e")
     )  # fmt: skip
     check_options(views=(views, "int >= 0"), covariance=(covariance, bool), max_iterations=(max_iterations, "int >= 0"))
+    check_options(tolerance=(tolerance, "float >= 0"))
     check_index(edges=(edges, views))
     edges = edges.long()
     with torch.no_grad():
@@ -151,7 +154,7 @@ def average_rotations(
         loss = GemanMcClure(REACH * scale)
         start, tree = (_rotations(graph.minimise(x, loss, max_iterations, ROUGH)) for x in (start, tree))
         start = graph.better(start, tree, loss)
-    found = graph.minimise(start, loss, max_iterations, 1e-6)
+    found = graph.minimise(start, loss, max_iterations, tolerance)
     model = _rotations(found)
     with torch.no_grad():
         plain = model.detach()

@@ -27,8 +27,8 @@ from torchsfm.optim import sparse_levenberg_marquardt as minimise
 
 CORNER = 0.1
 """Distance from its ray, at one unit ahead of the camera, from which a point pulls with constant force."""
-ROUGH, FINE = 1e-3, 1e-4
-"""Part of the cost to which sums are minimised that set the scale of the next, and the last."""
+ROUGH = 1e-3
+"""Part of the cost to which sums are minimised that set the scale of the next."""
 QUARTILE = 0.5754
 """Of a squared residual of two normal components."""
 EXACT = 1e-5
@@ -103,6 +103,7 @@ def position_globally(
     points: int,
     weights: Float[Tensor, "m"] | None = None,
     max_iterations: int = 100,
+    tolerance: float = 1e-4,
 ) -> GlobalPositions:
     """Centres of cameras of known rotation, and points, robustly and without a start.
 
@@ -115,6 +116,7 @@ def position_globally(
         points: Number of points.
         weights: What each ray counts; 0 leaves it out.
         max_iterations: Most steps of each of the two minimisations.
+        tolerance: Part of the cost that the last of them may leave; where all is adjusted later, 1e-3 will do.
 
     Returns:
         Centres, points, statuses, and what is thought of each ray. Rays that are not finite or 0, those of cameras whose
@@ -137,6 +139,7 @@ def position_globally(
     """
     check_one_problem(d=(d, "m 3"), view=(view, "m: int"), point=(point, "m: int"), R=(R, "v 3 3"), weights=(weights, "?m"))
     check_options(points=(points, "int >= 0"), max_iterations=(max_iterations, "int >= 0"))
+    check_options(tolerance=(tolerance, "float >= 0"))
     v, view, point = len(R), view.long(), point.long()
     check_index(view=(view, v), point=(point, points))
     with torch.no_grad():
@@ -157,7 +160,7 @@ def position_globally(
         lost = min(unknowns / max(2 * len(ray), 1), MOST_LOST)
         start = rays.angular(start, rays.scale(start, 0.0), max_iterations, ROUGH).x
         scale = rays.scale(start, lost)
-    found = rays.angular(start, scale, max_iterations, FINE)
+    found = rays.angular(start, scale, max_iterations, tolerance)
     c, X = rays.anchored(found, component)
     with torch.no_grad():
         scale = rays.scale({"c": c, "X": X}, lost)
