@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,18 +83,21 @@ class StageClock:
         self.last, self.stage = now, stage
 
 
-def photographs(views: int) -> Row:
+def photographs(views: int, method: str) -> Row:
     """The whole job."""
     from torchsfm.reconstruction import reconstruct
 
     with tempfile.TemporaryDirectory() as folder:
         files = render(Path(folder), views)
         before, clock = memory(), StageClock()
-        result = reconstruct(files, max_features=FEATURES, neighbours=NEIGHBOURS, out=Path(folder) / "out", progress=clock)
+        result = reconstruct(
+            files, max_features=FEATURES, neighbours=NEIGHBOURS, method=method, out=Path(folder) / "out", progress=clock
+        )
     names, spent = ("features", "pairs", "look", "match", "verify", "map"), clock.seconds
     return {
         "pairs compared": len(result.report.pairs.pairs),
         "registered": result.models[0].num_registered if result.models else 0,
+        "doubtful": sum(bool(image.doubt) for image in result.report.images),
         **{f"{name} s": spent.get(name, 0.0) for name in names},
         "MB before": before,
         "MB": memory(),
@@ -210,9 +214,9 @@ def bundle_worker(folder: str) -> Row:
     return row
 
 
-def apart(job: str, size: int) -> Row:
+def apart(job: str, size: int, method: str) -> Row:
     """One row in a process of its own."""
-    words = [sys.executable, "-m", "bench.scale", job, "--images", str(size), "--worker", "here"]
+    words = [sys.executable, "-m", "bench.scale", job, "--images", str(size), "--methods", method, "--worker", "here"]
     return dict(json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout.splitlines()[-1]))
 
 
@@ -256,11 +260,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.scale", description="Growth with the number of photographs.")
     parser.add_argument("job", choices=("photographs", "features", "recall", "bundle"))
     parser.add_argument("--images", type=int, nargs="+", default=[50, 100, 200])
+    parser.add_argument("--methods", nargs="+", default=["incremental", "global"], help="mappers of photographs")
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    jobs = {"photographs": photographs, "features": simulated, "recall": recall}
+    jobs = {"photographs": partial(photographs, method=options.methods[0]), "features": simulated, "recall": recall}
     if options.worker:
         row = bundle_worker(options.worker) if options.job == "bundle" else jobs[options.job](options.images[0])
         print(json.dumps(row))
@@ -272,8 +277,9 @@ def main(arguments: list[str] | None = None) -> None:
         for ranks, rows in found.items():
             print(f"{ranks} ranks: {sum(row['cpu s'] for row in rows):.1f} core-seconds in all")
     else:
-        rows = {size: apart(options.job, size) for size in options.images}
-        print(table(rows, "images"))
+        for method in options.methods if options.job == "photographs" else options.methods[:1]:
+            rows = {size: apart(options.job, size, method) for size in options.images}
+            print(table(rows, f"images, {method}" if options.job == "photographs" else "images"), flush=True)
         if options.job == "photographs":
             print("\nSmall photographs: what is said of larger numbers of them is a prediction.\n", predict(rows), sep="\n")
 
