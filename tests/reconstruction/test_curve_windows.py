@@ -14,7 +14,7 @@ from torchsfm.images import read_image
 from torchsfm.reconstruction.curve_mapping import CurveMapping
 from torchsfm.reconstruction.curve_sequence import Expected, Settled
 from torchsfm.reconstruction.curve_start import FirstCameras
-from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of, window_at
+from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of, turns_of, window_at
 from torchsfm.reconstruction.image_edges import ImageEdges
 
 F64 = torch.float64
@@ -48,22 +48,21 @@ def test_windows_that_overlap_are_one_chain(X: Tensor, generator: torch.Generato
     poses = arc()
     windows = [window(first, poses, X, generator) for first in (0, 2, 3, 5, 7, 8)]
     (chain,) = chains(windows)
-    # The frames at both ends are those of one window each, and farthest from its middle.
-    assert chain.views.tolist() == list(range(1, FRAMES - 1))
+    assert chain.views.tolist() == list(range(FRAMES))
     middle = windows[0].found.poses
     scale = torch.linalg.vector_norm(middle.centre[1] - middle.centre[0]) / torch.linalg.vector_norm(
         poses.centre[1] - poses.centre[0]
     )
     world = Similarity(scale, poses.R[2], scale * poses.t[2])
     truth = world.transform_pose(poses)
-    assert torch.allclose(chain.poses.R, truth.R[1:-1], atol=1e-9)
-    assert torch.allclose(chain.poses.t, truth.t[1:-1], atol=1e-9)
+    assert torch.allclose(chain.poses.R, truth.R, atol=1e-9)
+    assert torch.allclose(chain.poses.t, truth.t, atol=1e-9)
 
 
 def test_a_chain_ends_where_windows_share_too_little_or_contradict_each_other(X: Tensor, generator: torch.Generator) -> None:
     poses = arc()
     apart = [window(first, poses, X, generator) for first in (0, 4, 6, 8)]
-    assert [chain.views.tolist() for chain in chains(apart)] == [list(range(5, 12)), list(range(5))]
+    assert [chain.views.tolist() for chain in chains(apart)] == [list(range(4, FRAMES)), list(range(5))]
     shaken = 0.1 * torch.randn(WIDTH, 3, dtype=F64, generator=generator)
     wrong = apart[2].found.poses
     wrong = replace(apart[2].found, poses=Pose(rotation_from_rotvec(shaken) @ wrong.R, wrong.t))
@@ -71,10 +70,40 @@ def test_a_chain_ends_where_windows_share_too_little_or_contradict_each_other(X:
     assert [len(chain.views) for chain in chains(torn)] == [WIDTH] * 3
     right = [window(first, poses, X, generator) for first in (0, 2, 4, 6, 8)]
     longest, other = chains([*right[:4], torn[1], right[4]])
-    assert longest.views.tolist() == [1, 2, 3, 4, 5, 11]
+    assert longest.views.tolist() == [0, 1, 2, 3, 4, 5, 11, 12]
     assert len(other.views) == WIDTH
     nowhere = replace(apart[2].found, X=X[:0])
     assert len(chains([apart[1], Window(apart[2].views, nowhere)])) == 2
+
+
+def test_turns_of_windows_hold_the_frames_that_are_placed(X: Tensor, generator: torch.Generator) -> None:
+    """How sure they are is what windows that overlap agree on; what one has wrong lets go."""
+    poses = arc()
+    noise = math.radians(0.5)
+
+    def shaken(one: Window) -> Window:
+        found = one.found.poses
+        turn = rotation_from_rotvec(noise * torch.randn(WIDTH, 3, dtype=F64, generator=generator))
+        return Window(one.views, replace(one.found, poses=Pose(turn @ found.R, found.t)))
+
+    windows = [shaken(window(first, poses, X, generator)) for first in range(FRAMES - WIDTH + 1)]
+    turns = turns_of(windows)
+    assert len(turns.index) == (WIDTH - 1) * len(windows)
+    first, second = turns.index.unbind(1)
+    off = rotation_angle(turns.poses.R @ (poses.R[second] @ poses.R[first].mT).mT)
+    # Of both frames' noise, three numbers each.
+    assert off.square().mean().sqrt() == pytest.approx(math.sqrt(6) * noise, rel=0.3)
+    assert turns.sigma[:3] == pytest.approx(torch.full((3,), math.sqrt(2) * noise), rel=0.3)
+    assert bool(turns.sigma[3:].isinf().all())
+    placed = torch.arange(FRAMES) < 6
+    zero = torch.zeros((), dtype=F64)
+    expected = Expected(Camera(K, Radial(zero, zero)), ("focal",), {"focal": 0.5}, turns)
+    (kept,) = expected.terms(placed)["priors"]
+    assert len(kept.index) > 0
+    assert bool((kept.index < 6).all())
+    assert expected.terms()["priors"] == []
+    one = turns_of(windows[:1])
+    assert one.sigma[0] == pytest.approx(math.radians(1.0))
 
 
 def test_the_focal_length_of_windows(X: Tensor, generator: torch.Generator) -> None:

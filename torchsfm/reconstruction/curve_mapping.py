@@ -16,6 +16,7 @@ from torchsfm.geometry import BundleProblem, Camera, Pose, rotation_from_rotvec,
 from torchsfm.images.edge_field import EdgeField, edge_field
 from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_fusion import near_pairs
+from torchsfm.reconstruction.curve_noise import measured_weights
 from torchsfm.reconstruction.curve_pieces import image_pieces
 from torchsfm.reconstruction.curve_resection import pose_from_edges
 from torchsfm.reconstruction.curve_tracks import track_samples
@@ -173,8 +174,9 @@ def distances(mapping: CurveMapping) -> tuple[Float[Tensor, "k"], float]:
 
 
 def terms(mapping: CurveMapping) -> dict[str, Any]:
-    """The samples as a part of a bundle, where edges that are much farther away than most have no say."""
-    return {"structure": (mapping.curves.bundle(loss=GemanMcClure(_TRUSTED * distances(mapping)[1])),)}
+    """The samples as a part of a bundle, weighed by what is measured; edges much farther away than most have no say."""
+    r, scale = distances(mapping)
+    return {"structure": (measured_weights(mapping.curves, r).bundle(loss=GemanMcClure(_TRUSTED * scale)),)}
 
 
 def adjust(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float, iterations: int) -> CurveMapping:

@@ -26,7 +26,7 @@ _BENT = 0.05
 _MORE_BENT = 0.02
 """of others."""
 _RESTLESS = 0.5
-"""Degrees by which cameras may still turn as more samples are given up."""
+"""Degrees by which cameras may still turn when samples are found anew."""
 _CONTRADICTED = 1.0
 """Degrees between cameras of the model and those of a few frames by themselves, beyond which the model has drifted."""
 _FEWEST = 30
@@ -120,7 +120,7 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
     """How well the cameras are known, by the curves."""
     mapping = settled.mapping
     curves = mapping.curves
-    covariance = bundle_covariance(mapping.problem(), **terms(mapping), **expected.terms(lens=True))
+    covariance = bundle_covariance(mapping.problem(), **terms(mapping), **expected.terms())
     variance = covariance.poses.diagonal(dim1=-2, dim2=-1)
     seen = torch.bincount(curves.view, minlength=len(mapping.edges))
     depth = (mapping.poses.transform(curves.X)[..., 2]).median(-1).values
@@ -145,7 +145,7 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
         if zoomed is not None:
             return f"its focal length is {zoomed:.2f} times the one that a few frames at a time say"
         if settled.moved > _RESTLESS:
-            return f"cameras still turn by {settled.moved:.1f} degrees as more of the edges are left out"
+            return f"cameras still turn by {settled.moved:.1f} degrees when samples are found anew"
         if not DEVIATIONS * rotation[i] < WRONG_ANGLE:
             return f"its rotation is known to {rotation[i]:.1f} degrees only"
         if not DEVIATIONS * torch.atan(position[i]).rad2deg() < WRONG_ANGLE:

@@ -6,12 +6,31 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypedDict
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.bundle import RelativePosePrior
 from torchsfm.geometry import Camera, rotation_angle
-from torchsfm.reconstruction.curve_mapping import CurveMapping, add_pieces, prune, register, sampled, settle, track
-from torchsfm.reconstruction.curve_windows import Chain, all_windows, chains, contradictions, focal_of, windows_by_themselves
+from torchsfm.reconstruction.curve_mapping import (
+    NEAR,
+    CurveMapping,
+    add_pieces,
+    adjust,
+    prune,
+    register,
+    sampled,
+    settle,
+    track,
+)
+from torchsfm.reconstruction.curve_windows import (
+    Chain,
+    all_windows,
+    chains,
+    contradictions,
+    focal_of,
+    turns_of,
+    windows_by_themselves,
+)
 from torchsfm.reconstruction.curves import curves_of_edges
 from torchsfm.reconstruction.doubt import DEVIATIONS
 from torchsfm.reconstruction.image_edges import ImageEdges
@@ -44,8 +63,8 @@ _ROUGH: Ends = {"tolerance": 1e-4, "iterations": 15}
 """When to end an adjustment on the way,"""
 _FINE: Ends = {"tolerance": 1e-6, "iterations": 40}
 """and in the end."""
-_LAST = 8
-"""Times that cameras are adjusted then, and samples given up, the most,"""
+_LAST = 4
+"""Times that samples are found anew then, the most,"""
 _STILL = 0.1
 """while cameras turn by more degrees."""
 
@@ -55,7 +74,7 @@ class Settled(NamedTuple):
 
     mapping: CurveMapping
     moved: float
-    """Degrees by which cameras turned the last time that samples were given up."""
+    """Degrees by which cameras turned when samples were found anew for the last time."""
     apart: Float[Tensor, "v"]
     """Degrees by which the frames around each one, by themselves, see its camera turned; infinite where they do not tell."""
     told: "Expected"
@@ -79,6 +98,8 @@ class Expected:
     """Numbers that are not known."""
     sigma: dict[str, float]
     """Standard deviations of these, the focal length's as a part of it."""
+    turns: RelativePosePrior | None = None
+    """What is known of how cameras are turned from frame to frame."""
 
     def told(self, focal: Float[Tensor, ""], sigma: float) -> "Expected":
         """The same when the focal length is found to such a part of it."""
@@ -88,11 +109,14 @@ class Expected:
         K[:2, :2] *= focal / K[0, 0]
         return replace(self, camera=replace(self.camera, K=K), sigma={**self.sigma, "focal": sigma})
 
-    def terms(self, *, lens: bool) -> dict[str, Any]:
-        """What a bundle adjusts, the lens' distortion or only the focal length."""
-        free = self.free if lens else tuple(name for name in self.free if name == "focal")
-        sigma = {name: self.sigma[name] for name in free if name in self.sigma}
-        return {"free": free, "intrinsics_sigma": sigma, "intrinsics_mean": self.camera[(None,)]}
+    def terms(self, placed: Bool[Tensor, "v"] | None = None) -> dict[str, Any]:
+        """What a bundle adjusts of the camera, and what is known of it and of frames that are placed."""
+        priors = []
+        if placed is not None and self.turns is not None:
+            both = placed[self.turns.index].all(-1)
+            priors = [replace(self.turns, index=self.turns.index[both], poses=self.turns.poses[both])]
+        sigma = {name: self.sigma[name] for name in self.free}
+        return {"free": self.free, "intrinsics_sigma": sigma, "intrinsics_mean": self.camera[(None,)], "priors": priors}
 
 
 def map_sequence(
@@ -117,6 +141,7 @@ def map_sequence(
     if not windows:
         reasons = [window.found.refusal for window in found]
         return None, max(set(reasons), key=reasons.count)
+    expected = replace(expected, turns=turns_of(windows))
     told = expected.told(*focal_of(windows))
     best: CurveMapping | None = None
     for chain in chains(windows)[:_TRIES]:
@@ -139,9 +164,22 @@ def _begin(
     """A model of the frames of a chain of windows."""
     mapping = CurveMapping.start(edges, size, told.camera).placed(chain.views, chain.poses)
     for near in _NEARER:
-        mapping = sampled(mapping, progress, near)
-        for _ in range(2):
-            mapping = settle(mapping, told.terms(lens=True), near=near, **_ROUGH)
+        mapping = _anew(mapping, told, progress, near, **_ROUGH)
+    return mapping
+
+
+def _anew(
+    mapping: CurveMapping, known: Expected, progress: Progress, near: float = NEAR, *, tolerance: float, iterations: int
+) -> CurveMapping:
+    """The cameras adjusted to samples that are found anew.
+
+    What was left out once may be right: where cameras are wrong, so are the samples that agree with them best. So samples are
+    not given up one after the other while cameras move.
+    """
+    mapping = prune(track(sampled(mapping, progress, near), near), near)
+    for _ in range(2):
+        terms = known.terms(mapping.registered)
+        mapping = adjust(track(mapping, near), terms, tolerance=tolerance, iterations=iterations)
     return mapping
 
 
@@ -162,7 +200,7 @@ def _grow(mapping: CurveMapping, told: Expected, progress: Progress) -> CurveMap
         count = len(mapping.known)
         if count > adjusted and (not waiting or count >= _GROWN * adjusted or count == v):
             # What did not fit may fit then.
-            mapping, adjusted, failed = settle(mapping, told.terms(lens=True), **_ROUGH), count, set()
+            mapping, adjusted, failed = settle(mapping, told.terms(mapping.registered), **_ROUGH), count, set()
         elif not waiting:
             return mapping
 
@@ -170,17 +208,16 @@ def _grow(mapping: CurveMapping, told: Expected, progress: Progress) -> CurveMap
 def _together(mapping: CurveMapping, expected: Expected, told: Expected, progress: Progress) -> Settled:
     """All cameras, from samples that are found anew."""
     known = mapping.known
-    mapping = prune(track(sampled(mapping, progress)))
-    # What the windows say of the focal length counts only until it is clear which samples stay in one place.
-    mapping = settle(mapping, told.terms(lens=True), **_ROUGH)
+    mapping = _anew(mapping, told, progress, **_ROUGH)
     for _ in range(_LAST):
-        before, mapping = mapping, settle(mapping, expected.terms(lens=True), **_FINE)
+        # What the windows say of the focal length counts only until all frames tell it together.
+        before, mapping = mapping, _anew(mapping, expected, progress, **_FINE)
         turned = before.poses.R[known].mT @ mapping.poses.R[known]
         moved = float(rotation_angle(turned @ turned[len(known) // 2].mT).rad2deg().amax())
         if moved < _STILL:
             break
     alone = windows_by_themselves([sight.edges for sight in mapping.sights], told.camera.K)
-    return Settled(mapping, moved, contradictions(alone, mapping.poses, mapping.registered), told)
+    return Settled(prune(mapping), moved, contradictions(alone, mapping.poses, mapping.registered), told)
 
 
 def all_curves(mapping: CurveMapping, progress: Progress) -> Curves:

@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm.bundle import RelativePosePrior
 from torchsfm.geometry import Curve, Pose, Similarity, rotation_angle
 from torchsfm.images import Edges, track_curves
 from torchsfm.linalg import nearest_rotation
+from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_start import FirstCameras, first_cameras
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.report import Progress
@@ -29,6 +31,10 @@ _LINKED = 2.0
 """Pixels between the ends of a closed chain, the most."""
 _SURE = 0.02
 """Standard deviation of a focal length, as a part of it, that is given to windows, and the least that they tell."""
+_SURE_TURN = 0.3
+"""Degrees, the least, to which windows tell how cameras are turned: what misleads one misleads those that overlap it."""
+_WRONG = 4.0
+"""Standard deviations by which what a window says may be off and still count."""
 _SHARED = WIDTH // 2 + 1
 """Frames that two windows of a chain share, at least: the middle one of each is among them."""
 _ONE_TURN = 1.0
@@ -121,11 +127,36 @@ def focal_of(windows: Sequence[Window]) -> tuple[Float[Tensor, ""], float]:
     return middle, max(_SURE, scatter / math.sqrt(number))
 
 
+def turns_of(windows: Sequence[Window]) -> RelativePosePrior:
+    """How cameras are turned against the one in the middle of their window, as precise as windows that overlap agree on it."""
+    pairs, turns = [], []
+    for window in windows:
+        R = window.found.poses.R
+        middle = int((window.views == window.middle).nonzero()[0, 0])
+        others = [k for k in range(len(R)) if k != middle]
+        pairs += [(window.middle, int(window.views[k])) for k in others]
+        turns += [R[k] @ R[middle].mT for k in others]
+    off = [
+        r for k, window in enumerate(windows) for before in windows[max(k - WIDTH, 0) : k] for r in _differences(window, before)
+    ]
+    # The median of the length of three normal numbers, and of two windows.
+    sigma = float(torch.tensor(off).median()) / (1.54 * math.sqrt(2)) if off else math.inf
+    sigma = min(max(sigma, math.radians(_SURE_TURN)), math.radians(_ONE_TURN))
+    R = torch.stack(turns)
+    known = Pose(R, R.new_zeros(len(R), 3))
+    return RelativePosePrior(torch.tensor(pairs), known, R.new_tensor([sigma] * 3 + [math.inf] * 3), loss=GemanMcClure(_WRONG))
+
+
+def _differences(window: Window, before: Window) -> list[float]:
+    """Angles between what two windows say of how the frames that both have are turned from one to the next."""
+    a, b = _shared(window, before)
+    return rotation_angle((a.R[1:] @ a.R[:-1].mT) @ (b.R[1:] @ b.R[:-1].mT).mT).tolist()
+
+
 def chains(windows: Sequence[Window]) -> list[Chain]:
     """Cameras of windows that overlap and agree, the longest chain first.
 
-    Frames about which two windows contradict each other, or of which only the end of one tells, are left out where enough
-    others remain.
+    Frames about which two windows contradict each other are left out where enough others remain.
 
     Args:
         windows: In the order of their frames, no two of the same, all with an answer.
@@ -160,18 +191,15 @@ def _nowhere(like: Pose) -> Similarity:
 
 
 def _joined(run: Sequence[_Placed], contested: set[int]) -> Chain:
-    """Each frame as the window has it in whose middle it is nearest; the end of a single window is not sure of a frame."""
+    """Each frame as the window has it whose middle it is nearest to."""
     frames: dict[int, tuple[int, Pose]] = {}
-    confirmed = set[int]()
     for window, _, world in run:
         poses = world.transform_pose(window.found.poses)
         for k, view in enumerate(window.views.tolist()):
             away = abs(view - window.middle)
-            if view in frames or away < WIDTH // 2:
-                confirmed.add(view)
             if view not in frames or away < frames[view][0]:
                 frames[view] = away, poses[k]
-    sure = confirmed - contested
+    sure = frames.keys() - contested
     views = sorted(sure if len(sure) >= WIDTH else frames)
     return Chain(torch.tensor(views), Pose(*(torch.stack([getattr(frames[i][1], name) for i in views]) for name in ("R", "t"))))
 
