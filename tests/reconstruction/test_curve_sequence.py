@@ -1,6 +1,7 @@
 """Sequences by their edges alone: what is refused, and why; and a rendered one from images to cameras."""
 
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,23 @@ def test_cameras_and_curves_without_points(tmp_path: Path, generator: torch.Gene
     assert model.curves is not None
     assert len(model.curves) >= 6
     assert model.curve_residuals().median() < 0.3
+
+
+@pytest.mark.slow
+def test_a_real_turntable_by_a_long_lens(data: Path, tmp_path: Path) -> None:
+    """18 photographs 7.7 degrees apart, the lens twice as long as expected and its centre 17 px beside the middle."""
+    folder = data / "images" / "temple_ring"
+    rows = {name: numbers for name, *numbers in map(str.split, (folder / "templeR_par.txt").read_text().splitlines()[1:])}
+    names = [f"templeR{k:04d}.png" for k in range(13, 31)]
+    for name in names:
+        shutil.copy(folder / name, tmp_path)
+    numbers = torch.tensor([[float(n) for n in rows[name]] for name in names], dtype=F64)
+    R = numbers[:, 9:18].unflatten(1, (3, 3))
+    model = reconstruct(tmp_path, method="curves").model
+    assert bool(model.registered.all())
+    turn = nearest_rotation((R.mT @ model.poses.R).mean(0))
+    assert rotation_angle(model.poses.R @ (R @ turn).mT).rad2deg().max() < 1.0
+    assert abs(float(model.cameras.K[0, 0, 0]) / float(numbers[0, 0]) - 1) < 0.1
 
 
 @pytest.fixture

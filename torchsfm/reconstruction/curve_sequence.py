@@ -63,7 +63,9 @@ _ROUGH: Ends = {"tolerance": 1e-4, "iterations": 15}
 """When to end an adjustment on the way,"""
 _FINE: Ends = {"tolerance": 1e-6, "iterations": 40}
 """and in the end."""
-_LAST = 4
+_TOGETHER = 0.05
+"""Part of the focal length by which all windows may be wrong together: what misleads one misleads others too."""
+_LAST = 3
 """Times that samples are found anew then, the most,"""
 _STILL = 0.1
 """while cameras turn by more degrees."""
@@ -109,6 +111,12 @@ class Expected:
         K[:2, :2] *= focal / K[0, 0]
         return replace(self, camera=replace(self.camera, K=K), sigma={**self.sigma, "focal": sigma})
 
+    def loosened(self) -> "Expected":
+        """The same where all frames together may tell a little more of the focal length than a few at a time."""
+        if "focal" not in self.free:
+            return self
+        return replace(self, sigma={**self.sigma, "focal": max(self.sigma["focal"], _TOGETHER)})
+
     def terms(self, placed: Bool[Tensor, "v"] | None = None) -> dict[str, Any]:
         """What a bundle adjusts of the camera, and what is known of it and of frames that are placed."""
         priors = []
@@ -141,8 +149,7 @@ def map_sequence(
     if not windows:
         reasons = [window.found.refusal for window in found]
         return None, max(set(reasons), key=reasons.count)
-    expected = replace(expected, turns=turns_of(windows))
-    told = expected.told(*focal_of(windows))
+    told = replace(expected.told(*focal_of(windows)), turns=turns_of(windows))
     best: CurveMapping | None = None
     for chain in chains(windows)[:_TRIES]:
         begun = _begin(edges, size, told, chain, progress)
@@ -155,7 +162,7 @@ def map_sequence(
             break
     if best is None:
         return None, "no curves stay in one place"
-    return _together(best, expected, told, progress), ""
+    return _together(best, told, progress), ""
 
 
 def _begin(
@@ -205,15 +212,15 @@ def _grow(mapping: CurveMapping, told: Expected, progress: Progress) -> CurveMap
             return mapping
 
 
-def _together(mapping: CurveMapping, expected: Expected, told: Expected, progress: Progress) -> Settled:
+def _together(mapping: CurveMapping, told: Expected, progress: Progress) -> Settled:
     """All cameras, from samples that are found anew."""
-    known = mapping.known
+    views = mapping.known
     mapping = _anew(mapping, told, progress, **_ROUGH)
+    known = told.loosened()
     for _ in range(_LAST):
-        # What the windows say of the focal length counts only until all frames tell it together.
-        before, mapping = mapping, _anew(mapping, expected, progress, **_FINE)
-        turned = before.poses.R[known].mT @ mapping.poses.R[known]
-        moved = float(rotation_angle(turned @ turned[len(known) // 2].mT).rad2deg().amax())
+        before, mapping = mapping, _anew(mapping, known, progress, **_FINE)
+        turned = before.poses.R[views].mT @ mapping.poses.R[views]
+        moved = float(rotation_angle(turned @ turned[len(views) // 2].mT).rad2deg().amax())
         if moved < _STILL:
             break
     alone = windows_by_themselves([sight.edges for sight in mapping.sights], told.camera.K)
