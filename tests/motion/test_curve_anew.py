@@ -4,11 +4,14 @@ import math
 
 import torch
 
+from torchsfm._types import Status
 from torchsfm.geometry import camera_from_krt, curve_from_samples, project_points, rotation_from_rotvec
 from torchsfm.geometry.curve_places import curve_places
+from torchsfm.motion import factorize_curves
 from torchsfm.motion.many_views.curve_anew import put_together
 from torchsfm.motion.many_views.curve_fit import Scene
 from torchsfm.motion.many_views.curve_search import agreement, approach, typical_misfit
+from torchsfm.triangulation import triangulate_points_dlt
 
 F64 = torch.float64
 
@@ -47,3 +50,32 @@ def test_a_curve_of_which_nothing_is_known(generator: torch.Generator) -> None:
     x = approach(images, everything, x)
     assert float(agreement(images, everything, x)) > 0.8
     assert float(typical_misfit(images, everything, x)) < 1e-3
+
+
+def test_a_curve_that_looks_alike_from_both_ends() -> None:
+    """Its images run one way as well as the other, all guesses are wrong for it, and it is put together by the other curves.
+
+    One scene for all seeds, as this is not so of each.
+    """
+    v, n = 5, 300
+    generator = torch.Generator().manual_seed(0)
+    kind = {"generator": generator, "dtype": F64}
+    turn = torch.linspace(-0.5, 0.5, v, dtype=F64)[:, None] * math.radians(40) * torch.tensor([0.0, 1.0, 0.0], dtype=F64)
+    R = rotation_from_rotvec(0.15 * torch.randn(v, 3, **kind)) @ rotation_from_rotvec(turn)
+    K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=F64)
+    P = camera_from_krt(K, R, torch.tensor([0.0, 0.0, 10.0], dtype=F64) + 0.3 * torch.randn(v, 3, **kind))
+    t = torch.arange(n, dtype=F64) * (2 * math.pi / n)
+    waves = torch.stack([w for k in (1, 2, 3) for w in ((k * t).cos() / k**2, (k * t).sin() / k**2)], -1)
+    bends = torch.randn(2, 6, 3, **kind)
+    bends = 1.5 * bends / bends.square().sum((-2, -1), keepdim=True).sqrt()
+    alike = torch.stack((t.cos(), t.sin(), 0.3 * (2 * t).cos()), -1)[None]
+    X = torch.cat((waves @ bends, alike)) + 0.7 * torch.randn(3, 1, 3, **kind)
+    x = project_points(P[:, None], X)
+    back = torch.rand(v, 3, 1, generator=generator) < 0.5
+    slot = torch.where(back, -torch.arange(n), torch.arange(n)) + torch.randint(n, (v, 3, 1), generator=generator)
+    hidden = x.gather(2, (slot % n)[..., None].expand_as(x))
+    found = factorize_curves(curve_from_samples(hidden, closed=True), samples=24)
+    assert int(found.status) == Status.OK
+    points = x[:, :, ::20].flatten(1, 2)
+    seen = project_points(found.P, triangulate_points_dlt(points, found.P))
+    assert float((seen - points).square().sum(-1).mean().sqrt()) < 1e-2
