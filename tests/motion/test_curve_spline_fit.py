@@ -5,8 +5,18 @@ import math
 import torch
 from torch import Tensor
 
-from torchsfm.motion.many_views.curve_spline_fit import SplineDistances, SplineSystem, directions, held_directions
-from torchsfm.motion.many_views.curve_splines import Splines, see
+from torchsfm.geometry import camera_from_krt, rotation_from_rotvec
+from torchsfm.motion.many_views.curve_spline_fit import (
+    SplineDistances,
+    SplineSystem,
+    all_directions,
+    approach_splines,
+    directions,
+    fit_splines,
+    held_directions,
+)
+from torchsfm.motion.many_views.curve_splines import Splines, see, third_differences
+from torchsfm.motion.many_views.curve_stiffness import likeliest_stiffness
 
 F64 = torch.float64
 
@@ -67,3 +77,49 @@ def test_nothing_that_is_held_moves(generator: torch.Generator) -> None:
     step = terms.linearize(x).step(torch.full((1,), 1e-6, dtype=F64))
     assert int(torch.linalg.matrix_rank(terms.held[0])) == 18
     torch.testing.assert_close(terms.held[0].mT @ step.delta[0].flatten(), torch.zeros(18, dtype=F64), rtol=0, atol=1e-12)
+
+
+def test_points_unevenly_along_splines_do_not_count_as_bends(generator: torch.Generator) -> None:
+    """Fits that start from them are as stiff, and end as near, as those that start from even ones."""
+    p, v, c, k, n = 4, 6, 3, 16, 32
+    kind = {"generator": generator, "dtype": F64}
+    turn = torch.linspace(-0.35, 0.35, v, dtype=F64)[:, None] * torch.tensor([0.1, 1.0, 0.0], dtype=F64)
+    axes, far = torch.eye(3, dtype=F64), torch.tensor([0.0, 0.0, 10.0], dtype=F64)
+    P = camera_from_krt(axes, rotation_from_rotvec(turn), far + 0.3 * torch.randn(p, v, 3, **kind))
+    P = P / torch.linalg.matrix_norm(P)[..., None, None]
+    angle = torch.arange(k, dtype=F64) * (2 * math.pi / k)
+    waves = torch.stack([w for i in (1, 2, 3) for w in ((i * angle).cos() / i**2, (i * angle).sin() / i**2)], -1)
+    even = waves @ torch.nn.functional.normalize(torch.randn(p, c, 18, **kind), dim=-1).view(p, c, 6, 3) * 1.5
+    even = even + 0.7 * torch.randn(p, c, 1, 3, **kind)
+    closed = torch.ones(p, c, dtype=torch.bool)
+    t = (torch.arange(n, dtype=F64) * (k / n)).expand(p, v, c, n).clone()
+    measured = see(Splines(P, even, t), closed, torch.zeros(p, v, c, n, 2, dtype=F64)).points
+    measured = measured + 1e-3 * torch.randn(measured.shape, **kind)
+    along = torch.nn.functional.normalize(even.roll(-1, 2) - even.roll(1, 2), dim=-1)
+    ends, stiffness = [], []
+    for control in (even, even + 0.05 * along * torch.randn(p, c, k, 1, **kind)):
+        x = Splines(P, control, t)
+        weight, loose = torch.ones_like(t), torch.zeros(p, c, dtype=F64)
+        terms = SplineDistances(measured, weight, closed, loose, all_directions(control), held_directions(P))
+        for _ in range(3):
+            terms, x = approach_splines(terms, x)
+        ends.append(fit_splines(terms, x, 50, 1e-6).cost)
+        stiffness.append(terms.stiffness)
+    assert float((ends[1] / ends[0]).log().median().abs()) < 0.02
+    assert float((stiffness[1] / stiffness[0]).log().median().abs()) < 0.2
+
+
+def test_the_likeliest_stiffness_is_that_of_noise_to_bends(generator: torch.Generator) -> None:
+    """Third differences of known variance, and control points that are measured with a thirtieth of that noise, or thrice."""
+    p, c, k, bend = 3, 4, 40, 0.01
+    kind = {"generator": generator, "dtype": F64}
+    D = third_differences(torch.ones(p, c, dtype=torch.bool), k)
+    control = torch.linalg.pinv(D) @ (bend * torch.randn(p, c, k, 3, **kind))
+    noise = bend * torch.tensor([1 / 30, 1.0, 3.0], dtype=F64)
+    off = noise[:, None, None, None] * torch.randn(p, c, k, 3, **kind)
+    # Half the squared distance of control points that are `off` from what was measured.
+    G = torch.eye(3 * k, dtype=F64).expand(p, c, -1, -1)
+    number = torch.full((p,), 1e9, dtype=F64)
+    found = likeliest_stiffness(G, off.flatten(2), D, control + off, noise.square(), number, 0)
+    ratio = found * bend**2 / noise.square()[:, None]
+    assert (ratio.log().mean(-1).abs() < math.log(2)).all()

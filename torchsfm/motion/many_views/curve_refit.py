@@ -16,8 +16,8 @@ from torchsfm.motion.many_views.bilinear_fit import unit_frame
 from torchsfm.motion.many_views.curve_fit import Scene
 from torchsfm.motion.many_views.curve_spline_fit import (
     SplineDistances,
+    all_directions,
     approach_splines,
-    directions,
     fit_splines,
     held_directions,
     typical_distance,
@@ -86,7 +86,7 @@ def refit(
     weight = ((slot < points[..., None]) & shown[..., None] & (t.isfinite())).to(P.dtype)
     start = Splines(P, control, torch.where(weight > 0, t, 0))
     none = torch.zeros_like(knot[..., 0])
-    problem = SplineDistances(images.at(slot)[0], weight, closed, none, directions(control, closed), held_directions(P))
+    problem = SplineDistances(images.at(slot)[0], weight, closed, none, all_directions(control), held_directions(P))
     for _ in range(_ROUNDS):
         problem, start = approach_splines(problem, start)
         here = problem.linearize(start)

@@ -5,8 +5,10 @@ the points of an image leaves the true one where a space curve is seen end-on. I
 B-splines here, and what counts is the distance of each measured point from the nearest point of a spline's image, found anew
 each time (variable projection).
 
-Much may be changed that changes nothing or next to nothing, and is held: the frame and the scales of cameras, and control
-points along their splines. The bending of splines, in the frame of the start, is weighed by its own variance.
+Much may be changed that changes nothing or next to nothing, and is held: the frame and the scales of cameras, and in the end
+control points along their splines. The bending of splines, in the frame of the start, is weighed by its variance. At first it
+draws control points along their splines too: where noise has put them unevenly they would bend a spline as much as noise across
+it does, and it would be taken for one that bends.
 
 The valley is long, as far as noise lets curves bend, and distances are not small against how these bend: Gauss-Newton steps go
 astray in it, and exact second derivatives end it.
@@ -31,6 +33,7 @@ from torchsfm.motion.many_views.curve_splines import (
     spread,
     third_differences,
 )
+from torchsfm.motion.many_views.curve_stiffness import likeliest_stiffness
 from torchsfm.optim.descent import Descent, Options, Problem, Step, descend
 from torchsfm.optim.pytree import Places, choose, pick
 
@@ -66,7 +69,7 @@ class SplineSystem:
     """By Gauss and Newton,"""
     exact: Normal
     """and exact where that was asked for."""
-    across: Float[Tensor, "p c k 2 3"]
+    across: Float[Tensor, "p c k d 3"]
     held: Float[Tensor, "p r h"]
     total: Float[Tensor, "p"]
     distance: Float[Tensor, "p v c n"]
@@ -116,7 +119,7 @@ class SplineDistances(Problem[SplineSystem]):
     closed: Bool[Tensor, "p c"]
     stiffness: Float[Tensor, "p c"]
     """Weight of the squared third differences of control points."""
-    across: Float[Tensor, "p c k 2 3"]
+    across: Float[Tensor, "p c k d 3"]
     """Directions in which control points move."""
     held: Float[Tensor, "p r h"]
     """Directions in which cameras do not."""
@@ -152,14 +155,15 @@ class SplineDistances(Problem[SplineSystem]):
         bending = (self.stiffness * D.square().sum((-2, -1))).sum(-1)
         cost = ((self.weight * square).sum((-3, -2, -1)) + bending) / total
         cost = torch.where(cost.isfinite(), cost, torch.inf)
-        normal = self._normal(x, seen, exact=False)
+        normal = self.normal(x, seen, exact=False)
         return SplineSystem(x, cost, seen, normal, normal, self.across, self.held, total, square.sqrt())
 
     def curve(self, here: SplineSystem, where: Tensor) -> SplineSystem:
         """The system with the exact Hessian in some problems."""
-        return replace(here, exact=choose(where, self._normal(here.x, here.seen, exact=True), here.exact))
+        return replace(here, exact=choose(where, self.normal(here.x, here.seen, exact=True), here.exact))
 
-    def _normal(self, x: Splines, seen: Images, *, exact: bool) -> Normal:
+    def normal(self, x: Splines, seen: Images, *, exact: bool) -> Normal:
+        """The normal equations of cameras and control points."""
         p, v, c, n = seen.slope.shape
         w, depth = self.weight[..., None], seen.y[..., 2:]
         depth = torch.where(depth == 0, 1e-300, depth)
@@ -230,6 +234,11 @@ def held_directions(P: Float[Tensor, "p v 3 4"]) -> Float[Tensor, "p r h"]:
     return M.mT @ (vectors / root[:, None])
 
 
+def all_directions(control: Float[Tensor, "p c k 3"]) -> Float[Tensor, "p c k 3 3"]:
+    """The three axes, for control points that may move anywhere."""
+    return torch.eye(3, dtype=control.dtype, device=control.device).expand(*control.shape, 3)
+
+
 def directions(control: Float[Tensor, "p c k 3"], closed: Bool[Tensor, "p c"]) -> Float[Tensor, "p c k 2 3"]:
     """Two directions across splines at control points."""
     along = torch.nn.functional.normalize(courses(control, closed), dim=-1)
@@ -242,30 +251,40 @@ def sum_of(parts: Iterable[Tensor]) -> Tensor:
 
 
 def approach_splines(problem: SplineDistances, x: Splines) -> tuple[SplineDistances, Splines]:
-    """A few steps with weights by distances, and with what these say of the stiffness."""
+    """A few steps with weights by distances, and with what these say of the stiffness; control points move anywhere."""
     here = problem.linearize(x)
-    typical = typical_distance(problem, here)
-    trust = (1 + (here.distance / (_TRUSTED * typical[:, None, None, None])).square()).reciprocal().square()
-    problem = _anew(problem, here.x, typical)
-    return problem, descend(replace(problem, weight=problem.weight * trust), here.x, Options(_STEPS, 1e-10)).x
+    problem = _anew(problem, here)
+    weighed = replace(problem, weight=problem.weight * _trust(problem, here))
+    return problem, descend(weighed, here.x, Options(_STEPS, 1e-10)).x
 
 
 def fit_splines(problem: SplineDistances, x: Splines, steps: int, tolerance: float) -> Descent:
     """The least squares of what is near the splines."""
     here = problem.linearize(x)
-    typical = typical_distance(problem, here)
-    near = here.distance <= 2 * _TRUSTED * typical[:, None, None, None]
-    problem = replace(_anew(problem, here.x, typical), weight=problem.weight * near * problem.inside(here.x))
+    near = here.distance <= 2 * _TRUSTED * typical_distance(problem, here)[:, None, None, None]
+    weight = problem.weight * near * problem.inside(here.x)
+    problem = replace(_anew(problem, here), weight=weight, across=directions(here.x.control, problem.closed))
     return descend(problem, here.x, Options(steps, tolerance))
 
 
-def _anew(problem: SplineDistances, x: Splines, typical: Float[Tensor, "p"]) -> SplineDistances:
-    """The stiffness by the variance of distances over that of third differences; and what is held from here on."""
-    D = third_differences(problem.closed, x.control.shape[2])
-    rows = (D != 0).any(-1).sum(-1)
-    size = (D @ x.control).square().sum((-2, -1)) / (3 * rows).clamp(min=1)
-    stiffness = (1.4826 * typical[:, None]).square() / size.clamp_min(1e-100)
-    return replace(problem, stiffness=stiffness, across=directions(x.control, problem.closed), held=held_directions(x.P))
+def _trust(problem: SplineDistances, here: SplineSystem) -> Float[Tensor, "p v c n"]:
+    """Weights by distances."""
+    typical = typical_distance(problem, here)[:, None, None, None]
+    return (1 + (here.distance / (_TRUSTED * typical)).square()).reciprocal().square()
+
+
+def _anew(problem: SplineDistances, here: SplineSystem) -> SplineDistances:
+    """The stiffness by which what was measured is likeliest; and what is held from here on."""
+    x, closed = here.x, problem.closed
+    problem = replace(problem, across=all_directions(x.control), held=held_directions(x.P))
+    alone = replace(problem, weight=problem.weight * _trust(problem, here), stiffness=torch.zeros_like(problem.stiffness))
+    normal = alone.normal(x, here.seen, exact=False)
+    variance = (1.4826 * typical_distance(problem, here)).square()
+    number = ((problem.weight > 0) & problem.inside(x)).sum((1, 2, 3)).to(variance.dtype)
+    cameras = 11 * x.P.shape[1] - 15
+    D = third_differences(closed, x.control.shape[2])
+    stiffness = likeliest_stiffness(normal.G, normal.by_control, D, x.control, variance, number, cameras)
+    return replace(problem, stiffness=stiffness)
 
 
 def typical_distance(problem: SplineDistances, here: SplineSystem) -> Float[Tensor, "p"]:
