@@ -10,8 +10,9 @@ that the cameras found could see, root mean square in pixels; the bound is that 
 The model of the bound: of each measured point the distance along the normal of the exact image curve is known up to noise, and
 the points of all images are of the same samples of space curves; of a sample the two coordinates across its curve are unknown,
 as are all cameras. Where along curves points are measured does not matter as long as they are dense. That space curves are
-smooth helps only against what changes from one sample to the next, which is not what cameras do. Normals are not known to an
-estimator: the bound is not quite reached where points are few, or noise is large against their distances. From the true
+smooth helps most against what changes from one sample to the next, which is not what cameras do; what little else it tells is
+how errors come below the bound. Normals are not known to an estimator, which costs some where points are few or noise is large
+against their distances. From the true
 cameras, samples of exact image curves moved by interpolated noise end at it if there are several for each measured point (where
 there are as many, .2 to .6 above it), and so do splines through all measured points.
 """
