@@ -16,7 +16,7 @@ from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
 from torchsfm.robust.local_optimisation import LOCAL_DATA, LOCAL_STEPS, RIVAL_STEPS, optimise_fully, optimise_locally
-from torchsfm.robust.models import cast, join, put, select, take_slots, zip_map
+from torchsfm.robust.models import cast, join, put, select, take, take_slots, zip_map
 from torchsfm.robust.noise import scale_of_noise
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.samplers import Among, Sampler, draws
@@ -93,7 +93,7 @@ class Best:
 
     def take(self, index: Tensor) -> "Best":
         """Those of some problems."""
-        return tensor_map(lambda t: t[index], self)
+        return take(self, index, len(self.loss))
 
 
 def propose(
@@ -113,12 +113,9 @@ def propose(
     loss, solved = (torch.cat([one[i] for one in parts]) if len(parts) > 1 else parts[0][i] for i in (1, 2))
     if best.model is None:
         best = replace(best, model=tensor_map(lambda t: t.new_zeros(len(best.loss), *t.shape[2:]), models))
-    best = replace(
-        best,
-        solved=best.solved.index_put((part,), best.solved[part] | solved),
-        iterations=best.iterations.index_add(0, part, torch.full_like(part, number)),
-    )
-    return best, models, loss
+    old = take((best.solved, best.iterations), part, len(best.loss))
+    solved, iterations = put((best.solved, best.iterations), part, (old[0] | solved, old[1] + number))
+    return replace(best, solved=solved, iterations=iterations), models, loss
 
 
 def optimise(coarse: Problems, best: Best, part: Int[Tensor, "g"], models: Any, loss: Tensor, options: Options) -> Best:
@@ -128,17 +125,18 @@ def optimise(coarse: Problems, best: Best, part: Int[Tensor, "g"], models: Any, 
     the best of each round are optimised, whether better than those before or not. Models that are curves for each datum, as
     fundamental matrices, gain nothing by it on real images.
     """
-    improved = (loss[:, 0] < best.minimal_loss[part]).nonzero()[:, 0]
-    first, first_loss = tensor_map(lambda t: t[:, :OPTIMISED], models), loss[:, :OPTIMISED]
+    least = take(best.minimal_loss, part, len(best.loss))
+    improved, first = (loss[:, 0] < least).nonzero()[:, 0], tensor_map(lambda t: t[:, :OPTIMISED], (models, loss))
     for row in _portions(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), _NUMBERS):
-        best = _optimised(coarse.take(part[row]), best, part[row], _rows(first, row), first_loss[row], options)
+        index, (top, cost) = take((part, first), row, len(part))
+        best = _optimised(coarse.take(index), best, index, top, cost, options)
     if coarse.estimator.codimension == 1:
         return best
     wrong = best.chance[part]
     crowded = ((wrong >= _AMBIGUOUS) & (wrong >= _CROWDED * best.near[part].sum(-1))).nonzero()[:, 0]
     for row in _portions(crowded, RIVALS * min(coarse.width, LOCAL_DATA), _NUMBERS):
-        some = coarse.take(part[row])
-        best = _optimised(some, best, part[row], _rows(models, row), loss[row], options, steps=RIVAL_STEPS)
+        index, top, cost = take((part, models, loss), row, len(part))
+        best = _optimised(coarse.take(index), best, index, top, cost, options, steps=RIVAL_STEPS)
     return best
 
 
@@ -202,6 +200,8 @@ def search_inliers(fine: Problems, coarse: Problems, best: Best, options: Option
     is a part of that of the search.
     """
     worthwhile = best.solved & (best.chance >= _AMBIGUOUS) & (best.near.sum(-1) > 2 * fine.estimator.sample_size)
+    if not bool(worthwhile.any()):
+        return best
     number = torch.where(worthwhile, best.iterations // _PER_START, 0)
     sizes = torch.tensor((0, *STARTS), device=fine.count.device)
     starts, sampler = sizes[torch.searchsorted(sizes, number, right=True) - 1], Among(best.near)
@@ -212,7 +212,8 @@ def search_inliers(fine: Problems, coarse: Problems, best: Best, options: Option
             some, plan = coarse.take(part), [(min(LOCAL_DATA, coarse.width), size)]
             models, loss, _ = sift(some, models, valid, options.scoring, plan, size)
             for row in _portions(_all(some), size * EXPLORED_DATA, _NUMBERS):
-                best = _optimised(some.take(row), best, part[row], _rows(models, row), loss[row], options, EXPLORED_DATA)
+                index, top, cost = take((part, models, loss), row, len(part))
+                best = _optimised(some.take(row), best, index, top, cost, options, EXPLORED_DATA)
     return best
 
 
@@ -223,14 +224,14 @@ def try_alternatives(fine: Problems, coarse: Problems, best: Best, options: Opti
     doubtful = glance(fine, cast(best.model, torch.float64), best.limit.double(), best.near, best.chance)
     best = replace(best, doubtful=doubtful)
     for part in _portions(doubtful.nonzero()[:, 0], fine.width, _NUMBERS):
-        some = fine.take(part)
+        some, old = fine.take(part), best.take(part)
         estimator: Any = some.estimator
-        model, threshold = cast(_rows(best.model, part), torch.float64), best.limit[part].double().sqrt()
+        model, threshold = cast(old.model, torch.float64), old.limit.double().sqrt()
         found = estimator.alternative_models(model, *some.data, inside=some.inside, threshold=threshold, seed=options.seed)
-        row = (found.valid.any(-1) & best.solved[part]).nonzero()[:, 0]
+        row = (found.valid.any(-1) & old.solved).nonzero()[:, 0]
         if not len(row):
             continue
-        chosen, others = coarse.take(part[row]), cast(_rows(found.model, row), options.dtype)
+        chosen, others = coarse.take(part[row]), cast(take(found.model, row, len(part)), options.dtype)
         wide = chosen.spread()
         loss = losses(wide.estimator, others, wide.data, chosen.limit, chosen.counts, options.scoring)
         loss = torch.where(found.valid[row], loss, torch.inf)
@@ -295,7 +296,3 @@ def _portions(index: Int[Tensor, "g"], each: int, budget: int) -> Iterator[Int[T
 
 def _all(problems: Problems) -> Int[Tensor, "p"]:
     return torch.arange(len(problems.count), device=problems.count.device)
-
-
-def _rows(models: Any, index: Tensor) -> Any:
-    return tensor_map(lambda t: t[index], models)

@@ -35,6 +35,11 @@ def take_slots(models: T, index: Tensor) -> T:
     return tensor_map(lambda t: t[row, index], models)
 
 
+def take(tree: T, index: Tensor, size: int) -> T:
+    """Those at ascending places of a first batch dimension of a size: where these are all, what came."""
+    return tree if len(index) == size else tensor_map(lambda t: t[index], tree)
+
+
 def join(models: Sequence[T], dim: int = 0) -> T:
     """Concatenate models along a batch dimension."""
     return models[0] if len(models) == 1 else zip_map(lambda *parts: torch.cat(parts, dim), *models)
@@ -48,8 +53,8 @@ def select(condition: Tensor, models: T, others: T) -> T:
 
 
 def put(models: T, index: Tensor, others: T) -> T:
-    """Models with those at an index `(k)` of the first batch dimension replaced by others `(k, ...)`."""
-    return zip_map(lambda t, new: t.index_copy(0, index, new), models, others)
+    """Models with those at ascending places `(k)` of the first batch dimension replaced by others `(k, ...)`."""
+    return zip_map(lambda t, new: new if len(new) == len(t) else t.index_copy(0, index, new), models, others)
 
 
 def cast(tree: T, dtype: torch.dtype) -> T:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.robust.estimator import Estimator, check_estimator
-from torchsfm.robust.models import cast
+from torchsfm.robust.models import cast, take
 from torchsfm.robust.sampling import compact, prosac_growth, spread_order
 
 T = TypeVar("T")
@@ -166,9 +166,7 @@ class Problems:
 
     def take(self, index: Tensor) -> "Problems":
         """Some of the problems, in their order."""
-        if len(index) == len(self.count):
-            return self
-        return tensor_map(lambda t: t[index], self)
+        return take(self, index, len(self.count))
 
     def narrowed(self, width: int) -> "Problems":
         """With so many slots, enough for all data of each; without what only a search knows."""

@@ -213,12 +213,12 @@ def search(problems: Problems, options: Options) -> tuple[Best, Float[Tensor, "p
     best = Best.none(coarse)
     active = torch.arange(len(problems.count), device=problems.count.device)
     while len(active):
-        going_on = [active[:0]]
+        going_on = []
         for number, part in rounds(active, best.iterations, best.needed, options.min_iterations, options.max_iterations):
             best, models, loss = propose(problems, coarse, best, part, number, options)
             best = optimise(coarse, best, part, models, loss, options)
             going_on.append(part)
-        active = torch.cat(going_on)
+        active = torch.cat(going_on).sort().values if going_on else active[:0]
     best = search_inliers(problems, coarse, best, options)
     best = try_alternatives(problems, coarse, best, options)
     return refine_finally(problems, coarse, best)

@@ -69,9 +69,9 @@ def draw_samples(
     random = random_integers(seed, count, first, hypotheses, size)
     below = limit[:, None] - size + 1 + torch.arange(size, device=device)[:, None]
     index = (random * below) >> 31
-    columns, last = index.unbind(1), (below - 1).unbind(1)
+    columns, last = torch.split(index, 1, 1), torch.split(below - 1, 1, 1)
     for j in range(1, size):
-        taken = (index[:, :j] == columns[j][:, None]).any(1)
+        taken = (index[:, :j] == columns[j]).any(1, keepdim=True)
         torch.where(taken, last[j], columns[j], out=columns[j])
     if newest is not None:
         # The others are then a sample of the rest: Floyd's algorithm adds one datum to the pool at a time.

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchsfm.robust.models import take
+
 ROUNDS = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 """How many samples a round may draw for a problem."""
 
@@ -25,14 +27,13 @@ def rounds(
         least: Fewest samples of a problem.
         most: Most samples of a problem.
     """
-    drawn, needed = drawn[active], needed[active]
+    drawn, needed = take((drawn, needed), active, len(drawn))
     rest = needed.clamp(min=least, max=most) - drawn
-    wanted = torch.minimum(rest, (3 * drawn).clamp(min=least))
-    sizes = torch.tensor(ROUNDS, device=drawn.device)
-    size = sizes[torch.searchsorted(sizes, wanted.ceil().long()).clamp(max=len(ROUNDS) - 1)]
-    size = torch.where(rest > 0, size, 0)
+    wanted = torch.minimum(rest, (3 * drawn).clamp(min=max(least, 1)))
+    sizes = torch.tensor((0.0, *ROUNDS), dtype=wanted.dtype, device=drawn.device)
+    size = sizes[torch.searchsorted(sizes, wanted).clamp(max=len(ROUNDS))]
     for number in sorted(set(size.tolist()) - {0}):
-        yield number, active[size == number]
+        yield int(number), active[size == number]
 
 
 def around_model(
