@@ -60,22 +60,22 @@ def nullspace_columns(a: Float[Tensor, "n m batch"]) -> tuple[Float[Tensor, "n k
         smallest = length if smallest is None else torch.minimum(smallest, length)
         signed = torch.copysign(length, rows[0])
         rows[0] += signed
-        # By -1 / (signed v0) instead of 2 / (v'v), which is the same.
-        beta = (signed * rows[0]).reciprocal_().neg_()
+        # By 1 / (signed v0) instead of 2 / (v'v), which is the same.
+        beta = (signed * rows[0]).reciprocal_()
         reflections.append((rows, v, beta))
         if i + 1 < m:
             rest = a[i:, i + 1 :]
-            rest.addcmul_(v[:, None], combine_rows(rest.unbind(0), rows).mul_(beta))
+            rest.addcmul_(v[:, None], combine_rows(rest.unbind(0), rows).mul_(beta), value=-1)
     # The last reflection of the last rows of the identity; the other entries are still zero.
     rows, v, beta = reflections.pop()
     basis = a.new_zeros(n, n - m, batch)
-    torch.mul(v[:, None], v[1:] * beta, out=basis[m - 1 :])
+    torch.mul(v[:, None], v[1:] * -beta, out=basis[m - 1 :])
     for i in range(n - m):
         basis[m + i, i] += 1
     for i in range(m - 2, -1, -1):
         rows, v, beta = reflections[i]
         product = combine_rows(basis[i + 1 :].unbind(0), rows[1:]).mul_(beta)
-        basis[i:].addcmul_(v[:, None], product)
+        basis[i:].addcmul_(v[:, None], product, value=-1)
     assert smallest is not None
     return basis, smallest
 

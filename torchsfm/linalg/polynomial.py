@@ -73,11 +73,11 @@ def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, 
     ratio = (size / (root * root * root)).clamp_max(1)
     # 2 cos(acos(ratio) / 3) to three digits.
     y = torch.where(inner > 0, outer + Q / outer, root * (1.7320508 + ratio * (0.3208 - 0.0529 * ratio)))
+    linear, constant = 3 * Q, 2 * size
     for _ in range(3):
         square = y * y
-        y = y - (y * (square - 3 * Q) - 2 * size) / (3 * (square - Q))
-    y = torch.where(torch.isfinite(y), y, 0)
-    x = shift + torch.copysign(y, -R)
+        y = y - (y * (square - linear) - constant) / (3 * (square - Q))
+    x = shift + torch.copysign(y.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0), -R)
     new = x - (((x + a) * x + b) * x + c) / ((3 * x + 2 * a) * x + b)
     x = torch.where(torch.isfinite(new), new, x)
     # Division by x - x0 from the end that is stable for a root of this size.
@@ -94,7 +94,8 @@ def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, 
     new = x - value / ((3 * x + 2 * a) * x + b)
     better = (((new + a) * new + b) * new + c).abs() < value.abs()
     x = torch.where(better, new, x)
-    fine = torch.isfinite(x) & torch.isfinite(Q + R) & torch.isfinite(c3) & (c3 != 0)
+    # A sum is finite only if all numbers are.
+    fine = torch.isfinite(x + (Q + R + c3)) & (c3 != 0)
     return torch.where(fine, x, 0), fine & torch.stack((torch.ones_like(other), other, other))
 
 

@@ -16,7 +16,7 @@ from torchsfm.linalg.kernel import kernel
 from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.polynomial import cubic_rows
 from torchsfm.linalg.rows import combine_rows
-from torchsfm.linalg.vectors import fma, fms
+from torchsfm.linalg.vectors import fms
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _INDEPENDENT = 1e-12
@@ -79,8 +79,13 @@ def batch_last(x: Float[Tensor, "*#batch 7 2"], batch: tuple[int, ...]) -> Float
 @kernel(chunk=8192)
 def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tuple[Tensor, Tensor]:
     """F as (9, 3, batch) and valid as (3, batch)."""
-    (u, v), c1, size1 = _around_the_first(x1)
-    (a, b), c2, size2 = _around_the_first(x2)
+    # The points with the first one at the origin and the largest coordinate 1, in both images.
+    x = torch.stack((x1, x2))
+    c1, c2 = centre = x[:, :, 0]
+    moved = x[:, :, 1:] - centre[:, :, None]
+    size = moved.abs().amax((1, 2))
+    (u, v), (a, b) = moved * size.reciprocal()[:, None, None]
+    size1, size2 = size
     # The first point says that F33 = 0: six equations in eight entries are left.
     N, pivot = nullspace_columns(torch.stack((a * u, a * v, a, b * u, b * v, b, u, v)))
     # Each row for G and for H.
@@ -94,31 +99,24 @@ def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tup
     cubic = torch.cat((outer[:1], inner, outer[1:]))
     roots, real = cubic_rows(*torch.where(turn, cubic, cubic.flip(0)).unbind(0))
     s, t = torch.where(turn, 1.0, roots), torch.where(turn, roots, 1.0)
-    f0, f1, f2, f3, f4, f5, f6, f7 = fma(N[:, 1:], t, N[:, :1] * s).unbind(0)
-    # Back to the coordinates that came: T2' F T1 with T = [I, -c] / size, up to scale.
-    f2 = fms(c1[1], f1, fms(c1[0], f0, f2 * size1))
-    f5 = fms(c1[1], f4, fms(c1[0], f3, f5 * size1))
-    f6, f7 = f6 * size2, f7 * size2
-    f8 = -fma(c1[0], f6, c1[1] * f7)
-    f6, f7, f8 = (fms(c2[1], y, fms(c2[0], x, z)) for x, y, z in ((f0, f3, f6), (f1, f4, f7), (f2, f5, f8)))
-    rows = [f0, f1, f2, f3, f4, f5, f6, f7, f8]
-    square = combine_rows(rows, rows)
+    F = N.new_zeros(9, *s.shape)
+    torch.addcmul(N[:, :1] * s, N[:, 1:], t, out=F[:8])
+    # Back to the coordinates that came: T2' F T1 with T = [I, -c] / size, up to scale; by columns, then by rows.
+    rows = F.view(3, 3, *s.shape)
+    first, second, third = rows.unbind(1)
+    third.mul_(size1)
+    rows[2].mul_(size2)
+    third.addcmul_(c1[0], first, value=-1).addcmul_(c1[1], second, value=-1)
+    first, second, third = rows
+    third.addcmul_(c2[0], first, value=-1).addcmul_(c2[1], second, value=-1)
+    entries = F.unbind(0)
+    square = combine_rows(entries, entries)
     # False for NaN; an empty slot holds diag(1, 1, 0).
     valid = real & (torch.minimum(pivot, some) > _INDEPENDENT) & (square > 0) & (square < torch.inf)
     scale = torch.where(valid, square.rsqrt(), 0.0)
-    empty = torch.where(valid, torch.zeros_like(square), 0.5**0.5)
-    F = torch.stack(rows).mul_(scale).nan_to_num_(0.0, 0.0, 0.0)
-    F[0:5:4] += empty
+    F.mul_(scale).nan_to_num_(0.0, 0.0, 0.0)
+    F[0:5:4].add_(~valid, alpha=0.5**0.5)
     return F, valid
-
-
-def _around_the_first(x: Tensor) -> tuple[Tensor, Sequence[Tensor], Tensor]:
-    """The other points (2, 6, batch) with the first at the origin and the largest coordinate 1; where it was and the scale."""
-    x = x.contiguous()
-    centre = x[:, 0]
-    moved = x[:, 1:] - centre[:, None]
-    size = moved.abs().amax((0, 1))
-    return moved * size.reciprocal(), centre.unbind(0), size
 
 
 def _cofactors(f: Sequence[Tensor]) -> list[Tensor]:

@@ -49,19 +49,17 @@ def _orient(
     x2: Float[Tensor, "2 7 batch"],
 ) -> tuple[Tensor, Tensor]:
     """[F | e2] as (12, 3, batch) and valid as (3, batch)."""
-    f0, f1, f2, f3, f4, f5, f6, f7, f8 = F.unbind(0)
+    rows = F.view(3, 3, *F.shape[1:])
+    first, second, third = rows.unbind(1)
     # The left epipole is across all columns: across two mixtures of them, so that no choice is needed.
-    left = [torch.add(a, b, alpha=MIXTURE[0]) for a, b in ((f0, f2), (f3, f5), (f6, f8))]
-    right = [torch.add(a, b, alpha=MIXTURE[1]) for a, b in ((f1, f2), (f4, f5), (f7, f8))]
-    e0, e1, e2 = cross(tuple(left), tuple(right))
-    e = [e0, e1, e2]
-    scale = combine_rows(e, e).clamp(min=1e-200).rsqrt()
-    e0, e1, e2 = (row * scale for row in e)
+    e = cross(torch.add(first, third, alpha=MIXTURE[0]), torch.add(second, third, alpha=MIXTURE[1]))
+    e *= combine_rows(e, e).clamp(min=1e-200).rsqrt()
+    f0, f1, f2, f3, f4, f5, *_ = F.unbind(0)
+    e0, e1, e2 = e
     (u, v), (a, b) = x1[:, :, None].unbind(0), x2[:, :, None].unbind(0)
     # e2 x h2 and F h1 are parallel: two of their coordinates tell whether they point the same way.
     same = fms(e2, b, e1) * fma(f0, u, fma(f1, v, f2))
     same = torch.addcmul(same, fms(-e2, a, -e0), fma(f3, u, fma(f4, v, f5)))
     plus, minus = same.amin(0) >= 0, same.amax(0) <= 0
     sign = 2 * plus.to(F.dtype) - 1
-    rows = [f0, f1, f2, e0 * sign, f3, f4, f5, e1 * sign, f6, f7, f8, e2 * sign]
-    return torch.stack(rows), valid & (plus | minus)
+    return torch.cat((rows, (e * sign)[:, None]), 1).flatten(0, 1), valid & (plus | minus)
