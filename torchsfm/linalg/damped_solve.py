@@ -23,9 +23,9 @@ def damped_solve(A: Float[Tensor, "*batch k k"], b: Float[Tensor, "*batch k r"])
     """
     A = A.clone()
     diagonal = A.diagonal(dim1=-2, dim2=-1)
-    known = diagonal > 1e-290
+    unknown = diagonal <= 1e-290
     # As much as 1e-10 on the diagonal of the matrix scaled to a unit one; the scaling itself changes nothing.
-    diagonal.mul_(1 + 1e-10).add_(~known)
+    diagonal.mul_(1 + 1e-10).add_(unknown)
     factor, info = torch.linalg.cholesky_ex(A)
     x = torch.cholesky_solve(b, factor).nan_to_num_(0, 0, 0)
-    return x.mul_(((info == 0)[..., None] & known)[..., None])
+    return x.masked_fill_((unknown | (info[..., None] != 0))[..., None], 0)

@@ -170,8 +170,9 @@ def falling(u: Tensor, counts: Tensor, codimension: int) -> tuple[Tensor, Tensor
     taken from all in proportion, so that steps are as long as they should be on average, and bounded by a multiple of those of
     reweighted least squares.
     """
-    slope, counts = 1 - u, (u < 1) * counts
-    curvature = torch.sub(slope, u, alpha=2 / codimension)
-    raised = torch.maximum(curvature, _FLAT * slope) * counts
-    share = (curvature * counts).sum(-1, keepdim=True) / raised.sum(-1, keepdim=True).clamp(min=_LEAST)
-    return slope * counts, raised * share.clamp(min=0.3)
+    counts = (u < 1) * counts
+    weights = (1 - u) * counts
+    curvature = torch.addcmul(weights, u, counts, value=-2 / codimension)
+    raised = torch.maximum(curvature, _FLAT * weights)
+    share = curvature.sum(-1, keepdim=True) / raised.sum(-1, keepdim=True).clamp(min=_LEAST)
+    return weights, raised * share.clamp(min=0.3)

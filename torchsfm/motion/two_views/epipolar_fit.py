@@ -97,4 +97,4 @@ def with_left_epipole(F: Float[Tensor, "*#batch 3 3"], e: Float[Tensor, "*#batch
     across = torch.linalg.cross(torch.add(first, third, alpha=MIXTURE[0]), torch.add(second, third, alpha=MIXTURE[1]))
     length = torch.linalg.vector_norm(across, dim=-1, keepdim=True).clamp(min=1e-100)
     turned = across / torch.copysign(length, (across * e).sum(-1, keepdim=True))
-    return torch.cat((F, turned[..., None]), -1)
+    return torch.stack((first, second, third, turned), -1)

@@ -76,7 +76,8 @@ class FundamentalEstimator:
         The step minimises the quadratic model under the linearised constraint (sequential quadratic programming).
         """
         A, b = step_equations(model, x1, x2, weigh)
-        F, e = model[..., :3].double(), model[..., 3].double()
+        model = model.double()
+        F, e = model[..., :3], model[..., 3]
         f, normal = F.flatten(-2), cofactors(F).flatten(-2)
         # The unit sphere's normal, as large as the rest.
         size = A.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
@@ -85,7 +86,7 @@ class FundamentalEstimator:
         # The determinant is a third of the product with its gradient.
         gap = (normal * torch.sub(f, free, alpha=3)).sum(-1, keepdim=True) / 3
         share = (normal * bound).sum(-1, keepdim=True)
-        f = torch.addcmul(f - free, gap / torch.where(share > 0, share, torch.inf), bound, value=-1)
+        f = torch.addcmul(f - free, gap / share.masked_fill(share <= 0, torch.inf), bound, value=-1)
         F = matrices(f / torch.linalg.vector_norm(f, dim=-1, keepdim=True), 3)
         return with_left_epipole(F, e).to(x1.dtype)
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.motion.two_views.epipolar_fit import apply_rows, cross_rows, one_data_set_for_many, product
+from torchsfm.motion.two_views.epipolar_fit import apply_rows, one_data_set_for_many, product
 from torchsfm.motion.two_views.forms_of_models import ONE, Forms, Term
 from torchsfm.robust import Weigh
 
@@ -80,7 +80,7 @@ def _forms(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The residual, the side, the gradients over the first and over the second point, and their squared length."""
     F = model[..., :3]
-    lines = apply_rows(torch.cat((F, cross_rows(model[..., 3], F)), -2), h1)
+    lines = apply_rows(torch.cat((F, torch.linalg.cross(model[..., 3:], F, dim=-2)), -2), h1)
     u, v, w, a, b, c = lines.unbind(-2)
     first = apply_rows(F[..., :2].mT, h2)
     u1, v1 = first.unbind(-2)
@@ -100,10 +100,11 @@ def step_equations(
     share = e / size
     weights, curvature = weigh(infinite_where_positive(share * e, side))
     # |g| times the derivative of e / |g|: that of e, less e / |g|^2 times that of |g|^2 / 2.
+    row = share[..., None, :]
     left = h2.expand(*share.shape[:-1], *h2.shape[-2:]).clone()
-    left[..., :2, :].addcmul_(share[..., None, :], second, value=-1)
+    left[..., :2, :].addcmul_(row, second, value=-1)
     J = left[..., :, None, :] * h1[..., None, :, :]
-    J[..., :2, :].addcmul_(h2[..., :, None, :], (share[..., None, :] * first)[..., None, :, :], value=-1)
+    J[..., :2, :].addcmul_(h2[..., :, None, :], (row * first)[..., None, :, :], value=-1)
     J = J.flatten(-3, -2)
     # A product with a single column would be rounded otherwise for one problem than for several.
     both = product(torch.cat(((curvature / size)[..., None, :] * J, (weights * share)[..., None, :]), -2), J.mT).double()
