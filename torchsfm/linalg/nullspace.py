@@ -51,33 +51,29 @@ def nullspace_rows(a: Float[Tensor, "m n batch"]) -> tuple[Float[Tensor, "k n ba
 def nullspace_columns(a: Float[Tensor, "n m batch"]) -> tuple[Float[Tensor, "n k batch"], Float[Tensor, " batch"]]:
     """`nullspace_rows` with the matrices and the basis transposed, which is faster; what is in `a` is lost."""
     n, m, batch = a.shape
-    reflections: list[tuple[list[Tensor], Tensor, Tensor]] = []
-    smallest = None
+    basis, pivots, reflections = a.new_zeros(n, n - m, batch), [], []
     for i in range(m):
-        v = a[i:, i]
-        rows = list(v.unbind(0))
-        length = combine_rows(rows, rows).sqrt_()
-        smallest = length if smallest is None else torch.minimum(smallest, length)
-        signed = torch.copysign(length, rows[0])
-        rows[0] += signed
+        v, rest = torch.split(a, [1, m - i - 1], 1)
+        rows = v.unbind(0)
+        square, others = torch.split(combine_rows(a.unbind(0), rows), [1, m - i - 1])
+        pivots.append(square.sqrt())
+        signed = torch.copysign(pivots[-1], rows[0])
+        rows[0].add_(signed)
         # By 1 / (signed v0) instead of 2 / (v'v), which is the same.
         beta = (signed * rows[0]).reciprocal_()
         reflections.append((rows, v, beta))
         if i + 1 < m:
-            rest = a[i:, i + 1 :]
-            rest.addcmul_(v[:, None], combine_rows(rest.unbind(0), rows).mul_(beta), value=-1)
+            # The products were with v as it was.
+            rest.addcmul_(v, others.addcmul_(signed, rest[0]).mul_(beta), value=-1)
+            a = rest[1:]
     # The last reflection of the last rows of the identity; the other entries are still zero.
     rows, v, beta = reflections.pop()
-    basis = a.new_zeros(n, n - m, batch)
-    torch.mul(v[:, None], v[1:] * -beta, out=basis[m - 1 :])
-    for i in range(n - m):
-        basis[m + i, i] += 1
+    torch.mul(v, v[1:].mul(-beta).transpose(0, 1), out=basis[m - 1 :])
+    basis[m:].diagonal(dim1=0, dim2=1).add_(1)
     for i in range(m - 2, -1, -1):
         rows, v, beta = reflections[i]
-        product = combine_rows(basis[i + 1 :].unbind(0), rows[1:]).mul_(beta)
-        basis[i:].addcmul_(v[:, None], product, value=-1)
-    assert smallest is not None
-    return basis, smallest
+        basis[i:].addcmul_(v, combine_rows(basis[i + 1 :].unbind(0), rows[1:]).mul_(beta), value=-1)
+    return basis, torch.cat(pivots).amin(0)
 
 
 def null_vector(
