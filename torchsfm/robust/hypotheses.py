@@ -42,7 +42,7 @@ def solve_samples(
     index = sampler.draw(fine, part, drawn, number, seed)
     m = fine.estimator.sample_size
     # Coordinate, position in the sample, problem, sample: as solvers want it, who have the batch last.
-    flat = (index + part[:, None, None] * fine.width).transpose(0, 1).flatten()
+    flat = (index + (part * fine.width).view(-1, 1, 1)).transpose(0, 1).flatten()
     sample = []
     for d in fine.data:
         picked = d.permute(2, 0, 1).flatten(1).index_select(1, flat)
@@ -105,9 +105,8 @@ def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#
 def _no_numbers_for_none(estimator: Estimator[M], model: M, dims: int) -> M:
     """NaN in the place of what is no model: not finite, or zero where the estimator says that this is none."""
     with torch.no_grad():
-        parts = [
-            torch.linalg.vector_norm(t.flatten(dims) if t.ndim > dims else t[..., None], dim=-1) for t in tensors_of(model)
-        ]
+        own = [(t, tuple(range(dims, t.ndim))) for t in tensors_of(model)]
+        parts = [torch.linalg.vector_norm(t, dim=dim) if dim else t.abs() for t, dim in own]
         size = parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
         # 1, but 0 / 0 or inf / inf; or 0, but inf - inf.
         one = size / size if is_never_zero(estimator) else size - size + 1

@@ -18,8 +18,8 @@ LOCAL_STEPS, RIVAL_STEPS = (9.0, 1.0), (9.0, 4.0, 1.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold; and where many minima compete."""
 LOCAL_DATA = 256
 """How many data local optimisation looks at."""
-_LAST_STEPS, _MOST_STEPS = 2, 64
-"""Steps of the final refinement at least, and at most for what still moves."""
+_MOST_STEPS = 64
+"""Steps of the final refinement, of which there are two at least, for what still moves."""
 _STILL, _SMALL = 1e-7, 1e-10
 """What has no more than so much of the first step, or of the model, before it is still."""
 _ROUNDING, _DRAWN = 1e-6, 9.0
@@ -85,7 +85,7 @@ def optimise_fully(
     found, row = model, torch.arange(len(reach), device=reach.device)
     problem: tuple[Any, ...] = (estimator, tuple(data), reach, counts)
     start, last, step = model, model, _entries(model) - _entries(coarse)
-    first, least, damping = _length(step), torch.full_like(reach, torch.inf), torch.zeros_like(reach)
+    still, least, damping = _STILL * _length(step), torch.full_like(reach, torch.inf), torch.zeros_like(reach)
     for count in range(2, _MOST_STEPS + 1):
         own, values, edge, counted = problem
         moved, loss = step_within(own, model, values, edge, counted, damping)
@@ -97,20 +97,20 @@ def optimise_fully(
         before, step = step, entries - _entries(model)
         length, shrunk = _length(step), _length(before)
         # As a geometric series, steps that shrink have length^2 / (shrunk - length) before them.
-        most = torch.maximum(_STILL * first, _SMALL * _length(entries))
+        most = torch.maximum(still, _SMALL * _length(entries))
         done = good & (length * length <= most * torch.maximum(length, shrunk - length))
         drawn = _drawn_out(moved, last, step, before) if count > 2 else moved
         last, model = moved, select(good, drawn, start)
-        if count < _LAST_STEPS or not (bool(done.any()) or count == _MOST_STEPS):
+        if not (bool(done.any()) or count == _MOST_STEPS):
             continue
         found = put(found, row, select(done, moved, start))
         settled = settled.index_copy(0, row, done)
         rest = (~done).nonzero()[:, 0]
         if not len(rest):
             break
-        row, problem, start, last, model, step, first, least, damping = tensor_map(
+        row, problem, start, last, model, step, still, least, damping = tensor_map(
             lambda t: t[rest],  # noqa: B023
-            (row, problem, start, last, model, step, first, least, damping),
+            (row, problem, start, last, model, step, still, least, damping),
         )
     return found, settled
 

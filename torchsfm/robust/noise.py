@@ -100,13 +100,14 @@ def _first_noise(
     ratio, there, total = _within_window(squared_residual(estimator, model, *data), limit, counts)
     core = ((ratio < 1) * there).sum(-1)
     crowd = total[:, 0] - core > _CROWD * core
-    variance = torch.tensor(_VARIANCES, dtype=ratio.dtype, device=ratio.device)[:, None]
+    table = [(v, -0.5 / v, _peak(k) * _WINDOW**k * v ** (-k / 2)) for v in _VARIANCES]
+    variance, slope, peak = torch.tensor(table, dtype=ratio.dtype, device=ratio.device)[:, :, None].unbind(1)
     # The density of an inlier in units of that of an outlier.
-    density = torch.exp(ratio[:, None] * (-0.5 / variance)) * (_peak(k) * _WINDOW**k * variance ** (-k / 2))
+    density = torch.exp(ratio[:, None] * slope) * peak
     gain, there, some = density - 1, there[:, None], total[:, None].clamp(min=1)
-    share = torch.full_like(gain[..., :1], 0.5)
+    own, share = there * density, torch.full_like(gain[..., :1], 0.5)
     for _ in range(_SHARE_STEPS):
-        share = ((there * share * density / (1 + share * gain)).sum(-1, keepdim=True) / some).clamp(max=0.999)
+        share = ((share * own / (1 + share * gain)).sum(-1, keepdim=True) / some).clamp(max=0.999)
     evidence, index = (there * torch.log1p(share * gain)).sum(-1).max(-1, keepdim=True)
     variance = variance[:, 0][index]
     number = (share[..., 0].gather(-1, index) * total).clamp(min=1)

@@ -87,7 +87,7 @@ def random_integers(
     counter = (first[:, None] + torch.arange(hypotheses, device=device)) * size
     counter = counter[:, None] + torch.arange(size, device=device)[:, None]
     key = hash_integers(_signed(seed * 0xD1342543DE82EF95 & ((1 << 64) - 1)) + count * _GOLDEN)
-    return (hash_integers(key[:, None, None] + counter * _GOLDEN) >> 33) & 0x7FFFFFFF
+    return (hash_integers(key.view(-1, 1, 1) + counter * _GOLDEN) >> 33) & 0x7FFFFFFF
 
 
 def draw_weighted(

@@ -85,7 +85,7 @@ class Msac:
 
     def cost(self, squared: Tensor, limit: Tensor, weight: Tensor | None, codimension: int) -> Tensor:
         """The sum of truncated squared distances, in units of the squared threshold."""
-        return _total((squared * limit.reciprocal()[:, None, None]).clamp_(max=1), weight)
+        return _total((squared * limit.reciprocal().view(-1, 1, 1)).clamp_(max=1), weight)
 
     def weigh(self, ratio: Tensor, codimension: int) -> Tensor:
         """1 within the threshold."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.linalg import damped_solve, svd
 from torchsfm.motion.two_views.collinear import collinear, collinear_suspected
-from torchsfm.motion.two_views.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, with_left_epipole
+from torchsfm.motion.two_views.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, product, with_left_epipole
 from torchsfm.motion.two_views.estimate_homography import HomographyEstimator
 from torchsfm.motion.two_views.normalization import common_scale, largest_positive
 from torchsfm.motion.two_views.oriented_7pt import oriented_7pt
@@ -159,8 +159,8 @@ def _cofactors(f: Tensor) -> Tensor:
 def _determinant_step(f: Tensor) -> Tensor:
     """Move matrices of small determinant towards determinant 0 by a Newton step along its gradient, and to norm 1."""
     c = _cofactors(f)
-    square = (c * c).sum(-1)
-    f = f - ((c * f).sum(-1) / 3 / torch.where(square > 0, square, 1))[..., None] * c
+    square = (c * c).sum(-1, keepdim=True)
+    f = f - (c * f).sum(-1, keepdim=True) / 3 / torch.where(square > 0, square, 1) * c
     square = (f * f).sum(-1, keepdim=True)
     return f * torch.where(square > 0, square, 1).rsqrt()
 
@@ -215,7 +215,7 @@ def estimate_fundamental(
     y = common_scale(x1.double(), x2.double(), options.get("mask"))
 
     def back(model: Tensor) -> Tensor:
-        return largest_positive(_singular(y.T2.mT @ _singular(model[..., :3]) @ y.T1))
+        return largest_positive(_singular(product(product(y.T2.mT, _singular(model[..., :3])), y.T1)))
 
     return estimate_robustly(
         FundamentalEstimator(), y.x1, y.x2, threshold=threshold, dtype=x1.dtype, scale=y.scale, back=back, **options

@@ -70,7 +70,7 @@ def _squared_distances(model: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
 
     In float32 the square of the gradient's length is off by about 1e-7 of the squares of the entries of F and the coordinates.
     """
-    h = torch.cat((x1.mT, x2.mT, torch.ones_like(x1.mT[..., :1, :])), -2)[..., 0, :, :]
+    h = torch.nn.functional.pad(torch.cat((x1.mT, x2.mT), -2), (0, 0, 0, 1), value=1.0)[..., 0, :, :]
     e, side, size = SCORING.of(model.flatten(-2), h)
     return infinite_where_positive(e * e / size.clamp(min=_TINY), side)
 
