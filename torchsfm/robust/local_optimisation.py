@@ -85,7 +85,8 @@ def optimise_fully(
     found, row = model, torch.arange(len(reach), device=reach.device)
     problem: tuple[Any, ...] = (estimator, tuple(data), reach, counts)
     start, last, step = model, model, _entries(model) - _entries(coarse)
-    still, least, damping = _STILL * _length(step), torch.full_like(reach, torch.inf), torch.zeros_like(reach)
+    length = _length(step)
+    still, least, damping = _STILL * length, torch.full_like(reach, torch.inf), torch.zeros_like(reach)
     for count in range(2, _MOST_STEPS + 1):
         own, values, edge, counted = problem
         moved, loss = step_within(own, model, values, edge, counted, damping)
@@ -95,7 +96,7 @@ def optimise_fully(
         start, least = select(good, model, start), torch.where(good, loss, least)
         entries = _entries(moved)
         before, step = step, entries - _entries(model)
-        length, shrunk = _length(step), _length(before)
+        shrunk, length = length, _length(step)
         # As a geometric series, steps that shrink have length^2 / (shrunk - length) before them.
         most = torch.maximum(still, _SMALL * _length(entries))
         done = good & (length * length <= most * torch.maximum(length, shrunk - length))
@@ -108,9 +109,9 @@ def optimise_fully(
         rest = (~done).nonzero()[:, 0]
         if not len(rest):
             break
-        row, problem, start, last, model, step, still, least, damping = tensor_map(
+        row, problem, start, last, model, step, length, still, least, damping = tensor_map(
             lambda t: t[rest],  # noqa: B023
-            (row, problem, start, last, model, step, still, least, damping),
+            (row, problem, start, last, model, step, length, still, least, damping),
         )
     return found, settled
 

@@ -111,7 +111,7 @@ def _first_noise(
     evidence, index = (there * torch.log1p(share * gain)).sum(-1).max(-1, keepdim=True)
     variance = variance[:, 0][index]
     number = (share[..., 0].gather(-1, index) * total).clamp(min=1)
-    return evidence[:, 0], (variance, _odds_and_reach(total, number, variance, k)[0]), crowd
+    return evidence[:, 0], (variance, _odds(total, number, variance, k)), crowd
 
 
 def _scale_step(
@@ -131,7 +131,9 @@ def _scale_step(
         likely = there / (1 + odds * torch.exp((0.5 * ratio / variance).clamp(max=60)))
         number = likely.sum(-1, keepdim=True).clamp(min=1)
         variance = ((likely * ratio).sum(-1, keepdim=True) / (k * number)).clamp(_LEAST, _MOST)
-        odds, reach = _odds_and_reach(total, number, variance, k)
+        odds = _odds(total, number, variance, k)
+        # Where they are even, on a coarse grid.
+        reach = (-1.6 * k * variance * odds.clamp(max=1 / 3).log()).clamp(max=_WINDOW**2)
         reach = torch.exp2((4 * reach.log2()).round() / 4)
         found = reach[:, 0]
         return falling((ratio / reach).clamp(max=1), counts, k)
@@ -148,12 +150,12 @@ def _within_window(squared: Tensor, limit: Tensor, counts: Tensor) -> tuple[Tens
     return torch.where(near, ratio, _WINDOW**2), there, there.sum(-1, keepdim=True)
 
 
-def _odds_and_reach(total: Tensor, number: Tensor, variance: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The odds of an outlier where a model is, and the squared distance at which they are even, from the number of inliers."""
+def _odds(total: Tensor, number: Tensor, variance: Tensor, k: int) -> Tensor:
+    """The odds of an outlier where a model is, from the number of inliers."""
     # Never less than half an outlier between two and six thresholds.
     outlying = (total - number).clamp(min=0) / _WINDOW**k + 0.5 / (6**k - 2**k)
-    odds = outlying / (number * _peak(k) * variance ** (-k / 2))
-    return odds, (-1.6 * k * variance * odds.clamp(max=1 / 3).log()).clamp(max=_WINDOW**2)
+    odds: Tensor = outlying / (number * _peak(k) * variance ** (-k / 2))
+    return odds
 
 
 def _peak(k: int) -> float:

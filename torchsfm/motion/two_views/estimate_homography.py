@@ -59,7 +59,7 @@ class HomographyEstimator:
         self, H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared Sampson distance."""
-        c0, c1, _, (s00, s01, s11), _ = _constraint(H, x1, x2)
+        c0, c1, _, (s00, s01, s11), _ = _constraint(H, *x1.unbind(-1), *x2.unbind(-1))
         # The determinant and the numerator are positive but for rounding.
         det = (s00 * s11).addcmul_(s01, s01, value=-1).clamp_(min=1e-30)
         first = (s11 * c0).addcmul_(s01, c1, value=-1)
@@ -94,14 +94,14 @@ class HomographyEstimator:
         with S held fixed. The constraint is [I, -x2] H x1, so the normal matrix is a sum of Kronecker products of 3 x 3
         matrices.
         """
-        c0, c1, w, (s00, s01, s11), (b00, b01, b10, b11) = _constraint(H, x1, x2)
+        (x, y), (u, v) = x1.unbind(-1), x2.unbind(-1)
+        c0, c1, w, (s00, s01, s11), (b00, b01, b10, b11) = _constraint(H, x, y, u, v)
         # So large that nothing overflows, and what has no weight adds nothing.
         least = torch.finfo(c0.dtype).tiny ** (1 / 3)
         inverse = (s00 * s11).addcmul_(s01, s01, value=-1).clamp_(min=least).reciprocal_()
         k0 = (s11 * c0).addcmul_(s01, c1, value=-1).mul_(inverse)
         k1 = (s00 * c1).addcmul_(s01, c0, value=-1).mul_(inverse)
         weights, curvature = weigh((k0 * c0).addcmul_(k1, c1).abs_())
-        (x, y), (u, v) = x1.unbind(-1), x2.unbind(-1)
         x = torch.addcmul(x, b00, k0, value=-1).addcmul_(b10, k1, value=-1)
         y = torch.addcmul(y, b01, k0, value=-1).addcmul_(b11, k1, value=-1)
         u, v = torch.addcmul(u, w, k0), torch.addcmul(v, w, k1)
@@ -156,11 +156,10 @@ class HomographyEstimator:
 
 
 def _constraint(
-    H: Tensor, x1: Tensor, x2: Tensor
+    H: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
     """The constraint c, the depth w, S, and B row by row."""
     h00, h01, h02, h10, h11, h12, h20, h21, h22 = H.flatten(-2).unsqueeze(-1).unbind(-2)
-    (x, y), (u, v) = x1.unbind(-1), x2.unbind(-1)
     w = torch.addcmul(h22, h20, x).addcmul_(h21, y)
     b00, b01 = torch.addcmul(h00, h20, u, value=-1), torch.addcmul(h01, h21, u, value=-1)
     b10, b11 = torch.addcmul(h10, h20, v, value=-1), torch.addcmul(h11, h21, v, value=-1)

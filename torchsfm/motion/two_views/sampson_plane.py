@@ -30,7 +30,9 @@ def homogeneous_rows(x: Float[Tensor, "*batch n 2"]) -> Float[Tensor, "*batch 3 
 def infinite_where_positive(squared: Float[Tensor, "*batch n"], behind: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
     """Squared distances, infinite where another number is positive: a maximum, many times as fast as a choice."""
     most = torch.finfo(squared.dtype).max
-    return torch.maximum(squared, behind.detach() * most * most)
+    if torch.is_grad_enabled():
+        behind = behind.detach()
+    return torch.maximum(squared, behind * most * most)
 
 
 def squared_distance(
