@@ -8,7 +8,8 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.optim.dense import DenseSystem, dense_system, passable
-from torchsfm.optim.descent import Options, Problem, Step, descend
+from torchsfm.optim.descent import Options, descend
+from torchsfm.optim.problem import Problem, Step
 from torchsfm.optim.pytree import Places, pick
 
 F64 = torch.float64

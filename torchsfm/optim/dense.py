@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.optim.descent import Step
 from torchsfm.optim.loss import Loss, loss_slope
+from torchsfm.optim.problem import Step
 from torchsfm.optim.pytree import Places, leaves, norm, pick, places, put
 
 Linearize = Callable[..., tuple[Tensor, Tensor]]

@@ -1,8 +1,8 @@
 """One descent to a minimum: damped Gauss-Newton steps, and Newton steps where these are slow.
 
 Problems come in batches of any shape, each with its own damping, its own accepted and rejected steps and its own end; one large
-problem is a batch of none. What they are made of is behind two concepts: a `Problem` is linearised at a place, and the `System`
-found there gives a step for any damping. Two linear algebras serve it, `dense` for thousands of small problems and `schur` for
+problem is a batch of none. What they are made of is in `problem`: a `Problem` is linearised at a place, and the `System` found
+there gives a step for any damping. Two linear algebras serve it, `dense` for thousands of small problems and `schur` for
 one large sparse one; a room with a structure of its own brings a third.
 
 Near the minimum, differences of costs are rounding errors; what a step gains is then told by the slopes at its two ends (Hager
@@ -12,12 +12,13 @@ Nielsen & Tingleff 2004, 3.2).
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.optim.problem import Problem, Step
 from torchsfm.optim.pytree import Places, choose, pick, places, put
 
 SLOW = 0.25
@@ -42,89 +43,6 @@ WEAKEST = 1e-16
 """Damping below which it is none."""
 _UNDER_WAY = -1
 """The status of what has not ended."""
-
-
-class Step(NamedTuple):
-    """Steps, one for each element of the batch."""
-
-    delta: Any
-    """Tangent steps; of no account where there is none."""
-    promise: Tensor
-    """The decrease of the cost that the model promises; inf where there is no step, so that none is taken and nothing ends."""
-    solved: Tensor
-    """Where there is a step."""
-    bent: Tensor
-    """Where the cost bends down in some directions, in which the step goes as far as were it up: that promises nothing."""
-
-
-@runtime_checkable
-class System(Protocol):
-    """A problem linearised at a place. In a batch, a dataclass of tensors with the batch in front."""
-
-    @property
-    def x(self) -> Any:
-        """The place."""
-
-    @property
-    def cost(self) -> Tensor:
-        """The cost there, (*batch)."""
-
-    def steepest(self) -> Tensor:
-        """The largest absolute derivative, not finite where anything in the system is not, (*batch)."""
-
-    def along(self, delta: Any) -> Tensor:
-        """The derivative of the cost along a step, (*batch)."""
-
-    def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
-        """The step for a damping (*batch), relative to the diagonal of the Gauss-Newton matrix.
-
-        Where `exact` is True it is one with the exact Hessian, which `Problem.curve` has put in.
-        """
-
-
-S = TypeVar("S", bound=System)
-
-
-@runtime_checkable
-class Problem(Protocol[S]):
-    """What is minimised; a problem that inherits from this has no Newton steps, and ends by costs alone."""
-
-    @property
-    def epsilon(self) -> float:
-        """The relative rounding error of parameters and data."""
-        return torch.finfo(torch.float64).eps
-
-    @property
-    def patience(self) -> int | None:
-        """About how many Gauss-Newton steps a Newton step takes the time of; None where there are no Newton steps."""
-        return None
-
-    def linearize(self, x: Any) -> S:
-        """The system at x."""
-
-    def advance(self, here: S, step: Step) -> S:
-        """The system where a step leads; a cost that is not finite where there is nowhere to go."""
-
-    def relax(self, there: S, step: Step, where: Tensor) -> S:
-        """What follows from a step that led `there`, in the elements `where` in which such steps gain little by little.
-
-        A problem may move some of its variables on by themselves, as long as the cost does not rise.
-        """
-        return there
-
-    def curve(self, here: S, where: Tensor) -> S:
-        """The system with the exact Hessian in the elements `where`."""
-        return here
-
-    def rounding(self, here: S) -> Tensor:
-        """The decrease of the cost that is nothing, whatever the tolerance, (*batch)."""
-
-    def is_short(self, here: S, delta: Any, tolerance: float) -> Tensor:
-        """Where a step is shorter than a fraction of what it moves, (*batch)."""
-        return torch.zeros_like(here.cost, dtype=torch.bool)
-
-    def pick(self, at: Places) -> "Problem[S]":
-        """The problems at some places, in a batch of one dimension; never asked of a batch of none."""
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchsfm.linalg import eigh
 from torchsfm.optim.batched_cholesky import FLAT, Triangle, backward, diagonal, factor, floor, forward, measure, place, product
-from torchsfm.optim.descent import Step
 from torchsfm.optim.layout import Family, Layout
+from torchsfm.optim.problem import Step
 from torchsfm.optim.retained_blocks import RetainedBlocks
 from torchsfm.optim.schur_grouped import GroupCoupling
 from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, solve_reduced

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.optim.descent import MINIMUM, Options, Step, descend
+from torchsfm.optim.descent import MINIMUM, Options, descend
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.normal_equations import NormalEquations
+from torchsfm.optim.problem import Step
 from torchsfm.optim.pytree import Places
 from torchsfm.optim.ranks import Group, Ranks, share
 from torchsfm.optim.schur import Elimination, Solver, move

@@ -23,7 +23,8 @@ from torchsfm.linalg import damped_solve
 from torchsfm.motion.many_views.bilinear_steps import schur_step
 from torchsfm.motion.many_views.curve_fit import near_curves
 from torchsfm.optim import GemanMcClure
-from torchsfm.optim.descent import Options, Problem, Step, descend
+from torchsfm.optim.descent import Options, descend
+from torchsfm.optim.problem import Problem, Step
 from torchsfm.optim.pytree import Places, pick
 from torchsfm.reconstruction.similarities import DEVIATION
 

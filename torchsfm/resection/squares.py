@@ -13,7 +13,8 @@ from torch import Tensor
 from torchsfm.geometry import Pose, rotation_from_rotvec
 from torchsfm.geometry.projection import turn_slopes
 from torchsfm.optim.dense import DenseSystem, dense_system, passable
-from torchsfm.optim.descent import Descent, Options, Problem, Step, descend
+from torchsfm.optim.descent import Descent, Options, descend
+from torchsfm.optim.problem import Problem, Step
 from torchsfm.optim.pytree import Places, pick
 from torchsfm.resection.reprojection import Inside, State, camera_frame
 

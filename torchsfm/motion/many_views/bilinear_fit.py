@@ -30,7 +30,8 @@ from torchsfm.motion.many_views.bilinear_steps import (
     reduced,
     regular,
 )
-from torchsfm.optim.descent import Options, Problem, Step, descend
+from torchsfm.optim.descent import Options, descend
+from torchsfm.optim.problem import Problem, Step
 from torchsfm.optim.pytree import Places, pick
 
 _FRAMES = 60

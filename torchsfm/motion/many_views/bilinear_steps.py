@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg import qr
-from torchsfm.optim.descent import Step
+from torchsfm.optim.problem import Step
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from torchsfm.geometry.homogeneous import divide_safely
 from torchsfm.linalg import solve
 from torchsfm.motion.many_views.bilinear_fit import unit_frame
 from torchsfm.motion.many_views.bilinear_steps import BilinearSystem, Linearisation
-from torchsfm.optim.descent import Problem, Step
+from torchsfm.optim.problem import Problem, Step
 from torchsfm.optim.pytree import Places, pick
 
 _OWN = 2

@@ -34,7 +34,8 @@ from torchsfm.motion.many_views.curve_splines import (
     third_differences,
 )
 from torchsfm.motion.many_views.curve_stiffness import likeliest_stiffness
-from torchsfm.optim.descent import Descent, Options, Problem, Step, descend
+from torchsfm.optim.descent import Descent, Options, descend
+from torchsfm.optim.problem import Problem, Step
 from torchsfm.optim.pytree import Places, choose, pick
 
 _ROUNDING = 1e-12
