@@ -3,12 +3,14 @@
 from typing import Any
 
 import pytest
+import torch
 from chance import stream_seed
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from bench.ransac import ours, part, scenes
+from torchsfm.motion import estimate_fundamental
 
-MOST = {"F": 3100, "H": 2350, "P": 2850, "E": 4550}
+MOST = {"F": 3000, "H": 2200, "P": 2850, "E": 4450}
 """Of 1,000 matches, four in five of which are right, for the pair of nine that takes the least: chance decides of some whether
 the search and the refinement take more rounds."""
 
@@ -30,3 +32,16 @@ def test_one_pair_takes_few_operations(model: str) -> None:
             ours(model, part(some, slice(i, i + 1)))
         numbers.append(count.number)
     assert min(numbers) <= MOST[model], numbers
+
+
+def test_problems_that_go_on_keep_their_places() -> None:
+    """Their numbers of samples differ, and with them the order in which they are looked at."""
+    some = scenes("F", 32, 0.5, 0)
+
+    def drawn(index: slice) -> torch.Tensor:
+        few, g = part(some, index), torch.Generator().manual_seed(0)
+        return estimate_fundamental(few.x1, few.x2, threshold=2.0, generator=g).iterations
+
+    together = drawn(slice(0, 32))
+    assert len(set(together.tolist())) > 3
+    assert torch.equal(together, torch.cat([drawn(slice(i, i + 1)) for i in range(32)]))
