@@ -49,6 +49,8 @@ def test_windows_that_overlap_are_one_chain(X: Tensor, generator: torch.Generato
     windows = [window(first, poses, X, generator) for first in (0, 2, 3, 5, 7, 8)]
     (chain,) = chains(windows)
     assert chain.views.tolist() == list(range(FRAMES))
+    # The frames at both ends are those of one window each, and farthest from its middle.
+    assert chain.begun()[0].tolist() == list(range(1, FRAMES - 1))
     middle = windows[0].found.poses
     scale = torch.linalg.vector_norm(middle.centre[1] - middle.centre[0]) / torch.linalg.vector_norm(
         poses.centre[1] - poses.centre[0]
@@ -57,21 +59,27 @@ def test_windows_that_overlap_are_one_chain(X: Tensor, generator: torch.Generato
     truth = world.transform_pose(poses)
     assert torch.allclose(chain.poses.R, truth.R, atol=1e-9)
     assert torch.allclose(chain.poses.t, truth.t, atol=1e-9)
+    # In another world a frame that is not known there is where it is from the nearest that is.
+    known = torch.arange(3, FRAMES - 2)
+    guess = chain.carried(0, known, truth)
+    assert guess is not None
+    assert torch.allclose(guess.matrix(), truth[:1].matrix(), atol=1e-9)
+    assert chain.carried(FRAMES, known, truth) is None
 
 
 def test_a_chain_ends_where_windows_share_too_little_or_contradict_each_other(X: Tensor, generator: torch.Generator) -> None:
     poses = arc()
     apart = [window(first, poses, X, generator) for first in (0, 4, 6, 8)]
-    assert [chain.views.tolist() for chain in chains(apart)] == [list(range(4, FRAMES)), list(range(5))]
+    assert [chain.begun()[0].tolist() for chain in chains(apart)] == [list(range(5, 12)), list(range(5))]
     shaken = 0.1 * torch.randn(WIDTH, 3, dtype=F64, generator=generator)
     wrong = apart[2].found.poses
     wrong = replace(apart[2].found, poses=Pose(rotation_from_rotvec(shaken) @ wrong.R, wrong.t))
     torn = [apart[1], Window(apart[2].views, wrong), apart[3]]
-    assert [len(chain.views) for chain in chains(torn)] == [WIDTH] * 3
+    assert [len(chain.begun()[0]) for chain in chains(torn)] == [WIDTH] * 3
     right = [window(first, poses, X, generator) for first in (0, 2, 4, 6, 8)]
     longest, other = chains([*right[:4], torn[1], right[4]])
-    assert longest.views.tolist() == [0, 1, 2, 3, 4, 5, 11, 12]
-    assert len(other.views) == WIDTH
+    assert longest.begun()[0].tolist() == [1, 2, 3, 4, 5, 11]
+    assert len(other.begun()[0]) == WIDTH
     nowhere = replace(apart[2].found, X=X[:0])
     assert len(chains([apart[1], Window(apart[2].views, nowhere)])) == 2
 

@@ -18,7 +18,7 @@ from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_fusion import near_pairs
 from torchsfm.reconstruction.curve_noise import measured_weights
 from torchsfm.reconstruction.curve_pieces import image_pieces
-from torchsfm.reconstruction.curve_resection import pose_from_edges
+from torchsfm.reconstruction.curve_resection import Resection, pose_from_edges
 from torchsfm.reconstruction.curve_tracks import track_samples
 from torchsfm.reconstruction.curves import no_curves
 from torchsfm.reconstruction.edge_maps import EdgePoints
@@ -50,6 +50,8 @@ _SPEEDS = (1.0, 0.5, 1.5, 0.0, 2.0)
 """Of the motion before, with which a camera goes on."""
 _SWINGS = (-24.0, -12.0, 0.0, 12.0, 24.0)
 """Pixels, along both axes, by which the image may be elsewhere then."""
+_CLOSE = 4.0
+"""Pixels by which samples may be away from their edges where a guess is good."""
 _SHOWN = 0.5
 """Of the samples inside an image that must be on its edges,"""
 _FEWEST = 40
@@ -247,8 +249,15 @@ def _confirmed(mapping: CurveMapping, near: float) -> Bool[Tensor, "n"]:
     return torch.bincount(pairs[0], minlength=len(X)) >= _CONFIRM
 
 
-def register(mapping: CurveMapping, view: int) -> CurveMapping | None:
-    """The model with one more frame; None where it does not show the curves that frames around it do."""
+def register(mapping: CurveMapping, view: int, guess: Pose | None = None) -> CurveMapping | None:
+    """The model with one more frame; None where it does not show the curves that frames around it do.
+
+    Args:
+        mapping: The model.
+        view: The frame.
+        guess: Where it may be, batch (1). Only its surroundings are looked at first: where things repeat themselves, other
+            places fit as well.
+    """
     known = mapping.known
     near = known[(known - view).abs().argsort(stable=True)]
     a, b = int(near[0]), int(near[1])
@@ -256,12 +265,17 @@ def register(mapping: CurveMapping, view: int) -> CurveMapping | None:
     if int(use.sum()) < _FEWEST:
         return None
     X, tangent = mapping.curves.X[use], mapping.curves.tangents()[use]
-    starts = _starts(mapping, X, a, b, (view - a) / (a - b))
-    found = pose_from_edges(X, tangent, mapping.sights[view].field, mapping.size, mapping.camera.K, starts)
+    seen = (X, tangent, mapping.sights[view].field, mapping.size, mapping.camera.K)
+    if guess is not None and (pose := _shown(pose_from_edges(*seen, guess, reach=_CLOSE))) is not None:
+        return mapping.placed(torch.tensor([view]), pose)
+    pose = _shown(pose_from_edges(*seen, _starts(mapping, X, a, b, (view - a) / (a - b))))
+    return None if pose is None else mapping.placed(torch.tensor([view]), pose)
+
+
+def _shown(found: Resection) -> Pose | None:
+    """The pose whose frame shows the most samples, where these are enough."""
     k = int(found.near.argmax())
-    if found.near[k] < max(_FEWEST, _SHOWN * float(found.inside[k])):
-        return None
-    return mapping.placed(torch.tensor([view]), found.pose[k : k + 1])
+    return None if found.near[k] < max(_FEWEST, _SHOWN * float(found.inside[k])) else found.pose[k : k + 1]
 
 
 def _starts(mapping: CurveMapping, X: Tensor, a: int, b: int, steps: float) -> Pose:

@@ -40,6 +40,8 @@ def pose_from_edges(
     size: tuple[int, int],
     K: Float[Tensor, "3 3"],
     start: Pose,
+    *,
+    reach: float = _RADII[0],
 ) -> Resection:
     """Poses at the robust least squares of distances from the nearest edges of like direction, from several starts.
 
@@ -50,12 +52,13 @@ def pose_from_edges(
         size: Height and width of the image.
         K: The camera.
         start: Where to start, batch (h).
+        reach: Distance of edges, in pixels, that samples feel at first.
     """
     some = slice(None, None, -(-len(X) // _SCREEN))
     first = _look(X[some], tangent[some], field, size, K, start)
     gap = torch.where(first.inside, first.far.clamp(max=_RADII[0]), _RADII[0]).mean(-1)
     pose = start[gap.argsort()[:_BEST]]
-    for radius in _RADII:
+    for radius in (r for r in _RADII if r <= reach):
         for _ in range(_STEPS):
             pose = pose.retract(_step(_look(X, tangent, field, size, K, pose), K, radius))
     found = _look(X, tangent, field, size, K, pose)

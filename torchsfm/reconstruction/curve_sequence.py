@@ -155,7 +155,7 @@ def map_sequence(
         begun = _begin(edges, size, told, chain, progress)
         if not len(begun.curves):
             continue
-        grown = _grow(begun, told, progress)
+        grown = _grow(begun, chain, told, progress)
         if best is None or len(grown.known) > len(best.known):
             best = grown
         if len(best.known) >= _MOST * v:
@@ -169,7 +169,7 @@ def _begin(
     edges: Sequence[ImageEdges], size: tuple[int, int], told: Expected, chain: Chain, progress: Progress
 ) -> CurveMapping:
     """A model of the frames of a chain of windows."""
-    mapping = CurveMapping.start(edges, size, told.camera).placed(chain.views, chain.poses)
+    mapping = CurveMapping.start(edges, size, told.camera).placed(*chain.begun())
     for near in _NEARER:
         mapping = _anew(mapping, told, progress, near, **_ROUGH)
     return mapping
@@ -190,7 +190,7 @@ def _anew(
     return mapping
 
 
-def _grow(mapping: CurveMapping, told: Expected, progress: Progress) -> CurveMapping:
+def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progress) -> CurveMapping:
     """Frame after frame, the nearest to those that are placed first."""
     v = len(mapping.edges)
     adjusted, failed = len(mapping.known), set[int]()
@@ -199,7 +199,7 @@ def _grow(mapping: CurveMapping, told: Expected, progress: Progress) -> CurveMap
         away = (torch.arange(v)[:, None] - mapping.known).abs().amin(-1)
         waiting = [i for i in away.argsort(stable=True).tolist() if 0 < away[i] <= _GAP and i not in failed]
         if waiting:
-            more = register(mapping, waiting[0])
+            more = register(mapping, waiting[0], chain.carried(waiting[0], mapping.known, mapping.poses))
             if more is None:
                 failed.add(waiting[0])
             else:

@@ -64,6 +64,22 @@ class Chain:
 
     views: Int[Tensor, "k"]
     poses: Pose
+    sure: Bool[Tensor, "k"]
+    """Frames about which windows do not contradict each other, and of which not only the end of one tells."""
+
+    def begun(self) -> tuple[Int[Tensor, "s"], Pose]:
+        """The frames that are sure; all where these are too few."""
+        there = self.sure if int(self.sure.sum()) >= WIDTH else torch.ones_like(self.sure)
+        return self.views[there], self.poses[there]
+
+    def carried(self, view: int, known: Int[Tensor, "n"], poses: Pose) -> Pose | None:
+        """Where a frame is, seen from the nearest of those whose poses are known elsewhere; None where it tells of none."""
+        own = (self.views == view).nonzero()[:, 0]
+        near = torch.isin(self.views, known).nonzero()[:, 0]
+        if not len(own) or not len(near):
+            return None
+        a = near[(self.views[near] - view).abs().argmin()]
+        return self.poses[own] @ self.poses[a].inverse() @ poses[int(self.views[a])]
 
 
 def window_at(edges: Sequence[ImageEdges], first: int, K: Float[Tensor, "3 3"], sigma: float = _SURE) -> Window:
@@ -156,8 +172,6 @@ def _differences(window: Window, before: Window) -> list[float]:
 def chains(windows: Sequence[Window]) -> list[Chain]:
     """Cameras of windows that overlap and agree, the longest chain first.
 
-    Frames about which two windows contradict each other are left out where enough others remain.
-
     Args:
         windows: In the order of their frames, no two of the same, all with an answer.
     """
@@ -174,7 +188,7 @@ def chains(windows: Sequence[Window]) -> list[Chain]:
                 own = _Placed(window, before.chain, _after(before.world, step))
         placed.append(own or _Placed(window, k, _nowhere(window.found.poses)))
     runs = [[one for one in placed if one.chain == k] for k in dict.fromkeys(one.chain for one in placed)]
-    return sorted((_joined(run, contested) for run in runs), key=lambda chain: -len(chain.views))
+    return sorted((_joined(run, contested) for run in runs), key=lambda chain: -len(chain.begun()[0]))
 
 
 class _Placed(NamedTuple):
@@ -191,17 +205,20 @@ def _nowhere(like: Pose) -> Similarity:
 
 
 def _joined(run: Sequence[_Placed], contested: set[int]) -> Chain:
-    """Each frame as the window has it whose middle it is nearest to."""
+    """Each frame as the window has it whose middle it is nearest to; the end of a single window is not sure of a frame."""
     frames: dict[int, tuple[int, Pose]] = {}
+    confirmed = set[int]()
     for window, _, world in run:
         poses = world.transform_pose(window.found.poses)
         for k, view in enumerate(window.views.tolist()):
             away = abs(view - window.middle)
+            if view in frames or away < WIDTH // 2:
+                confirmed.add(view)
             if view not in frames or away < frames[view][0]:
                 frames[view] = away, poses[k]
-    sure = frames.keys() - contested
-    views = sorted(sure if len(sure) >= WIDTH else frames)
-    return Chain(torch.tensor(views), Pose(*(torch.stack([getattr(frames[i][1], name) for i in views]) for name in ("R", "t"))))
+    views = sorted(frames)
+    poses = Pose(*(torch.stack([getattr(frames[i][1], name) for i in views]) for name in ("R", "t")))
+    return Chain(torch.tensor(views), poses, torch.tensor([i in confirmed - contested for i in views]))
 
 
 class _Turn(NamedTuple):
