@@ -14,7 +14,7 @@ from torchsfm.bundle import BundleTerms, Rig, bundle_adjust, bundle_adjust_model
 from torchsfm.bundle.blocks import Bundle, cheapest_elimination
 from torchsfm.formats import read_libmv
 from torchsfm.geometry import BundleProblem, Camera, Pose, intrinsics, project_points
-from torchsfm.optim import Block, RigidMotion, Subset
+from torchsfm.optim import Block, RigidMotion, Subset, Term
 from torchsfm.reconstruction import Reconstruction
 from torchsfm.simulation import orbit_poses, random_bundle_problem, random_points
 
@@ -113,9 +113,12 @@ def test_poses_are_eliminated_where_they_are_many() -> None:
         "camera": Block(torch.zeros(30, 7), Subset(7, (0,))),
         "point": Block(torch.zeros(20, 3)),
     }
-    assert cheapest_elimination(blocks) == ("pose",)
+    assert cheapest_elimination(blocks, []) == ("pose",)
+    one = torch.zeros(1, dtype=torch.long)
+    bound = Term(lambda a, b: a - b, ("pose", "pose"), (one, one + 1))
+    assert cheapest_elimination(blocks, [bound]) == ("point",)
     blocks["point"] = Block(torch.zeros(60, 3))
-    assert cheapest_elimination(blocks) == ("point",)
+    assert cheapest_elimination(blocks, []) == ("point",)
     few = p.point < 20
     fixed = torch.arange(40) < 3
     args = (p.poses, p.cameras, p.X, p.x[few], p.view[few], p.point[few])
