@@ -184,7 +184,8 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     if options.step_tolerance > 0 and bool((still := near & (state.damping <= LIGHT) & ~step.bent & ~done).any()):
         done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
     there = problem.advance(here, step)
-    if bool((crawling := active & (state.dull > 0)).any()):
+    # Where all must come to the minimum, Newton steps follow instead: variables that have settled hide that others crawl.
+    if options.function_tolerance > LOOSE and bool((crawling := active & (state.dull > 0)).any()):
         there = problem.relax(there, step, crawling)
     gain = cost - there.cost
     if bool(near.any()):
