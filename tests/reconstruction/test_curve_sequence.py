@@ -90,7 +90,7 @@ def test_a_real_turntable_by_a_long_lens(data: Path, tmp_path: Path) -> None:
     assert bool(model.registered.all())
     turn = nearest_rotation((R.mT @ model.poses.R).mean(0))
     assert rotation_angle(model.poses.R @ (R @ turn).mT).rad2deg().max() < 1.0
-    assert abs(float(model.cameras.K[0, 0, 0]) / float(numbers[0, 0]) - 1) < 0.1
+    assert abs(float(model.cameras.K[0, 0, 0]) / float(numbers[0, 0]) - 1) < 0.15
 
 
 @pytest.fixture
