@@ -167,11 +167,7 @@ class Bent:
 
 @dataclass(frozen=True)
 class Crawling(Problem[Bent]):
-    """Steps that gain little by little, and variables that, moved by themselves, gain a part of what is left."""
-
-    part: float
-    relaxed: list[float]
-    """The costs from which they were moved."""
+    """Steps that gain little by little."""
 
     @property
     def patience(self) -> int:
@@ -186,17 +182,12 @@ class Crawling(Problem[Bent]):
     def advance(self, here: Bent, step: Step) -> Bent:
         return replace(here, cost=here.cost - step.promise)
 
-    def relax(self, there: Bent, step: Step, where: Tensor) -> Bent:
-        assert bool(where)
-        self.relaxed.append(float(there.cost))
-        return replace(there, cost=there.cost - self.part * (there.cost - 1))
-
     def rounding(self, here: Bent) -> Tensor:
         return torch.zeros_like(here.cost)
 
 
 def test_damping_that_was_too_weak_for_the_exact_hessian_is_not_tried_again() -> None:
-    found = descend(Crawling(0.0, []), torch.tensor(1.0, dtype=F64), Options(200, 1e-9))
+    found = descend(Crawling(), torch.tensor(1.0, dtype=F64), Options(200, 1e-9))
     tried = found.end.tried
     assert found.status == Status.OK
     assert len(tried) > 4
@@ -205,16 +196,3 @@ def test_damping_that_was_too_weak_for_the_exact_hessian_is_not_tried_again() ->
     most = tried[-1]
     assert tried.index(most) < 6
     assert set(tried[tried.index(most) :]) == {most}
-
-
-def test_where_steps_gain_little_by_little_variables_are_moved_by_themselves() -> None:
-    start = torch.tensor(100.0, dtype=F64)
-    slow, fast = Crawling(0.0, []), Crawling(0.9, [])
-    steps = [int(descend(p, start, Options(200, 1.1e-4)).iterations) for p in (slow, fast)]
-    assert steps[1] + 2 <= steps[0]
-    # Not before steps are seen to be slow.
-    assert max(fast.relaxed) < 1 + 0.3e-1
-    # What settles would hide what crawls: where all must come to the minimum, it does not.
-    exact = Crawling(0.9, [])
-    descend(exact, start, Options(200, 1e-9))
-    assert exact.relaxed == []

@@ -46,9 +46,9 @@ def visit(generator: torch.Generator, *, views: int = 8, points: int = 250) -> t
 
 
 def test_forward_motion_finds_its_focal_length(generator: torch.Generator) -> None:
-    views, focal = 20, 707.0
+    views, focal = 30, 707.0
     options = {"generator": generator, "dtype": torch.float64}
-    X = (torch.rand(600, 3, **options) - torch.tensor([0.5, 0.5, 0.0])) * torch.tensor([16.0, 8.0, views + 20.0])
+    X = (torch.rand(900, 3, **options) - torch.tensor([0.5, 0.5, 0.0])) * torch.tensor([16.0, 8.0, views + 20.0])
     centre = 0.02 * torch.randn(views, 3, **options)
     centre[:, 2] += torch.arange(views)
     R = rotation_from_rotvec(0.005 * torch.randn(views, 3, **options))

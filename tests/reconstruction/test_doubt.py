@@ -122,7 +122,7 @@ def judged(mapping: Mapping) -> tuple[str, ...]:
 
 
 def test_a_right_model_is_not_doubted(generator: torch.Generator) -> None:
-    for _ in range(8):
+    for _ in range(20):
         mapping = scene(generator)
         conflicts = missing_correspondences(mapping)
         assert len(conflicts.pairs) > 0
@@ -131,7 +131,7 @@ def test_a_right_model_is_not_doubted(generator: torch.Generator) -> None:
 
 
 def test_a_folded_model_is_doubted_whole(generator: torch.Generator) -> None:
-    for _ in range(4):
+    for _ in range(10):
         mapping = folded(generator)
         refuted = missing_correspondences(mapping).refuted
         assert len(refuted) > 1
@@ -141,7 +141,7 @@ def test_a_folded_model_is_doubted_whole(generator: torch.Generator) -> None:
 
 
 def test_images_beyond_a_hinge_are_doubted(generator: torch.Generator) -> None:
-    for _ in range(2):
+    for _ in range(4):
         mapping = distant(generator)
         assert judged(mapping) == ("",) * 14
         bent = hinged(mapping, 0.7, 9)

@@ -146,10 +146,6 @@ class DenseProblem:
             ]
         return value.detach(), torch.stack(columns, -1)
 
-    def relax(self, there: DenseSystem, step: Step, where: Tensor) -> DenseSystem:
-        """No variable moves by itself."""
-        return there
-
     def advance(self, here: DenseSystem, step: Step) -> DenseSystem:
         """The system where a step leads."""
         return passable(self.linearize(self.retract(here.x, step.delta.to(leaves(here.x)[0].dtype))))

@@ -184,9 +184,6 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     if options.step_tolerance > 0 and bool((still := near & (state.damping <= LIGHT) & ~step.bent & ~done).any()):
         done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
     there = problem.advance(here, step)
-    # Where all must come to the minimum, Newton steps follow instead: variables that have settled hide that others crawl.
-    if options.function_tolerance > LOOSE and bool((crawling := active & (state.dull > 0)).any()):
-        there = problem.relax(there, step, crawling)
     gain = cost - there.cost
     if bool(near.any()):
         slopes = -(here.along(step.delta) + there.along(step.delta)) / 2
@@ -198,11 +195,11 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     plain = accepted & ~exact
     done = active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
     dull, slow, curved = state.dull, state.slow, state.curved
-    if problem.patience is not None:
+    if problem.patience is not None and options.function_tolerance <= LOOSE:
         grows = (gain > GROWTH * state.last) & (gain > 100 * least)
         crawls, slow = plain & (rate > SLOW) & (gain <= NEAR * cost) & ~grows, exact
         dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
-        if options.function_tolerance <= LOOSE and bool(crawls.any()):
+        if bool(crawls.any()):
             far = gain * rate ** (problem.patience + 1) > least * (1 - rate)
             slow = slow | (crawls & far & ((dull > problem.patience) | (gain <= 100 * least)))
         slow, curved = slow & ~done, curved & ~accepted

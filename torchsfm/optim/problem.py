@@ -72,13 +72,6 @@ class Problem(Protocol[S]):
     def advance(self, here: S, step: Step) -> S:
         """The system where a step leads; a cost that is not finite where there is nowhere to go."""
 
-    def relax(self, there: S, step: Step, where: Tensor) -> S:
-        """What follows from a step that led `there`, in the elements `where` in which such steps gain little by little.
-
-        A problem may move some of its variables on by themselves, as long as the cost does not rise.
-        """
-        return there
-
     def curve(self, here: S, where: Tensor) -> S:
         """The system with the exact Hessian in the elements `where`."""
         return here

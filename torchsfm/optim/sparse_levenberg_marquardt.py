@@ -290,15 +290,6 @@ class _SparseProblem:
         bent.strayed = True
         return bent if bool(bent.cost < there.cost) else there
 
-    def relax(self, there: _Place, step: Step, where: Tensor) -> _Place:
-        """Eliminated variables settled: a point far away or between wrong data takes many small steps, here many at once."""
-        if not bool(step.solved) or bool(step.promise <= TELLING * self.epsilon * there.cost):
-            return there
-        x = self.engine.settling.settle(there.x, ROUNDS, WORTH * step.promise / self.points)
-        settled = _Place(self.engine, x, self.engine.cost(x))
-        settled.strayed = there.strayed
-        return settled if bool(settled.cost < there.cost) else there
-
     def curve(self, here: _Place, where: Tensor) -> _Place:
         """The system with exact second derivatives."""
         here.exact = self.engine.curve(here.x, here.system)
