@@ -125,14 +125,9 @@ class PosePrior:
         """The prior as a term of the optimiser."""
 
         def residual(pose: Tensor, known: Tensor, white: Tensor) -> Tensor:
-            (R, t), (R0, t0) = _split(pose), _split(known)
-            turn = R @ R0.mT
-            v = t - _apply(turn, t0)
-            return _apply(white, torch.cat((rotvec_from_rotation(turn), v), -1))
+            return _apply(white, _pose_error(_split(pose), _split(known)))
 
-        known = torch.cat((self.poses.R.flatten(1), self.poses.t), 1)
-        white = _whitener(self.sigma, self.covariance, known[:, :6])
-        return Term(residual, ("pose",), (self.index,), (known, white), self.loss)
+        return Term(residual, ("pose",), (self.index,), _known_poses(self), self.loss)
 
 
 @dataclass(frozen=True)
@@ -174,14 +169,10 @@ class RelativePosePrior:
         """The prior as a term of the optimiser."""
 
         def residual(first: Tensor, second: Tensor, known: Tensor, white: Tensor) -> Tensor:
-            (A, a), (B, b), (R, t) = _split(first), _split(second), _split(known)
-            turn = B @ (R @ A).mT
-            v = b - _apply(turn, _apply(R, a) + t)
-            return _apply(white, torch.cat((rotvec_from_rotation(turn), v), -1))
+            (A, a), (R, t) = _split(first), _split(known)
+            return _apply(white, _pose_error(_split(second), (R @ A, _apply(R, a) + t)))
 
-        known = torch.cat((self.poses.R.flatten(1), self.poses.t), 1)
-        white = _whitener(self.sigma, self.covariance, known[:, :6])
-        return Term(residual, ("pose", "pose"), (self.index[:, 0], self.index[:, 1]), (known, white), self.loss)
+        return Term(residual, ("pose", "pose"), (self.index[:, 0], self.index[:, 1]), _known_poses(self), self.loss)
 
 
 @dataclass(frozen=True)
@@ -220,6 +211,19 @@ class PointPrior:
 
         white = _whitener(self.sigma, self.covariance, self.X)
         return Term(residual, ("point",), (self.index,), (self.X, white), self.loss)
+
+
+def _known_poses(prior: PosePrior | RelativePosePrior) -> tuple[Tensor, Tensor]:
+    """Known poses as rows, and what turns errors of theirs into units of standard deviations."""
+    known = torch.cat((prior.poses.R.flatten(1), prior.poses.t), 1)
+    return known, _whitener(prior.sigma, prior.covariance, known[:, :6])
+
+
+def _pose_error(pose: tuple[Tensor, Tensor], known: tuple[Tensor, Tensor]) -> Float[Tensor, "k 6"]:
+    """The step (w, v) from known poses to poses, as in `Pose.retract`."""
+    (R, t), (R0, t0) = pose, known
+    turn = R @ R0.mT
+    return torch.cat((rotvec_from_rotation(turn), t - _apply(turn, t0)), -1)
 
 
 def _whitener(sigma: Sigma, covariance: Tensor | None, like: Tensor) -> Tensor:
