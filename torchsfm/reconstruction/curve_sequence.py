@@ -63,8 +63,6 @@ _ROUGH: Ends = {"tolerance": 1e-4, "iterations": 15}
 """When to end an adjustment on the way,"""
 _FINE: Ends = {"tolerance": 1e-6, "iterations": 40}
 """and in the end."""
-_TOGETHER = 0.05
-"""Part of the focal length by which all windows may be wrong together: what misleads one misleads others too."""
 _LAST = 3
 """Times that samples are found anew then, the most,"""
 _STILL = 0.1
@@ -110,12 +108,6 @@ class Expected:
         K = self.camera.K.clone()
         K[:2, :2] *= focal / K[0, 0]
         return replace(self, camera=replace(self.camera, K=K), sigma={**self.sigma, "focal": sigma})
-
-    def loosened(self) -> "Expected":
-        """The same where all frames together may tell a little more of the focal length than a few at a time."""
-        if "focal" not in self.free:
-            return self
-        return replace(self, sigma={**self.sigma, "focal": max(self.sigma["focal"], _TOGETHER)})
 
     def terms(self, placed: Bool[Tensor, "v"] | None = None) -> dict[str, Any]:
         """What a bundle adjusts of the camera, and what is known of it and of frames that are placed."""
@@ -216,9 +208,8 @@ def _together(mapping: CurveMapping, told: Expected, progress: Progress) -> Sett
     """All cameras, from samples that are found anew."""
     views = mapping.known
     mapping = _anew(mapping, told, progress, **_ROUGH)
-    known = told.loosened()
     for _ in range(_LAST):
-        before, mapping = mapping, _anew(mapping, known, progress, **_FINE)
+        before, mapping = mapping, _anew(mapping, told, progress, **_FINE)
         turned = before.poses.R[views].mT @ mapping.poses.R[views]
         moved = float(rotation_angle(turned @ turned[len(views) // 2].mT).rad2deg().amax())
         if moved < _STILL:
