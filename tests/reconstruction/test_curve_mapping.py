@@ -1,0 +1,126 @@
+"""A growing model of cameras and curves: what edges count, and where frames are placed."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
+from torchsfm.geometry.distortion import Radial
+from torchsfm.reconstruction.curve_fusion import piece_tangents
+from torchsfm.reconstruction.curve_mapping import CurveMapping, register, terms, track
+from torchsfm.reconstruction.curves import no_curves
+from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.model_curves import Curves
+
+F64 = torch.float64
+FRAMES, CURVES, SAMPLES = 6, 12, 60
+SIZE = 300, 400
+ZERO = torch.zeros((), dtype=F64)
+CAMERA = Camera(intrinsics(torch.tensor(500.0, dtype=F64), torch.tensor([199.5, 149.5], dtype=F64)), Radial(ZERO, ZERO))
+
+
+def frames() -> Pose:
+    """Cameras around the origin, five units away and six degrees from each other."""
+    turn = math.radians(6.0) * torch.arange(FRAMES, dtype=F64)[:, None] * torch.tensor([0.1, 1.0, 0.0], dtype=F64)
+    return Pose(rotation_from_rotvec(turn), torch.tensor([0.0, 0.0, 5.0], dtype=F64).expand(FRAMES, 3))
+
+
+def wavy(generator: torch.Generator) -> Tensor:
+    """Curves from top to bottom, (c, n, 3)."""
+    height = torch.linspace(-1, 1, SAMPLES, dtype=F64)
+    wave = 3 * torch.rand(CURVES, 4, 1, generator=generator, dtype=F64)
+    place = 2.4 * torch.rand(CURVES, 2, 1, generator=generator, dtype=F64) - 1.2
+    x = place[:, 0] + 0.15 * (wave[:, 0] * height + wave[:, 1]).sin()
+    z = place[:, 1] + 0.15 * (wave[:, 2] * height + wave[:, 3]).cos()
+    return torch.stack((x, height.expand_as(x), z), -1)
+
+
+def seen(X: Tensor, poses: Pose) -> list[ImageEdges]:
+    """The edges that frames show, each of which has the brighter side to the left of its curve."""
+    chain = torch.arange(CURVES).repeat_interleave(SAMPLES)
+    none = torch.zeros(len(chain), dtype=F64)
+    edges = []
+    for x in project_points(CAMERA.K @ poses.matrix(), X.flatten(0, 1)):
+        tangent = piece_tangents(x, chain)
+        normal = torch.stack((-tangent[:, 1], tangent[:, 0]), -1)
+        edges.append(ImageEdges(x, normal, none, none + 0.1, none[:, None].expand(-1, 3), chain))
+    return edges
+
+
+def model(X: Tensor, edges: list[ImageEdges], placed: Tensor) -> CurveMapping:
+    """All curves, some of the frames."""
+    mapping = CurveMapping.start(edges, SIZE, CAMERA).placed(placed, frames()[placed])
+    none = no_curves(mapping.poses.R)
+    points = X.flatten(0, 1)
+    curve = torch.arange(CURVES).repeat_interleave(SAMPLES)
+    ones = torch.ones_like(points)
+    tracks = (none.x, none.normal, none.curvature, none.weight, none.view, none.sample)
+    curves = Curves(points, curve, torch.zeros(CURVES, dtype=torch.bool), ones, ones[:, 0], *tracks)
+    return mapping.with_curves(curves, placed[curve % len(placed)])
+
+
+NEAR = 0.05
+"""Degrees to which edges of points three pixels apart tell a camera."""
+
+
+def degrees_off(mapping: CurveMapping, view: int) -> float:
+    """Between a frame's camera and the true one."""
+    return float(rotation_angle(mapping.poses.R[view] @ frames().R[view].mT).rad2deg())
+
+
+def test_edges_that_are_wrong_alike_along_curves_do_not_count_one_by_one(generator: torch.Generator) -> None:
+    """Noise that each edge point has for itself, and noise of the same size that all of a chain have."""
+    X, poses = wavy(generator), frames()
+    exact = seen(X, poses)
+    single = torch.randn(FRAMES, CURVES * SAMPLES, dtype=F64, generator=generator)
+    whole = torch.randn(FRAMES, CURVES, dtype=F64, generator=generator).repeat_interleave(SAMPLES, 1)
+    count = []
+    for noise in (single, whole):
+        edges = [
+            ImageEdges(e.x + 0.2 * r[:, None] * e.normal, e.normal, e.curvature, e.sigma, e.color, e.chain)
+            for e, r in zip(exact, noise, strict=True)
+        ]
+        mapping = track(model(X, edges, torch.arange(FRAMES)))
+        (structure,) = terms(mapping)["structure"]
+        # In units of what as many independent distances of this size weigh.
+        count.append(float(structure.weights.sum()) * 0.2**2 / len(structure.weights))
+    assert count[0] == pytest.approx(1.0, rel=0.5)
+    # All but few of the sixty of a chain are no more than one.
+    assert count[1] < 0.1 * count[0]
+
+
+def test_a_frame_is_placed_near_a_guess_that_its_edges_confirm(generator: torch.Generator) -> None:
+    X = wavy(generator)
+    mapping = model(X, seen(X, frames()), torch.arange(FRAMES - 1))
+    last = FRAMES - 1
+    nearly = frames()[last:].retract(1e-3 * torch.randn(1, 6, dtype=F64, generator=generator))
+    found = register(mapping, last, nearly)
+    assert found is not None
+    assert degrees_off(found, last) < NEAR
+    # A guess that the edges do not confirm is no harm: the curves are looked for as without one.
+    turned = (
+        Pose(rotation_from_rotvec(torch.tensor([[0.0, 0.3, 0.0]], dtype=F64)), torch.zeros(1, 3, dtype=F64)) @ frames()[last:]
+    )
+    for guess in (turned, None):
+        found = register(mapping, last, guess)
+        assert found is not None
+        assert degrees_off(found, last) < NEAR
+
+
+def test_what_repeats_itself_does_not_draw_a_frame_from_its_guess(generator: torch.Generator) -> None:
+    """A row of like posts: all but the last fit one post further on, too."""
+    height = torch.linspace(-1, 1, SAMPLES, dtype=F64)
+    post = torch.arange(CURVES, dtype=F64)[:, None] * 0.12 - 0.66
+    X = torch.stack((post.expand(-1, SAMPLES), height.expand(CURVES, -1), (0.1 * (2 * height).sin()).expand(CURVES, -1)), -1)
+    mapping = model(X, seen(X, frames()), torch.arange(FRAMES - 1))
+    last = FRAMES - 1
+    # Posts are twelve pixels apart; only around the guess is looked, not where the most of them fit.
+    moved = Pose(frames().R[last:], frames().t[last:] + frames().R[last:] @ torch.tensor([0.12, 0.0, 0.0], dtype=F64))
+    found = register(mapping, last, moved)
+    assert found is not None
+    assert torch.linalg.vector_norm(found.poses.t[last] - moved.t[0]) < 0.02
+    anywhere = register(mapping, last)
+    assert anywhere is not None
+    assert torch.linalg.vector_norm(anywhere.poses.t[last] - frames().t[last]) < 0.02
