@@ -73,6 +73,8 @@ class NormalEquations:
     """The gradient by retained variables."""
     curved: bool = False
     """Whether second derivatives are exact, so that it need not be positive."""
+    held: bool = False
+    """Whether eliminated variables are held that have something left to gain."""
 
     def step(self, damping: float) -> Step:
         """The step for `damping` times the diagonal.
@@ -96,7 +98,10 @@ class NormalEquations:
         own, failed = self.layout.ranks.sum(torch.stack((own, failed)))
         promise, solved = promise + own, solved & (failed == 0)
         return Step(
-            self.split(kept, points), torch.where(solved, promise / 2, torch.inf), solved, torch.full_like(solved, bent)
+            self.split(kept, points),
+            torch.where(solved, promise / 2, torch.inf),
+            solved,
+            torch.full_like(solved, bent or self.held),
         )
 
     def _reduced(self, weight: Tensor, triangles: list[Triangle], right: list[Tensor]) -> tuple[Tensor, Tensor, bool]:

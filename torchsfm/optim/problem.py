@@ -21,7 +21,8 @@ class Step(NamedTuple):
     solved: Tensor
     """Where there is a step."""
     bent: Tensor
-    """Where the cost bends down in some directions, in which the step goes as far as were it up: that promises nothing."""
+    """Where the cost bends down in some directions, in which the step goes as far as were it up, or not at all: that promises
+    nothing."""
 
 
 @runtime_checkable

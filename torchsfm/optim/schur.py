@@ -19,7 +19,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsfm.optim.batched_cholesky import factor, hold, measure, place
+from torchsfm.optim.batched_cholesky import STIFF, factor, hold, measure, place
 from torchsfm.optim.curvature import curvature
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.multigrid import PairGraph
@@ -49,7 +49,7 @@ PASS = 4e-6
 ALONG = 0.1
 """Part of a step by which residuals are moved both ways for their second derivative along it."""
 BENT = 1e-3
-"""Exact blocks of eliminated variables that exceed no more than this part of the Gauss-Newton ones give way to these."""
+"""Eliminated variables are held whose exact blocks do not exceed this part of the Gauss-Newton ones."""
 Solver = Literal["auto", "dense", "pcg"]
 """How the reduced system is solved: by a dense Cholesky factor, or by conjugate gradients without forming it."""
 
@@ -124,8 +124,9 @@ class Elimination:
     def curve(self, x: dict[str, Tensor], system: NormalEquations, *, minimum: bool = False) -> NormalEquations:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
 
-        An eliminated variable between two minima of its own keeps its Gauss-Newton block: it must not hold back all others.
-        At a `minimum` it is held where the cost is flat along it. The system holds until the next call.
+        An eliminated variable between two minima of its own is held, and may settle by itself afterwards: its step would be
+        long, and take the others along. At a `minimum` it is held where the cost is flat along it. The system holds until the
+        next call.
         """
         exact = self._other()
         exact._clear()
@@ -133,7 +134,7 @@ class Elimination:
             exact._add_curvature(part, x)
         for mine, other in zip(exact.squares.values, system.squares.values, strict=True):
             mine[:, -1], mine[:, :, -1] = other[:, -1], other[:, :, -1]
-        eliminated = []
+        eliminated, held = [], torch.zeros_like(system.slope[:1]).sum()
         for own, given in zip(exact.eliminated, system.eliminated, strict=True):
             q = own.q
             for a in range(q):
@@ -141,9 +142,13 @@ class Elimination:
             if minimum:
                 hold(own.V, given.V, q)
             else:
-                own.V.copy_(torch.where(factor(own.V - BENT * measure(given.V, q), q)[1], own.V, given.V))
+                measured = measure(given.V, q)
+                straight = factor(own.V - BENT * measured, q)[1]
+                for row in (place(a, b, q) for a in range(q) for b in range(a, q)):
+                    own.V[row] = torch.where(straight, own.V[row], STIFF * measured[row])
+                held = held + (~straight).sum()
             eliminated.append(replace(own, metric=given.V))
-        return replace(system, eliminated=eliminated, squares=exact.squares, curved=True)
+        return replace(system, eliminated=eliminated, squares=exact.squares, curved=True, held=bool(self.ranks.sum(held) > 0))
 
     def accelerate(self, x: dict[str, Tensor], step: dict[str, Tensor], damping: float) -> dict[str, Tensor]:
         """What a step from `x` lacks to follow a valley of the cost that is curved.

@@ -25,7 +25,7 @@ STRAIGHT = 0.75
 TELLING = 1e4
 """Comparing costs still checks a promise of this many of their rounding errors. Down to there, steps are shortened point by
 point: a single one in a bent valley would hold all others back."""
-ROUNDS = 10
+ROUNDS = 50
 """Most steps that eliminated variables take by themselves after a step with the exact Hessian,"""
 WORTH = 1e-2
 """and the part of what such a step promises, divided by their number, for which they take one."""
@@ -259,8 +259,9 @@ class _SparseProblem:
         engine = self.engine
         x = move(engine.blocks, engine.layout, here.x, step.delta)
         cost = engine.cost(x)
-        if bool(step.promise <= TELLING * self.epsilon * here.cost):
-            # So near the minimum costs do not tell what is good for a variable.
+        # So near the minimum costs do not tell what is good for a variable, but for those that are held nothing else does.
+        held = here.exact is not None and here.exact.held
+        if not held and bool(step.promise <= TELLING * self.epsilon * here.cost):
             return _Place(engine, x, cost)
         strays = not bool(here.cost - cost >= STRAIGHT * step.promise)
         if not bool(here.cost - cost > POOR * step.promise):
