@@ -12,6 +12,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.geometry import point_line_distance, project_lines
 from torchsfm.motion import PointLineTrifocalEstimator, estimate_trifocal
+from torchsfm.motion.three_views.line_reprojection import squared_line_distance
 from torchsfm.robust import Degeneracy, RobustResult
 from torchsfm.tensors import transfer_points_trifocal, trifocal_from_cameras
 from torchsfm.triangulation import triangulate_lines
@@ -71,6 +72,27 @@ def test_distance_is_that_from_the_images_of_the_best_line(generator: torch.Gene
     data = (*l.flatten(-2).unbind(1), torch.ones(40, 1, dtype=F64))
     found = PointLineTrifocalEstimator().squared_residual(P[:, 1:] @ H[:, None], *data).sqrt()
     assert_share((found / optimum - 1).abs() < 1e-3, 0.99)
+
+
+def test_short_segments_of_nothing_are_not_near(generator: torch.Generator) -> None:
+    """A step may be longer than the segment: what is then near after a few steps is near after many."""
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=F64)
+
+    turned = 0.3 * normal(40, 2, 3, 3)
+    K = torch.tensor([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]], dtype=F64)
+    P = K @ torch.cat((torch.matrix_exp(turned - turned.mT) @ torch.linalg.inv(K), 0.5 * normal(40, 2, 3, 1)), -1)
+    ends = []
+    for _ in range(3):
+        a = torch.rand(40, 500, 2, generator=generator, dtype=F64) * torch.tensor([640.0, 480.0])
+        along = normal(40, 500, 2)
+        length = 2 + 20 * torch.rand(40, 500, 1, generator=generator, dtype=F64)
+        ends.append([*a.unbind(-1), *(a + length * along / along.norm(dim=-1, keepdim=True)).unbind(-1)])
+    near = squared_line_distance(P, ends) < 2**2
+    wrong = near & ~(squared_line_distance(P, ends, 60) < 3**2)
+    # Of 2,400 some twenty; while steps went along segments too, and could shrink them to a point, 3,745 of 6,153.
+    assert int(wrong.sum()) < 0.03 * int(near.sum())
 
 
 def test_distances_are_in_the_unit_of_the_images(generator: torch.Generator) -> None:

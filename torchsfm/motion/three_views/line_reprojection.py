@@ -52,7 +52,7 @@ def squared_line_distance(model: Float[Tensor, "*#batch 2 3 4"], x: Sequence[Row
         steps: Of Gauss-Newton towards ends that one line has.
     """
     moved = _nearest(model, x, steps)
-    return _squared(moved, x).masked_fill(_blind(_transfer(model, moved)), torch.inf)
+    return _arrived(_squared(moved, x), _transfer(model, moved))
 
 
 def line_equations(
@@ -77,7 +77,14 @@ def line_equations(
     F = [torch.stack(torch.broadcast_tensors(*e), -2) for e in entries]  # type: ignore[no-untyped-call]
     first, mixed, second = (s[..., None, :] for s in (first, mixed, second))
     J = torch.stack((F[0] * first, (F[1] - mixed * F[0]) * second), -2)
-    return _squared(moved, x).masked_fill(_blind(there), torch.inf), r, J
+    return _arrived(_squared(moved, x), there), r, J
+
+
+def _arrived(squared: Tensor, at: Transfer) -> Tensor:
+    """Squared distances, with what is missing to a line, to first order, where the steps have not arrived at one."""
+    first, mixed, second = _factor(at)
+    r0, r1 = at.f[0] * first, (at.f[1] - mixed * at.f[0]) * second
+    return (squared + r0 * r0 + r1 * r1).masked_fill(_blind(at), torch.inf)
 
 
 def _transfer(model: Tensor, x: Sequence[Rows]) -> Transfer:
@@ -104,18 +111,16 @@ def _transfer(model: Tensor, x: Sequence[Rows]) -> Transfer:
         slopes.append((through2, through3))
     J: list[list[list[Rows | None]]] = [[[m[:2], None], [None, m[:2]]]]
     for view in (1, 2):
-        # Of g'(a x b) over the length of the segment by a and b.
+        # Of g'(a x b) over the length of the segment by a and b: along it they do not move their line.
         a, b = x[view][:2], x[view][2:]
+        u, v, _ = lines[view - 1]
+        along_a, along_b = ((w[0] * v - w[1] * u) for w in (a, b))
         over = _over_length(x[view])
-        J.append(
-            [
-                [
-                    [(b[1] * g[2] - g[1]) * over, (g[0] - b[0] * g[2]) * over],
-                    [(g[1] - a[1] * g[2]) * over, (a[0] * g[2] - g[0]) * over],
-                ]
-                for g in (slopes[k][view - 1] for k in range(2))
-            ]
-        )
+        J.append([])
+        for g in (slopes[k][view - 1] for k in range(2)):
+            turned = g[0] * v - g[1] * u
+            by_a, by_b = (turned - along_b * g[2]) * over, (along_a * g[2] - turned) * over
+            J[-1].append([[by_a * u, by_a * v], [by_b * u, by_b * v]])
     products = []
     for k, i in ((0, 0), (0, 1), (1, 1)):
         total = torch.zeros_like(f[0])
