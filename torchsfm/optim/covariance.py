@@ -107,7 +107,7 @@ def sparse_covariance(
             covariance[free] = torch.where(known[free][:, None, None], kept, covariance[free])
         found[name], determined[name], columns[name] = covariance, known, place
     families = zip(layout.families, inverse.determined, strict=True)
-    nullity = layout.size - inverse.root.shape[1]
+    nullity = layout.size - inverse.rank
     unknowns = layout.size - nullity + sum(int(good.sum()) * family.point_size for family, good in families)
     return SparseCovariance(found, determined, inverse.kept, columns, nullity, rows - unknowns, squares)
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.linalg import eigh
+from torchsfm.linalg.semidefinite import PseudoInverse, pseudo_inverse
 from torchsfm.optim.batched_cholesky import FLAT, Triangle, backward, diagonal, factor, floor, forward, measure, place, product
 from torchsfm.optim.layout import Family, Layout
 from torchsfm.optim.problem import Step
@@ -164,13 +165,16 @@ class NormalEquations:
         S = S[:size, :size]
         if like is None:
             scale = floor(self.diagonal).rsqrt()
-            values, vectors, ok = eigh(scale[:, None] * S * scale)
-            seen, vectors = values > NULL * values[-1:], scale[:, None] * vectors
+            scaled = pseudo_inverse(scale[:, None] * S * scale, NULL)
+            kept, rank, ok = scale[:, None] * scaled.inverse * scale, scaled.rank, scaled.ok
         else:
-            values, vectors, ok = eigh(like.root.mT @ (S.tril() + S.tril(-1).mT) @ like.root)
-            seen, vectors = values > FLAT, like.root @ vectors
-        root = torch.where(ok, vectors[:, seen] * values[seen].rsqrt(), torch.inf)
-        return Inverse(self, triangles, root, root @ root.mT, [known & ok for known in determined])
+            scale, scaled = like.scale, like.scaled
+            root = scale[:, None] * scaled.root()
+            values, vectors, ok = eigh(root.mT @ (S.tril() + S.tril(-1).mT) @ root)
+            seen = values > FLAT
+            rank, root = int(seen.sum()), torch.where(ok, root @ vectors[:, seen] * values[seen].rsqrt(), torch.inf)
+            kept = root @ root.mT
+        return Inverse(self, triangles, kept, rank, [known & ok for known in determined], scale, scaled)
 
     def information(self, columns: Tensor) -> Tensor:
         """What the problem says of some retained variables: the system left when all other variables are eliminated.
@@ -233,12 +237,15 @@ class Inverse:
     system: NormalEquations
     triangles: list[Triangle]
     """The factors of each family's V."""
-    root: Tensor
-    """A root of `kept`, (size, rank)."""
     kept: Tensor
     """The inverse of the reduced system: the covariance of the retained variables, (size, size)."""
+    rank: int
     determined: list[Tensor]
     """Which eliminated variables of each family the residuals determine, given the others."""
+    scale: Tensor
+    """Units of the retained variables,"""
+    scaled: PseudoInverse
+    """and the inverse in these of the Gauss-Newton system."""
 
     def apply(self, kept: Tensor, points: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
         """The product with a vector, given and returned in its retained and eliminated parts."""
