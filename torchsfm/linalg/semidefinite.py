@@ -38,7 +38,7 @@ class PseudoInverse:
         if self._null is None:
             return self._factor
         eye = torch.eye(len(self._factor), dtype=self._factor.dtype, device=self._factor.device)
-        inverse = torch.linalg.solve_triangular(self._factor.mT, eye, upper=True)
+        inverse: Tensor = torch.linalg.solve_triangular(self._factor.mT, eye, upper=True)
         return inverse - self._null @ (self._null.mT @ inverse)
 
 
