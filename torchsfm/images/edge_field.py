@@ -27,7 +27,8 @@ class EdgeField(NamedTuple):
     closed: Tensor
     """Which chains are, (k)."""
     nearest: Int[Tensor, "b h w"]
-    """Index of the nearest edge point whose normal has about that direction; -1 in maps without any."""
+    """Index of the nearest edge point whose normal has about that direction; -1 in maps without any. Of 32 bits: maps of many
+    frames are most of the memory that following curves takes."""
     cell: float
     """Side of what an entry of these maps stands for, in pixels."""
 
@@ -38,7 +39,7 @@ class EdgeField(NamedTuple):
         h, w = self.nearest.shape[1:]
         column, row = (x / self.cell).nan_to_num(-1.0, -1.0, -1.0).round().clamp(-1, max(h, w)).long().unbind(-1)
         inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
-        index = self.nearest[_direction(normal), row.clamp(0, h - 1), column.clamp(0, w - 1)]
+        index = self.nearest[_direction(normal), row.clamp(0, h - 1), column.clamp(0, w - 1)].long()
         there = inside & (index >= 0)
         index = index.clamp(min=0)
         if len(self.x) == 0:
@@ -73,7 +74,7 @@ def edge_field(
         t.clamp(0, s - 1).numpy() for t, s in zip((x / cell).round().long().cpu().unbind(-1), (width, height), strict=True)
     )
     angle = torch.atan2(normal[:, 1], normal[:, 0]).cpu().numpy()
-    maps = np.full((_DIRECTIONS, height, width), -1, dtype=np.int64)
+    maps = np.full((_DIRECTIONS, height, width), -1, dtype=np.int32)
     for k in range(_DIRECTIONS):
         off = np.abs((angle - 2 * math.pi * k / _DIRECTIONS + math.pi) % (2 * math.pi) - math.pi)
         near = np.flatnonzero(off < 2 * math.pi / _DIRECTIONS)
@@ -82,7 +83,7 @@ def edge_field(
         empty = np.ones((height, width), dtype=np.uint8)
         empty[row[near], column[near]] = 0
         _, label = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-        table = np.zeros(int(label.max()) + 1, dtype=np.int64)
+        table = np.zeros(int(label.max()) + 1, dtype=np.int32)
         table[label[row[near], column[near]]] = near
         maps[k] = table[label]
     return EdgeField(x, normal, chain, start, length, closed[start], torch.from_numpy(maps).to(x.device), cell)
