@@ -183,3 +183,35 @@ def test_a_loss_leaves_out_what_is_wrong(generator: torch.Generator) -> None:
     plain = calibrate_planes(x, X, image_size=SIZE)
     assert float(off.mean()) < 0.3 * float((plain.camera.K[..., 0, 0] - K[0, 0]).abs().mean())
     assert float(robust.deviation[..., 0].mean()) < 0.3 * float(plain.deviation[..., 0].mean())
+
+
+@pytest.mark.parametrize("loss", [None, Cauchy(1.0)])
+@pytest.mark.parametrize("unit", [1e-10, 1e5, 1e30])
+def test_unit_and_origin_of_the_plane_are_free(unit: float, loss: Cauchy | None, generator: torch.Generator) -> None:
+    """At first they were not: 1e-10 did not converge, with 1e10 focal lengths were 4 % off and called OK."""
+    x, X, _, _ = views(generator, 4, [-0.2, 0.1, 0, 0, 0], noise=0.1)
+    visible = torch.ones(4, len(X), dtype=torch.bool)
+    # The lens takes the points of a view that has no pose so far that there may be no number for it.
+    visible[1] = False
+    wanted = calibrate_planes(x, X, visible=visible, loss=loss)
+    aside = torch.tensor([1e4, -3e4], dtype=torch.float64)
+    found = calibrate_planes(x, unit * (X + aside), visible=visible, loss=loss)
+    assert wanted.status == found.status == Status.OK
+    pairs = [(found.camera.K, wanted.camera.K), (found.rms, wanted.rms), (found.view_rms, wanted.view_rms)]
+    pairs += [(found.covariance, wanted.covariance), (found.poses.R, wanted.poses.R)]
+    moved = wanted.poses.t - (wanted.poses.R[..., :2] @ aside[:, None])[..., 0]
+    used = wanted.used
+    pairs += [(found.poses.t[used] / unit, moved[used])]
+    of_t = (slice(None), slice(3, None), slice(3, None))
+    pairs += [(found.pose_covariance[of_t][used] / unit**2, wanted.pose_covariance[of_t][used])]
+    for of, other in pairs:
+        assert torch.allclose(of, other, rtol=1e-5, atol=1e-7)
+
+
+def test_one_view_says_two_numbers(generator: torch.Generator) -> None:
+    """How the lens bends lines says the rest, but so little that its minimum may be far off."""
+    x, X, K, _ = views(generator, 1, [-0.2, 0.1, 0, 0, 0], noise=0.1)
+    assert calibrate_planes(x, X).status == Status.DEGENERATE
+    found = calibrate_planes(x, X, image_size=(1041.0, 781.0), free=("focal", "aspect"))
+    assert found.status == Status.OK
+    assert abs(found.camera.K[0, 0] - K[0, 0]) < 6 * found.deviation[0]

@@ -71,8 +71,9 @@ class PlaneCalibration:
     iterations: Int[Tensor, "*batch"]
     """Steps tried."""
     status: Int8[Tensor, "*batch"]
-    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance), or a pose so badly
-    that the dtype cannot hold its covariance; TOO_FEW: no view, or fewer measurements than unknowns; NOT_CONVERGED."""
+    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance, or fewer than one
+    for two of the free parameters, those of the lens aside), or a pose so badly that the dtype cannot hold its covariance;
+    TOO_FEW: no view, or fewer measurements than unknowns; NOT_CONVERGED."""
 
     @property
     def deviation(self) -> Float[Tensor, "*batch q"]:
@@ -144,16 +145,21 @@ def calibrate_planes(
     with torch.no_grad():
         used = (seen.sum(-1) >= 4) & _spread_out(X64, seen)
         seen = seen & used[..., None]
+        middle, unit = _extent(X64, seen.any(-2))
+    # Neither the unit of the plane nor its origin matters, nor what rounding makes of them.
+    shown = X64 if radius is None else circle_points(X64, radius)
+    X64, shown = ((p - middle[..., None, :]) / unit[..., None, None] for p in (X64, shown))
+    with torch.no_grad():
         start = start_from_homographies(x64, X64, seen, used, image_size, columns, distortion.num_parameters)
     columns += tuple(range(HEAD, HEAD + distortion.num_parameters))
     q = len(columns)
     weights = seen.double().flatten(-2)
-    problem = _Problem(PixelProjection(distortion, columns, SKEW in columns), radius)
+    problem = _Problem(PixelProjection(distortion, columns, SKEW in columns), radius is not None)
     result = levenberg_marquardt(
         problem.residual,
         start,
         x64,
-        X64,
+        shown,
         retract=problem.retract,
         size=q + 6 * v,
         weights=weights,
@@ -166,11 +172,15 @@ def calibrate_planes(
     found = result.x
     with torch.no_grad():
         settled = tensor_map(torch.Tensor.detach, found)
-        flat = tensor_map(lambda a: a.reshape(-1, *a.shape[len(batch) :]), (settled, x64.detach(), X64.detach(), weights))
+        flat = tensor_map(lambda a: a.reshape(-1, *a.shape[len(batch) :]), (settled, x64.detach(), shown.detach(), weights))
         residual, J = problem.linearize(flat[0], flat[1], flat[2])
+        # Where nothing is measured, points may be anywhere.
+        residual = torch.where((flat[3] > 0)[..., None], residual, 0.0)
         # What the loss trusts an observation.
         trust = flat[3] if loss is None else flat[3] * loss_slope(loss, residual.square().sum(-1))
         covariance, pose_covariance = _covariance(residual, J, trust, q, v, used.reshape(-1, v))
+        lengths = torch.stack((torch.ones_like(unit), unit), -1).repeat_interleave(3, -1).reshape(-1, 1, 6)
+        pose_covariance = lengths[..., :, None] * pose_covariance * lengths[..., None, :]
         square = residual.square().sum(-1) * flat[3]
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
@@ -179,16 +189,19 @@ def calibrate_planes(
         measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
         held = [torch.isfinite(c.to(x.dtype)).flatten(1).all(-1).reshape(batch) for c in (covariance, pose_covariance)]
         unsure = unsure | ~(held[0] & held[1])
+        # A plane tells two numbers of a camera; what the lens bends tells more, but along a valley that no covariance shows.
+        unsure = unsure | (2 * used.sum(-1) < sum(column < HEAD for column in columns))
         status = torch.where(unsure, int(Status.DEGENERATE), result.status)
         status = torch.where((measured < unknowns) | ~used.any(-1), int(Status.TOO_FEW), status).to(torch.int8)
     dtype = x.dtype
+    t = unit[..., None, None] * found.t - (found.R[..., :2] @ middle[..., None, :, None])[..., 0]
     names = [intrinsic_labels(distortion)[column] for column in columns]
     names[0] = "fx"
     if ASPECT in columns:
         names[1], covariance = "fy", _lengths(covariance, flat[0].row)
     return PlaneCalibration(
         camera=camera_from_row(found.row.to(dtype), distortion),
-        poses=Pose(found.R.to(dtype), found.t.to(dtype)),
+        poses=Pose(found.R.to(dtype), t.to(dtype)),
         rms=rms.to(dtype),
         view_rms=view_rms.to(dtype),
         used=used,
@@ -210,10 +223,10 @@ def _lengths(covariance: Tensor, found: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Reprojection of the plane's points, or of its circles, and its derivatives."""
+    """Reprojection of the plane's points, or of the outlines of its circles, and its derivatives."""
 
     projection: PixelProjection
-    radius: float | None
+    circles: bool
 
     def retract(self, u: CameraAndPoses, delta: Tensor) -> CameraAndPoses:
         free = self.projection.free
@@ -226,23 +239,20 @@ class _Problem:
         return CameraAndPoses(row, turn @ u.R, moved)
 
     def residual(self, u: CameraAndPoses, x: Tensor, X: Tensor) -> Tensor:
-        pixels = self.projection.pixels(*_seen(u, self._outlined(X)))
-        if self.radius is not None:
+        pixels = self.projection.pixels(*_seen(u, X))
+        if self.circles:
             pixels = outline_centres(centre_weights(pixels), pixels)
         return (pixels.movedim(0, -1) - x).flatten(-3, -2)
-
-    def _outlined(self, X: Tensor) -> Tensor:
-        return X if self.radius is None else circle_points(X, self.radius)
 
     def linearize(self, u: CameraAndPoses, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
         """Residuals and Jacobian; every view depends on its own pose alone, so that all poses are differentiated at once."""
         b, v, n = x.shape[:3]
         q = len(self.projection.free)
-        ray, row = _seen(u, self._outlined(X))
+        ray, row = _seen(u, X)
         local = x.new_empty(2, 6 + q, b, v, ray.shape[-1])
         pixels = self.projection.linearize(ray, row, local[:, 3:6], local[:, 6:])
         turn_slopes(ray, local[:, 3:6], local)
-        if self.radius is not None:
+        if self.circles:
             K = centre_weights(pixels)
             pixels, local = outline_centres(K, pixels), outline_centres(K[:, :, None], local)
         J = x.new_zeros(b, v, n, 2, q + 6 * v)
@@ -255,6 +265,15 @@ def _seen(u: CameraAndPoses, X: Tensor) -> tuple[Tensor, Tensor]:
     """The plane's points in the frames of the views (3, *batch, v, n), and the rows of the cameras (k, *batch, 1, 1)."""
     Y = u.R[..., :2] @ X.mT[..., None, :, :] + u.t[..., None]
     return Y.movedim(-2, 0), u.row.movedim(-1, 0)[..., None, None]
+
+
+def _extent(X: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    """The middle (*batch, 2) of the points that are seen, and how far from it they reach."""
+    low, high = torch.where(seen[..., None], X, torch.inf).amin(-2), torch.where(seen[..., None], X, -torch.inf).amax(-2)
+    some = seen.any(-1)[..., None]
+    low, high = torch.where(some, low, 0.0), torch.where(some, high, 0.0)
+    unit = (high / 2 - low / 2).amax(-1)
+    return low / 2 + high / 2, torch.where(unit > 0, unit, 1.0)
 
 
 def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
