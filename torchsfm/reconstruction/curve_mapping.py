@@ -64,15 +64,13 @@ class Sight(NamedTuple):
     edges: ImageEdges
     """Those that the lens shows, as they are."""
     points: EdgePoints
-    field: EdgeField
 
-
-def sight_of(edges: ImageEdges, camera: Camera, size: tuple[int, int]) -> Sight:
-    """What a camera sees of a frame's edges."""
-    kept, points = edges.seen_by(camera)
-    bright = torch.stack((points.tangent[:, 1], -points.tangent[:, 0]), -1)
-    chain = torch.unique(points.chain, return_inverse=True)[1]
-    return Sight(kept, points, edge_field(points.x, bright, chain, torch.zeros_like(chain, dtype=torch.bool), size))
+    def field(self, size: tuple[int, int]) -> EdgeField:
+        """Its edges, to be looked up; larger than all else, so it is not kept."""
+        tangent = self.points.tangent
+        bright = torch.stack((tangent[:, 1], -tangent[:, 0]), -1)
+        chain = torch.unique(self.points.chain, return_inverse=True)[1]
+        return edge_field(self.points.x, bright, chain, torch.zeros_like(chain, dtype=torch.bool), size)
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ class CurveMapping:
         v = len(edges)
         poses = Pose.identity(v, dtype=torch.float64)
         none = no_curves(poses.R)
-        sights = tuple(sight_of(own, camera, size) for own in edges)
+        sights = tuple(Sight(*own.seen_by(camera)) for own in edges)
         return cls(tuple(edges), size, camera, poses, torch.zeros(v, dtype=torch.bool), none, none.curve, sights)
 
     @property
@@ -196,7 +194,7 @@ def adjust(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float,
     if found.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
     camera = found.cameras[0]
-    sights = tuple(sight_of(own, camera, mapping.size) for own in mapping.edges)
+    sights = tuple(Sight(*own.seen_by(camera)) for own in mapping.edges)
     curves = mapping.curves.adjusted(found.structure[0])  # type: ignore[arg-type]
     return replace(mapping, poses=found.poses, camera=camera, curves=curves, sights=sights)
 
@@ -218,11 +216,9 @@ def prune(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
     return mapping.with_curves(curves, mapping.home[keep])
 
 
-def settle(
-    mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float, iterations: int, near: float = NEAR
-) -> CurveMapping:
+def settle(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float, iterations: int) -> CurveMapping:
     """The cameras adjusted, and without samples that are of no curve; `cameras` as for `adjust`."""
-    return prune(adjust(track(mapping, near), cameras, tolerance=tolerance, iterations=iterations), near)
+    return prune(adjust(track(mapping), cameras, tolerance=tolerance, iterations=iterations))
 
 
 def sampled(mapping: CurveMapping, progress: Progress, near: float = NEAR) -> CurveMapping:
@@ -265,7 +261,7 @@ def register(mapping: CurveMapping, view: int, guess: Pose | None = None) -> Cur
     if int(use.sum()) < _FEWEST:
         return None
     X, tangent = mapping.curves.X[use], mapping.curves.tangents()[use]
-    seen = (X, tangent, mapping.sights[view].field, mapping.size, mapping.camera.K)
+    seen = (X, tangent, mapping.sights[view].field(mapping.size), mapping.size, mapping.camera.K)
     if guess is not None and (pose := _shown(pose_from_edges(*seen, guess, reach=_CLOSE))) is not None:
         return mapping.placed(torch.tensor([view]), pose)
     pose = _shown(pose_from_edges(*seen, _starts(mapping, X, a, b, (view - a) / (a - b))))
