@@ -134,7 +134,7 @@ class Elimination:
             exact._add_curvature(part, x)
         for mine, other in zip(exact.squares.values, system.squares.values, strict=True):
             mine[:, -1], mine[:, :, -1] = other[:, -1], other[:, :, -1]
-        eliminated, held = [], torch.zeros_like(system.slope[:1]).sum()
+        eliminated, bent = [], [torch.zeros_like(system.slope.sum(), dtype=torch.bool)]
         for own, given in zip(exact.eliminated, system.eliminated, strict=True):
             q = own.q
             for a in range(q):
@@ -146,9 +146,10 @@ class Elimination:
                 straight = factor(own.V - BENT * measured, q)[1]
                 for row in (place(a, b, q) for a in range(q) for b in range(a, q)):
                     own.V[row] = torch.where(straight, own.V[row], STIFF * measured[row])
-                held = held + (~straight).sum()
+                bent.append(~straight.all())
             eliminated.append(replace(own, metric=given.V))
-        return replace(system, eliminated=eliminated, squares=exact.squares, curved=True, held=bool(self.ranks.sum(held) > 0))
+        held = bool(self.ranks.any(torch.stack(bent).any()))
+        return replace(system, eliminated=eliminated, squares=exact.squares, curved=True, held=held)
 
     def accelerate(self, x: dict[str, Tensor], step: dict[str, Tensor], damping: float) -> dict[str, Tensor]:
         """What a step from `x` lacks to follow a valley of the cost that is curved.
