@@ -25,7 +25,7 @@ STRAIGHT = 0.75
 TELLING = 1e4
 """Comparing costs still checks a promise of this many of their rounding errors. Down to there, steps are shortened point by
 point: a single one in a bent valley would hold all others back."""
-ROUNDS = 50
+ROUNDS = 20
 """Most steps that eliminated variables take by themselves after a step with the exact Hessian,"""
 WORTH = 1e-2
 """and the part of what such a step promises, divided by their number, for which they take one."""
