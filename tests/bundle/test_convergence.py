@@ -126,17 +126,17 @@ def between_two_places(problem: BundleProblem, share: float, generator: torch.Ge
 
 
 def test_points_between_two_places_do_not_hold_back_the_others() -> None:
-    found = []
+    steps = []
     for stream in range(6):
         g = seeded(stream)
         problem = random_bundle_problem(10, 400, 2400, noise=0.2, generator=g).problem
         problem = between_two_places(problem, 0.3, g)
-        options = {"free": ("focal", "k1"), "loss": Cauchy(1.0), "tolerance": 1e-9, "max_iterations": 300}
-        found.append(bundle_adjust_model(problem, **options).result)
-    # A point may still crawl: none of 180 problems took more than 86 steps, one of 240 took 300 before such points were held.
-    assert sum(result.status == Status.OK for result in found) >= 5
+        found = bundle_adjust_model(problem, free=("focal", "k1"), loss=Cauchy(1.0), tolerance=1e-9, max_iterations=300).result
+        # Of 700 such problems none took more than 103 steps; before these points were held, one of 240 took all 300.
+        assert found.status == Status.OK
+        steps.append(found.iterations)
     # Were all damped until the Hessian is positive, it would be nearly ninety on average.
-    assert sorted(result.iterations for result in found)[3] < 60
+    assert sum(steps) < 60 * len(steps)
 
 
 def test_a_point_beside_its_minimum_does_not_take_cameras_along() -> None:

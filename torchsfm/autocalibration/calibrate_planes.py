@@ -179,8 +179,8 @@ def calibrate_planes(
         # What the loss trusts an observation.
         trust = flat[3] if loss is None else flat[3] * loss_slope(loss, residual.square().sum(-1))
         covariance, pose_covariance = _covariance(residual, J, trust, q, v, used.reshape(-1, v))
-        lengths = torch.stack((torch.ones_like(unit), unit), -1).repeat_interleave(3, -1).reshape(-1, 1, 6)
-        pose_covariance = lengths[..., :, None] * pose_covariance * lengths[..., None, :]
+        units = torch.stack((torch.ones_like(unit), unit), -1).repeat_interleave(3, -1).reshape(-1, 1, 6)
+        pose_covariance = units[..., :, None] * pose_covariance * units[..., None, :]
         square = residual.square().sum(-1) * flat[3]
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)

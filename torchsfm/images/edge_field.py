@@ -27,8 +27,8 @@ class EdgeField(NamedTuple):
     closed: Tensor
     """Which chains are, (k)."""
     nearest: Int[Tensor, "b h w"]
-    """Index of the nearest edge point whose normal has about that direction; -1 in maps without any. Of 32 bits: maps of many
-    frames are most of the memory that following curves takes."""
+    """Index of the nearest edge point whose normal has about that direction; -1 in maps without any. Of 32 bits, as they
+    are large."""
     cell: float
     """Side of what an entry of these maps stands for, in pixels."""
 
