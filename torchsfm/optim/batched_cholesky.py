@@ -48,20 +48,25 @@ def measure(V: Tensor, q: int) -> Tensor:
     return measured
 
 
-def hold(V: Tensor, metric: Tensor, q: int) -> None:
-    """Make blocks stiff, in place, along directions in which next to nothing is left of the curvature that `metric` has."""
+def hold(V: Tensor, metric: Tensor, q: int, least: float = FLAT) -> Tensor:
+    """Make blocks stiff, in place, along directions in which no more than a part is left of the curvature that `metric` has.
+
+    Returns:
+        Which blocks (n) were so flat, or bent down.
+    """
     measured = measure(metric, q)
-    _, curved = factor(V - FLAT * measured, q)
+    _, curved = factor(V - least * measured, q)
     flat = (~curved).nonzero()[:, 0]
     rows = torch.tensor([[place(min(a, b), max(a, b), q) for b in range(q)] for a in range(q)], device=V.device)
     root = torch.linalg.cholesky_ex(measured[:, flat][rows].permute(2, 0, 1))[0]
     half = torch.linalg.solve_triangular(root, V[:, flat][rows].permute(2, 0, 1), upper=False)
     values, vectors, _ = eigh(torch.linalg.solve_triangular(root, half.mT, upper=False))
-    held = root @ (vectors * (values <= FLAT)[:, None])
+    held = root @ (vectors * (values <= least)[:, None])
     stiff = STIFF * held @ held.mT
     for a in range(q):
         for b in range(a, q):
             V[place(a, b, q), flat] += stiff[:, a, b]
+    return ~curved
 
 
 def product(V: Tensor, x: Tensor) -> Tensor:

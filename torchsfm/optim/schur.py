@@ -19,7 +19,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsfm.optim.batched_cholesky import STIFF, factor, hold, measure, place
+from torchsfm.optim.batched_cholesky import FLAT, hold, place
 from torchsfm.optim.curvature import curvature
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.multigrid import PairGraph
@@ -49,7 +49,7 @@ PASS = 4e-6
 ALONG = 0.1
 """Part of a step by which residuals are moved both ways for their second derivative along it."""
 BENT = 1e-3
-"""Eliminated variables are held whose exact blocks do not exceed this part of the Gauss-Newton ones."""
+"""Eliminated variables are held along directions in which they have no more than this part of the Gauss-Newton curvature."""
 Solver = Literal["auto", "dense", "pcg"]
 """How the reduced system is solved: by a dense Cholesky factor, or by conjugate gradients without forming it."""
 
@@ -124,9 +124,9 @@ class Elimination:
     def curve(self, x: dict[str, Tensor], system: NormalEquations, *, minimum: bool = False) -> NormalEquations:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
 
-        An eliminated variable between two minima of its own is held, and may settle by itself afterwards: its step would be
-        long, and take the others along. At a `minimum` it is held where the cost is flat along it. The system holds until the
-        next call.
+        An eliminated variable between two minima of its own is held along the way from one to the other, and may settle by itself
+        afterwards: its step would be long, and take the others along. At a `minimum` it is held where the cost is flat. The
+        system holds until the next call.
         """
         exact = self._other()
         exact._clear()
@@ -139,14 +139,7 @@ class Elimination:
             q = own.q
             for a in range(q):
                 own.V[place(a, q, q)] = given.V[place(a, q, q)]
-            if minimum:
-                hold(own.V, given.V, q)
-            else:
-                measured = measure(given.V, q)
-                straight = factor(own.V - BENT * measured, q)[1]
-                for row in (place(a, b, q) for a in range(q) for b in range(a, q)):
-                    own.V[row] = torch.where(straight, own.V[row], STIFF * measured[row])
-                bent.append(~straight.all())
+            bent.append(hold(own.V, given.V, q, FLAT if minimum else BENT).any())
             eliminated.append(replace(own, metric=given.V))
         held = bool(self.ranks.any(torch.stack(bent).any()))
         return replace(system, eliminated=eliminated, squares=exact.squares, curved=True, held=held)
