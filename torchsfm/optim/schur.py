@@ -124,9 +124,9 @@ class Elimination:
     def curve(self, x: dict[str, Tensor], system: NormalEquations, *, minimum: bool = False) -> NormalEquations:
         """The system at `x` with exact second derivatives, in memory of its own; damped and sloped as the one given.
 
-        An eliminated variable between two minima of its own is held along the way from one to the other, and may settle by itself
-        afterwards: its step would be long, and take the others along. At a `minimum` it is held where the cost is flat. The
-        system holds until the next call.
+        An eliminated variable between two minima of its own is held along the way from one to the other, and may settle by
+        itself afterwards: its step would be long, and take the others along. At a `minimum` it is held where the cost is
+        flat. The system holds until the next call.
         """
         exact = self._other()
         exact._clear()
