@@ -271,3 +271,16 @@ def test_a_real_image(pose6dscene):
     assert found.status == Status.OK
     assert found.error < 1.5
     assert step_between(found.pose, Pose.from_matrix(truth))[:3].norm() < 0.02
+
+
+@pytest.mark.parametrize("loss", [None, Cauchy(2.0)])
+@pytest.mark.parametrize("unit", [1e-12, 1e-8, 1e8, 1e12])
+def test_the_unit_of_the_world_is_free(make_problem, generator, unit, loss):
+    x, X, pose, camera = make_problem(10, noise=1.0)
+    start = perturbed(pose, 0.05, generator)
+    found = refine_camera(x, X, start, camera, loss=loss)
+    again = refine_camera(x, X * unit, Pose(start.R, start.t * unit), camera, loss=loss)
+    assert (found.status == Status.OK).all()
+    assert (again.status == Status.OK).all()
+    torch.testing.assert_close(again.cost, found.cost, rtol=1e-5, atol=0)
+    torch.testing.assert_close(again.pose.t / unit, found.pose.t, rtol=1e-4, atol=1e-4)

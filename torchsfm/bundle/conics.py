@@ -20,7 +20,7 @@ from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.structure import Sight
 from torchsfm.geometry import Camera, Ellipse, Ellipsoid, Pose, Similarity
 from torchsfm.geometry.conic_distance import root_slopes
-from torchsfm.geometry.ellipse_manifold import Ellipse3D, ellipse_from_row, ellipse_row, spanning
+from torchsfm.geometry.ellipse_manifold import Ellipse3D, ellipse_from_row, ellipse_row, ellipse_size, spanning
 from torchsfm.geometry.intrinsic_parameters import row_from_camera
 from torchsfm.linalg import inverse
 from torchsfm.optim import Block, Loss, Term
@@ -119,7 +119,10 @@ class BundleConics:
         These are the centre, turns about the first and the second axis (radians), semi-axis a, (a - b) times the turn about the
         normal, and semi-axis b.
         """
-        return C
+        size = ellipse_size(x)[:, None].expand(-1, 8)
+        turns = torch.tensor([3, 4], device=x.device)
+        unit = torch.where(size.isfinite(), size, 1.0).index_fill(1, turns, 1.0)
+        return unit[:, :, None] * C * unit[:, None, :]
 
     def moved(self, start: Tensor, end: Tensor, world: Similarity | None) -> "BundleConics":
         """The ellipses after the adjustment."""

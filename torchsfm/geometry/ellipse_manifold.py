@@ -15,7 +15,8 @@ class Ellipse3D:
     """Ellipses `c + (u, v) S w`, |w| = 1, with orthonormal u and v and a symmetric S: `(c, u, v, S11, S12, S22)` in 12 numbers.
 
     A step moves the centre by three numbers, turns the plane about u and about v by two, and adds three to S, so that a circle
-    is an ellipse like any other: its axes need no direction.
+    is an ellipse like any other: its axes need no direction. Lengths of a step are in units of the ellipse's own size, that of
+    `ellipse_size`, so that all its numbers are of one kind.
     """
 
     ambient: int = 12
@@ -26,8 +27,14 @@ class Ellipse3D:
         u, v = x[..., 3:6], x[..., 6:9]
         turn = rotation_from_rotvec(delta[..., 3:4] * u + delta[..., 4:5] * v)
         frame = torch.stack((u, v), -2).expand(*turn.shape[:-2], 2, 3) @ turn.mT
-        centre, root = x[..., :3] + delta[..., :3], x[..., 9:] + delta[..., 5:]
+        size = ellipse_size(x)[..., None]
+        centre, root = x[..., :3] + size * delta[..., :3], x[..., 9:] + size * delta[..., 5:]
         return torch.cat((centre, frame.flatten(-2), root), -1)
+
+
+def ellipse_size(x: Float[Tensor, "*batch 12"]) -> Float[Tensor, "*batch"]:
+    """The quadratic mean of the semi-axes."""
+    return torch.linalg.vector_norm(x[..., [9, 10, 10, 11]], dim=-1) * 0.5**0.5
 
 
 def ellipse_row(ellipse: Ellipsoid) -> Float[Tensor, "*batch 12"]:

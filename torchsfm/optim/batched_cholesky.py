@@ -28,12 +28,22 @@ def diagonal(V: Tensor, q: int) -> Tensor:
     return V[[place(a, a, q) for a in range(q)]]
 
 
-def floor(diagonal: Tensor) -> Tensor:
-    """A variable that nothing depends on in some direction gets a damping of its own, and does not move."""
+def floor(diagonal: Tensor, kinds: Tensor | None = None) -> Tensor:
+    """A variable that nothing depends on in some direction gets a damping of its own, and does not move.
+
+    Args:
+        diagonal: Of the systems, columns first.
+        kinds: The number of each column's kind, as where columns have units of their own.
+    """
     if diagonal.numel() == 0:
         return diagonal
-    least = 1e-12 * diagonal.amax(0, keepdim=True)
-    return torch.where(least > 0, torch.maximum(diagonal, least), torch.ones_like(diagonal))
+    top = diagonal.amax(0, keepdim=True)
+    least = 1e-12 * top
+    if kinds is not None:
+        own = diagonal.new_zeros(diagonal.shape).scatter_reduce(0, kinds, diagonal, "amax")[kinds]
+        # What is left of a kind by rounding alone is no unit.
+        least = torch.maximum(1e-12 * own, 1e-30 * top)
+    return torch.where(top > 0, torch.maximum(diagonal, least), torch.ones_like(diagonal))
 
 
 def measure(V: Tensor, q: int) -> Tensor:

@@ -44,7 +44,7 @@ class DenseSystem:
         """The step for a damping."""
         diagonal = self.metric.diagonal(dim1=-2, dim2=-1)
         # A direction that nothing depends on gets the damping of the others, and so does not move.
-        floor = 1e-9 * diagonal.amax(-1, keepdim=True) + torch.finfo(diagonal.dtype).tiny
+        floor = 1e-30 * diagonal.amax(-1, keepdim=True) + torch.finfo(diagonal.dtype).tiny
         damped = damping[..., None] * diagonal.clamp_min(floor)
         matrix = self.metric if exact is None else torch.where(exact[..., None, None], self.hessian, self.metric)
         factor, info = torch.linalg.cholesky_ex(matrix + torch.diag_embed(damped))

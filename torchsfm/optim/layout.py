@@ -64,6 +64,8 @@ class Layout:
     """First column of each retained block with free variables."""
     size: int
     """Number of columns of the reduced system; the gradient is column `size`, column `size + 1` belongs to fixed variables."""
+    kinds: Tensor
+    """A number for the block and the coordinate of each column: those of a kind have one unit."""
     families: list[Family]
     """The eliminated blocks that have free variables."""
     pieces: list[Piece]
@@ -132,7 +134,19 @@ def lay_out(
     for name in numbers:
         own = [piece if piece.family == name else replace(piece, family=None, point=None) for piece in pieces]
         families.append(Family(name, size, blocks[name].tangent, free[name].numel(), own))
-    return Layout(free, first, size, families, pieces, still, ranks)
+    return Layout(free, first, size, _kinds(blocks, free, first), families, pieces, still, ranks)
+
+
+def _kinds(blocks: dict[str, Block], free: dict[str, Tensor], first: dict[str, int]) -> Tensor:
+    """The kind of each column."""
+    device = next(iter(free.values())).device
+    found = [torch.zeros(0, dtype=torch.int64, device=device)]
+    known = 0
+    for name in first:
+        width = blocks[name].tangent
+        found.append((known + torch.arange(width, device=device)).repeat(free[name].numel()))
+        known += width
+    return torch.cat(found)
 
 
 def _cut(term: Term, number: dict[str, Tensor], gone: tuple[str, ...]) -> dict[tuple[bool, bool], Tensor]:

@@ -82,7 +82,7 @@ class NormalEquations:
 
         The promise holds for steps of conjugate gradients too: their residual is orthogonal to the step.
         """
-        weight = damping * floor(self.diagonal)
+        weight = damping * floor(self.diagonal, self.layout.kinds)
         metrics = [damping * measure(part.metric, part.q) for part in self.eliminated]
         factors = [factor(part.V + metric, part.q) for part, metric in zip(self.eliminated, metrics, strict=True)]
         triangles = [L for L, _ in factors]
@@ -136,7 +136,7 @@ class NormalEquations:
         Away from a minimum it does so along every gauge freedom, too, since no orbit but that of a shift or a scale is
         straight (saddle-free Newton steps, Dauphin et al. 2014).
         """
-        scale = floor(self.diagonal).rsqrt()
+        scale = floor(self.diagonal, self.layout.kinds).rsqrt()
         values, vectors, ok = eigh(scale[:, None] * S * scale)
         kept = -scale * (vectors @ ((vectors.mT @ (scale * slope)) / values.abs().clamp_min(NULL)))
         return kept, ok & kept.isfinite().all()
@@ -164,7 +164,7 @@ class NormalEquations:
             determined.append(torch.stack([L[a][a] > 0 for a in range(part.q)]).all(0))
         S = S[:size, :size]
         if like is None:
-            scale = floor(self.diagonal).rsqrt()
+            scale = floor(self.diagonal, self.layout.kinds).rsqrt()
             scaled = pseudo_inverse(scale[:, None] * S * scale, NULL)
             kept, rank, ok = scale[:, None] * scaled.inverse * scale, scaled.rank, scaled.ok
         else:
@@ -192,15 +192,17 @@ class NormalEquations:
         others = torch.ones(size, dtype=torch.bool, device=S.device)
         others[columns] = False
         A = S[others][:, others]
-        A.diagonal().add_(NULL * floor(self.diagonal[others]))
+        A.diagonal().add_(NULL * floor(self.diagonal, self.layout.kinds)[others])
         half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(A)[0], S[others][:, columns], upper=False)
         left: Tensor = S[columns][:, columns] - half.mT @ half
         return left
 
     def gradient(self) -> Tensor:
-        """Largest absolute derivative of the cost."""
-        found = torch.cat((self.slope, *(part.gradient().flatten() for part in self.eliminated)))
-        return self.layout.ranks.largest(found.abs().amax())
+        """The largest absolute derivative of the cost, each in units of its variable's own precision."""
+        scaled = [self.slope * floor(self.diagonal, self.layout.kinds).rsqrt()]
+        for part in self.eliminated:
+            scaled.append((part.gradient() * floor(diagonal(part.metric, part.q)).rsqrt()).flatten())
+        return self.layout.ranks.largest(torch.cat(scaled).abs().amax())
 
     def along(self, step: dict[str, Tensor]) -> Tensor:
         """The derivative of the cost along a step."""

@@ -97,7 +97,7 @@ def sparse_levenberg_marquardt(
         max_iterations: Most accepted or rejected steps.
         function_tolerance: End when no more than this fraction of the cost is left to gain, by the promise of a step or by how
             fast gains fall.
-        gradient_tolerance: End when no derivative of the cost is larger.
+        gradient_tolerance: End when residuals make no larger cosine with what any variable moves them by.
         step_tolerance: End when the step of every variable is shorter than this fraction of that variable's norm.
         initial_damping: Damping relative to the diagonal of the normal equations, at the start (1 / Ceres' radius).
         linear_solver: "dense" forms the reduced system of the retained variables and factors it; "pcg" solves it by
@@ -212,8 +212,9 @@ class _Place:
         return self._system
 
     def steepest(self) -> Tensor:
-        """The largest absolute derivative."""
-        return self.system.gradient()
+        """The largest cosine between the residuals and what a variable moves them by, whatever the units of either."""
+        slope = self.system.gradient()
+        return torch.where(slope == 0, slope, slope / (2 * self.cost).sqrt())
 
     def along(self, delta: dict[str, Tensor]) -> Tensor:
         """The derivative of the cost along a step."""
