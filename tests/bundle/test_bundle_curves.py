@@ -21,7 +21,8 @@ from structure_scenes import (
 )
 from torch import Tensor
 
-from torchsfm.bundle import BundleCurves, BundleLines, bundle_adjust, bundle_covariance
+from torchsfm._types import Status
+from torchsfm.bundle import BundleCurves, BundleLines, RelativePosePrior, bundle_adjust, bundle_covariance
 from torchsfm.bundle.blocks import Bundle
 from torchsfm.geometry import (
     BundleProblem,
@@ -317,3 +318,40 @@ def test_wrong_curves(generator: torch.Generator) -> None:
         dataclasses.replace(curves, sample=curves.sample + 1)
     with pytest.raises(ValueError, match=r"structure.view: wanted numbers from 0 to 4"):
         bundle_adjust(scene.problem, structure=[dataclasses.replace(curves, view=curves.view + 1)])
+
+
+@pytest.mark.parametrize("solver", ["dense", "pcg"])
+@pytest.mark.parametrize("turns", [False, True])
+def test_noise_does_not_carry_the_world_away(generator: torch.Generator, turns: bool, solver: str) -> None:
+    """Samples cannot follow the world, so that their residuals say a little of where it is, by noise alone."""
+    scene = make_scene(generator, noise=0.5)
+    problem, curves = disturbed(scene, generator)
+    pairs = torch.tensor([[0, 1], [1, 2], [2, 3], [3, 4]])
+    motions = scene.problem.poses[pairs[:, 1]] @ scene.problem.poses[pairs[:, 0]].inverse()
+    # How cameras turn says nothing of where they are.
+    known = RelativePosePrior(pairs, motions, torch.tensor([0.01] * 3 + [torch.inf] * 3, dtype=F64))
+    priors = (known,) if turns else ()
+    result = bundle_adjust(problem, free=(), structure=[curves], priors=priors, linear_solver=solver, max_iterations=12)
+    assert result.status == Status.OK
+    before, after = problem.poses, result.poses
+    assert (after.centre.mean(0) - before.centre.mean(0)).norm() < 0.02
+    assert (after.centre.std(0).norm() / before.centre.std(0).norm() - 1).abs() < 0.02
+    assert rotvec_from_rotation(after.R.mT @ before.R).mean(0).norm() < 0.01
+
+
+def test_derivatives_in_a_free_world(generator: torch.Generator) -> None:
+    scene = make_scene(generator, noise=0.5, samples=8, points=12, views=4)
+    problem, curves = disturbed(scene, generator)
+
+    def found(x: Tensor) -> Tensor:
+        some = dataclasses.replace(curves, x=x)
+        result = bundle_adjust(problem, free=(), structure=[some], tolerance=1e-16, max_iterations=100)
+        assert result.status == Status.OK
+        away = (result.poses.centre[1:] - result.poses.centre[0]).norm(dim=-1)
+        return away[0] / away[1]
+
+    leaf = curves.x.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(found(leaf), leaf)
+    step = torch.randn(curves.x.shape, generator=generator, dtype=F64)
+    numeric = (found(curves.x + 1e-3 * step) - found(curves.x - 1e-3 * step)) / 2e-3
+    torch.testing.assert_close((slope * step).sum(), numeric.detach(), rtol=1e-2, atol=1e-6)

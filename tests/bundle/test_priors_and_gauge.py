@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.bundle import CentrePrior, PointPrior, PosePrior, Prior, RelativePosePrior, Rig, bundle_adjust, bundle_covariance
+from torchsfm.bundle.gauge import gauge_motions
 from torchsfm.geometry import (
     BundleProblem,
     Camera,
@@ -16,7 +17,7 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
     similarity_from_points,
 )
-from torchsfm.optim import Cauchy
+from torchsfm.optim import Cauchy, RigidMotion
 
 F64 = torch.float64
 Scene = tuple[Pose, Camera, Tensor, Tensor, Tensor, Tensor]
@@ -293,3 +294,21 @@ def test_wrong_priors(scene: Scene) -> None:
             problem,
             priors=[PointPrior(torch.tensor([7]), X[:1], 1.0), PosePrior(torch.tensor([6]), poses[:1], 1.0)],
         )
+
+
+def test_motions_of_the_gauge_change_no_image(generator: torch.Generator) -> None:
+    R, t = random_rotation(5, generator=generator, dtype=F64), torch.randn(5, 3, generator=generator, dtype=F64)
+    poses, X = Pose(R, t), torch.randn(40, 3, generator=generator, dtype=F64)
+    rows, middle, size = torch.cat((R.flatten(1), t), 1), poses.centre.mean(0), 1e-6
+    motions = gauge_motions(rows, keep_size=False)
+    assert gauge_motions(rows, keep_size=True).equal(motions[..., :6])
+
+    def rays(R: Tensor, t: Tensor, X: Tensor) -> Tensor:
+        return torch.nn.functional.normalize((R[:, None] @ X[..., None])[..., 0] + t[:, None], dim=-1)
+
+    for k, way in enumerate(torch.eye(7, dtype=F64)):
+        moved = RigidMotion().retract(rows, size * motions[..., k])
+        off = X - middle
+        world = X + size * (way[:3] + torch.linalg.cross(way[3:6].expand_as(off), off) + way[6] * off)
+        apart = rays(moved[:, :9].reshape(-1, 3, 3), moved[:, 9:], world) - rays(R, t, X)
+        assert apart.abs().max() < 1e-4 * size

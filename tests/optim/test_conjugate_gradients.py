@@ -103,3 +103,19 @@ def test_memory_does_not_grow_with_the_square_of_the_retained(generator: torch.G
 def test_wrong_solver(chain: tuple[dict[str, Block], list[Term]], unchecked: None) -> None:
     with pytest.raises(ValueError, match="linear_solver"):
         sparse_levenberg_marquardt(*chain, linear_solver="qr")
+
+
+@pytest.mark.parametrize("solver", ["dense", "pcg"])
+def test_steps_have_no_part_along_motions_at_rest(chain: tuple[dict[str, Block], list[Term]], solver: schur.Solver) -> None:
+    blocks, terms = chain
+    road = torch.tensor([1.0, 0.0], dtype=F64)
+    blocks["station"] = dataclasses.replace(blocks["station"], rest=lambda x: road.expand(len(x), 2)[..., None])
+    found = layout.lay_out(blocks, terms, "mark")
+    system = schur.Elimination(blocks, found, solver).linearize({name: b.x for name, b in blocks.items()})
+    # Measured by what the residuals say of each station.
+    precision = system.diagonal[:48].view(24, 2)
+    part = (system.step(1e-4).delta["station"] * precision)[:, 0].sum() / precision[:, 0].sum()
+    free = dataclasses.replace(system, rest=None).step(1e-4).delta["station"]
+    assert part.abs() < 1e-5 * (free * precision)[:, 0].sum().abs() / precision[:, 0].sum()
+    result = sparse_levenberg_marquardt(blocks, terms, linear_solver=solver, eliminate="mark", max_iterations=200)
+    assert result.status == Status.OK

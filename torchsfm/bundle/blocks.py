@@ -205,12 +205,12 @@ def cheapest_elimination(
 ) -> tuple[str, ...]:
     """Points and other structure, unless eliminating poses leaves a system of less than half the size: film of few points.
 
-    Poses that something binds to each other cannot be eliminated one by one.
+    Poses that something binds to each other, or that move together in no step, cannot be eliminated one by one.
     """
     sizes = {name: block.x.shape[0] * block.tangent for name, block in blocks.items()}
     seen = sum(sizes[name] for name in structure)
     rest = sum(size for name, size in sizes.items() if name not in ("pose", *structure))
-    bound = any(term.blocks.count("pose") > 1 for term in terms)
+    bound = blocks["pose"].rest is not None or any(term.blocks.count("pose") > 1 for term in terms)
     return ("pose",) if 2 * (seen + rest) < sizes["pose"] + rest and not bound else structure
 
 

@@ -1,7 +1,8 @@
 """Bundle adjustment of points, poses and cameras."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Unpack
 
 import torch
@@ -17,7 +18,8 @@ from torchsfm.bundle.blocks import (
     moved_poses,
     structure_blocks,
 )
-from torchsfm.bundle.gauge import Gauge, restore_gauge
+from torchsfm.bundle.curves import BundleCurves
+from torchsfm.bundle.gauge import Gauge, gauge_motions, restore_gauge, size_is_known, world_is_free
 from torchsfm.bundle.rig import Rig
 from torchsfm.bundle.structure import Structure
 from torchsfm.geometry import BundleProblem, Camera, Pose
@@ -87,7 +89,8 @@ def bundle_adjust(
     Points, and lines, conics and curves where `structure` has some, are eliminated by the Schur complement (poses, where there
     are many more poses than structure). Seven dimensions of gauge (place, orientation, size of the world) are free unless
     something holds them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does no harm:
-    the damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Fixed and
+    the damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Curves,
+    whose samples move across alone, say a little of it by their noise, so with them steps have no part along it. Fixed and
     unobserved poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a pinhole
     shows them mirrored): leave them out, or use a loss. Computed in float64.
 
@@ -128,6 +131,10 @@ def bundle_adjust(
         raise ValueError("gauge: wanted 'free' where something is fixed or known beforehand, got 'first'")
     blocks, residuals = bundle.problem()
     poses, rig, X = bundle.poses, bundle.rig, problem.X
+    keep_size = size_is_known(bundle.priors, rig, bundle.fixed_sensors)
+    free = world_is_free(bundle.priors, bundle.fixed_poses, bundle.fixed_points)
+    if free and any(isinstance(some, BundleCurves) for some in bundle.structure):
+        blocks["pose"] = replace(blocks["pose"], rest=partial(gauge_motions, keep_size=keep_size))
     result = sparse_levenberg_marquardt(
         blocks,
         residuals,
@@ -147,9 +154,6 @@ def bundle_adjust(
         rig = Rig(moved_poses(rig.cam_from_rig, blocks["sensor"].x, result.x["sensor"]), rig.sensor, rig.frame)
     world = None
     if gauge == "first":
-        keep_size = (
-            rig is not None and bundle.fixed_sensors is not None and bool((rig.cam_from_rig.t[bundle.fixed_sensors] != 0).any())
-        )
         moved = (points != X).any(-1)
         new_poses, points, rig, world = restore_gauge(poses, new_poses, points, moved, rig, keep_size)
     structure = tuple(s.moved(blocks[s.block].x, result.x[s.block], world) for s in bundle.structure)

@@ -1,12 +1,15 @@
 """The gauge: seven dimensions (place, orientation, size of the world) that image points alone do not determine."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.bundle.priors import Prior, RelativePosePrior
 from torchsfm.bundle.rig import Rig
-from torchsfm.geometry import Pose, Similarity
+from torchsfm.geometry import Pose, Similarity, cross_matrix
 
 Gauge = Literal["free", "first"]
 """What is done about the place, turn and size of the world, which no residual tells.
@@ -55,3 +58,33 @@ def restore_gauge(
     if rig is not None and not keep_size:
         rig = Rig(Pose(rig.cam_from_rig.R, scale * rig.cam_from_rig.t), rig.sensor, rig.frame)
     return Pose(R_new, t_new), points, rig, world
+
+
+def world_is_free(priors: Sequence[Prior], *fixed: Tensor | None) -> bool:
+    """Whether nothing says where the world is: no pose or point held, none known but to others."""
+    return all(isinstance(p, RelativePosePrior) for p in priors) and not any(m is not None and bool(m.any()) for m in fixed)
+
+
+def size_is_known(priors: Sequence[Prior], rig: Rig | None, fixed_sensors: Tensor | None) -> bool:
+    """Whether a rig, or motions between poses, say how large the world is."""
+    rigid = rig is not None and fixed_sensors is not None and bool((rig.cam_from_rig.t[fixed_sensors] != 0).any())
+    return rigid or any(isinstance(p, RelativePosePrior) and p.knows_places() for p in priors)
+
+
+def gauge_motions(rows: Float[Tensor, "v 12"], keep_size: bool) -> Float[Tensor, "v 6 k"]:
+    """How poses move, by steps of `RigidMotion`, with a world that shifts, turns and, unless its size is known, grows.
+
+    Samples of curves move across their curves alone and cannot follow a world that moves as a whole. Their residuals then do
+    depend on the gauge, a little and by noise only, and steps would lead a free world far along that valley.
+    """
+    R, t = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
+    centre = -(R.mT @ t[..., None])[..., 0]
+    known = centre.isfinite().all(-1, keepdim=True)
+    middle = torch.where(known, centre, 0.0).sum(0) / known.sum().clamp_min(1)
+    # About the middle: a far origin would make turns look like shifts.
+    shift = torch.cat((torch.zeros_like(R), -R), 1)
+    away = (R @ (centre - middle)[..., None])[..., 0]
+    turn = torch.cat((-R, cross_matrix(away) @ R), 1)
+    grow = torch.cat((torch.zeros_like(t), -away), 1)[..., None]
+    motions = torch.cat((shift, turn) if keep_size else (shift, turn, grow), 2)
+    return torch.where(known[..., None], motions, 0.0)

@@ -165,6 +165,10 @@ class RelativePosePrior:
         if bool((self.index[:, 0] == self.index[:, 1]).any()):
             raise ValueError("index: wanted two different poses in each row")
 
+    def knows_places(self) -> bool:
+        """Whether it says something of translations, not of rotations alone."""
+        return bool((_known_poses(self)[1][:, :, 3:].nan_to_num() != 0).any())
+
     def term(self) -> Term:
         """The prior as a term of the optimiser."""
 

@@ -21,6 +21,9 @@ from torchsfm.optim.schur_pairwise import PairCoupling
 NULL = 1e-11
 """Eigenvalues of the reduced system, scaled to unit diagonal of U, that count as zero: directions of gauge."""
 
+HELD = 1e6
+"""Stiffness, scaled likewise, along motions of which no step has a part."""
+
 LARGEST_BENT = 500
 """Columns of the largest reduced system whose eigenvalues are found where it is not positive."""
 
@@ -76,6 +79,8 @@ class NormalEquations:
     """Whether second derivatives are exact, so that it need not be positive."""
     held: bool = False
     """Whether eliminated variables are held that have something left to gain."""
+    rest: Tensor | None = None
+    """Motions of the retained variables, (size, k), of which no step has a part."""
 
     def step(self, damping: float) -> Step:
         """The step for `damping` times the diagonal.
@@ -114,7 +119,7 @@ class NormalEquations:
                 for part, L, z in zip(self.eliminated, triangles, right, strict=True)
                 if isinstance(part.coupling, RowCoupling)
             ]
-            kept, positive = solve_reduced(self.squares, rows, self.plan, weight)
+            kept, positive = solve_reduced(self.squares, rows, self.plan, weight, self._resting())
             return kept, kept.isfinite().all() & (positive or not self.curved), False
         if not size:
             return weight, torch.ones_like(weight, dtype=torch.bool).all(), False
@@ -123,12 +128,30 @@ class NormalEquations:
             part.reduce(S, L, z)
         S = self.layout.ranks.sum(S)
         S.diagonal()[:size] += weight
+        self._hold(S[:size, :size])
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
         if self.curved and size <= LARGEST_BENT and bool(info):
             return *self._downhill(S[:size, :size], S[:size, size]), True
         half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
         kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
         return kept, (info == 0) & kept.isfinite().all(), False
+
+    def _hold(self, S: Tensor) -> None:
+        """Make the reduced system stiff, in place, along motions of which no step has a part."""
+        if (rest := self._resting()) is not None:
+            S += HELD * rest[1] @ rest[1].mT
+
+    def _resting(self) -> tuple[Tensor, Tensor] | None:
+        """A basis E of these motions, and F with `F'E = 1`; orthonormal with variables in units of their own precision."""
+        if self.rest is None:
+            return None
+        root = floor(self.diagonal, self.layout.kinds).sqrt()[:, None]
+        moves = root * self.rest
+        moves = moves / torch.linalg.vector_norm(moves, dim=0).clamp_min(torch.finfo(moves.dtype).tiny)
+        values, vectors, _ = eigh(moves.mT @ moves)
+        seen = values > NULL
+        basis = moves @ (vectors[:, seen] * values[seen].rsqrt())
+        return basis / root, basis * root
 
     def _downhill(self, S: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
         """The step of the retained variables where the cost bends down in some directions: as far as were it up.
@@ -163,6 +186,7 @@ class NormalEquations:
             triangles.append(L)
             determined.append(torch.stack([L[a][a] > 0 for a in range(part.q)]).all(0))
         S = S[:size, :size]
+        self._hold(S)
         if like is None:
             scale = floor(self.diagonal, self.layout.kinds).rsqrt()
             scaled = pseudo_inverse(scale[:, None] * S * scale, NULL)
@@ -199,7 +223,10 @@ class NormalEquations:
 
     def gradient(self) -> Tensor:
         """The largest absolute derivative of the cost, each in units of its variable's own precision."""
-        scaled = [self.slope * floor(self.diagonal, self.layout.kinds).rsqrt()]
+        kept = self.slope
+        if (rest := self._resting()) is not None:
+            kept = kept - rest[1] @ (rest[0].mT @ kept)
+        scaled = [kept * floor(self.diagonal, self.layout.kinds).rsqrt()]
         for part in self.eliminated:
             scaled.append((part.gradient() * floor(diagonal(part.metric, part.q)).rsqrt()).flatten())
         return self.layout.ranks.largest(torch.cat(scaled).abs().amax())

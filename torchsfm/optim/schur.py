@@ -205,8 +205,21 @@ class Elimination:
         for part in self.parts:
             self._add(part, x, lifts, ends)
         diagonal, slope = self.ranks.sum(torch.stack((self.squares.diagonal(), self.squares.gradient())))
-        self.current = NormalEquations(self.layout, self.eliminated, self.squares, self.plan, diagonal, slope)
+        self.current = NormalEquations(
+            self.layout, self.eliminated, self.squares, self.plan, diagonal, slope, rest=self._rest(x)
+        )
         return self.current
+
+    def _rest(self, x: dict[str, Tensor]) -> Tensor | None:
+        """The motions of retained variables of which steps have no part, (size, k)."""
+        found = []
+        for name, start in self.layout.first.items():
+            rest = self.blocks[name].rest
+            if rest is not None:
+                moves = rest(x[name])[self.layout.free[name]].flatten(0, 1)
+                end = self.layout.size - start - len(moves)
+                found.append(torch.nn.functional.pad(moves, (0, 0, start, end)))
+        return torch.cat(found, 1) if found else None
 
     def _lifts(self, x: dict[str, Tensor]) -> dict[str, Tensor | None]:
         """Derivatives of the retractions that derivatives of terms are multiplied by."""

@@ -258,7 +258,11 @@ class _SchurJacobi:
 
 
 def solve_reduced(
-    squares: RetainedBlocks, eliminated: Sequence[tuple[RowCoupling, Triangle, Tensor]], plan: Plan, weight: Tensor
+    squares: RetainedBlocks,
+    eliminated: Sequence[tuple[RowCoupling, Triangle, Tensor]],
+    plan: Plan,
+    weight: Tensor,
+    rest: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, bool]:
     """The step of the retained variables for a damping `weight`, to the accuracy of `FORCING`, and whether there is one.
 
@@ -267,6 +271,7 @@ def solve_reduced(
         eliminated: W, the factors L of V, and `L^-1 h` of each eliminated family that meets retained variables.
         plan: How to precondition, and the ranks over which all of this is divided.
         weight: Added to the diagonal, (size).
+        rest: Motions E (size, k) of which the step has no part, and F with `F'E = 1` that tells what part there is.
     """
     size = squares.size
     right = torch.nn.functional.pad(squares.gradient(), (0, 2))
@@ -274,7 +279,15 @@ def solve_reduced(
     for (coupling, _, _), values in zip(eliminated, coupled, strict=True):
         right.index_add_(0, coupling.columns.flatten(), values[:, :-1, -1].flatten(), alpha=-1)
     right = plan.ranks.sum(right[:size])
-    precondition = plan.preconditioner(squares, coupled, weight)
+    plain = plan.preconditioner(squares, coupled, weight)
+
+    def precondition(r: Tensor) -> Tensor:
+        if rest is None:
+            return plain(r)
+        # All that conjugate gradients build comes from here.
+        E, F = rest
+        z = plain(r - F @ (E.mT @ r))
+        return z - E @ (F.mT @ z)
 
     def apply(x: Tensor) -> Tensor:
         out = squares.product(x)

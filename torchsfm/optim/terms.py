@@ -41,6 +41,10 @@ class Block:
     """Plain addition in all k coordinates if not given."""
     fixed: Bool[Tensor, "n"] | None = None
     """Which variables do not move; none if not given."""
+    rest: Callable[[Tensor], Tensor] | None = None
+    """Given where the variables are, motions (n, tangent, k) of all of them together of which steps have no part, if any.
+
+    A gauge that residuals say a little of by their noise, say. Eliminated variables are free of it."""
 
     @property
     def tangent(self) -> int:
