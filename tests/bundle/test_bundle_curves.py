@@ -26,8 +26,10 @@ from torchsfm.bundle import BundleCurves, BundleLines, RelativePosePrior, bundle
 from torchsfm.bundle.blocks import Bundle
 from torchsfm.geometry import (
     BundleProblem,
+    Similarity,
     pluecker_from_points,
     random_rotation,
+    rotation_from_rotvec,
     rotvec_from_rotation,
 )
 from torchsfm.optim import Huber
@@ -355,3 +357,18 @@ def test_derivatives_in_a_free_world(generator: torch.Generator) -> None:
     step = torch.randn(curves.x.shape, generator=generator, dtype=F64)
     numeric = (found(curves.x + 1e-3 * step) - found(curves.x - 1e-3 * step)) / 2e-3
     torch.testing.assert_close((slope * step).sum(), numeric.detach(), rtol=1e-2, atol=1e-6)
+
+
+def test_samples_that_are_held_say_where_the_world_is(generator: torch.Generator) -> None:
+    scene = make_scene(generator)
+    held = dataclasses.replace(scene.curves, fixed=torch.ones(len(scene.curves.X), dtype=torch.bool))
+    turn = rotation_from_rotvec(torch.tensor([0.02, -0.01, 0.01], dtype=F64))
+    away = Similarity(torch.tensor(1.01, dtype=F64), turn, torch.tensor([0.01, 0.02, -0.01], dtype=F64))
+    elsewhere = dataclasses.replace(
+        scene.problem, poses=away.transform_pose(scene.problem.poses), X=away.transform(scene.problem.X)
+    )
+    result = bundle_adjust(elsewhere, free=(), structure=[held], tolerance=1e-14)
+    assert result.status == Status.OK
+    torch.testing.assert_close(result.poses.centre, scene.problem.poses.centre, rtol=0, atol=1e-3)
+    with pytest.raises(ValueError, match="gauge"):
+        bundle_adjust(elsewhere, free=(), structure=[held], gauge="first")

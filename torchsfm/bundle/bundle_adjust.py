@@ -126,13 +126,12 @@ def bundle_adjust(
     """
     bundle = Bundle(problem, **terms)
     check_options(gauge=(gauge, ("free", "first")))
-    held = bundle.priors or any(bool(m.any()) for m in (bundle.fixed_poses, bundle.fixed_points) if isinstance(m, Tensor))
-    if gauge == "first" and held:
-        raise ValueError("gauge: wanted 'free' where something is fixed or known beforehand, got 'first'")
     blocks, residuals = bundle.problem()
+    free = world_is_free(bundle.priors, *(blocks[name].fixed for name in ("pose", *structure_blocks(bundle))))
+    if gauge == "first" and (bundle.priors or not free):
+        raise ValueError("gauge: wanted 'free' where something is fixed or known beforehand, got 'first'")
     poses, rig, X = bundle.poses, bundle.rig, problem.X
     keep_size = size_is_known(bundle.priors, rig, bundle.fixed_sensors)
-    free = world_is_free(bundle.priors, bundle.fixed_poses, bundle.fixed_points)
     if free and any(isinstance(some, BundleCurves) for some in bundle.structure):
         blocks["pose"] = replace(blocks["pose"], rest=partial(gauge_motions, keep_size=keep_size))
     result = sparse_levenberg_marquardt(
