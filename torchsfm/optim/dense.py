@@ -43,7 +43,7 @@ class DenseSystem:
     def step(self, damping: Tensor, exact: Tensor | None = None) -> Step:
         """The step for a damping."""
         diagonal = self.metric.diagonal(dim1=-2, dim2=-1)
-        # A direction that nothing depends on gets the damping of the others, and so does not move.
+        # A direction that nothing depends on is damped all the same, and so does not move; others each in their own unit.
         floor = 1e-30 * diagonal.amax(-1, keepdim=True) + torch.finfo(diagonal.dtype).tiny
         damped = damping[..., None] * diagonal.clamp_min(floor)
         matrix = self.metric if exact is None else torch.where(exact[..., None, None], self.hessian, self.metric)

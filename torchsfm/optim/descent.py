@@ -55,7 +55,7 @@ class Options:
     step_tolerance: float = 0.0
     """End when a step is shorter than this fraction of what it moves, and promises next to nothing."""
     gradient_tolerance: float = 0.0
-    """End when no derivative of the cost is larger."""
+    """End when the cost is no steeper, as `System.steepest` measures it."""
     initial_damping: float = 1e-4
     progress: Callable[[int, Tensor], bool | None] | None = None
     """Called with the number of steps and the costs after each; False ends the descent."""

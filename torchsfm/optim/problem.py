@@ -38,7 +38,7 @@ class System(Protocol):
         """The cost there, (*batch)."""
 
     def steepest(self) -> Tensor:
-        """The largest absolute derivative, not finite where anything in the system is not, (*batch)."""
+        """The largest derivative, in units of the system's choice; not finite where anything in the system is not, (*batch)."""
 
     def along(self, delta: Any) -> Tensor:
         """The derivative of the cost along a step, (*batch)."""
