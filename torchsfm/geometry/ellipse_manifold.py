@@ -34,7 +34,8 @@ class Ellipse3D:
 
 def ellipse_size(x: Float[Tensor, "*batch 12"]) -> Float[Tensor, "*batch"]:
     """The quadratic mean of the semi-axes."""
-    return torch.linalg.vector_norm(x[..., [9, 10, 10, 11]], dim=-1) * 0.5**0.5
+    size: Tensor = torch.linalg.vector_norm(x[..., [9, 10, 10, 11]], dim=-1) * 0.5**0.5
+    return size
 
 
 def ellipse_row(ellipse: Ellipsoid) -> Float[Tensor, "*batch 12"]:
