@@ -372,3 +372,18 @@ def test_samples_that_are_held_say_where_the_world_is(generator: torch.Generator
     torch.testing.assert_close(result.poses.centre, scene.problem.poses.centre, rtol=0, atol=1e-3)
     with pytest.raises(ValueError, match="gauge"):
         bundle_adjust(elsewhere, free=(), structure=[held], gauge="first")
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5, 2.0])
+def test_covariances_in_a_free_world(generator: torch.Generator, noise: float) -> None:
+    """By adjusted samples they are those by exact ones: noise says nothing of the gauge."""
+    scene = make_scene(generator, noise=noise)
+    problem, curves = disturbed(scene, generator)
+    result = bundle_adjust(problem, free=(), structure=[curves])
+    there = dataclasses.replace(problem, poses=result.poses, X=result.X)
+    found = bundle_covariance(there, free=(), structure=result.structure, sigma=1.0)
+    exact = bundle_covariance(scene.problem, free=(), structure=[scene.curves], sigma=1.0)
+    assert found.nullity == exact.nullity == 7
+    for name in ("poses", "X"):
+        a, b = (getattr(some, name).diagonal(dim1=1, dim2=2).sqrt() for some in (found, exact))
+        torch.testing.assert_close(a, b, rtol=0.3, atol=0)

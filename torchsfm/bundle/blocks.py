@@ -11,8 +11,10 @@ from torch import Tensor
 
 from torchsfm._types import check_index, check_one_problem, check_options, check_tensors
 from torchsfm.bundle.bending import bend
+from torchsfm.bundle.curves import BundleCurves
+from torchsfm.bundle.gauge import gauge_motions
 from torchsfm.bundle.intrinsics import Switched, free_columns, free_switches, intrinsics_prior
-from torchsfm.bundle.priors import Prior
+from torchsfm.bundle.priors import Prior, RelativePosePrior
 from torchsfm.bundle.projection import Projection
 from torchsfm.bundle.rays import RayPoint, ray_points
 from torchsfm.bundle.rig import Rig, RigProjection
@@ -197,7 +199,23 @@ class Bundle:
         terms += [_prior_term(prior) for prior in self.priors]
         if self.intrinsics_sigma:
             terms.append(intrinsics_prior(self.intrinsics_sigma, self.intrinsics_mean or cameras))
+        if self.world_is_free(blocks) and any(isinstance(some, BundleCurves) for some in self.structure):
+            rest = partial(gauge_motions, keep_size=self.size_is_known)
+            blocks["pose"] = replace(blocks["pose"], rest=rest)
         return blocks, terms
+
+    def world_is_free(self, blocks: Mapping[str, Block]) -> bool:
+        """Whether nothing says where the world is: no pose or structure held, no pose known but to others."""
+        held = [blocks[name].fixed for name in ("pose", *structure_blocks(self))]
+        relative = all(isinstance(prior, RelativePosePrior) for prior in self.priors)
+        return relative and not any(fixed is not None and bool(fixed.any()) for fixed in held)
+
+    @property
+    def size_is_known(self) -> bool:
+        """Whether a rig, or motions between poses, say how large the world is."""
+        rig, held = self.rig, self.fixed_sensors
+        rigid = rig is not None and held is not None and bool((rig.cam_from_rig.t[held] != 0).any())
+        return rigid or any(isinstance(prior, RelativePosePrior) and prior.knows_places() for prior in self.priors)
 
 
 def cheapest_elimination(

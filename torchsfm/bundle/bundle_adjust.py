@@ -1,8 +1,7 @@
 """Bundle adjustment of points, poses and cameras."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Unpack
 
 import torch
@@ -18,8 +17,7 @@ from torchsfm.bundle.blocks import (
     moved_poses,
     structure_blocks,
 )
-from torchsfm.bundle.curves import BundleCurves
-from torchsfm.bundle.gauge import Gauge, gauge_motions, restore_gauge, size_is_known, world_is_free
+from torchsfm.bundle.gauge import Gauge, restore_gauge
 from torchsfm.bundle.rig import Rig
 from torchsfm.bundle.structure import Structure
 from torchsfm.geometry import BundleProblem, Camera, Pose
@@ -89,10 +87,10 @@ def bundle_adjust(
     Points, and lines, conics and curves where `structure` has some, are eliminated by the Schur complement (poses, where there
     are many more poses than structure). Seven dimensions of gauge (place, orientation, size of the world) are free unless
     something holds them: fixed poses or points, priors, a rig of known size (which holds the size). A free gauge does no harm:
-    the damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Curves,
-    whose samples move across alone, say a little of it by their noise, so with them steps have no part along it. Fixed and
-    unobserved poses, cameras and points come back bit for bit. Observations behind a camera count by the formula (a pinhole
-    shows them mirrored): leave them out, or use a loss. Computed in float64.
+    the damping takes the shortest step, and the model stays about where it was; see `gauge` for other wishes. Samples
+    of curves move across their curves alone and would carry the model along the gauge by their noise, so with curves steps
+    leave the gauge out. Fixed and unobserved poses, cameras and points come back bit for bit. Observations behind a camera
+    count by the formula (a pinhole shows them mirrored): leave them out, or use a loss. Computed in float64.
 
     Args:
         problem: Views of points, with estimates of everything.
@@ -127,13 +125,9 @@ def bundle_adjust(
     bundle = Bundle(problem, **terms)
     check_options(gauge=(gauge, ("free", "first")))
     blocks, residuals = bundle.problem()
-    free = world_is_free(bundle.priors, *(blocks[name].fixed for name in ("pose", *structure_blocks(bundle))))
-    if gauge == "first" and (bundle.priors or not free):
+    if gauge == "first" and (bundle.priors or not bundle.world_is_free(blocks)):
         raise ValueError("gauge: wanted 'free' where something is fixed or known beforehand, got 'first'")
     poses, rig, X = bundle.poses, bundle.rig, problem.X
-    keep_size = size_is_known(bundle.priors, rig, bundle.fixed_sensors)
-    if free and any(isinstance(some, BundleCurves) for some in bundle.structure):
-        blocks["pose"] = replace(blocks["pose"], rest=partial(gauge_motions, keep_size=keep_size))
     result = sparse_levenberg_marquardt(
         blocks,
         residuals,
@@ -154,7 +148,7 @@ def bundle_adjust(
     world = None
     if gauge == "first":
         moved = (points != X).any(-1)
-        new_poses, points, rig, world = restore_gauge(poses, new_poses, points, moved, rig, keep_size)
+        new_poses, points, rig, world = restore_gauge(poses, new_poses, points, moved, rig, bundle.size_is_known)
     structure = tuple(s.moved(blocks[s.block].x, result.x[s.block], world) for s in bundle.structure)
     seen = zip(result.residuals[1:], result.used[1:], bundle.structure, strict=False)
     apart = tuple(torch.where(counts[:, None], r, torch.inf).to(X.dtype) for r, counts, _ in seen)

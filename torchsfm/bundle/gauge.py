@@ -1,13 +1,11 @@
 """The gauge: seven dimensions (place, orientation, size of the world) that image points alone do not determine."""
 
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.bundle.priors import Prior, RelativePosePrior
 from torchsfm.bundle.rig import Rig
 from torchsfm.geometry import Pose, Similarity, cross_matrix
 
@@ -58,17 +56,6 @@ def restore_gauge(
     if rig is not None and not keep_size:
         rig = Rig(Pose(rig.cam_from_rig.R, scale * rig.cam_from_rig.t), rig.sensor, rig.frame)
     return Pose(R_new, t_new), points, rig, world
-
-
-def world_is_free(priors: Sequence[Prior], *fixed: Tensor | None) -> bool:
-    """Whether nothing says where the world is: no pose or point held, none known but to others."""
-    return all(isinstance(p, RelativePosePrior) for p in priors) and not any(m is not None and bool(m.any()) for m in fixed)
-
-
-def size_is_known(priors: Sequence[Prior], rig: Rig | None, fixed_sensors: Tensor | None) -> bool:
-    """Whether a rig, or motions between poses, say how large the world is."""
-    rigid = rig is not None and fixed_sensors is not None and bool((rig.cam_from_rig.t[fixed_sensors] != 0).any())
-    return rigid or any(isinstance(p, RelativePosePrior) and p.knows_places() for p in priors)
 
 
 def gauge_motions(rows: Float[Tensor, "v 12"], keep_size: bool) -> Float[Tensor, "v 6 k"]:

@@ -4,6 +4,7 @@ See `schur` for the notation. Eliminated blocks are factored elementwise, all at
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -87,7 +88,7 @@ class NormalEquations:
 
         The promise holds for steps of conjugate gradients too: their residual is orthogonal to the step.
         """
-        weight = damping * floor(self.diagonal, self.layout.kinds)
+        weight = damping * self.precision
         metrics = [damping * measure(part.metric, part.q) for part in self.eliminated]
         factors = [factor(part.V + metric, part.q) for part, metric in zip(self.eliminated, metrics, strict=True)]
         triangles = [L for L, _ in factors]
@@ -119,7 +120,7 @@ class NormalEquations:
                 for part, L, z in zip(self.eliminated, triangles, right, strict=True)
                 if isinstance(part.coupling, RowCoupling)
             ]
-            kept, positive = solve_reduced(self.squares, rows, self.plan, weight, self._resting())
+            kept, positive = solve_reduced(self.squares, rows, self.plan, weight, self._resting)
             return kept, kept.isfinite().all() & (positive or not self.curved), False
         if not size:
             return weight, torch.ones_like(weight, dtype=torch.bool).all(), False
@@ -138,14 +139,29 @@ class NormalEquations:
 
     def _hold(self, S: Tensor) -> None:
         """Make the reduced system stiff, in place, along motions of which no step has a part."""
-        if (rest := self._resting()) is not None:
+        if (rest := self._resting) is not None:
             S += HELD * rest[1] @ rest[1].mT
 
+    def _without_rest(self, S: Tensor) -> Tensor:
+        """The reduced system, variables in units of their own precision, as if nothing were known of motions at rest."""
+        if self._resting is None:
+            return S
+        basis = self._resting[1] * self.precision.rsqrt()[:, None]
+        S = S.tril() + S.tril(-1).mT
+        S = S - basis @ (basis.mT @ S)
+        return S - (S @ basis) @ basis.mT
+
+    @cached_property
+    def precision(self) -> Tensor:
+        """Of each retained variable, the others held: what its damping is measured by."""
+        return floor(self.diagonal, self.layout.kinds)
+
+    @cached_property
     def _resting(self) -> tuple[Tensor, Tensor] | None:
-        """A basis E of these motions, and F with `F'E = 1`; orthonormal with variables in units of their own precision."""
+        """A basis E of motions at rest, and F with `F'E = 1`; orthonormal with variables in units of their own precision."""
         if self.rest is None:
             return None
-        root = floor(self.diagonal, self.layout.kinds).sqrt()[:, None]
+        root = self.precision.sqrt()[:, None]
         moves = root * self.rest
         moves = moves / torch.linalg.vector_norm(moves, dim=0).clamp_min(torch.finfo(moves.dtype).tiny)
         values, vectors, _ = eigh(moves.mT @ moves)
@@ -159,7 +175,7 @@ class NormalEquations:
         Away from a minimum it does so along every gauge freedom, too, since no orbit but that of a shift or a scale is
         straight (saddle-free Newton steps, Dauphin et al. 2014).
         """
-        scale = floor(self.diagonal, self.layout.kinds).rsqrt()
+        scale = self.precision.rsqrt()
         values, vectors, ok = eigh(scale[:, None] * S * scale)
         kept = -scale * (vectors @ ((vectors.mT @ (scale * slope)) / values.abs().clamp_min(NULL)))
         return kept, ok & kept.isfinite().all()
@@ -186,10 +202,9 @@ class NormalEquations:
             triangles.append(L)
             determined.append(torch.stack([L[a][a] > 0 for a in range(part.q)]).all(0))
         S = S[:size, :size]
-        self._hold(S)
         if like is None:
-            scale = floor(self.diagonal, self.layout.kinds).rsqrt()
-            scaled = pseudo_inverse(scale[:, None] * S * scale, NULL)
+            scale = self.precision.rsqrt()
+            scaled = pseudo_inverse(self._without_rest(scale[:, None] * S * scale), NULL)
             kept, rank, ok = scale[:, None] * scaled.inverse * scale, scaled.rank, scaled.ok
         else:
             scale, scaled = like.scale, like.scaled
@@ -213,10 +228,11 @@ class NormalEquations:
             part.reduce(S, factor(V, part.q)[0], torch.zeros_like(pivots))
         S = S[:size, :size]
         S = S.tril() + S.tril(-1).mT
+        self._hold(S)
         others = torch.ones(size, dtype=torch.bool, device=S.device)
         others[columns] = False
         A = S[others][:, others]
-        A.diagonal().add_(NULL * floor(self.diagonal, self.layout.kinds)[others])
+        A.diagonal().add_(NULL * self.precision[others])
         half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(A)[0], S[others][:, columns], upper=False)
         left: Tensor = S[columns][:, columns] - half.mT @ half
         return left
@@ -224,9 +240,9 @@ class NormalEquations:
     def gradient(self) -> Tensor:
         """The largest absolute derivative of the cost, each in units of its variable's own precision."""
         kept = self.slope
-        if (rest := self._resting()) is not None:
+        if (rest := self._resting) is not None:
             kept = kept - rest[1] @ (rest[0].mT @ kept)
-        scaled = [kept * floor(self.diagonal, self.layout.kinds).rsqrt()]
+        scaled = [kept * self.precision.rsqrt()]
         for part in self.eliminated:
             scaled.append((part.gradient() * floor(diagonal(part.metric, part.q)).rsqrt()).flatten())
         return self.layout.ranks.largest(torch.cat(scaled).abs().amax())
