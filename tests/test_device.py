@@ -4,6 +4,7 @@ Without an accelerator the device is a pretended one, which tells when tensors o
 one.
 """
 
+import inspect
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from bench.fuzz.scene import Scene
 from torchsfm._types import tensor_map
 from torchsfm.robust import ransac, soft_ransac
 
+STEPS = 8
+"""Of what is slow."""
 OPENCV = "OpenCV takes images and gives points on the CPU"
 ON_THE_CPU = EXCEPTIONS | {
     **{
@@ -72,10 +75,16 @@ def device(request: pytest.FixtureRequest) -> Iterator[Device]:
 
 
 def agreeable(call: Callable[..., Any], how: Function) -> dict[str, Any]:
-    """Arguments that the function accepts; some that may be left out belong together, and chance separates them."""
+    """Arguments that the function accepts; some that may be left out belong together, and chance separates them.
+
+    What is slow gets one problem and few steps: these are enough to see where its numbers lie.
+    """
+    batch = (1,) if how.slow else (2,)
     for stream in range(20):
-        scene = Scene(seeded(stream), (2,) if how.batched else (), tuple(how.sizes.items()), how.planar, how.centred)
+        scene = Scene(seeded(stream), batch if how.batched else (), tuple(how.sizes.items()), how.planar, how.centred)
         arguments = good_arguments(call, how, scene)
+        if how.slow and "max_iterations" in inspect.signature(call).parameters:
+            arguments["max_iterations"] = STEPS
         try:
             apply(call, arguments)
         except ValueError:

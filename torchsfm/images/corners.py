@@ -95,6 +95,9 @@ def detect_corners(
         keep &= mask.expand(*batch, height, width).reshape(-1, 1, height, width)
     slots = min(max_corners, height * width)
     score, flat = torch.where(keep, strength, 0.0).flatten(1).topk(slots)
+    # Nothing is done for slots that are empty in all images.
+    slots = int((score > 0).sum(-1).amax()) if len(score) else 0
+    score, flat = score[:, :slots], flat[:, :slots]
     valid = score > 0
     offset = _sub_pixel(gray, tensor, strength, flat)
     x = torch.stack([flat % width, flat // width], -1) + offset

@@ -194,33 +194,47 @@ class SplineDistances(Problem[SplineSystem]):
     def _of_curve(
         self, x: Splines, seen: Images, by_image: Tensor, H: Tensor, moves: Tensor, i: int, exact: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What one curve brings; one after the other, which bounds memory."""
+        """What one curve brings; one after the other, which bounds memory.
+
+        A point is X = sum B_k c_k of the control points, and its image moves by dP X + M sum B_k dc_k, with the first three
+        columns M of the camera. So all that a point says of control points is said of X itself, by three numbers or three by
+        three, and spread by the weights B; with exact second derivatives also of the course B' of the spline there.
+        """
         k, E = x.control.shape[2], self.across[:, i]
         weights, index = control_weights(x.t[:, :, i], self.closed[:, None, i], k)
         B, B1 = (spread(b, index, k) for b in weights[:2])
         X, X1 = ((b @ x.control[:, None, i]) for b in (B, B1))
         X, X1 = torch.cat((X, torch.ones_like(X[..., :1])), -1), torch.cat((X1, torch.zeros_like(X1[..., :1])), -1)
-        first = seen.first[:, :, i]
-        # Derivatives of y by the camera and by control points.
-        eye = torch.eye(3, dtype=X.dtype, device=X.device)
-        by_camera = (eye[:, :, None] * X[..., None, None, :]).flatten(-2)
-        PE = torch.einsum("pvad,pked->pvkea", x.P[..., :3], E)
-        by_point = (B[..., None, None] * PE[:, :, None]).flatten(-3, -2).mT
-        D = torch.cat((by_camera, by_point), -1)
-        turned = H @ first[..., None]
-        rows = (D.mT @ turned)[..., 0]
+        first, M = seen.first[:, :, i], x.P[..., :3]
+        HM = (H.flatten(2, 3) @ M).view(H.shape)
+        MHM = (HM.mT.flatten(2, 3) @ M).view(H.shape)
+        A = (H.flatten(-2).mT @ _products(X, X)).unflatten(-2, (3, 3)).unflatten(-1, (4, 4))
+        A = A.transpose(-3, -2).flatten(-4, -3).flatten(-2)
+        both = HM[..., :, None, :] * X[..., None, :, None]
+        G = B.flatten(1, 2).mT @ _products(B, MHM.flatten(-2)).flatten(1, 2)
+        by_camera, pull = (by_image.mT @ X).flatten(-2), B.mT @ (by_image @ M)
+        # The nearest point follows: how the derivative along the spline changes with the camera and with control points.
+        turned = (H @ first[..., None])[..., 0]
+        camera, control = _products(turned, X), _products(B, turned @ M)
         if exact:
-            to_camera = (by_image[..., :, None] * X1[..., None, :]).flatten(-2)
-            to_point = B1[..., None] * torch.einsum("pvkea,pvna->pvnke", PE, by_image)
-            rows = rows + torch.cat((to_camera, to_point.flatten(-2)), -1)
-        N = D.flatten(2, 3).mT @ (H @ D).flatten(2, 3) - rows.mT @ (moves[..., None] * rows)
-        slope = (D.mT @ by_image[..., None])[..., 0].sum(2)
-        slope = slope - (rows.mT @ (moves * (by_image * first).sum(-1))[..., None])[..., 0]
-        cross = N[..., :12, 12:]
-        if exact:
-            both = torch.einsum("pvak,pked->pvadke", by_image.mT @ B, E)
-            cross = cross + torch.nn.functional.pad(both.flatten(-2), (0, 0, 0, 1)).flatten(2, 3)
-        return N[..., :12, :12], N[..., 12:, 12:].sum(1), cross.flatten(1, 2), slope[..., :12], slope[..., 12:].sum(1)
+            both = both + by_image[..., None, None] * torch.eye(4, 3, dtype=X.dtype, device=X.device)
+            camera, control = camera + _products(by_image, X1), control + _products(B1, by_image @ M)
+        moved = (moves[..., None] * camera).mT
+        slope = (moves * (by_image * first).sum(-1))[..., None]
+        cross = (both.flatten(-3).mT @ B).unflatten(2, (12, 3)).transpose(-2, -1) - (moved @ control).unflatten(-1, (k, 3))
+        G = G.unflatten(-1, (k, 3, 3)).transpose(2, 3)
+        G = G - (control.flatten(1, 2).mT @ (moves[..., None] * control).flatten(1, 2)).view(G.shape)
+        pull = (pull - (control.mT @ slope).view(pull.shape)).sum(1)
+        # Control points move in some directions only.
+        G = torch.einsum("pkalb,pkda,pleb->pkdle", G, E, E).flatten(3).flatten(1, 2)
+        cross = torch.einsum("pvrka,pkea->pvrke", cross, E).flatten(-2).flatten(1, 2)
+        by_camera = by_camera - (camera.mT @ slope)[..., 0]
+        return A - moved @ camera, G, cross, by_camera, (E @ pull[..., None]).flatten(1)
+
+
+def _products(a: Float[Tensor, "*b m"], b: Float[Tensor, "*b n"]) -> Float[Tensor, "*b mn"]:
+    """All products of the numbers of a and b."""
+    return (a[..., :, None] * b[..., None, :]).flatten(-2)
 
 
 def held_directions(P: Float[Tensor, "p v 3 4"]) -> Float[Tensor, "p r h"]:
