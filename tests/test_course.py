@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 from scripts import Runner
 
 COURSE = Path(__file__).parent.parent / "examples" / "course"
@@ -96,20 +95,18 @@ LOOPS = {
     "05_ransac.py": "(errors := train(seed))[1] < min(5, errors[0] / 3)",
     "07_resection.py": "train(seed, 1) < min(0.2, learn(layer_dlt, seed, 1)[0][-10:].mean())",
 }
-"""For a notebook with a loop that learns, what must hold of it whatever the seed."""
+"""For a notebook with a loop that learns, what must hold of it whatever the seed; the first one it shows itself."""
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_runs_and_tells_the_truth(name: str, runner: Runner, generator: torch.Generator) -> None:
-    text, space = runner.run(COURSE / name)
+def test_runs_and_tells_the_truth(name: str, runner: Runner) -> None:
+    text, _ = runner.run(COURSE / name)
     assert not list(runner.folder.iterdir())
     for pattern, low, high in TRUTHS.get(name, []):
         found = re.search(pattern, text)
         assert found is not None, (pattern, text)
         assert low <= float(found[1]) <= high, found[0]
-    if name in LOOPS:
-        assert eval(LOOPS[name], space | {"seed": int(torch.randint(1, 1000, (), generator=generator))})
 
 
 @pytest.mark.slow
@@ -140,7 +137,7 @@ def test_cells_read_the_same_in_editors_and_in_galleries(name: str) -> None:
 def test_figures_are_saved_where_told(tmp_path: Path) -> None:
     script = str(COURSE / "save_figures.py")
     done = subprocess.run(
-        [sys.executable, script, str(tmp_path / "figures"), "1"], capture_output=True, text=True, cwd=tmp_path
+        [sys.executable, script, str(tmp_path / "figures"), "6"], capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
     assert {p.name for p in tmp_path.iterdir()} == {"figures"}

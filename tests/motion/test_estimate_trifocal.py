@@ -196,7 +196,7 @@ def test_transfer_in_oxford_quadruplets(
 ) -> None:
     x, _, P = read(data, name, views)
     # One half may be a bad one: many of them, judged together.
-    x, held = (torch.stack(part) for part in zip(*(halves(x, generator) for _ in range(20)), strict=True))
+    x, held = (torch.stack(part) for part in zip(*(halves(x, generator) for _ in range(8)), strict=True))
     fit = quadrifocal_6pt(x)
     assert (fit.status == Status.OK).all()
 

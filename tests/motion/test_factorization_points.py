@@ -211,7 +211,7 @@ def test_data_that_do_not_determine_the_answer_say_so() -> None:
 @pytest.mark.parametrize(("views", "n", "told"), [(2, 40, 0.95), (3, 10, 0.9), (3, 60, 0.98), (8, 30, 0.98)])
 def test_noise_is_not_taken_for_a_third_dimension(views: int, n: int, told: float, generator: torch.Generator) -> None:
     """Planes and views from one centre: a fourth dimension always takes some of the noise."""
-    batch, kind = 20, {"generator": generator, "dtype": torch.float64}
+    batch, kind = 12, {"generator": generator, "dtype": torch.float64}
     x, _ = scene(batch, 1, n)
     H = torch.eye(3, dtype=torch.float64) + 0.1 * torch.randn(batch, views, 3, 3, **kind)
     flat = 500 * from_homogeneous(to_homogeneous((x - 500) / 500) @ H.mT)[0] + 500
