@@ -92,7 +92,7 @@ def _attempt(A: Tensor, B: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         values = determinant(Pencil.of(a, b).multiply(c, nodes[0][:, None], nodes[1][:, None]))
         forms.append(combine_rows(values, to_coefficients.mT[..., None]))
     form = torch.cat(forms, 1)
-    roots = real_root_list(torch.where(torch.isfinite(form).all(0), form, torch.nan), steps=2)
+    roots = real_root_list(torch.where(torch.isfinite(form).all(0), form, torch.nan))
     A, B, C = (take_columns(q, roots.item) for q in (A, B, C))
     # A root s : t is z : w.
     v = Pencil.of(A, B).common_point(C, roots.s, roots.t)

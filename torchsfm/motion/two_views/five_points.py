@@ -49,9 +49,9 @@ class FivePointRoots(NamedTuple):
 
 
 def five_point_roots(
-    d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], *, steps: int, other_coordinates: bool = False
+    d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], *, other_coordinates: bool = False
 ) -> FivePointRoots:
-    """All real roots, in any order, after some steps of Newton's method."""
+    """All real roots, in any order."""
     d1, fine1 = _unit(d1)
     d2, fine2 = _unit(d2)
     basis, pivot = nullspace_basis(d1, d2)
@@ -60,7 +60,7 @@ def five_point_roots(
     rows, p = polynomial(basis)
     # Without five independent equations there is no polynomial and no root.
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
-    item, s, t = real_root_list(torch.where(fine, p, torch.nan), steps=steps, in_order=False)
+    item, s, t = real_root_list(torch.where(fine, p, torch.nan), in_order=False)
     return FivePointRoots(item, s, t, take_columns(rows, item), take_columns(basis, item), d1, d2)
 
 

@@ -87,7 +87,7 @@ def relative_5pt(
 
 def _poses(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack: Tensor) -> tuple[Tensor, Tensor]:
     """The samples, in order, and the poses (12, poses) of those in front of both cameras."""
-    roots = five_point_roots(d1, d2, steps=1)
+    roots = five_point_roots(d1, d2)
     item, u, basis = roots.item, roots.s, roots.basis
     rays = take_columns(torch.cat((roots.d1, roots.d2)), item)
     angle = slack.index_select(0, item)
