@@ -11,9 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg import cross
 from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.resection.points_and_lines import Candidates, Sample, frame, solve_poses
+from torchsfm.linalg.rows import take_columns
+from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
+from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, norm_rows, outer_rows
 
 
 def camera_1p2l(
@@ -55,19 +56,17 @@ def camera_1p2l(
 
 
 def _candidates(s: Sample) -> Candidates:
-    d, _, l, V, A = (v.permute(2, 1, 0).contiguous() for v in s[:5])  # noqa: E741
-    x, (l1, l2) = d[:, 0], l.unbind(1)
     # The point is the origin.
-    distance = A.square().sum(-1).sqrt()
-    w = A / distance[..., None]
-    u = cross(V, w)
-    a1, a2 = (-(l * x[:, None]).sum(-1) / distance).unbind(-1)
+    l1, l2 = s.l.unbind(1)
+    distance = norm_rows(s.A)
+    w = s.A / distance
+    u = cross_rows(s.V, w)
+    a1, a2 = (-dot_rows(s.l, s.d.expand_as(s.l)) / distance).unbind(0)
     (w1, w2), (u1, u2) = w.unbind(1), u.unbind(1)
-    k = (l1 * l2).sum(-1)
-    ww, uu = (w1 * w2).sum(-1), (u1 * u2).sum(-1)
-    by1, by2 = (u1 * w2).sum(-1) * a2, (w1 * u2).sum(-1) * a1
+    k, ww, uu = dot_rows(l1, l2), dot_rows(w1, w2), dot_rows(u1, u2)
+    by1, by2 = dot_rows(u1, w2) * a2, dot_rows(w1, u2) * a1
     # In p = b1 + b2 and q = b1 - b2 = product / p; the unknown scaled to the size of the a's.
-    size = (a1 * a1 + a2 * a2).sqrt()
+    size = (a1 * a1).addcmul_(a2, a2).sqrt_()
     a1, a2, by1, by2 = (v / size for v in (a1, a2, by1, by2))
     product = (a2 - a1) * (a2 + a1)
     c = torch.stack(
@@ -80,17 +79,21 @@ def _candidates(s: Sample) -> Candidates:
         )
     )
     # Roots about 1 are told apart best.
-    scale = (c[0].abs() / c[4].abs().clamp_min(1e-300)).pow(0.25).clamp(1e-4, 1e4)
-    c = c * scale ** torch.arange(5, device=c.device)[:, None]
+    scale = (c[0].abs() / c[4].abs().clamp_min(1e-300)).sqrt_().sqrt_().clamp_(1e-4, 1e4)
+    power = scale
+    for row in c[1:]:
+        row *= power
+        power = power * scale
     roots = real_root_list(torch.where(c.isfinite().all(0), c, torch.nan))
-    p = scale[roots.item] * roots.s / roots.t
-    q = product[roots.item] / p
-    b = c.new_full((2, 4, c.shape[1]), torch.nan)
-    slot = roots.slot().clamp_max(3)
-    b[0, slot, roots.item], b[1, slot, roots.item] = 0.5 * (p + q), 0.5 * (p - q)
-    b1, b2 = b
-    depth = (a1 * a1 + b1 * b1).rsqrt()
-    g1 = depth.T[..., None] * (a1[:, None, None] * w1[:, None] + b1.T[..., None] * u1[:, None])
-    g2 = depth.T[..., None] * (a2[:, None, None] * w2[:, None] + b2.T[..., None] * u2[:, None])
-    R = frame(l1, l2)[:, None] @ frame(g1, g2).mT
-    return Candidates.of_slots(R, (depth / size).T[..., None] * x[:, None])
+    item = roots.item
+    scale, product, a1, a2, size = take_columns(torch.stack((scale, product, a1, a2, size)), item).unbind(0)
+    p = scale * roots.s / roots.t
+    q = product / p
+    b1, b2 = 0.5 * (p + q), 0.5 * (p - q)
+    depth = (a1 * a1).addcmul_(b1, b1).rsqrt_()
+    (w1, w2), (u1, u2) = (take_columns(v, item).unbind(1) for v in (w, u))
+    # A frame does not depend on how long the vectors are.
+    world = frame_rows(a1 * w1 + b1 * u1, a2 * w2 + b2 * u2)
+    R = outer_rows([take_columns(v, item) for v in frame_rows(l1, l2)], world)
+    one = s.of(item)
+    return Candidates(item, roots.slot(), R, depth / size * one.d[:, 0], one)

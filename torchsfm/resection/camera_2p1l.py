@@ -10,8 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.nullspace import nullspace_rows
-from torchsfm.resection.points_and_lines import Candidates, Sample, frame, solve_poses
+from torchsfm.linalg.nullspace import nullspace_columns
+from torchsfm.linalg.rows import add_rows
+from torchsfm.linalg.vectors import across
+from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
+from torchsfm.resection.vector_rows import dot_rows, frame_rows, norm_rows, outer_rows
 
 
 def camera_2p1l(
@@ -53,49 +56,48 @@ def camera_2p1l(
 
 
 def _candidates(s: Sample) -> Candidates:
-    d, X, l, V, A = (v.permute(2, 1, 0).contiguous() for v in s[:5])  # noqa: E741
-    (x1, x2), l, V, A = d.unbind(1), l[:, 0], V[:, 0], A[:, 0]  # noqa: E741
-    D = X[:, 1]
-    length = D.square().sum(-1).sqrt()
+    (x1, x2), l, V, A, D = s.d.unbind(1), s.l[:, 0], s.V[:, 0], s.A[:, 0], s.X[:, 1]  # noqa: E741
     # The first point is the origin; lengths in units of D.
-    A = A / length[:, None]
-    D = D / length[:, None]
-    axis = torch.nn.functional.one_hot(D.abs().argmin(-1), 3).to(D.dtype)
-    side = V - (V * D).sum(-1, keepdim=True) * D
-    along = side.square().sum(-1, keepdim=True) < 1e-20
-    world = frame(D, torch.where(along, axis, V))
-    v1, v2, _ = (world.mT @ V[..., None])[..., 0].unbind(-1)
-    w1, w2, w3 = (world.mT @ A[..., None])[..., 0].unbind(-1)
-    k1, k2 = -(l * x1).sum(-1), (l * x2).sum(-1)
-    zero = torch.zeros_like(k1)
+    length = norm_rows(D)
+    A, D = A / length, D / length
+    side = V - dot_rows(V, D) * D
+    along = dot_rows(side, side) < 1e-20
+    e1, e2, e3 = frame_rows(D, torch.where(along, across(D)[0], V))
+    v1, v2 = dot_rows(e1, V), dot_rows(e2, V)
+    w1, w2, w3 = dot_rows(e1, A), dot_rows(e2, A), dot_rows(e3, A)
+    k1, k2 = -dot_rows(l, x1), dot_rows(l, x2)
     # Of (a1, a2, g2, g3) with g1 = k1 a1 + k2 a2.
-    rows = torch.stack((v1 * k1, v1 * k2, v2, zero, w1 * k1 - k1, w1 * k2, w2, w3)).reshape(2, 4, -1)
-    basis, _ = nullspace_rows(rows)
-    a1, a2, g2, g3 = basis.unbind(1)
-    g1 = k1 * a1 + k2 * a2
-    c = (x1 * x2).sum(-1)
-
-    def forms(i: int, j: int) -> tuple[Tensor, Tensor]:
-        normal = g1[i] * g1[j] + g2[i] * g2[j] + g3[i] * g3[j]
-        return normal, a1[i] * a1[j] + a2[i] * a2[j] - c * (a1[i] * a2[j] + a2[i] * a1[j])
-
-    (n11, q11), (n12, q12), (n22, q22) = forms(0, 0), forms(0, 1), forms(1, 1)
-    e11, e12, e22 = n11 - q11, n12 - q12, n22 - q22
+    columns = (v1 * k1, (w1 - 1) * k1, v1 * k2, w1 * k2, v2, w2, torch.zeros_like(k1), w3)
+    basis, _ = nullspace_columns(torch.stack(columns).view(4, 2, -1))
+    a1, a2, g2, g3 = basis.unbind(0)
+    g1 = (k1 * a1).addcmul_(k2, a2)
+    c = dot_rows(x1, x2)
+    # Of each pair of basis vectors: |g|^2, and the difference to |a2 x2 - a1 x1|^2.
+    n11, n12, n22 = _products((g1, g2, g3))
+    q11, q12, q22 = _products((a1, a2))
+    e11, e22 = (n - q + 2 * c * m for n, q, m in ((n11, q11, a1[0] * a2[0]), (n22, q22, a1[1] * a2[1])))
+    e12 = n12 - q12 + c * (a1[0] * a2[1] + a2[0] * a1[1])
     root = e12 * e12 - e11 * e22
     real = root >= -1e-13 * (e12 * e12 + (e11 * e22).abs())
     z = -(e12 + torch.copysign(root.clamp_min(0).sqrt(), e12))
-    first, second = torch.stack((z, e22), 1), torch.stack((e11, z), 1)
-    scale = (n11[:, None] * first**2 + 2 * n12[:, None] * first * second + n22[:, None] * second**2).rsqrt()
-    scale = torch.where(real[:, None], scale, torch.nan)
+    first, second = torch.stack((z, e22)), torch.stack((e11, z))
+    scale = (n11 * first**2 + 2 * n12 * first * second + n22 * second**2).rsqrt()
+    # In front of the camera.
+    scale = torch.copysign(scale, first * (a1 + a2)[0] + second * (a1 + a2)[1])
+    first, second = torch.where(real, scale, torch.nan) * torch.stack((first, second))
+    a1, a2, g2, g3 = (first * v[0] + second * v[1] for v in (a1, a2, g2, g3))
+    # The normal g across D.
+    size = (g2 * g2 + g3 * g3).rsqrt_()
+    g2, g3 = g2 * size, g3 * size
+    e1, e2, e3, x1, x2, l = (v[:, None] for v in (e1, e2, e3, x1, x2, l))  # noqa: E741
+    world = e1.expand(3, *g2.shape), g2 * e2 + g3 * e3, g2 * e3 - g3 * e2
+    R = outer_rows(frame_rows(a2 * x2 - a1 * x1, l.expand(3, *g2.shape)), world)
+    slot, item = torch.meshgrid(*(torch.arange(k, device=l.device) for k in g2.shape), indexing="ij")
+    t = a1 * length * x1
+    return Candidates(item.flatten(), slot.flatten(), R.flatten(2), t.flatten(1), s.times(2), len(length))
 
-    def at(v: Tensor) -> Tensor:
-        return (first * v[0][:, None] + second * v[1][:, None]) * scale
 
-    a1, a2 = at(a1), at(a2)
-    sign = torch.where(a1 + a2 < 0, -1.0, 1.0)
-    a1, a2 = a1 * sign, a2 * sign
-    g = torch.stack((at(g1), at(g2), at(g3)), -1) * sign[..., None]
-    g = (world[:, None] @ g[..., None])[..., 0]
-    y = a2[..., None] * x2[:, None] - a1[..., None] * x1[:, None]
-    R = frame(y, l[:, None].expand_as(y)) @ frame(D[:, None].expand_as(g), g).mT
-    return Candidates.of_slots(R, (a1 * length[:, None])[..., None] * x1[:, None])
+def _products(rows: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Scalar products of two vectors: of the first with itself, of both, of the second with itself."""
+    first, both, second = (add_rows([row[i] * row[j] for row in rows]) for i, j in ((0, 0), (0, 1), (1, 1)))
+    return first, both, second

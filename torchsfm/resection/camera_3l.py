@@ -14,7 +14,7 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.real_roots import real_root_list
 from torchsfm.linalg.rows import add_rows, take_columns
 from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
-from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, turned
+from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, outer_rows, turned
 
 CONCURRENT = 1e-7
 """Volume that the unit normals of three planes of sight span, at which they meet in a line but for rounding."""
@@ -55,52 +55,57 @@ def camera_3l(
 
 
 def _candidates(s: Sample) -> Candidates:
-    l, V, A = _ordered(s)  # noqa: E741
+    l, V = _ordered(s)  # noqa: E741
     (l1, l2, l3), (V1, V2, V3) = l.unbind(1), V.unbind(1)
     # The world's frame has the columns 2, 3, 1 of this one, so that V1 is the third axis.
     camera, (f1, f2, f3) = frame_rows(l1, l2), frame_rows(V1, V2)
     p = [dot_rows(c, l2) for c in camera[:2]], [dot_rows(c, l3) for c in camera]
     q = [dot_rows(f2, V2), dot_rows(f1, V2)], [dot_rows(f, V3) for f in (f2, f3, f1)]
-    quartics = _circle_point(p, q)
-    roots = real_root_list(_on_circle(quartics))
+    rows = _two_rows(p, q)
+    roots = real_root_list(_on_circle(_circle_point(rows)))
     slot, item = roots.slot(), roots.item
-    w = [_at(form, roots.s, roots.t) for form in take_columns(quartics, item).unbind(0)]
     # tan(alpha / 2) = s / t.
     size = 1 / (roots.s.square() + roots.t.square())
     cos, sin = (roots.t - roots.s) * (roots.t + roots.s) * size, 2 * roots.s * roots.t * size
-    length = torch.copysign((w[1].square() + w[2].square()).sqrt(), w[0])
-    cos_b, sin_b = w[1] / length, w[2] / length
-    zero = torch.zeros_like(cos)
-    # Rx(alpha) Rz(beta), column by column.
-    turns = torch.stack(
-        (cos_b, cos * sin_b, sin * sin_b, -sin_b, cos * cos_b, sin * cos_b, zero, -sin, cos)
-    ).view(3, 3, -1).transpose(0, 1)  # fmt: skip
-    turns = turned(take_columns(torch.stack(camera, 1), item), turns)
-    # Rows of the world's frame: turns world'.
-    R = turned(turns, take_columns(torch.stack((f2, f3, f1)), item))
+    a0, a1, a2, zc, zs, u, uc, us, v, vc, vs = take_columns(torch.stack(rows), item).unbind(0)
+    second = torch.stack((a0 * sin, a1, a2 * cos))
+    third = torch.stack((zc * cos, u, v)).addcmul_(torch.stack((zs, us, vs)), sin)
+    third[1:].addcmul_(torch.stack((uc, vc)), cos)
+    length, cos_b, sin_b = cross_rows(second, third).unbind(0)
+    length = torch.copysign((cos_b * cos_b).addcmul_(sin_b, sin_b).sqrt_(), length)
+    cos_b, sin_b = cos_b / length, sin_b / length
+    # Columns of Rx(alpha) Rz(beta) in the camera's frame.
+    x, y, z = (take_columns(v, item) for v in camera)
+    y, z = (cos * y).addcmul_(sin, z), (cos * z).addcmul_(sin, y, value=-1)
+    x, y = (cos_b * x).addcmul_(sin_b, y), (cos_b * y).addcmul_(sin_b, x, value=-1)
+    R = outer_rows((x, y, z), [take_columns(v, item) for v in (f2, f3, f1)])
     # Concurrent image lines: three planes of sight through one line, along which nothing is told.
+    (l1, l2, l3), one = s.l.unbind(1), s.of(item)
     e1 = cross_rows(l2, l3)
     volume = dot_rows(l1, e1)
     edges = torch.stack((e1, cross_rows(l3, l1), cross_rows(l1, l2)), 1)
     edges = edges / torch.where(volume.abs() > CONCURRENT, volume, torch.nan)
-    offset = dot_rows(take_columns(l, item), turned(R, take_columns(A, item)))
-    t = -turned(take_columns(edges, item), offset[:, None])[:, 0]
-    return Candidates(item, slot, R, t)
+    offset = dot_rows(one.l, turned(R, one.A))
+    t = turned(take_columns(edges, item), -offset[:, None])[:, 0]
+    return Candidates(item, slot, R, t, one)
 
 
-def _circle_point(p: tuple[list[Tensor], list[Tensor]], q: tuple[list[Tensor], list[Tensor]]) -> Tensor:
-    """The vector along (1, cos beta, sin beta): three forms of degree four in sin and cos of half alpha, as (3, 5, n).
+def _two_rows(p: tuple[list[Tensor], list[Tensor]], q: tuple[list[Tensor], list[Tensor]]) -> list[Tensor]:
+    """What (1, cos beta, sin beta) is across: a row of the second line, (a0 sin, a1, a2 cos), and one of the third one.
 
-    It is the cross product of two rows (z q3, p1 q1 + y q2, y q1 - p1 q2) with y = p2 cos + p3 sin, z = p3 cos - p2 sin, of
-    the second line, whose p3 and q2 are zero, and of the third.
+    A row is (z q3, p1 q1 + y q2, y q1 - p1 q2) with y = p2 cos + p3 sin, z = p3 cos - p2 sin, of alpha; of the second line p3
+    and q2 are zero. Of the third line there are the parts in cos and sin of the first number, and the constant and these parts
+    of the others.
     """
     (p1, p2), (q1, q3) = p[0], q[0]
-    a0, a1, a2 = -p2 * q3, p1 * q1, p2 * q1
+    a = [-p2 * q3, p1 * q1, p2 * q1]
     (p1, p2, p3), (q1, q2, q3) = p[1], q[1]
-    # Rows of the third line: z q3; constant, cos and sin of the other two.
-    zc, zs = p3 * q3, -p2 * q3
-    u, uc, us = p1 * q1, p2 * q2, p3 * q2
-    v, vc, vs = -p1 * q2, p2 * q1, p3 * q1
+    return [*a, p3 * q3, -p2 * q3, p1 * q1, p2 * q2, p3 * q2, -p1 * q2, p2 * q1, p3 * q1]
+
+
+def _circle_point(rows: list[Tensor]) -> Tensor:
+    """The vector along (1, cos beta, sin beta): three forms of degree four in sin and cos of half alpha, as (3, 5, n)."""
+    a0, a1, a2, zc, zs, u, uc, us, v, vc, vs = rows
     zero = torch.zeros_like(a0)
     forms = (
         # 1, cos, sin, cos^2, cos sin, sin^2
@@ -129,23 +134,15 @@ def _on_circle(w: Float[Tensor, "3 5 n"]) -> Float[Tensor, "9 n"]:
     return torch.where(c.isfinite().all(0), c, torch.nan)
 
 
-def _at(form: Float[Tensor, "5 m"], s: Tensor, t: Tensor) -> Tensor:
-    """A form of degree four where the sine is to the cosine of a half angle as s to t; over its size."""
-    size = (s.square() + t.square()).square()
-    value = form[4]
-    power = t
-    for k in (3, 2, 1, 0):
-        value = (value * s).addcmul(form[k], power)
-        power = power * t
-    return value / size
-
-
-def _ordered(s: Sample) -> tuple[Tensor, Tensor, Tensor]:
+def _ordered(s: Sample) -> tuple[Tensor, Tensor]:
     """Lines in the order in which that whose direction is least like another one's is first: two of them may be parallel."""
     (a, b), (c, d), (e, f) = [(s.V[:, i], s.V[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))]
     across = [cross_rows(*pair) for pair in ((a, b), (c, d), (e, f))]
     sines = [dot_rows(v, v) for v in across]
-    least = torch.stack((sines[0].minimum(sines[1]), sines[0].minimum(sines[2]), sines[1].minimum(sines[2])))
-    order = (least.argmax(0) + torch.arange(3, device=least.device)[:, None]) % 3
-    l, V, A = (v.gather(1, order.expand_as(v)) for v in (s.l, s.V, s.A))  # noqa: E741
-    return l, V, A
+    # The least sine of each with the others.
+    m1, m2, m3 = sines[0].minimum(sines[1]), sines[0].minimum(sines[2]), sines[1].minimum(sines[2])
+    first = torch.where(m3 > torch.maximum(m1, m2), 2, (m2 > m1).long())
+    second = torch.where(first < 2, first + 1, 0)
+    order = torch.stack((first, second, 3 - first - second))
+    l, V = (v.gather(1, order.expand_as(v)) for v in (s.l, s.V))  # noqa: E741
+    return l, V

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross, usable
-from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
+from torchsfm.linalg.rows import add_rows, take_columns
 from torchsfm.optim import attach_implicit, for_slots, rotation_exponential, wants_derivative
 from torchsfm.resection.vector_rows import cross_rows, dot_rows, length_rows, norm_rows, turned, unit_rows
 
@@ -47,25 +47,35 @@ class Sample(NamedTuple):
     """Unit directions."""
     A: Float[Tensor, "3 k n"]
     """The point of each line that is nearest to the origin."""
-    origin: Float[Tensor, "3 n"]
-    unit: Float[Tensor, " n"]
+    points: Float[Tensor, "3 p n"]
+    """The points as they came."""
+    feet: Float[Tensor, "3 k n"]
+    """The point of each line that is nearest to the origin of the world."""
+    origin: Float[Tensor, "3 1 n"]
+    unit: Float[Tensor, "1 1 n"]
     sound: Bool[Tensor, " n"]
     """Finite, with directions."""
 
+    def of(self, item: Int[Tensor, " m"]) -> "Sample":
+        """The problems of a list, but for what is sound."""
+        return self._replace(**{name: take_columns(v, item) for name, v in self._asdict().items() if v.ndim == 3})
+
+    def times(self, slots: int) -> "Sample":
+        """Every problem so many times, first each once."""
+        return self._replace(**{name: v.repeat(1, 1, slots) for name, v in self._asdict().items() if v.ndim == 3})
+
 
 class Candidates(NamedTuple):
-    """Poses that may be solutions, one after the other, those of a problem together."""
+    """Poses that may be solutions, one after the other; not finite where there is none."""
 
     item: Int[Tensor, " m"]
     slot: Int[Tensor, " m"]
     R: Float[Tensor, "3 3 m"]
     t: Float[Tensor, "3 m"]
-
-    @classmethod
-    def of_slots(cls, R: Float[Tensor, "n slots 3 3"], t: Float[Tensor, "n slots 3"]) -> "Candidates":
-        """Those that are finite."""
-        item, slot = (R.isfinite().flatten(-2).all(-1) & t.isfinite().all(-1)).nonzero().unbind(-1)
-        return cls(item, slot, R[item, slot].permute(1, 2, 0).contiguous(), t[item, slot].mT.contiguous())
+    problem: Sample
+    """`Sample.of(item)`."""
+    apart: int = 1
+    """How far apart in the list the candidates of a problem are."""
 
 
 def equations(
@@ -115,15 +125,15 @@ def solve_poses(
         for start in range(0, number, _CHUNK):
             rows = [t[start : start + _CHUNK].permute(2, 1, 0).contiguous() for t in flat]
             sample = _prepare(rows, torch.finfo(dtype).eps)
-            found = candidates(sample)
-            item, slot, pose = _finish(sample, found, slots)
-            pose, kept = _in_world(sample, rows, item, pose)
-            pose = pose.to(dtype)
-            kept &= pose.isfinite().all(0)
-            (keep,) = kept.nonzero(as_tuple=True)
-            place = ((start + item) * slots + slot)[keep]
-            model.index_copy_(0, place, pose.mT[keep])
-            valid[place] = True
+            item, slot, pose = _finish(sample, candidates(sample), slots)
+            if dtype != pose.dtype:
+                # What passes for a number in float64 may be none here.
+                pose = pose.to(dtype)
+                (keep,) = pose.isfinite().all(0).nonzero(as_tuple=True)
+                item, slot, pose = item[keep], slot[keep], pose[:, keep]
+            place = (item + start).mul_(slots).add_(slot)
+            model.index_copy_(0, place, pose.mT)
+            valid.index_fill_(0, place, True)
         model, valid = model.reshape(*batch, slots, 3, 4), valid.reshape(*batch, slots)
     if wants_derivative(*data):
         model = attach_implicit(equations, model, *(for_slots(t, batch) for t in data), dims=2, valid=valid)
@@ -132,26 +142,27 @@ def solve_poses(
 
 def _prepare(data: list[Tensor], eps: float) -> Sample:
     """Lay the problems out; what is not sound gets harmless numbers."""
-    sound = torch.cat([usable(t).flatten(0, 1) for t in data]).all(0)
-    d, X, l, L = (torch.where(sound, t, 1.0) for t in data)  # noqa: E741
-    for t in (d, l, L[:3]):
-        sound = sound & (t != 0).any(0).all(0)
+    largest = torch.stack([t.flatten(0, 1).abs().amax(0) for t in data if t.numel()]).amax(0)
+    sound = usable(largest)
+    d, X, l, L = data if sound.all() else (torch.where(sound, t, 1.0) for t in data)  # noqa: E741
+    for t in (d, l):
+        sound = sound & (t.abs().amax(0) > 0).all(0)
     d, l = unit_rows(d), unit_rows(l)  # noqa: E741
     size = length_rows(L[:3])
     # Squares of what is smaller vanish.
     sound = sound & (size > 1e-150).all(0)
     V, m = L[:3] / size, L[3:] / size
     A = cross_rows(V, m)
-    origin = X[:, 0] if X.shape[1] else _nearest_to_all(V, A)
-    X = X - origin[:, None]
-    A = A - origin[:, None]
+    points, feet = X, A
+    origin = (X[:, 0] if X.shape[1] else _nearest_to_all(V, A))[:, None]
+    X, A = X - origin, A - origin
     A = A - dot_rows(A, V) * V
     unit = add_rows(torch.cat((X, A), 1).flatten(0, 1).square()).sqrt()
     unit = torch.where(unit > 0, unit, 1.0)
     # A moment that is not across the direction is none, but for rounding.
     off = dot_rows(V, m).abs()
     sound = sound & (off <= eps**0.5 * (unit + length_rows(origin))).all(0)
-    return Sample(d, X / unit, l, V, A / unit, origin, unit, sound)
+    return Sample(d, X / unit, l, V, A / unit, points, feet, origin, unit[None, None], sound)
 
 
 def _nearest_to_all(V: Tensor, A: Tensor) -> Tensor:
@@ -172,121 +183,106 @@ def _nearest_to_all(V: Tensor, A: Tensor) -> Tensor:
 
 
 def _finish(s: Sample, found: Candidates, slots: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the candidates those that are solutions in the frame of the sample: item, slot and pose (12, m), row by row."""
-    finite = torch.cat((found.R.flatten(0, 1), found.t)).isfinite().all(0)
-    (keep,) = (finite & s.sound[found.item] & (found.slot < slots)).nonzero(as_tuple=True)
-    item, slot = found.item[keep], found.slot[keep]
-    one = _taken(s, item)
-    R, t, met = _polished(one, take_columns(found.R, keep), take_columns(found.t, keep))
-    far = length_rows(t).clamp_min(1.0)
-    good = met <= _MET * far
-    if s.X.shape[1]:
-        good &= (dot_rows(turned(R, one.X) + t[:, None], one.d) > _FLAT * far).all(0)
+    """Of the candidates those that are solutions: item, slot and pose (12, m) in the world, row by row."""
+    item, slot, one = found.item, found.slot, found.problem
+    R, t, left = _polished(one, found.R, found.t)
+    far = length_rows(t).clamp_min_(1.0)
+    # No comparison holds where anything is not finite.
+    good = left.amax(0) <= _MET * far
+    good &= s.sound.index_select(0, item) & (slot < slots)
+    shift = one.unit[0] * t - turned(R, one.origin)[:, 0]
+    good &= _in_world(one, R, shift, far, left[len(left) - 2 * s.V.shape[1] :])
+    good[_repeated(found, R, t, good, slots)] = False
     (keep,) = good.nonzero(as_tuple=True)
-    item, slot = item[keep], slot[keep]
-    pose = take_columns(torch.cat((R, t[:, None]), 1).flatten(0, 1), keep)
-    keep = _first_of_equals(item, slot, pose, slots)
-    return item[keep], slot[keep], take_columns(pose, keep)
+    pose = torch.cat((take_columns(R, keep), take_columns(shift, keep)[:, None]), 1).flatten(0, 1)
+    return item.index_select(0, keep), slot.index_select(0, keep), pose
 
 
-def _taken(s: Sample, item: Tensor) -> Sample:
-    """The problems of a list."""
-    d, X, l, V, A, origin = (take_columns(v, item) for v in s[:6])  # noqa: E741
-    return Sample(d, X, l, V, A, origin, s.unit[item], s.sound[item])
-
-
-def _first_of_equals(item: Tensor, slot: Tensor, pose: Tensor, slots: int) -> Tensor:
-    """Of poses of a problem that are one the first: numbers in the list."""
-    # Equal poses have equal sums; few others do.
-    total = combine_rows(pose.unbind(0), [pose.new_tensor(1 / (i + 1.5)) for i in range(len(pose))])
-    pairs = [torch.zeros(2, 0, dtype=torch.long, device=item.device)]
-    for apart in range(1, min(slots, len(item))):
-        near = (item[apart:] == item[:-apart]) & ((total[apart:] - total[:-apart]).abs() < 4 * _TWICE)
-        (first,) = near.nonzero(as_tuple=True)
+def _repeated(found: Candidates, R: Tensor, t: Tensor, good: Tensor, slots: int) -> Tensor:
+    """Of good poses of a problem that are one all but the first: numbers in the list."""
+    # Equal poses have equal sums of some of their numbers; few others do.
+    total = torch.where(good, R[0, 0] + 0.7 * R[1, 1] + 0.4 * R[1, 2] + 0.3 * t[2], torch.nan)
+    pairs = [torch.zeros(2, 0, dtype=torch.long, device=t.device)]
+    for apart in range(found.apart, min(slots * found.apart, len(total)), found.apart):
+        (first,) = ((total[apart:] - total[:-apart]).abs_() < 4 * _TWICE).nonzero(as_tuple=True)
         pairs.append(torch.stack((first, first + apart)))
     first, second = torch.cat(pairs, 1)
-    same = (pose[:, first] - pose[:, second]).abs().amax(0) < _TWICE
+    same = found.item[first] == found.item[second]
+    for v in (R.flatten(0, 1), t):
+        same &= (v[:, first] - v[:, second]).abs().amax(0) < _TWICE
     first, second = first[same], second[same]
-    good = torch.ones_like(item, dtype=torch.bool)
+    alive = torch.ones_like(good)
     for k in range(1, slots if len(first) else 1):
-        own = (slot[second] == k) & good[first]
-        good[second[own]] = False
-    return good.nonzero()[:, 0]
+        own = (found.slot[second] == k) & alive[first]
+        alive[second[own]] = False
+    return (~alive).nonzero()[:, 0]
 
 
-def _in_world(s: Sample, data: list[Tensor], item: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses (12, m) of the world, and which of them satisfy the equations there.
+def _in_world(one: Sample, R: Tensor, t: Tensor, far: Tensor, lines: Tensor) -> Tensor:
+    """Which poses of the world satisfy the equations there, with points in front; `lines` is what is left of those of lines.
 
     What is small against far points need not be so against a near line.
     """
-    pose = pose.view(3, 4, -1)
-    R, t = pose[:, :3], pose[:, 3]
-    t = s.unit[item] * t - turned(R, take_columns(s.origin, item)[:, None])[:, 0]
-    gram = [dot_rows(R[:, i], R[:, j]) - float(i == j) for i in range(3) for j in range(i + 1)]
-    left = torch.stack(gram).abs().amax(0)
-    _, X, _, L = (take_columns(v, item) for v in data)
-    if X.shape[1]:
-        Y = turned(R, X) + t[:, None]
-        ray = take_columns(s.d, item)
-        left = left.maximum((length_rows(cross_rows(ray, Y)) / length_rows(Y)).amax(0))
-    if L.shape[1]:
-        V, normal = take_columns(s.V, item), take_columns(s.l, item)
-        foot = cross_rows(V, L[3:] / length_rows(L[:3]))
-        Y = turned(R, foot) + t[:, None]
-        left = left.maximum((dot_rows(normal, Y).abs() / length_rows(Y)).amax(0))
-        left = left.maximum(dot_rows(normal, turned(R, V)).abs().amax(0))
-    return torch.cat((R, t[:, None]), 1).flatten(0, 1), left <= _LEFT
+    left = [*(dot_rows(R, R) - 1).unbind(0), *dot_rows(R[:, :2], R[:, 1:]).unbind(0), dot_rows(R[:, 0], R[:, 2])]
+    # Directions are the same in every frame.
+    left += lines[: one.V.shape[1]].unbind(0)
+    good = torch.stack(left).abs_().amax(0) <= _LEFT
+    if one.X.shape[1]:
+        Y = turned(R, one.points) + t[:, None]
+        good &= (dot_rows(Y, one.d) > _FLAT * far * one.unit[0]).all(0)
+        across = cross_rows(one.d, Y)
+        good &= dot_rows(across, across).addcmul_(dot_rows(Y, Y), Y.new_tensor(_LEFT**2), value=-1).amax(0) <= 0
+    if one.V.shape[1]:
+        Y = turned(R, one.feet) + t[:, None]
+        good &= dot_rows(one.l, Y).square_().addcmul_(dot_rows(Y, Y), Y.new_tensor(_LEFT**2), value=-1).amax(0) <= 0
+    return good
 
 
 def _polished(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Newton's method where rounding has left something: poses, and the largest equation of each."""
-    left = _rows(s, R, t)[0].abs().amax(0)
+    """Newton's method where rounding has left something: poses, and what is left of the equations of each."""
+    left = _left(s, R, t)
+    (rough,) = (left.amax(0) > _ROUNDING).nonzero(as_tuple=True)
     for _ in range(_STEPS):
-        (rough,) = (left > _ROUNDING).nonzero(as_tuple=True)
         if not len(rough):
             break
-        part, old_R, old_t = _taken(s, rough), take_columns(R, rough), take_columns(t, rough)
+        part, old_R, old_t = s.of(rough), take_columns(R, rough), take_columns(t, rough)
         J, r = _linearized(part, old_R, old_t)
         step = torch.linalg.solve_ex(J, r)[0][..., 0]
         step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
         new_R = (rotation_exponential(step[:, :3]) @ old_R.permute(2, 0, 1)).permute(1, 2, 0)
         new_t = old_t + step[:, 3:].mT
-        new_left = _rows(part, new_R, new_t)[0].abs().amax(0)
-        better = new_left < left[rough]
-        rough = rough[better]
-        R[..., rough], t[..., rough], left[rough] = new_R[..., better], new_t[..., better], new_left[better]
+        new_left = _left(part, new_R, new_t)
+        worst = new_left.amax(0)
+        better = worst < left[:, rough].amax(0)
+        place = rough[better]
+        R[..., place], t[..., place], left[:, place] = new_R[..., better], new_t[..., better], new_left[:, better]
+        rough = rough[better & (worst > _ROUNDING)]
     return R, t, left
 
 
-def _rows(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, Tensor]]:
-    """The six equations (6, m), and what their derivatives are made of: X, two vectors across d; V, A; all turned."""
-    X, V, A = (turned(R, v) for v in (s.X, s.V, s.A))
+def _left(s: Sample, R: Tensor, t: Tensor) -> Tensor:
+    """What is left of the equations, as absolute numbers: of points, then of the directions and of the places of lines."""
     rows: list[Tensor] = []
-    across: tuple[Tensor, ...] = ()
     if s.X.shape[1]:
-        across = _across(s.d)
-        rows += [dot_rows(e, X + t[:, None]) for e in across]
+        rows.append(cross_rows(s.d, turned(R, s.X) + t[:, None]).flatten(0, 1))
     if s.V.shape[1]:
-        rows += [dot_rows(s.l, V), dot_rows(s.l, A + t[:, None])]
-    return torch.cat(rows), (X, *across), (V, A)
+        rows += [dot_rows(s.l, turned(R, s.V)), dot_rows(s.l, turned(R, s.A) + t[:, None])]
+    return torch.cat(rows).abs_()
 
 
 def _linearized(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives (m, 6, 6) of the equations along a turn from the left and a shift, and the equations' negatives (m, 6, 1)."""
-    r, (X, *across), (V, A) = _rows(s, R, t)
-    slopes = [torch.cat((cross_rows(X, e), e)) for e in across]
+    X, V, A = (turned(R, v) for v in (s.X, s.V, s.A))
+    rows, slopes = [], []
+    if s.X.shape[1]:
+        across = _across(s.d)
+        rows += [dot_rows(e, X + t[:, None]) for e in across]
+        slopes += [torch.cat((cross_rows(X, e), e)) for e in across]
     if s.V.shape[1]:
+        rows += [dot_rows(s.l, V), dot_rows(s.l, A + t[:, None])]
         slopes.append(torch.cat((cross_rows(V, s.l), torch.zeros_like(V))))
         slopes.append(torch.cat((cross_rows(A, s.l), s.l)))
-    return torch.cat(slopes, 1).permute(2, 1, 0), -r.mT[..., None]
-
-
-def frame(a: Tensor, b: Tensor) -> Tensor:
-    """Orthonormal columns: along a, across it in the plane of a and b, and their normal; not finite where there is none."""
-    first = a / torch.linalg.vector_norm(a, dim=-1, keepdim=True)
-    normal = cross(first, b)
-    third = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    return torch.stack((first, cross(third, first), third), -1)
+    return torch.cat(slopes, 1).permute(2, 1, 0), -torch.cat(rows).mT[..., None]
 
 
 def _across(u: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,16 +1,25 @@
 """Vectors with coordinates in the first and the batch in the last dimension: products, turns, frames."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 
-def frame_rows(a: Float[Tensor, "3 n"], b: Float[Tensor, "3 n"]) -> tuple[Tensor, Tensor, Tensor]:
+def frame_rows(a: Float[Tensor, "3 *n"], b: Float[Tensor, "3 *n"]) -> tuple[Tensor, Tensor, Tensor]:
     """Along a, across it in the plane of a and b, and their normal; not finite where there is none."""
     first = a / norm_rows(a)
     normal = cross_rows(first, b)
     third = normal / norm_rows(normal)
     return first, cross_rows(third, first), third
+
+
+def outer_rows(a: Sequence[Float[Tensor, "3 *k"]], b: Sequence[Float[Tensor, "3 *k"]]) -> Float[Tensor, "3 3 *k"]:
+    """The sum of the products `a_i b_i'` of vectors: the turn from the frame of the b to that of the a."""
+    (a1, a2, a3), (b1, b2, b3) = a, b
+    out = a1[:, None] * b1
+    return out.addcmul_(a2[:, None], b2).addcmul_(a3[:, None], b3)
 
 
 def turned(R: Float[Tensor, "3 3 m"], v: Float[Tensor, "3 k m"]) -> Float[Tensor, "3 k m"]:
@@ -27,7 +36,8 @@ def dot_rows(a: Float[Tensor, "3 *k"], b: Float[Tensor, "3 *k"]) -> Float[Tensor
 def cross_rows(a: Float[Tensor, "3 *k"], b: Float[Tensor, "3 *k"]) -> Float[Tensor, "3 *k"]:
     """Vector products."""
     (a1, a2, a3), (b1, b2, b3) = a.unbind(0), b.unbind(0)
-    return torch.stack((a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1))
+    pairs = ((a2, b3, a3, b2), (a3, b1, a1, b3), (a1, b2, a2, b1))
+    return torch.stack([(p * q).addcmul_(r, s, value=-1) for p, q, r, s in pairs])
 
 
 def norm_rows(v: Float[Tensor, "3 *k"]) -> Float[Tensor, "*k"]:
