@@ -3,6 +3,8 @@
 Blocks come as the distinct entries of their upper triangle row by row, each row followed by the entry of a right-hand side.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -86,7 +88,7 @@ def product(V: Tensor, x: Tensor) -> Tensor:
     return torch.stack([(row * x).sum(0) for row in rows])
 
 
-def factor(V: Tensor, q: int) -> tuple[Triangle, Tensor]:
+def factor(V: Tensor | Sequence[Tensor], q: int) -> tuple[Triangle, Tensor]:
     """Cholesky factors `V = L L'`, and which blocks (n) are positive definite."""
     L: Triangle = []
     positive = torch.ones_like(V[0], dtype=torch.bool)

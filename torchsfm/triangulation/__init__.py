@@ -1,10 +1,11 @@
 """The cameras are known: where are the points, lines, conics and curves? Photogrammetry calls it intersection."""
 
 from torchsfm.triangulation.conics_2view import conics_2view
+from torchsfm.triangulation.line_faults import LineFault
 from torchsfm.triangulation.optimal_correction import correct_matches
 from torchsfm.triangulation.triangulate_conics import ConicTriangulation, triangulate_conics, triangulate_quadrics
 from torchsfm.triangulation.triangulate_curves import CurveTriangulation, triangulate_curves
-from torchsfm.triangulation.triangulate_lines import LineFault, LineTriangulation, triangulate_lines
+from torchsfm.triangulation.triangulate_lines import LineTriangulation, triangulate_lines
 from torchsfm.triangulation.triangulate_lines_robust import (
     LineEstimator,
     RobustLineTriangulation,

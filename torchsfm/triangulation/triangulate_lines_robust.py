@@ -12,15 +12,9 @@ from torchsfm.geometry import point_line_distance, project_lines, to_homogeneous
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.linalg import cross, damped_solve, determinant_3x3
 from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
-from torchsfm.triangulation.line_views import (
-    frame_of_centres,
-    image_rows,
-    in_world,
-    line_forms,
-    observe,
-    slopes_along,
-    through_centre,
-)
+from torchsfm.triangulation.line_layout import lay_out
+from torchsfm.triangulation.line_residuals import image_rows, in_world, line_forms, slopes_along, through_centre
+from torchsfm.triangulation.line_views import frame_of_centres, observe
 from torchsfm.triangulation.triangulate_lines import triangulate_lines
 
 _ROUNDED = 2.0
@@ -247,26 +241,27 @@ def triangulate_lines_robust(
         t = t.detach().expand(*batch, *t.shape[t.ndim - 2 - rest :]).movedim(-1 - rest, -2 - rest)
         return t.reshape(batch.numel() * n, v, *t.shape[t.ndim - rest :])
 
-    cameras = P.detach().expand(*batch, v, 3, 4)[..., None, :, :].expand(*batch, v, n, 3, 4)
     weights = options.get("weights")
-    views = observe(by_line(l, trailing), by_line(cameras, 2), by_line(visible), by_line(weights))  # type: ignore[arg-type]
-    origin, unit = frame_of_centres(views)
-    inner = views.moved(origin, unit)
-    sign = torch.where(determinant_3x3(inner.P[..., :3]) < 0, -1.0, 1.0).to(inner.P.dtype)
+    laid = lay_out(batch, l.detach(), trailing, P.detach(), visible, None if weights is None else weights.detach())
+    views = observe(*laid)
+    origin, unit, _ = frame_of_centres(views)
+    inner = views.moved(origin, unit).permute(3, 2, 0, 1)[:, :v]
+    ends, used = views.ends.permute(3, 2, 1, 0)[:, :v], views.used.mT[:, :v]
+    sign = torch.where(determinant_3x3(inner[..., :3]) < 0, -1.0, 1.0).to(inner.dtype)
     double = {name: t.double() for name in ("weights", "quality") if (t := by_line(options.get(name))) is not None}  # type: ignore[arg-type]
     limit = threshold.double().expand(*batch, n).reshape(-1) if isinstance(threshold, Tensor) else threshold
     every: Any = {"max_iterations": 256} | options | double
     found = ransac(
-        LineEstimator(segments), views.ends.flatten(-2), (inner.P * sign[..., None, None]).flatten(-2),
-        threshold=limit, mask=views.used, min_iterations=16, **every,
+        LineEstimator(segments), ends.flatten(-2), (inner * sign[..., None, None]).flatten(-2),
+        threshold=limit, mask=used, min_iterations=16, **every,
     )  # fmt: skip
 
     def by_problem(t: Tensor) -> Tensor:
         return t.reshape(*batch, n, *t.shape[1:])
 
-    wanted = torch.ones_like(views.used) if visible is None else by_line(visible)
+    wanted = torch.ones_like(used) if visible is None else by_line(visible)
     assert wanted is not None
-    number, seen = found.inliers.sum(-1), views.used.sum(-1)
+    number, seen = found.inliers.sum(-1), used.sum(-1)
     # What there is, is not finite.
     status = torch.where((found.status == Status.TOO_FEW) & (wanted.sum(-1) >= 2), int(Status.NOT_FINITE), found.status)
     # Two planes always meet, so out of more than two a third must confirm the line.
@@ -283,7 +278,7 @@ def triangulate_lines_robust(
         lost = (inliers & ~(distance <= _ROUNDED * by_problem(found.threshold)[..., None, :])).any(-2)
         status = torch.where((status == Status.OK) & lost, int(Status.NO_CONSENSUS), status)
     settled = status == Status.OK
-    rough = by_problem(in_world(found.model, origin, unit)).to(dtype)
+    rough = by_problem(in_world(found.model, origin.mT, unit)).to(dtype)
 
     def kept(t: Tensor) -> Tensor:
         return torch.where(settled.reshape(settled.shape + (1,) * (t.ndim - settled.ndim)), t, 0)
