@@ -43,6 +43,7 @@ def start(views: LineViews) -> Start:
     third = views.P[2, :3]
     least = 1e-6 * combine_rows(third, third) * place.unit.square()
     weight = views.w * square / torch.maximum(place.depth.square(), least).clamp_min(1e-200)
+    weight = weight / weight.amax(0).clamp_min(1e-300)
     z1, z2, largest, second = _power(planes, weight, *axes)
     d, foot = _line_of(z1, z2)
     chart = chart_about(mean + spread * (foot + d * combine_rows(origin - foot, d)), d, place.unit)
@@ -98,7 +99,8 @@ def _power(planes: Tensor, weight: Tensor, z1: Tensor, z2: Tensor) -> tuple[Tens
     y2 = y2 * combine_rows(y2, y2).clamp_min(1e-300).rsqrt()
     half = torch.hypot(0.5 * (A11 - A22), A12)
     largest = 0.5 * (A11 + A22) + half
-    second = difference(A11, A22, A12, A12).clamp_min(0) / largest.clamp_min(1e-300)
+    most = largest.clamp_min(1e-300)
+    second = difference(A11 / most, A22, A12 / most, A12).clamp_min(0)
     return y1, y2, largest.sqrt(), second.sqrt()
 
 
