@@ -63,6 +63,27 @@ def test_exact_lines_are_found(make_scene, image_of, v, depth, origin):
     assert_share(ends[good] < 1e-5, 0.999)
 
 
+@pytest.mark.parametrize("depth", [10.0, 30.0, 100.0])
+def test_the_angle_is_that_of_the_planes_of_sight(make_scene, image_of, depth):
+    l, P, _ = segments(make_scene, image_of, v=4, n=50, depth=depth)  # noqa: E741
+    h = to_homogeneous(l)
+    image = torch.linalg.cross(h[..., 0, :], h[..., 1, :])
+    normal = torch.nn.functional.normalize((image @ P)[..., :3], dim=-1)
+
+    def between(i: int, j: int) -> Tensor:
+        sine = torch.linalg.cross(normal[i], normal[j]).norm(dim=-1)
+        return torch.atan2(sine, (normal[i] * normal[j]).sum(-1).abs())
+
+    two, four = triangulate_lines(l[:2], P[:2]), triangulate_lines(l, P)
+    good = two.status == Status.OK
+    assert good.any()
+    torch.testing.assert_close(two.angle[good], between(0, 1)[good], rtol=1e-5, atol=1e-7)
+    good = four.status == Status.OK
+    largest = torch.stack([between(i, j) for i in range(4) for j in range(i)]).amax(0)
+    assert (four.angle <= largest + 1e-6)[good].all()
+    assert (four.angle >= largest / 4)[good].all()
+
+
 def test_bare_lines_are_found(make_scene, image_of):
     _, P, X = segments(make_scene, image_of, v=4, n=300)
     wanted = pluecker(X)

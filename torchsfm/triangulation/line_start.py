@@ -48,7 +48,18 @@ def start(views: LineViews) -> Start:
     d, foot = _line_of(z1, z2)
     chart = chart_about(mean + spread * (foot + d * combine_rows(origin - foot, d)), d, place.unit)
     # Planes of one centre may well meet in different lines, but only through it.
-    return Start(chart, (second <= SAME * largest) | one, 2 * torch.atan(second / largest.clamp_min(1e-300)))
+    return Start(chart, (second <= SAME * largest) | one, _angle(planes, chart))
+
+
+def _angle(planes: Tensor, chart: Chart) -> Tensor:
+    """The angle (n) at which planes meet around the third axes of charts: of two their own, of more a kind of mean.
+
+    Turned about its line, a plane is the same after half a turn: so it is twice the angles of their normals that are averaged.
+    """
+    a, b = (combine_rows(planes[:3], axis[:, None]) for axis in chart.axes[:2].unbind(0))
+    total = combine_rows(a, a) + combine_rows(b, b)
+    mean = torch.hypot(combine_rows(a, a) - combine_rows(b, b), 2 * combine_rows(a, b))
+    return 2 * torch.atan((total - mean).clamp_min(0).div((total + mean).clamp_min(1e-300)).sqrt())
 
 
 def _planes(views: LineViews, mean: Tensor, spread: Tensor, used: Tensor) -> tuple[Tensor, Tensor]:

@@ -55,7 +55,8 @@ class LineTriangulation:
     in_front: Bool[Tensor, "*batch n"]
     """Whether the middles of all its segments are in front of the cameras that see them; True for lines without ends."""
     angle: Float[Tensor, "*batch n"]
-    """The angle at which the planes of sight meet: that of the two that are farthest apart is at least as large. Radians."""
+    """The angle at which the planes of sight meet, radians: of two their own, of more a mean, which is no larger than that of
+    the two that are farthest apart if all lie within a right angle."""
     covariance: Float[Tensor, "*batch n 4 4"]
     """Of the steps of `Line3D` from `model`, for independent noise of variance 1 / weight of the ends across each image line;
     zero where the data do not determine it, and for lines through the world's origin, where those steps say too little."""

@@ -208,8 +208,7 @@ class SplineDistances(Problem[SplineSystem]):
         first, M = seen.first[:, :, i], x.P[..., :3]
         HM = (H.flatten(2, 3) @ M).view(H.shape)
         MHM = (HM.mT.flatten(2, 3) @ M).view(H.shape)
-        A = (H.flatten(-2).mT @ _products(X, X)).unflatten(-2, (3, 3)).unflatten(-1, (4, 4))
-        A = A.transpose(-3, -2).flatten(-4, -3).flatten(-2)
+        A = (H.flatten(-2).mT @ _products(X, X)).view(*H.shape[:2], 3, 3, 4, 4).transpose(3, 4).reshape(*H.shape[:2], 12, 12)
         both = HM[..., :, None, :] * X[..., None, :, None]
         G = B.flatten(1, 2).mT @ _products(B, MHM.flatten(-2)).flatten(1, 2)
         by_camera, pull = (by_image.mT @ X).flatten(-2), B.mT @ (by_image @ M)
@@ -221,8 +220,9 @@ class SplineDistances(Problem[SplineSystem]):
             camera, control = camera + _products(by_image, X1), control + _products(B1, by_image @ M)
         moved = (moves[..., None] * camera).mT
         slope = (moves * (by_image * first).sum(-1))[..., None]
-        cross = (both.flatten(-3).mT @ B).unflatten(2, (12, 3)).transpose(-2, -1) - (moved @ control).unflatten(-1, (k, 3))
-        G = G.unflatten(-1, (k, 3, 3)).transpose(2, 3)
+        cross = (both.flatten(-3).mT @ B).view(*H.shape[:2], 12, 3, k).transpose(-2, -1)
+        cross = cross - (moved @ control).view(cross.shape)
+        G = G.view(-1, k, k, 3, 3).transpose(2, 3)
         G = G - (control.flatten(1, 2).mT @ (moves[..., None] * control).flatten(1, 2)).view(G.shape)
         pull = (pull - (control.mT @ slope).view(pull.shape)).sum(1)
         # Control points move in some directions only.
