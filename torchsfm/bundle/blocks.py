@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchsfm._types import check_index, check_one_problem, check_options, check_tensors
 from torchsfm.bundle.bending import bend
-from torchsfm.bundle.curves import BundleCurves
 from torchsfm.bundle.gauge import gauge_motions
 from torchsfm.bundle.intrinsics import Switched, free_columns, free_switches, intrinsics_prior
 from torchsfm.bundle.priors import Prior, RelativePosePrior
@@ -199,7 +198,7 @@ class Bundle:
         terms += [_prior_term(prior) for prior in self.priors]
         if self.intrinsics_sigma:
             terms.append(intrinsics_prior(self.intrinsics_sigma, self.intrinsics_mean or cameras))
-        if self.world_is_free(blocks) and any(isinstance(some, BundleCurves) for some in self.structure):
+        if self.world_is_free(blocks) and not all(some.follows_world for some in self.structure):
             rest = partial(gauge_motions, keep_size=self.size_is_known)
             blocks["pose"] = replace(blocks["pose"], rest=rest)
         return blocks, terms

@@ -71,6 +71,7 @@ class BundleConics:
     loss: Loss | None = None
     """Robust loss of the squared residual, all five numbers together: chi-square of 5 where the covariance is right."""
     block = "conic"
+    follows_world = True
 
     def __post_init__(self) -> None:
         check_options(model=(self.model, Ellipsoid), ellipse=(self.ellipse, Ellipse), loss=(self.loss, Callable | None))

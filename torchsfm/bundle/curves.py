@@ -63,6 +63,8 @@ class BundleCurves:
     loss: Loss | None = None
     """Robust loss of the squared distance, pixels."""
     block = "curve"
+    follows_world = False
+    """Samples move across their curves alone."""
 
     def __post_init__(self) -> None:
         check_tensors(

@@ -55,6 +55,7 @@ class BundleLines:
     loss: Loss | None = None
     """Robust loss of the squared distance, both ends together, pixels."""
     block = "line"
+    follows_world = True
 
     def __post_init__(self) -> None:
         check_tensors(

@@ -62,6 +62,10 @@ class Structure(Protocol):
     def block(self) -> str:
         """The name of the variables."""
 
+    @property
+    def follows_world(self) -> bool:
+        """Whether the variables can go where a motion of the world takes them; if not, noise seems to say where it is."""
+
     def check(self, views: int) -> None:
         """See that the observations fit a bundle of so many views.
 
