@@ -9,7 +9,7 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.reconstruction.curve_fusion import piece_tangents
-from torchsfm.reconstruction.curve_mapping import CurveMapping, register, terms, track
+from torchsfm.reconstruction.curve_mapping import CurveMapping, covariance, register, terms, track
 from torchsfm.reconstruction.curves import no_curves
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
@@ -76,7 +76,7 @@ def test_edges_that_are_wrong_alike_along_curves_do_not_count_one_by_one(generat
     exact = seen(X, poses)
     single = torch.randn(FRAMES, CURVES * SAMPLES, dtype=F64, generator=generator)
     whole = torch.randn(FRAMES, CURVES, dtype=F64, generator=generator).repeat_interleave(SAMPLES, 1)
-    count = []
+    count, sigma = [], []
     for noise in (single, whole):
         edges = [
             ImageEdges(e.x + 0.2 * r[:, None] * e.normal, e.normal, e.curvature, e.sigma, e.color, e.chain)
@@ -86,9 +86,12 @@ def test_edges_that_are_wrong_alike_along_curves_do_not_count_one_by_one(generat
         (structure,) = terms(mapping)["structure"]
         # In units of what as many independent distances of this size weigh.
         count.append(float(structure.weights.sum()) * 0.2**2 / len(structure.weights))
+        sigma.append(float(covariance(mapping, {"free": ("focal",)}).cameras[0, 0, 0].sqrt()))
     assert count[0] == pytest.approx(1.0, rel=0.5)
     # All but few of the sixty of a chain are no more than one.
     assert count[1] < 0.1 * count[0]
+    # And so much less do they tell.
+    assert sigma[1] > 3 * sigma[0]
 
 
 def test_a_frame_is_placed_near_a_guess_that_its_edges_confirm(generator: torch.Generator) -> None:

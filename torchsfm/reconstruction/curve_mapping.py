@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import bundle_adjust
+from torchsfm.bundle import BundleCovariance, bundle_adjust, bundle_covariance
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import BundleProblem, Camera, Pose, rotation_from_rotvec, rotvec_from_rotation
 from torchsfm.images.edge_field import EdgeField, edge_field
@@ -197,6 +197,14 @@ def adjust(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float,
     sights = tuple(Sight(*own.seen_by(camera)) for own in mapping.edges)
     curves = mapping.curves.adjusted(found.structure[0])  # type: ignore[arg-type]
     return replace(mapping, poses=found.poses, camera=camera, curves=curves, sights=sights)
+
+
+def covariance(mapping: CurveMapping, cameras: Named[str, Any]) -> BundleCovariance:
+    """How well the cameras are known by the curves; `cameras` as for `adjust`.
+
+    What edges weigh is measured: a unit that is estimated anew would undo how many of them are alike along a curve.
+    """
+    return bundle_covariance(mapping.problem(), sigma=1.0, **terms(mapping), **cameras)
 
 
 def prune(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:

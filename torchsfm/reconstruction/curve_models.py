@@ -6,10 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm.bundle import bundle_covariance
 from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
 from torchsfm.reconstruction.cameras import DEFAULT_FOCAL, FOCAL_SIGMA
-from torchsfm.reconstruction.curve_mapping import CurveMapping, terms
+from torchsfm.reconstruction.curve_mapping import CurveMapping, covariance
 from torchsfm.reconstruction.curve_sequence import Expected, Settled, all_curves, map_sequence
 from torchsfm.reconstruction.doubt import DEVIATIONS, GUESSED_FOCAL, WRONG_ANGLE, Standing
 from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges, scaled
@@ -120,8 +119,8 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
     """How well the cameras are known, by the curves."""
     mapping = settled.mapping
     curves = mapping.curves
-    covariance = bundle_covariance(mapping.problem(), **terms(mapping), **expected.terms())
-    variance = covariance.poses.diagonal(dim1=-2, dim2=-1)
+    known = covariance(mapping, expected.terms())
+    variance = known.poses.diagonal(dim1=-2, dim2=-1)
     seen = torch.bincount(curves.view, minlength=len(mapping.edges))
     depth = (mapping.poses.transform(curves.X)[..., 2]).median(-1).values
     there = mapping.registered
@@ -131,7 +130,7 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
     contradicted = float(told.amax()) if len(told) else 0.0
     focal, zoomed = 0.0, settled.zoomed()
     if "focal" in expected.free:
-        focal = float(covariance.cameras[0, 0, 0].sqrt() / mapping.camera.K[0, 0])
+        focal = float(known.cameras[0, 0, 0].sqrt() / mapping.camera.K[0, 0])
 
     def doubt(i: int) -> str:
         if int(seen[i]) < _FEWEST:
