@@ -1,15 +1,17 @@
 """A growing model of cameras and curves: what edges count, and where frames are placed."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.reconstruction.curve_fusion import piece_tangents
-from torchsfm.reconstruction.curve_mapping import CurveMapping, covariance, register, terms, track
+from torchsfm.reconstruction.curve_mapping import CurveMapping, adjust, covariance, distances, register, terms, track
 from torchsfm.reconstruction.curves import no_curves
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
@@ -92,6 +94,45 @@ def test_edges_that_are_wrong_alike_along_curves_do_not_count_one_by_one(generat
     assert count[1] < 0.1 * count[0]
     # And so much less do they tell.
     assert sigma[1] > 3 * sigma[0]
+
+
+def noisy(exact: list[ImageEdges], generator: torch.Generator) -> list[ImageEdges]:
+    """Edges that wriggle by 0.05 px across, and run as they wriggle."""
+    edges = []
+    for e in exact:
+        noise = torch.randn(CURVES, 1, SAMPLES + 2, dtype=F64, generator=generator)
+        smooth = torch.nn.functional.conv1d(noise, torch.full((1, 1, 3), 3**-0.5, dtype=F64)).flatten()
+        x = e.x + 0.05 * smooth[:, None] * e.normal
+        tangent = piece_tangents(x, e.chain)
+        normal = torch.stack((-tangent[:, 1], tangent[:, 0]), -1)
+        edges.append(ImageEdges(x, normal, e.curvature, e.sigma, e.color, e.chain))
+    return edges
+
+
+def test_samples_that_go_on_along_their_curves_are_as_far_from_edges(generator: torch.Generator) -> None:
+    X, poses = wavy(generator), frames()
+    mapping = track(model(X, noisy(seen(X, poses), generator), torch.arange(FRAMES)))
+    (structure,) = terms(mapping)["structure"]
+    before, _ = distances(mapping)
+    now = edge_distances(mapping.poses, mapping.one_camera, structure)
+    torch.testing.assert_close(now, before, rtol=0, atol=1e-9)
+    # A pixel is a hundredth.
+    moved = replace(structure, X=structure.X + 1e-4 * structure.tangent)
+    assert (edge_distances(mapping.poses, mapping.one_camera, moved) - now).abs().max() < 1e-4
+
+
+def test_noise_of_edges_does_not_hold_a_wrong_focal_length(generator: torch.Generator) -> None:
+    """As it changes, all curves are seen shifted along themselves."""
+    low = torch.tensor([[0.98, 0.98, 1.0], [0.98, 0.98, 1.0], [1.0, 1.0, 1.0]], dtype=F64)
+    off = []
+    for _ in range(4):
+        X, poses = wavy(generator), frames()
+        mapping = model(X, noisy(seen(X, poses), generator), torch.arange(FRAMES))
+        mapping = replace(mapping, camera=replace(CAMERA, K=low * CAMERA.K))
+        mapping = adjust(adjust(mapping, {"free": ()}, rounds=5), {"free": ("focal",)}, rounds=10)
+        off.append(float(mapping.camera.K[0, 0] / CAMERA.K[0, 0]) - 1)
+    # Held, they stay up to 1.4 percent off.
+    assert max(map(abs, off)) < 0.008
 
 
 def test_a_frame_is_placed_near_a_guess_that_its_edges_confirm(generator: torch.Generator) -> None:

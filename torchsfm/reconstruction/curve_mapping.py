@@ -15,6 +15,7 @@ from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import BundleProblem, Camera, Pose, rotation_from_rotvec, rotvec_from_rotation
 from torchsfm.images.edge_field import EdgeField, edge_field
 from torchsfm.optim import GemanMcClure
+from torchsfm.reconstruction.curve_directions import across_own_curves, own_directions
 from torchsfm.reconstruction.curve_fusion import near_pairs
 from torchsfm.reconstruction.curve_noise import measured_weights
 from torchsfm.reconstruction.curve_pieces import image_pieces
@@ -40,6 +41,8 @@ _TRUSTED = 3.0
 """Standard deviations of a distance beyond which edges show something else: outlines of surfaces, highlights."""
 _FINEST = 0.05
 """Least standard deviation of distances that is believed, in pixels."""
+_STEPS = 3
+"""Of an adjustment to the same edge points: images that go on along their curves leave these behind."""
 _BESIDE = 8.0
 """Pixels along a curve, the most, from a sample to one of another frame's edge that is on the same curve,"""
 _PARALLEL = 0.9
@@ -157,13 +160,19 @@ def add_pieces(mapping: CurveMapping, view: int, near: float = NEAR) -> CurveMap
     return mapping.with_curves(curves, torch.cat((mapping.home, torch.full_like(piece, view))))
 
 
+def directions(mapping: CurveMapping) -> Float[Tensor, "n 3"]:
+    """Which way curves run at samples: by the edges that show them, as of their neighbours' places each is known poorly."""
+    loss = _loss(mapping)
+    r, _ = distances(mapping)
+    return own_directions(mapping.curves.bundle(), mapping.poses, mapping.one_camera, loss.slope(r.square()))
+
+
 def track(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
     """Which edges of all placed frames show the samples."""
     known = mapping.known
     seen = [mapping.sights[i] for i in known.tolist()]
-    curves = track_samples(
-        mapping.curves, [s.edges for s in seen], [s.points for s in seen], mapping.P[known], mapping.size, near
-    )
+    edges, points = [s.edges for s in seen], [s.points for s in seen]
+    curves = track_samples(mapping.curves, directions(mapping), edges, points, mapping.P[known], mapping.size, near)
     return replace(mapping, curves=replace(curves, view=known[curves.view]))
 
 
@@ -173,24 +182,38 @@ def distances(mapping: CurveMapping) -> tuple[Float[Tensor, "k"], float]:
     return r, max(_FINEST, 1.4826 * float(r.abs().median())) if len(r) else _FINEST
 
 
+def _loss(mapping: CurveMapping) -> GemanMcClure:
+    """Lets go of edges much farther away than most."""
+    return GemanMcClure(_TRUSTED * distances(mapping)[1])
+
+
 def terms(mapping: CurveMapping) -> dict[str, Any]:
     """The samples as a part of a bundle, weighed by what is measured; edges much farther away than most have no say."""
-    r, scale = distances(mapping)
-    return {"structure": (measured_weights(mapping.curves, r).bundle(loss=GemanMcClure(_TRUSTED * scale)),)}
+    r, _ = distances(mapping)
+    loss = _loss(mapping)
+    curves = measured_weights(mapping.curves, r).bundle(loss=loss)
+    return {"structure": (across_own_curves(curves, mapping.poses, mapping.one_camera, loss.slope(r.square())),)}
 
 
-def adjust(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float, iterations: int) -> CurveMapping:
+def adjust(mapping: CurveMapping, cameras: Named[str, Any], near: float = NEAR, *, rounds: int) -> CurveMapping:
     """Cameras and samples at the robust least squares of the distances of edges.
 
     Args:
-        mapping: The model, with its tracks.
+        mapping: The model.
         cameras: What is adjusted and expected of the camera, as for `bundle_adjust`.
-        tolerance: Of the cost that is left.
-        iterations: Most steps.
+        near: Pixels between samples and the edges that show them.
+        rounds: Times that these edges are looked for.
     """
+    for _ in range(rounds):
+        mapping = _stepped(track(mapping, near), cameras)
+    return mapping
+
+
+def _stepped(mapping: CurveMapping, cameras: Named[str, Any]) -> CurveMapping:
+    """The model a few steps further, with its tracks."""
     if not len(mapping.curves.x):
         return mapping
-    found = bundle_adjust(mapping.problem(), max_iterations=iterations, tolerance=tolerance, **terms(mapping), **cameras)
+    found = bundle_adjust(mapping.problem(), max_iterations=_STEPS, **terms(mapping), **cameras)
     if found.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
     camera = found.cameras[0]
@@ -224,9 +247,9 @@ def prune(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
     return mapping.with_curves(curves, mapping.home[keep])
 
 
-def settle(mapping: CurveMapping, cameras: Named[str, Any], *, tolerance: float, iterations: int) -> CurveMapping:
-    """The cameras adjusted, and without samples that are of no curve; `cameras` as for `adjust`."""
-    return prune(adjust(track(mapping), cameras, tolerance=tolerance, iterations=iterations))
+def settle(mapping: CurveMapping, cameras: Named[str, Any], *, rounds: int) -> CurveMapping:
+    """The cameras adjusted, and without samples that are of no curve; arguments as for `adjust`."""
+    return prune(adjust(mapping, cameras, rounds=rounds))
 
 
 def sampled(mapping: CurveMapping, progress: Progress, near: float = NEAR) -> CurveMapping:

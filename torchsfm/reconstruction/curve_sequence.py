@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -37,14 +37,6 @@ from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
 
-
-class Ends(TypedDict):
-    """When an adjustment ends; see `adjust`."""
-
-    tolerance: float
-    iterations: int
-
-
 FEWEST = 4
 """Frames of the shortest sequence."""
 _TRIES = 3
@@ -59,9 +51,9 @@ _MOST = 0.5
 """Of the frames that must be placed for no other start to be tried."""
 _NEIGHBOURS = 6
 """Frames in which curves are sought in the end."""
-_ROUGH: Ends = {"tolerance": 1e-4, "iterations": 15}
-"""When to end an adjustment on the way,"""
-_FINE: Ends = {"tolerance": 1e-6, "iterations": 40}
+_ROUGH = 5
+"""Rounds of an adjustment on the way,"""
+_FINE = 10
 """and in the end."""
 _LAST = 3
 """Times that samples are found anew then, the most,"""
@@ -109,6 +101,10 @@ class Expected:
         K[:2, :2] *= focal / K[0, 0]
         return replace(self, camera=replace(self.camera, K=K), sigma={**self.sigma, "focal": sigma})
 
+    def steady(self) -> "Expected":
+        """The same with the focal length held: some of the frames tell it worse, and what they say misplaces others."""
+        return replace(self, free=tuple(name for name in self.free if name != "focal"))
+
     def terms(self, placed: Bool[Tensor, "v"] | None = None) -> dict[str, Any]:
         """What a bundle adjusts of the camera, and what is known of it and of frames that are placed."""
         priors = []
@@ -144,10 +140,10 @@ def map_sequence(
     told = replace(expected.told(*focal_of(windows)), turns=turns_of(windows))
     best: CurveMapping | None = None
     for chain in chains(windows)[:_TRIES]:
-        begun = _begin(edges, size, told, chain, progress)
+        begun = _begin(edges, size, told.steady(), chain, progress)
         if not len(begun.curves):
             continue
-        grown = _grow(begun, chain, told, progress)
+        grown = _grow(begun, chain, told.steady(), progress)
         if best is None or len(grown.known) > len(best.known):
             best = grown
         if len(best.known) >= _MOST * v:
@@ -163,23 +159,18 @@ def _begin(
     """A model of the frames of a chain of windows."""
     mapping = CurveMapping.start(edges, size, told.camera).placed(*chain.begun())
     for near in _NEARER:
-        mapping = _anew(mapping, told, progress, near, **_ROUGH)
+        mapping = _anew(mapping, told, progress, near, rounds=_ROUGH)
     return mapping
 
 
-def _anew(
-    mapping: CurveMapping, known: Expected, progress: Progress, near: float = NEAR, *, tolerance: float, iterations: int
-) -> CurveMapping:
+def _anew(mapping: CurveMapping, known: Expected, progress: Progress, near: float = NEAR, *, rounds: int) -> CurveMapping:
     """The cameras adjusted to samples that are found anew.
 
     What was left out once may be right: where cameras are wrong, so are the samples that agree with them best. So samples are
     not given up one after the other while cameras move.
     """
     mapping = prune(track(sampled(mapping, progress, near), near), near)
-    for _ in range(2):
-        terms = known.terms(mapping.registered)
-        mapping = adjust(track(mapping, near), terms, tolerance=tolerance, iterations=iterations)
-    return mapping
+    return adjust(mapping, known.terms(mapping.registered), near, rounds=rounds)
 
 
 def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progress) -> CurveMapping:
@@ -199,7 +190,7 @@ def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progres
         count = len(mapping.known)
         if count > adjusted and (not waiting or count >= _GROWN * adjusted or count == v):
             # What did not fit may fit then.
-            mapping, adjusted, failed = settle(mapping, told.terms(mapping.registered), **_ROUGH), count, set()
+            mapping, adjusted, failed = settle(mapping, told.terms(mapping.registered), rounds=_ROUGH), count, set()
         elif not waiting:
             return mapping
 
@@ -207,9 +198,9 @@ def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progres
 def _together(mapping: CurveMapping, told: Expected, progress: Progress) -> Settled:
     """All cameras, from samples that are found anew."""
     views = mapping.known
-    mapping = _anew(mapping, told, progress, **_ROUGH)
+    mapping = _anew(mapping, told, progress, rounds=_ROUGH)
     for _ in range(_LAST):
-        before, mapping = mapping, _anew(mapping, told, progress, **_FINE)
+        before, mapping = mapping, _anew(mapping, told, progress, rounds=_FINE)
         turned = before.poses.R[views].mT @ mapping.poses.R[views]
         moved = float(rotation_angle(turned @ turned[len(views) // 2].mT).rad2deg().amax())
         if moved < _STILL:

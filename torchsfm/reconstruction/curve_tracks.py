@@ -21,6 +21,7 @@ EDGE = 0.3
 
 def track_samples(
     curves: Curves,
+    tangent: Float[Tensor, "n 3"],
     edges: Sequence[ImageEdges],
     points: Sequence[EdgePoints],
     P: Float[Tensor, "v 3 4"],
@@ -31,13 +32,14 @@ def track_samples(
 
     Args:
         curves: The curves.
+        tangent: Which way they run.
         edges: Edge points of the images.
         points: The same as cameras without distortion see them.
         P: These cameras.
         size: Height and width of the images.
         threshold: Largest distance of the image of a sample from its edge point across the edge, pixels.
     """
-    X, tangent = curves.X.double(), curves.tangents().double()
+    X, tangent = curves.X.double(), tangent.double()
     count = [len(own) for own in edges]
     found = [
         _shown(X, tangent, curves.curve, straight, P[v], size, threshold) if count[v] else (curves.sample, curves.sample)

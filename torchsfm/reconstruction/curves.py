@@ -152,7 +152,7 @@ def curves_of_edges(
         no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
-    tracked = track_samples(curves, kept, lines, P, size, threshold)
+    tracked = track_samples(curves, curves.tangents(), kept, lines, P, size, threshold)
     return measured_weights(tracked, edge_distances(poses, cameras, tracked.bundle()))
 
 
