@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 from torchsfm.bundle import BundleCurves
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose
+from torchsfm.linalg import eigh
 
 _GUESSED = 0.01
 """Weight of the directions that samples have, against that of edges: it tells where all edges are in one plane of sight."""
@@ -37,7 +38,8 @@ def own_directions(curves: BundleCurves, poses: Pose, cameras: Camera, trust: Fl
     A = plane.new_zeros(len(guess), 3, 3).index_add(0, curves.sample, trust[:, None, None] * plane[:, :, None] * plane[:, None])
     held = torch.eye(3, dtype=A.dtype, device=A.device) - guess[:, :, None] * guess[:, None]
     size = A.diagonal(dim1=1, dim2=2).sum(-1).clamp_min(_TINY)
-    found = torch.linalg.eigh(A / size[:, None, None] + _GUESSED * held).eigenvectors[..., 0]
+    _, vectors, _ = eigh(A / size[:, None, None] + _GUESSED * held)
+    found = vectors[..., 0]
     return torch.where((found * guess).sum(-1, keepdim=True) < 0, -found, found)
 
 

@@ -13,6 +13,7 @@ from torchsfm.bundle import RelativePosePrior
 from torchsfm.geometry import Camera, rotation_angle
 from torchsfm.reconstruction.curve_mapping import (
     NEAR,
+    UNIT,
     CurveMapping,
     add_pieces,
     adjust,
@@ -112,6 +113,9 @@ class Expected:
             both = placed[self.turns.index].all(-1)
             priors = [replace(self.turns, index=self.turns.index[both], poses=self.turns.poses[both])]
         sigma = {name: self.sigma[name] for name in self.free}
+        if "focal" in sigma:
+            # So that it counts beside the edges of all frames what it is worth.
+            sigma["focal"] /= UNIT
         return {"free": self.free, "intrinsics_sigma": sigma, "intrinsics_mean": self.camera[(None,)], "priors": priors}
 
 
