@@ -8,12 +8,15 @@ real devices.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
+
+from torchsfm.linalg.constants import Constant
 
 ELSEWHERE = torch.device("meta")
 """The name of the device; nothing else uses it here."""
@@ -110,10 +113,18 @@ class _Lists(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
+_on = Constant.on
+
+
+def _table(constant: Constant, device: torch.device, dtype: torch.dtype | None = None) -> Tensor:
+    """Tables of the program come to a device once, however large."""
+    return ElsewhereTensor(_on(constant, torch.device("cpu"), dtype)) if device == ELSEWHERE else _on(constant, device, dtype)
+
+
 @contextmanager
 def elsewhere() -> Iterator[None]:
     """Here `device=ELSEWHERE` makes such tensors."""
-    with _Factories(), _Lists():
+    with _Factories(), _Lists(), patch.object(Constant, "on", _table):
         yield
 
 
