@@ -39,9 +39,6 @@ _SAMPLES = 350
 """Samples of a frame, the most."""
 _TRUSTED = 3.0
 """Standard deviations of a distance beyond which edges show something else: outlines of surfaces, highlights."""
-UNIT = 4.0
-"""Standard deviation of what weighs one: what is wrong alike in all frames, as by shades beside edges and outlines that hardly
-move, no frame's edges tell. Cameras of rendered sequences are about so many times farther off than edges by themselves say."""
 _FINEST = 0.05
 """Least standard deviation of distances that is believed, in pixels."""
 _STEPS = 3
@@ -230,7 +227,7 @@ def covariance(mapping: CurveMapping, cameras: Named[str, Any]) -> BundleCovaria
 
     What edges weigh is measured: a unit that is estimated anew would undo how many of them are alike along a curve.
     """
-    return bundle_covariance(mapping.problem(), sigma=UNIT, **terms(mapping), **cameras)
+    return bundle_covariance(mapping.problem(), sigma=1.0, **terms(mapping), **cameras)
 
 
 def prune(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:

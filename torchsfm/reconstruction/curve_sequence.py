@@ -13,7 +13,6 @@ from torchsfm.bundle import RelativePosePrior
 from torchsfm.geometry import Camera, rotation_angle
 from torchsfm.reconstruction.curve_mapping import (
     NEAR,
-    UNIT,
     CurveMapping,
     add_pieces,
     adjust,
@@ -56,8 +55,11 @@ _ROUGH = 5
 """Rounds of an adjustment on the way,"""
 _FINE = 10
 """and in the end."""
+_OPTIMISM = 4.0
+"""Focal lengths by the edges of all frames are about so many times farther off than these say, in rendered sequences: what is
+wrong alike in all frames, as by shades beside edges and outlines that hardly move, none of them tells."""
 _LAST = 3
-"""Times that samples are found anew then, the most,"""
+"""Times that samples are found anew in the end, the most,"""
 _STILL = 0.1
 """while cameras turn by more degrees."""
 
@@ -106,6 +108,10 @@ class Expected:
         """The same with the focal length held: some of the frames tell it worse, and what they say misplaces others."""
         return replace(self, free=tuple(name for name in self.free if name != "focal"))
 
+    def beside_edges(self) -> "Expected":
+        """The same with the focal length as sure, beside the edges of all frames, as it is worth."""
+        return replace(self, sigma={**self.sigma, "focal": self.sigma["focal"] / _OPTIMISM}) if "focal" in self.free else self
+
     def terms(self, placed: Bool[Tensor, "v"] | None = None) -> dict[str, Any]:
         """What a bundle adjusts of the camera, and what is known of it and of frames that are placed."""
         priors = []
@@ -113,9 +119,6 @@ class Expected:
             both = placed[self.turns.index].all(-1)
             priors = [replace(self.turns, index=self.turns.index[both], poses=self.turns.poses[both])]
         sigma = {name: self.sigma[name] for name in self.free}
-        if "focal" in sigma:
-            # So that it counts beside the edges of all frames what it is worth.
-            sigma["focal"] /= UNIT
         return {"free": self.free, "intrinsics_sigma": sigma, "intrinsics_mean": self.camera[(None,)], "priors": priors}
 
 
@@ -201,10 +204,10 @@ def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progres
 
 def _together(mapping: CurveMapping, told: Expected, progress: Progress) -> Settled:
     """All cameras, from samples that are found anew."""
-    views = mapping.known
-    mapping = _anew(mapping, told, progress, rounds=_ROUGH)
+    views, known = mapping.known, told.beside_edges()
+    mapping = _anew(mapping, known, progress, rounds=_ROUGH)
     for _ in range(_LAST):
-        before, mapping = mapping, _anew(mapping, told, progress, rounds=_FINE)
+        before, mapping = mapping, _anew(mapping, known, progress, rounds=_FINE)
         turned = before.poses.R[views].mT @ mapping.poses.R[views]
         moved = float(rotation_angle(turned @ turned[len(views) // 2].mT).rad2deg().amax())
         if moved < _STILL:
