@@ -86,10 +86,11 @@ def adjust(found: dict[str, Case]) -> dict[str, Any]:
     return answers
 
 
-def test_costs_and_answers_are_those_of_one_process(generator: torch.Generator, tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 3])
+def test_costs_and_answers_are_those_of_one_process(count: int, generator: torch.Generator, tmp_path: Path) -> None:
     found = cases(generator)
     alone = adjust(found)
-    ranks = processes.run_ranks(3, tmp_path, adjust, found)
+    ranks = processes.run_ranks(count, tmp_path, adjust, found)
     for name, (costs, tensors, status) in alone.items():
         for rank in ranks:
             own_costs, own_tensors, own_status = rank[name]

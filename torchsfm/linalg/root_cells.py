@@ -29,6 +29,21 @@ _GRAIN = 4096
 """Starts are rounded to so many places of a cell: how the products round depends on how many polynomials there are."""
 
 
+class Parts(NamedTuple):
+    """Parts of cells, with the Bernstein coefficients of the form there."""
+
+    number: Int[Tensor, "2 k"]
+    """The polynomial and the cell."""
+    low: Float[Tensor, " k"]
+    """Where each begins, along the chord of a cell from 0 to 1."""
+    b: Float[Tensor, "m k"]
+
+    def some(self, which: Tensor) -> "Parts":
+        """Those for which this is True."""
+        (at,) = which.nonzero(as_tuple=True)
+        return Parts(take_columns(self.number, at), self.low.index_select(0, at), take_columns(self.b, at))
+
+
 class Cells(NamedTuple):
     """Places where roots are, each in the part from `low` to `low + width`, of lengths 0 to 1 along the chord of a cell."""
 
@@ -47,36 +62,29 @@ def root_cells(c: Float[Tensor, "m batch"]) -> tuple[Cells, Cells]:
     """Places of one root each, and of two roots or none, the polynomials in columns; neither list is in any order."""
     degree, batch = c.shape[0] - 1, c.shape[1]
     to_cells, to_parts = (t.on(c.device, c.dtype) for t in _matrices(degree))
-    item, cell, rows = [], [], []
+    number, rows = [], []
     for start in range(0, max(batch, 1), _CHUNK):
         piece = c[:, start : start + _CHUNK]
-        count = piece.shape[1]
         b = (to_cells @ piece).view(degree + 1, -1)
         place = _with_changes(b).nonzero()[:, 0]
         rows.append(take_columns(b, place))
-        which, place = _row_and_column(place, count)
-        cell.append(which)
-        item.append(place.add_(start))
+        cell, item = _row_and_column(place, piece.shape[1])
+        number.append(torch.stack((item.add_(start), cell)))
     b = torch.cat(rows, -1)
-    zero = b.new_zeros(b.shape[1])
-    where = Cells(torch.cat(item), torch.cat(cell), zero, zero + 1, zero, zero)
-    single, pair = [], []
+    where, single, widths = Parts(torch.cat(number, -1), b.new_zeros(b.shape[1]), b), [], []
     for cut in range(_CUTS + 1):
-        changes, before = _changes(b)
-        last = cut == _CUTS
+        changes, last = _changes(where.b), cut == _CUTS
         one = changes % 2 == 1 if last else changes == 1
-        keep = one.nonzero()[:, 0]
-        single.append(_start(_taken(where, keep), take_columns(b, keep), before[keep]))
-        keep = (~one).nonzero()[:, 0]
-        if not len(keep):
+        found, where = where.some(one), where.some(~one)
+        single.append(found)
+        widths.append(torch.full_like(found.low, _PARTS**-cut))
+        if last or not where.number.shape[1]:
             break
-        where, b = _taken(where, keep), take_columns(b, keep)
-        if last:
-            pair.append(_dip(where, b))
-        else:
-            where, b = _cut(where, b, to_parts)
-    empty = [_taken(where, where.item[:0])]
-    return Cells(*map(torch.cat, zip(*single, strict=True))), Cells(*map(torch.cat, zip(*(pair or empty), strict=True)))
+        where = _cut(where, to_parts, _PARTS ** -(cut + 1))
+    # What is left after the last cut has two roots, or none.
+    pair = _cells(where, torch.full_like(where.low, _PARTS**-cut), _dip(where.b))
+    where = Parts(*(torch.cat(parts, -1) for parts in zip(*single, strict=True)))
+    return _cells(where, torch.cat(widths), _crossing(where.b)), pair
 
 
 def _with_changes(b: Float[Tensor, "m k"]) -> Tensor:
@@ -84,50 +92,48 @@ def _with_changes(b: Float[Tensor, "m k"]) -> Tensor:
     return (b.amin(0) < 0) & (b.amax(0) >= 0)
 
 
-def _changes(b: Float[Tensor, "m k"]) -> tuple[Tensor, Tensor]:
-    """The number of changes of sign of a column, and how many of its numbers after the first have its sign."""
+def _changes(b: Float[Tensor, "m k"]) -> Tensor:
+    """The number of changes of sign of a column."""
     positive = b >= 0
-    changes = (positive[1:] ^ positive[:-1]).sum(0)
-    return changes, (positive[1:] == positive[0]).sum(0)
+    return (positive[1:] ^ positive[:-1]).sum(0)
 
 
-def _start(where: Cells, b: Float[Tensor, "m k"], before: Int[Tensor, " k"]) -> Cells:
-    """The polygon of the coefficients begins with so many numbers of one sign: where it passes through zero."""
-    degree = len(b) - 1
+def _crossing(b: Float[Tensor, "m k"]) -> Float[Tensor, " k"]:
+    """Where the polygon of the coefficients, from 0 to 1, first passes through zero."""
+    positive, degree = b >= 0, len(b) - 1
+    before = (positive[1:] == positive[0]).sum(0)
     ends = b.gather(0, torch.stack((before, before + 1)).clamp_max_(degree))
-    return _from(where, b, (before + ends[0] / (ends[0] - ends[1])) / degree)
+    return (before + ends[0] / (ends[0] - ends[1])) / degree
 
 
-def _dip(where: Cells, b: Float[Tensor, "m k"]) -> Cells:
-    """The vertex of the parabola through both ends with the slope at the begin."""
+def _dip(b: Float[Tensor, "m k"]) -> Float[Tensor, " k"]:
+    """The vertex of the parabola through both ends, at 0 and 1, with the slope at the begin."""
     slope = (len(b) - 1) * (b[1] - b[0])
-    return _from(where, b, -0.5 * slope / (b[-1] - b[0] - slope))
+    return -0.5 * slope / (b[-1] - b[0] - slope)
 
 
-def _from(where: Cells, b: Float[Tensor, "m k"], u: Float[Tensor, " k"]) -> Cells:
+def _cells(where: Parts, width: Float[Tensor, " k"], u: Float[Tensor, " k"]) -> Cells:
+    """Parts of a width, each with its start at u."""
     u = (u * _GRAIN).round_().div_(_GRAIN).nan_to_num_(0.5).clamp_(0, 1)
-    return where._replace(start=torch.addcmul(where.low, u, where.width), sign=torch.where(b[0] < 0, -1.0, 1.0).to(b.dtype))
+    sign = torch.where(where.b[0] < 0, -1.0, 1.0).to(where.b.dtype)
+    item, cell = where.number.unbind(0)
+    return Cells(item, cell, where.low, width, torch.addcmul(where.low, u, width), sign)
 
 
-def _cut(where: Cells, b: Float[Tensor, "m k"], to_parts: Tensor) -> tuple[Cells, Tensor]:
-    """The parts of some cells that may have roots."""
-    count = b.shape[1]
-    parts = (to_parts @ b).view(len(b), -1)
+def _cut(where: Parts, to_parts: Tensor, width: float) -> Parts:
+    """The parts of some cells, of this width, that may have roots."""
+    count = where.b.shape[1]
+    parts = (to_parts @ where.b).view(len(where.b), -1)
     place = _with_changes(parts).nonzero()[:, 0]
     part, column = _row_and_column(place, count)
-    where = _taken(where, column)
-    width = where.width / _PARTS
-    return where._replace(low=torch.addcmul(where.low, part.to(width.dtype), width), width=width), take_columns(parts, place)
+    low = where.low.index_select(0, column).add_(part, alpha=width)
+    return Parts(take_columns(where.number, column), low, take_columns(parts, place))
 
 
 def _row_and_column(place: Int[Tensor, " k"], columns: int) -> tuple[Tensor, Tensor]:
     # Faster than a division of integers, and exact.
     row = (place.double() / max(columns, 1)).long()
     return row, place.sub(row, alpha=columns)
-
-
-def _taken(where: Cells, keep: Tensor) -> Cells:
-    return Cells(*(t.index_select(0, keep) for t in where))
 
 
 @cache

@@ -15,8 +15,9 @@ from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross, usable
 from torchsfm.linalg.rows import add_rows, take_columns
+from torchsfm.linalg.vectors import across
 from torchsfm.optim import attach_implicit, for_slots, rotation_exponential, wants_derivative
-from torchsfm.resection.vector_rows import cross_rows, dot_rows, length_rows, norm_rows, turned, unit_rows
+from torchsfm.resection.vector_rows import cross_rows, dot_rows, length_rows, turned, unit_rows
 
 _STEPS = 3
 _MET = 1e-9
@@ -230,8 +231,8 @@ def _in_world(one: Sample, R: Tensor, t: Tensor, far: Tensor, lines: Tensor) -> 
     if one.X.shape[1]:
         Y = turned(R, one.points) + t[:, None]
         good &= (dot_rows(Y, one.d) > _FLAT * far * one.unit[0]).all(0)
-        across = cross_rows(one.d, Y)
-        good &= dot_rows(across, across).addcmul_(dot_rows(Y, Y), Y.new_tensor(_LEFT**2), value=-1).amax(0) <= 0
+        off = cross_rows(one.d, Y)
+        good &= dot_rows(off, off).addcmul_(dot_rows(Y, Y), Y.new_tensor(_LEFT**2), value=-1).amax(0) <= 0
     if one.V.shape[1]:
         Y = turned(R, one.feet) + t[:, None]
         good &= dot_rows(one.l, Y).square_().addcmul_(dot_rows(Y, Y), Y.new_tensor(_LEFT**2), value=-1).amax(0) <= 0
@@ -275,22 +276,14 @@ def _linearized(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     X, V, A = (turned(R, v) for v in (s.X, s.V, s.A))
     rows, slopes = [], []
     if s.X.shape[1]:
-        across = _across(s.d)
-        rows += [dot_rows(e, X + t[:, None]) for e in across]
-        slopes += [torch.cat((cross_rows(X, e), e)) for e in across]
+        sides = across(s.d)
+        rows += [dot_rows(e, X + t[:, None]) for e in sides]
+        slopes += [torch.cat((cross_rows(X, e), e)) for e in sides]
     if s.V.shape[1]:
         rows += [dot_rows(s.l, V), dot_rows(s.l, A + t[:, None])]
         slopes.append(torch.cat((cross_rows(V, s.l), torch.zeros_like(V))))
         slopes.append(torch.cat((cross_rows(A, s.l), s.l)))
     return torch.cat(slopes, 1).permute(2, 1, 0), -torch.cat(rows).mT[..., None]
-
-
-def _across(u: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors orthogonal to unit vectors and to each other, coordinates first."""
-    axis = torch.zeros_like(u).scatter_(0, u.abs().argmin(0, keepdim=True), 1.0)
-    first = cross_rows(u, axis)
-    first = first / norm_rows(first)
-    return first, cross_rows(u, first)
 
 
 def _length(v: Tensor) -> Tensor:
