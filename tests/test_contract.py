@@ -246,7 +246,7 @@ def test_gradients_of_minimal_solutions(kind: type, generator: torch.Generator) 
     tried = [solutions(sample_scene(kind, (3,), generator)) for _ in range(4)]
     solve, inputs, steepest = min(tried, key=lambda one: one[2])
     assert steepest < math.inf
-    assert torch.autograd.gradcheck(solve, inputs, eps=1e-8, rtol=1e-3, atol=1e-3, fast_mode=True)
+    assert torch.autograd.gradcheck(solve, inputs, eps=1e-8, rtol=1e-3, atol=1e-3)
 
 
 # ---- estimation in the presence of outliers --------------------------------------------------------------------------------
