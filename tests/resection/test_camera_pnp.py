@@ -4,7 +4,7 @@ from chance import assert_share
 
 from torchsfm._types import Status
 from torchsfm.geometry import random_rotation, rotation_angle, rotvec_from_rotation
-from torchsfm.resection import camera_planar, camera_pnp
+from torchsfm.resection import camera_epnp, camera_planar, camera_pnp
 
 F64 = torch.float64
 
@@ -49,11 +49,32 @@ def test_exact_data(make_views, n, thickness):
     assert (found.error[good] < 1e-8).all()
 
 
-def test_rays_in_all_directions(generator):
+@pytest.mark.parametrize("n", [4, 5, 6, 20])
+@pytest.mark.parametrize("thickness", [1.0, 1e-2, 2e-3, 1e-6, 0.0])
+def test_exact_data_by_control_points(make_views, n, thickness):
+    d, X, R, t = make_views(400, n=n, thickness=thickness)
+    found = camera_epnp(d, X)
+    good = (turn(found.model, R) < 1e-7) & ((found.model[..., 3] - t).norm(dim=-1) < 1e-6)
+    # Four points leave four coefficients, which the approximations may take to another minimum.
+    assert_share(good, 0.999 if n > 4 or thickness == 0 else 0.75)
+    assert_share(found.status == Status.OK, 0.99)
+    assert (found.error[good] < 1e-8).all()
+
+
+@pytest.mark.parametrize(("n", "thickness"), [(6, 1.0), (20, 1.0), (20, 0.02), (20, 0.0)])
+def test_control_points_lead_to_the_minimum(make_views, n, thickness):
+    d, X, *_ = make_views(400, n=n, thickness=thickness, noise=2e-3)
+    found, best = camera_epnp(d, X), camera_pnp(d, X)
+    assert (found.error >= best.error * (1 - 1e-7)).all()
+    assert_share(found.error <= best.error * (1 + 1e-6), 0.98)
+
+
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp])
+def test_rays_in_all_directions(generator, solve):
     Y = torch.randn(500, 8, 3, generator=generator, dtype=F64)
     R = random_rotation(500, generator=generator, dtype=F64)
     t = torch.randn(500, 3, generator=generator, dtype=F64)
-    found = camera_pnp(2 * Y, (Y - t[:, None]) @ R)
+    found = solve(2 * Y, (Y - t[:, None]) @ R)
     assert (found.status == Status.OK).all()
     assert_share(turn(found.model, R) < 1e-8, 0.998)
 
@@ -96,7 +117,7 @@ def test_weights_and_absent_points(make_views, generator):
     torch.testing.assert_close(camera_pnp(d[:, :8], X[:, :8], weights=w).model, doubled.model, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("solve", [camera_pnp, camera_planar])
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp, camera_planar])
 def test_the_gradient_vanishes(make_views, solve):
     d, X, *_ = make_views(30, n=9, thickness=0.0, noise=2e-3)
     found = solve(d, X)
@@ -112,7 +133,7 @@ def test_the_gradient_vanishes(make_views, solve):
     assert_share(g[valid].abs() < 1e-7, 0.97)
 
 
-@pytest.mark.parametrize("solve", [camera_pnp, camera_planar])
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp, camera_planar])
 def test_statuses_and_neighbours(make_views, solve):
     d, X, *_ = make_views(12, n=8, thickness=0.0 if solve is camera_planar else 1.0, noise=1e-3)
     good = solve(d, X)
@@ -139,7 +160,7 @@ def test_statuses_and_neighbours(make_views, solve):
     assert (found.status[10:] == Status.OK).all()
 
 
-@pytest.mark.parametrize("solve", [camera_pnp, camera_planar])
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp, camera_planar])
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3), (0,)])
 def test_shapes(make_views, solve, batch):
     d, X, R, _ = make_views(*batch, n=6, thickness=0.0)
@@ -157,7 +178,7 @@ def test_shapes(make_views, solve, batch):
         assert (turn(best.double(), R) < 1e-2).all()
 
 
-@pytest.mark.parametrize("solve", [camera_pnp, camera_planar])
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp, camera_planar])
 def test_batched_is_the_same_as_one_by_one(make_views, solve):
     d, X, *_ = make_views(5, n=7, thickness=0.0, noise=1e-3)
     whole = solve(d, X).model
@@ -166,7 +187,7 @@ def test_batched_is_the_same_as_one_by_one(make_views, solve):
     torch.testing.assert_close(solve(d[:, None], X[0]).model[0, 0], whole[0], rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("solve", [camera_pnp, camera_planar])
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp, camera_planar])
 def test_derivatives_of_the_optimum(make_views, generator, solve):
     d, X, *_ = make_views(2, n=6, thickness=0.0, noise=1e-3)
     w = torch.rand(2, 6, generator=generator, dtype=F64) + 0.5
@@ -210,7 +231,7 @@ def test_points_in_no_plane_are_reported(make_views):
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("solve", [camera_pnp, camera_planar])
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp, camera_planar])
 def test_wrong_arguments(make_views, solve):
     d, X, *_ = make_views(3, n=6)
     with pytest.raises(ValueError, match="wanted n = 6"):
@@ -219,6 +240,22 @@ def test_wrong_arguments(make_views, solve):
         solve(d, X.float())
     with pytest.raises(ValueError, match="wanted shape"):
         solve(d[..., :2], X)
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize("thickness", [1.0, 0.0])
+def test_opencv_by_control_points_is_not_better(make_views, thickness):
+    cv2 = pytest.importorskip("cv2")
+    import numpy as np
+
+    d, X, R, _ = make_views(200, n=10, thickness=thickness, noise=2e-3)
+    error = []
+    for i in range(200):
+        _, r, _ = cv2.solvePnP(X[i].numpy(), d[i, :, :2].numpy().copy(), np.eye(3), None, flags=cv2.SOLVEPNP_EPNP)
+        error.append(rotation_angle(torch.tensor(cv2.Rodrigues(r)[0]) @ R[i].mT))
+    ours = turn(camera_epnp(d, X).model, R)
+    assert ours.median() < torch.stack(error).median()
+    assert ours.quantile(0.9) < torch.stack(error).quantile(0.9)
 
 
 @pytest.mark.reference

@@ -6,6 +6,7 @@ from torchsfm.resection.camera_3l import camera_3l
 from torchsfm.resection.camera_circle import camera_circle
 from torchsfm.resection.camera_conics import ConicPoses, camera_conics
 from torchsfm.resection.camera_dlt import CameraEstimate, camera_dlt
+from torchsfm.resection.camera_epnp import camera_epnp
 from torchsfm.resection.camera_gp3p import camera_gp3p
 from torchsfm.resection.camera_p3p import camera_p3p
 from torchsfm.resection.camera_p4pf import camera_p4pf
@@ -54,6 +55,7 @@ __all__ = [
     "camera_circle",
     "camera_conics",
     "camera_dlt",
+    "camera_epnp",
     "camera_gp3p",
     "camera_p3p",
     "camera_p4pf",

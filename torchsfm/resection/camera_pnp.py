@@ -1,5 +1,6 @@
 """The pose of a calibrated camera from four or more points, wherever they lie."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -83,9 +84,31 @@ def camera_pnp(
         (True, True)
     """
     batch = check_tensors(d=(d, "n 3"), X=(X, "n 3"), weights=(weights, "?n"))
+    return least_sines(_starts, d, X, weights, batch, steps=_LONG)
+
+
+def least_sines(
+    starts: Callable[[Rays], tuple[Tensor, Tensor]],
+    d: Tensor,
+    X: Tensor,
+    weights: Tensor | None,
+    batch: torch.Size,
+    *,
+    steps: int,
+) -> PoseEstimate:
+    """The pose of least squared sines that is reached in some steps from the best start, with its derivative.
+
+    Args:
+        starts: Gives several poses of each problem, as R (b, k, 3, 3) and t (b, k, 3).
+        d: Rays, as they came.
+        X: Points.
+        weights: Of both.
+        batch: The batch dimensions of all together.
+        steps: From the best one.
+    """
     with torch.no_grad():
         fixed = (d.detach(), X.detach(), None if weights is None else weights.detach())
-        parts = [_solve(data) for data in in_pieces(*fixed, batch)]
+        parts = [_solve(data, *starts(data), steps) for data in in_pieces(*fixed, batch)]
         model, error, status = (torch.cat(part) for part in zip(*parts, strict=True))
         model, error, status = model.reshape(*batch, 3, 4), error.reshape(batch), status.reshape(batch)
         # Numbers of the caller's kind may be too small for them.
@@ -97,12 +120,11 @@ def camera_pnp(
     return PoseEstimate(model.to(d.dtype), error.to(d.dtype), status)
 
 
-def _solve(data: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    R, t = _starts(data)
+def _solve(data: Rays, R: Tensor, t: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     R, t, value, _, _ = gauss_newton(data, R, t, 2)
     best = value.argmin(-1)[:, None]
     R, t = R.gather(1, best[..., None, None].expand(-1, 1, 3, 3)), t.gather(1, best[..., None].expand(-1, 1, 3))
-    R, t, value, N, _ = gauss_newton(data, R, t, _LONG)
+    R, t, value, N, _ = gauss_newton(data, R, t, steps)
     value = value[:, 0]
     status = status_of(data, R, t, determined(data, N)[:, 0], 4)
     total = data.w.sum(-1)
