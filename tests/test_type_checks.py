@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import pytest
 import torch
@@ -80,6 +81,33 @@ def test_dataclasses_and_methods() -> None:
     for arguments, options in (((start, end, "1"), {}), ((start, 1), {}), ((start, end), {"size": "1"})):
         with broken:
             Segment.between(*arguments, **options)  # type: ignore[arg-type]
+
+
+@checked
+def chosen(
+    among: list[Float[Tensor, "n"]], by: dict[str, int], how: Literal["first", "last"], as_is: object = None
+) -> Float[Tensor, "n"]:
+    return among[by[how]] if as_is is None else as_is  # type: ignore[return-value]
+
+
+def test_what_passed_lets_nothing_else_pass() -> None:
+    x, by = torch.ones(3), {"first": 0, "last": -1}
+    for _ in range(2):
+        assert torch.equal(chosen([x, x], by, "last"), x)
+        for among, what, how in (
+            ([x[0], x[0]], by, "last"),
+            ([1, 1], by, "last"),
+            ((x, x), by, "last"),
+            ([x, x], {"first": None, "last": None}, "last"),
+            ([x, x], by, "middle"),
+            ([x, x], by, 1),
+            ([x, x], by, True),
+        ):
+            with broken:
+                chosen(among, what, how)  # type: ignore[arg-type]
+        for value in (x[:2], x.long(), x.numpy(), [x]):
+            with broken:
+                chosen([x], by, "first", value)
 
 
 @pytest.mark.usefixtures("unchecked")
