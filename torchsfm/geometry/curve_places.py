@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.geometry.curves import Curve, Segments, segments_of
+from torchsfm.geometry.curves import Cubics, Curve, Segments, segments_of
 
 _LONGEST = 1 / 40
 """Of a curve, by which a place moves at most in one step to a nearer one."""
@@ -23,6 +23,7 @@ class CurvePlaces:
     """Smooth curves whose points are told by places; see `curve_places`."""
 
     segments: Segments
+    cubics: Cubics
     number: Int[Tensor, "*batch"]
     """How many segments a curve has; places of a closed one repeat after so many."""
     closed: Bool[Tensor, "*batch"]
@@ -37,7 +38,7 @@ class CurvePlaces:
         before = torch.where(self.closed[..., None], index, inside)
         share = place - before
         on = share.clamp(0, 1)
-        x, first, second = self.segments.take(torch.where(self.closed[..., None], around, inside)).at(on)
+        x, first, second = self.cubics.take(torch.where(self.closed[..., None], around, inside)).at(on)
         beyond = (share - on)[..., None]
         return x + beyond * first, first, torch.where(beyond == 0, second, 0)
 
@@ -106,10 +107,11 @@ class CurvePlaces:
         after = torch.where(ring, (slot + 1) % number.clamp(min=1), (slot + 1).clamp(max=n - 1))
         ahead = slope.gather(-2, after[..., None].expand_as(slope))
         ahead = torch.where((enough & s.there)[..., None], ahead, s.next_slope)
-        return replace(self, segments=s._replace(slope=slope, next_slope=ahead))
+        segments = s._replace(slope=slope, next_slope=ahead)
+        return replace(self, segments=segments, cubics=segments.cubics())
 
 
 def curve_places(curve: Curve) -> CurvePlaces:
     """Make smooth curves' points ready to be told by places."""
     segments = segments_of(curve)
-    return CurvePlaces(segments, segments.there.sum(-1), ~segments.open)
+    return CurvePlaces(segments, segments.cubics(), segments.there.sum(-1), ~segments.open)

@@ -74,7 +74,7 @@ class Curve:
         index = torch.minimum(index, (s.there.sum(-1) - 1).clamp(min=0)[..., None])
         length = s.length.gather(-1, index)
         t = (place - end.gather(-1, index) + length) / torch.where(length > 0, length, 1)
-        x, _, _ = s.take(index).at(t.clamp(0, 1))
+        x, _, _ = s.cubics().take(index).at(t.clamp(0, 1))
         there = ((total > 0) & torch.isfinite(x).all(-1).all(-1, keepdim=True)).expand(x.shape[:-1])
         return Curve(torch.where(there[..., None], x, 0), there, self.closed)
 
@@ -140,19 +140,31 @@ class Segments(NamedTuple):
         length, there = self.length.gather(-1, index), self.there.gather(-1, index)
         return Segments(start, chord, length, slope, next_slope, there, self.open)
 
-    def at(self, t: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor, Tensor]:
-        """The point at a share of each, and the first and second derivative by the share."""
+    def cubics(self) -> "Cubics":
+        """The smooth curve along each of them."""
         h = self.length[..., None]
-        t = t[..., None]
         a, b = h * self.slope, h * self.next_slope
         # p = start + a t + c t^2 + e t^3 with the chord and b at its end.
-        e = a + b - 2 * self.chord
-        c = 3 * self.chord - 2 * a - b
-        return (
-            self.start + t * (a + t * (c + t * e)),
-            a + t * (2 * c + 3 * t * e),
-            2 * c + 6 * t * e,
-        )
+        c, e = 3 * self.chord - 2 * a - b, a + b - 2 * self.chord
+        return Cubics(torch.cat((self.start, a, c, e), -1))
+
+
+class Cubics(NamedTuple):
+    """Points by their share of the way along segments."""
+
+    coefficients: Float[Tensor, "*batch n 4*d"]
+    """Of powers of the share from 0 to 3."""
+
+    def take(self, index: Int[Tensor, "*batch m"]) -> "Cubics":
+        """Some of them."""
+        return Cubics(_rows(self.coefficients, index))
+
+    def at(self, t: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor, Tensor]:
+        """The point at a share of each, and the first and second derivative by the share."""
+        start, a, c, e = self.coefficients.chunk(4, -1)
+        t = t[..., None]
+        te, c2 = t * e, 2 * c
+        return start + t * (a + t * (c + te)), a + t * (c2 + 3 * te), c2 + 6 * te
 
 
 def segments_of(curve: Curve) -> Segments:

@@ -75,7 +75,7 @@ def foot_points(curve: Curve, y: Float[Tensor, "*#batch m d"]) -> FootPoints:
         rows = max(1, _NUMBERS // max(n * d * len(points), 1))
         parts = [_feet(held, points[:, i : i + rows]) for i in range(0, max(m, 1), rows)]
         index, share, tangent, good, beyond = (torch.cat(part, 1) for part in zip(*parts, strict=True))
-    x = torch.where(good[..., None], s.take(index).at(share)[0], 0)
+    x = torch.where(good[..., None], s.cubics().take(index).at(share)[0], 0)
     return FootPoints(*(part.reshape(*batch, m, *part.shape[2:]) for part in (x, tangent, good & ~beyond)))
 
 
@@ -88,8 +88,9 @@ def _feet(s: Segments, y: Float[Tensor, "b m d"]) -> tuple[Tensor, ...]:
     index = torch.where(s.there[:, None], gap, torch.inf).nan_to_num(nan=torch.inf).argmin(-1)
     t = t.gather(-1, index[..., None])[..., 0]
     number, around = s.there.sum(-1, keepdim=True), ~s.open[:, None]
+    cubics = s.cubics()
     for again in (True, False):
-        own = s.take(index)
+        own = cubics.take(index)
         for _ in range(_NEWTON):
             p, first, second = own.at(t)
             speed = first.square().sum(-1)

@@ -10,6 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.geometry.curves import Cubics
+
+_POWERS = [[1.0, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]
+"""Six times the coefficients of a spline after a knot, by the four control points about it."""
 _NEWTON = 5
 """Steps to the nearest point, from where it was before."""
 _LONGEST = 1.0
@@ -31,8 +35,7 @@ class Images(NamedTuple):
 
     y: Float[Tensor, "p v c n 3"]
     first: Float[Tensor, "p v c n 3"]
-    """Derivatives of y by the knots,"""
-    second: Float[Tensor, "p v c n 3"]
+    """The derivative of y by the knots."""
     points: Float[Tensor, "p v c n 2"]
     away: Float[Tensor, "p v c n 2"]
     speed: Float[Tensor, "p v c n"]
@@ -47,13 +50,23 @@ class Images(NamedTuple):
 
 def see(x: Splines, closed: Bool[Tensor, "p c"], measured: Float[Tensor, "p v c n 2"]) -> Images:
     """Where points of splines are seen."""
-    k = x.control.shape[2]
-    weights, index = control_weights(x.t, closed[:, None], k)
-    own = x.control[:, None].expand(-1, x.t.shape[1], -1, -1, -1)
-    own = own.gather(3, index.flatten(3)[..., None].expand(*index.shape[:3], -1, 3)).view(*index.shape, 3)
-    X, X1, X2 = ((w[..., None] * own).sum(-2) for w in weights)
-    M, a = x.P[:, :, None, :, :3].mT, x.P[:, :, None, None, :, 3]
-    y, first, second = X @ M + a, X1 @ M, X2 @ M
+    return _seen(_images(x, closed), x.t, closed, measured)
+
+
+def _images(x: Splines, closed: Bool[Tensor, "p c"]) -> Cubics:
+    """Homogeneous images of splines from each knot to the next, (p, v, c, k)."""
+    about = torch.stack([x.control.roll(-i, 2) for i in range(4)], 3)
+    powers = (x.control.new_tensor(_POWERS) / 6 @ about)[:, None]
+    y = powers.flatten(3, 4) @ x.P[:, :, None, :, :3].mT
+    y = y.unflatten(3, (-1, 4)) + torch.nn.functional.pad(x.P[:, :, None, None, None, :, 3], (0, 0, 0, 3))
+    return Cubics(y.flatten(4))
+
+
+def _seen(images: Cubics, t: Float[Tensor, "p v c n"], closed: Bool[Tensor, "p c"], measured: Tensor) -> Images:
+    """Where the points at places are seen."""
+    ring, k = closed[:, None, :, None], images.coefficients.shape[3]
+    low = _knots(t, ring, k)
+    y, first, second = images.take(torch.where(ring, low % k, low).long()).at(t - low)
     depth = torch.where(y[..., 2:] == 0, 1e-300, y[..., 2:])
     points = y[..., :2] / depth
     move = (first[..., :2] - points * first[..., 2:]) / depth
@@ -61,25 +74,31 @@ def see(x: Splines, closed: Bool[Tensor, "p c"], measured: Float[Tensor, "p v c 
     away, speed = points - measured, move.square().sum(-1)
     bent = torch.maximum(speed + (away * bend).sum(-1), _BENT * speed).clamp_min(1e-300)
     slope = (away * move).sum(-1)
-    end = torch.where(slope < 0, x.t >= k - 3, x.t <= 0)
-    return Images(y, first, second, points, away, speed, bent, slope, end & ~closed[:, None, :, None])
+    end = torch.where(slope < 0, t >= k - 3, t <= 0)
+    return Images(y, first, points, away, speed, bent, slope, end & ~ring)
 
 
 def nearest(x: Splines, closed: Bool[Tensor, "p c"], measured: Float[Tensor, "p v c n 2"]) -> tuple[Splines, Images]:
     """The nearest points that are reached from given ones, each step to a nearer one."""
-    seen, most = see(x, closed, measured), _LONGEST
+    images, t, most = _images(x, closed), x.t, _LONGEST
+    seen = _seen(images, t, closed, measured)
     last = x.control.shape[2] - 3
     ring = closed[:, None, :, None]
-    longest = torch.full_like(x.t, most)
+    longest = torch.full_like(t, most)
     for _ in range(_NEWTON):
         move = (-seen.slope / seen.bent).clamp(-longest, longest)
-        t = torch.where(ring, x.t + move, (x.t + move).clamp(0, last))
-        other = see(x._replace(t=t), closed, measured)
+        moved = torch.where(ring, t + move, (t + move).clamp(0, last))
+        other = _seen(images, moved, closed, measured)
         nearer = other.away.square().sum(-1) <= seen.away.square().sum(-1)
         longest = torch.where(nearer, most, move.abs() / 4)
-        x = x._replace(t=torch.where(nearer, t, x.t))
+        t = torch.where(nearer, moved, t)
         seen = Images(*(torch.where(nearer[(...,) + (None,) * (a.ndim - 4)], b, a) for a, b in zip(seen, other, strict=True)))
-    return x, seen
+    return x._replace(t=t), seen
+
+
+def _knots(t: Float[Tensor, "*b n"], ring: Bool[Tensor, "*#b 1"], k: int) -> Float[Tensor, "*b n"]:
+    """The knot before each place; at the ends of open splines the first and the last that another follows."""
+    return torch.where(ring, t.floor(), t.floor().clamp(0, k - 4))
 
 
 def control_weights(
@@ -87,7 +106,7 @@ def control_weights(
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
     """Weights of the four control points about places, two derivatives of these, and the points' numbers, (*b, n, 4)."""
     ring = closed[..., None]
-    low = torch.where(ring, t.floor(), t.floor().clamp(0, k - 4))
+    low = _knots(t, ring, k)
     index = low.long()[..., None] + torch.arange(4, device=t.device)
     u = t - low
     s = 1 - u
