@@ -5,7 +5,7 @@ the CPU and back. Single numbers may be read (`.item()`, `bool()`), and CPU tens
 real devices.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 from torchsfm.linalg.constants import Constant
 
@@ -58,7 +57,7 @@ class TransferError(RuntimeError):
 
 
 def compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    leaves, form = tree_flatten((args, kwargs))
+    leaves = list(_leaves((args, list(kwargs.values()))))
     own = [v for v in leaves if isinstance(v, ElsewhereTensor)]
     wanted = kwargs.get("device")
     here = wanted is None and not own
@@ -74,8 +73,7 @@ def compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return func(*args, **kwargs)
     elif any(isinstance(v, Tensor) and v.numel() > CONSTANT for v in leaves):
         raise TransferError(f"{func}: a tensor is brought here from the CPU")
-    inner = [v.numbers if isinstance(v, ElsewhereTensor) else v for v in leaves]
-    args, kwargs = tree_unflatten(inner, form)
+    args, kwargs = _changed(_numbers, args), {name: _changed(_numbers, v) for name, v in kwargs.items()}
     if wanted is not None:
         kwargs["device"] = torch.device("cpu")
     found = func(*args, **kwargs)
@@ -89,7 +87,25 @@ def compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         # Derivatives that are zero have no memory, which operations below autograd do not expect.
         return ElsewhereTensor(torch.zeros(v.shape, dtype=v.dtype) if v._is_zerotensor() else v)
 
-    return tree_map(brought, found)
+    return _changed(brought, found)
+
+
+def _leaves(tree: Any) -> Iterator[Any]:
+    """Of lists and tuples, which are all that operations take and give."""
+    if isinstance(tree, list | tuple):
+        for part in tree:
+            yield from _leaves(part)
+    else:
+        yield tree
+
+
+def _changed(change: Callable[[Any], Any], tree: Any) -> Any:
+    """The tree with every leaf changed."""
+    return type(tree)([_changed(change, v) for v in tree]) if isinstance(tree, list | tuple) else change(tree)
+
+
+def _numbers(v: Any) -> Any:
+    return v.numbers if isinstance(v, ElsewhereTensor) else v
 
 
 class _Factories(TorchDispatchMode):

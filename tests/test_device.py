@@ -54,9 +54,8 @@ class Device:
     def send(self, tree: Any) -> Any:
         return tensor_map(send if self.pretended else lambda t: t.to(self.name), tree)
 
-    def compare(self, call: Callable[[Any], Any], arguments: Any) -> None:
-        """All results lie there; pretended, they are those of the CPU, but for rounding."""
-        here = call(arguments)
+    def compare(self, call: Callable[[Any], Any], arguments: Any, here: Any) -> None:
+        """All results lie there; pretended, they are those here on the CPU, but for rounding."""
         with elsewhere() if self.pretended else nullcontext():
             there = call(self.send(arguments))
         for (name, wanted), (_, found) in zip(tensors(here), tensors(there), strict=True):
@@ -70,14 +69,18 @@ class Device:
 @pytest.fixture
 def device(request: pytest.FixtureRequest) -> Iterator[Device]:
     wanted = request.config.option.device
+    if wanted == "cpu":
+        yield Device(ELSEWHERE)
+        return
     with torch.device("cpu"):  # what is made without `device=` is to be found out
-        yield Device(ELSEWHERE if wanted == "cpu" else torch.device(wanted))
+        yield Device(torch.device(wanted))
 
 
-def agreeable(call: Callable[..., Any], how: Function) -> dict[str, Any]:
-    """Arguments that the function accepts; some that may be left out belong together, and chance separates them.
+def agreeable(call: Callable[..., Any], how: Function) -> tuple[dict[str, Any], Any]:
+    """Arguments that the function accepts, and its answer.
 
-    What is slow gets one problem and few steps: these are enough to see where its numbers lie.
+    Some that may be left out belong together, and chance separates them: these are not accepted. What is slow gets one
+    problem and few steps: these are enough to see where its numbers lie.
     """
     batch = (1,) if how.slow else (2,)
     for stream in range(20):
@@ -86,10 +89,9 @@ def agreeable(call: Callable[..., Any], how: Function) -> dict[str, Any]:
         if how.slow and "max_iterations" in inspect.signature(call).parameters:
             arguments["max_iterations"] = STEPS
         try:
-            apply(call, arguments)
+            return arguments, apply(call, arguments)
         except ValueError:
             continue
-        return arguments
     raise LookupError("no arguments that are accepted")
 
 
@@ -97,10 +99,10 @@ def agreeable(call: Callable[..., Any], how: Function) -> dict[str, Any]:
 @pytest.mark.usefixtures("unchecked")
 def test_functions(name: str, device: Device) -> None:
     how = FUNCTIONS.get(name, Function())
-    arguments = agreeable(CALLS[name], how)
+    arguments, here = agreeable(CALLS[name], how)
     if not any(True for _ in tensors(arguments)):
         pytest.skip("takes no tensors")
-    device.compare(lambda given: apply(CALLS[name], given), arguments)
+    device.compare(lambda given: apply(CALLS[name], given), arguments, here)
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS, ids=lambda kind: kind.model_name)
@@ -109,9 +111,12 @@ def test_estimators(kind: type, device: Device) -> None:
     sample = tuple(d[:, : kind.sample_size] for d in scene.data)  # type: ignore[attr-defined]
     options = {"threshold": 3e-3, "max_iterations": 200}
     arguments = scene.estimator, scene.model, scene.data, sample
-    device.compare(lambda a: (a[0].minimal(*a[3]), a[0].degenerate(*a[3]), a[0].squared_residual(a[1], *a[2])), arguments)
-    device.compare(lambda a: ransac(a[0], *a[2], generator=seeded(1), **options), arguments)
-    device.compare(lambda a: soft_ransac(a[0], *a[2], threshold=3e-3, hypotheses=8, generator=seeded(1)), arguments)
+    for call in (
+        lambda a: (a[0].minimal(*a[3]), a[0].degenerate(*a[3]), a[0].squared_residual(a[1], *a[2])),
+        lambda a: ransac(a[0], *a[2], generator=seeded(1), **options),
+        lambda a: soft_ransac(a[0], *a[2], threshold=3e-3, hypotheses=8, generator=seeded(1)),
+    ):
+        device.compare(call, arguments, call(arguments))
 
 
 def test_the_pretended_device_tells() -> None:
