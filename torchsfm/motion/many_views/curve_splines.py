@@ -58,7 +58,7 @@ def _images(x: Splines, closed: Bool[Tensor, "p c"]) -> Cubics:
     about = torch.stack([x.control.roll(-i, 2) for i in range(4)], 3)
     powers = (x.control.new_tensor(_POWERS) / 6 @ about)[:, None]
     y = powers.flatten(3, 4) @ x.P[:, :, None, :, :3].mT
-    y = y.unflatten(3, (-1, 4)) + torch.nn.functional.pad(x.P[:, :, None, None, None, :, 3], (0, 0, 0, 3))
+    y = y.reshape(*y.shape[:3], -1, 4, 3) + torch.nn.functional.pad(x.P[:, :, None, None, None, :, 3], (0, 0, 0, 3))
     return Cubics(y.flatten(4))
 
 
