@@ -66,7 +66,8 @@ def _seen(images: Cubics, t: Float[Tensor, "p v c n"], closed: Bool[Tensor, "p c
     """Where the points at places are seen."""
     ring, k = closed[:, None, :, None], images.coefficients.shape[3]
     low = _knots(t, ring, k)
-    y, first, second = images.take(torch.where(ring, low % k, low).long()).at(t - low)
+    index = low.long()  # in range also where a place is not finite
+    y, first, second = images.take(torch.where(ring, index % k, index.clamp(0, k - 4))).at(t - low)
     depth = torch.where(y[..., 2:] == 0, 1e-300, y[..., 2:])
     points = y[..., :2] / depth
     move = (first[..., :2] - points * first[..., 2:]) / depth
