@@ -123,7 +123,10 @@ def undamped_step(blocks: dict[str, Block], terms: list[Term], eliminate: str | 
     return schur.move(blocks, found, x, step)
 
 
-def test_both_couplings_and_no_elimination_agree(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("cameras", [2, 1])
+def test_both_couplings_and_no_elimination_agree(scene: Scene, cameras: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where all views have a camera in common, which pairs of residuals then leave out."""
+    scene.focal, scene.camera = scene.focal[:cameras], scene.camera % cameras
     blocks = scene.blocks(pose=torch.arange(6) < 2)
     expected = undamped_step(blocks, [scene.term()], None)
     for seconds in (0.0, torch.inf):

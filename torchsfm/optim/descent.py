@@ -101,7 +101,7 @@ class _State:
     damping: Tensor
     growth: Tensor
     last: Tensor
-    """What the last step gained."""
+    """What the last step gained by itself."""
     dull: Tensor
     """How many Gauss-Newton steps in a row were slow."""
     slow: Tensor
@@ -190,7 +190,9 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
         gain = torch.where(near & (gain >= -settled), slopes, gain)
     accepted = active & (gain > LEAST * promise)
     # Steps that fall as a geometric series have this much still before them.
-    rate = (gain / state.last).clamp_max(1)
+    # No more than twice its promise comes from the step itself, the rest from what settled after it, which ends at once.
+    own = torch.minimum(gain, 2 * promise)
+    rate = (own / state.last).clamp_max(1)
     series = torch.where(rate < 1, gain * rate / (1 - rate), torch.inf)
     plain = accepted & ~exact
     done = active & (done | (plain & (torch.maximum(torch.maximum(gain, left), series) <= least)))
@@ -211,7 +213,7 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
         iterations=state.iterations + active,
         damping=torch.where(accepted, state.damping * shrink, state.damping * state.growth).clamp_min(WEAKEST),
         growth=torch.where(accepted, 2.0, 2 * state.growth),
-        last=torch.where(accepted, gain, state.last),
+        last=torch.where(accepted, own, state.last),
         dull=dull,
         slow=slow,
         curved=curved,

@@ -1,7 +1,8 @@
 """The Schur complement pair by pair: residuals of the same eliminated variable couple their slots.
 
 Pairs are sorted by the block of the system they add to and cut into runs, padded with a row of zeros, so that a batched product
-sums over a run. Best where each eliminated variable sees few of many retained ones.
+sums over a run. Best where each eliminated variable sees few of many retained ones. Columns that all slots have in common (a
+camera of all photographs) meet each residual with the sum over its variable's others: no pairs for these.
 """
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import Triangle
 from torchsfm.optim.layout import Family
-from torchsfm.optim.retained_blocks import add_squares
+from torchsfm.optim.retained_blocks import add_squares, find_runs
 from torchsfm.optim.schur_matrix_free import RowCoupling
 from torchsfm.optim.terms import Workspace
 
@@ -26,6 +27,9 @@ class PairCoupling:
 
     def __init__(self, family: Family, some: Tensor) -> None:
         self._rows = RowCoupling(family, some)
+        same = (self._rows.columns == self._rows.columns[:1]).all(0)
+        self._common, self._own = same.nonzero()[:, 0], (~same).nonzero()[:, 0]
+        self._slots = find_runs(self._rows.slots).ends
         self._plan(self._rows.slots, self._rows.columns.shape[0], family.size + 2)
         # One row of zeros more, for padding.
         self._Y = some.new_zeros((self._rows.slots.numel() + 1, self._rows.q, self._rows.width))
@@ -62,18 +66,23 @@ class PairCoupling:
         self._right = blank.index_copy(0, place, right[sort].int())
         self._block = torch.arange(blocks.numel(), device=blocks.device).repeat_interleave(runs)
         # Entries (r, c) and (c, r) both go below the diagonal, so one on it counts twice.
-        row = self._rows.columns[torch.div(blocks, max(count, 1), rounding_mode="floor")][:, :, None]
-        column = self._rows.columns[blocks % max(count, 1)][:, None]
+        columns = self._rows.columns[:, self._own]
+        row = columns[torch.div(blocks, max(count, 1), rounding_mode="floor")][:, :, None]
+        column = columns[blocks % max(count, 1)][:, None]
         self._places = (torch.maximum(row, column) * wide + torch.minimum(row, column)).flatten()
         self._twice = (row == column).flatten().nonzero()[:, 0]
 
     def reduce(self, S: Tensor, L: Triangle, z: Tensor) -> None:
         """Subtract `W V^-1 W'` from the lower triangle of S, with `V = L L'`, and `W L'^-1 z` from its column `size`."""
-        q, c = self._rows.q, self._rows.width
+        q, c = self._rows.q, len(self._own)
         squares = self._rows.squares(L, z, self._Y[:-1])
+        if len(self._common):
+            self._add_common(squares)
         columns = torch.nn.functional.pad(self._rows.columns, (0, 1), value=self._rows.size)
         add_squares(S, columns, squares, -1.0)
-        flat = self._Y.view(-1, q * c)
+        if not c:
+            return
+        flat = (self._Y[:, :, self._own] if len(self._common) else self._Y).view(-1, q * c)
         total = S.new_zeros((self._places.numel() // (c * c), c * c))
         for begin in range(0, self._left.numel(), BATCH):
             sides = []
@@ -87,6 +96,17 @@ class PairCoupling:
         entries = total.view(-1)
         entries[self._twice] *= 2
         S.view(-1).index_add_(0, self._places, entries, alpha=-1)
+
+    def _add_common(self, squares: Tensor) -> None:
+        """Add to the squares of slots what the common columns of each variable's other residuals make with them."""
+        Y, common, own = self._Y[:-1], self._common, self._own
+        mine = Y[:, :, common]
+        total = mine.new_zeros((self._rows.points, *mine.shape[1:])).index_add_(0, self._rows.point, mine)
+        others = total[self._rows.point] - mine
+        ends = self._slots
+        met = torch.stack([Y[a:b].flatten(0, 1).mT @ others[a:b].flatten(0, 1) for a, b in ends])
+        squares[:, :-1, common] += met
+        squares[:, common[:, None], own] += met[:, own].mT
 
 
 def _pairs(point: Tensor, slots: Tensor, count: int) -> tuple[Tensor, Tensor]:

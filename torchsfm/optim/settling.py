@@ -18,6 +18,9 @@ DAMPING = 1e-10
 """Of the first step of a variable, relative to its block: so little that it may go as far as infinity;"""
 RAISED, LOWERED = 1e3, 0.1
 """what it is multiplied by after one that leads up, and after one that does not."""
+LONGER = 1.5
+"""What steps of a variable are multiplied by, again and again, while each gains more than Gauss-Newton promises: the loss bends
+down there, and plain steps would fall as a geometric series (over-relaxation)."""
 PARTS = (0.25, 0.0625, 0.0)
 """Of a step that eliminated variables may take instead of a whole one that leads them up."""
 
@@ -51,7 +54,7 @@ class Settling:
     work: Workspace
 
     def settle(self, x: dict[str, Tensor], rounds: int = 1, least: Tensor | float = 0.0) -> dict[str, Tensor]:
-        """`x` with every eliminated variable moved by Gauss-Newton steps of its own that lower its cost.
+        """`x` with every eliminated variable moved by Gauss-Newton steps of its own, or longer ones, that lower its cost.
 
         Args:
             x: All variables.
@@ -62,7 +65,7 @@ class Settling:
         for family, seen in zip(self.layout.families, self.seen, strict=True):
             name, q, free = family.name, family.point_size, self.layout.free[family.name]
             columns, work, some = x[name].mT.contiguous(), self.work, torch.arange(family.points, device=free.device)
-            damping = columns.new_full(some.shape, DAMPING)
+            damping, length = columns.new_full(some.shape, DAMPING), columns.new_ones(some.shape)
             cost = _costs(seen, found, len(some), work)
             for number in range(rounds):
                 V = self._squares(seen, found, name, q, len(some), work)
@@ -70,17 +73,21 @@ class Settling:
                 slope = V[[place(a, q, q) for a in range(q)]]
                 step = -backward(L, forward(L, slope))
                 start = gather(found[name], free[some])
-                moved = self.blocks[name].retract(start, step.mT)
+                moved = self.blocks[name].retract(start, (length * step).mT)
                 found[name] = columns.index_copy(1, free[some], moved.mT).mT
                 after = _costs(seen, found, len(some), work)
                 better = after < cost
                 columns = columns.index_copy(1, free[some], torch.where(better, moved.mT, start.mT))
                 found[name] = columns.mT
-                going = (-(slope * step).sum(0) / 2 > least).nonzero()[:, 0]
+                promise = -(slope * step).sum(0) / 2
+                going = (promise > least).nonzero()[:, 0]
                 if number + 1 == rounds or not len(going):
                     break
                 seen = [each.of(going, len(some)) for each in seen]
-                damping = (damping * torch.where(better, LOWERED, RAISED).to(damping.dtype)).clamp_min(DAMPING)[going]
+                # A plain step comes after one that was too long.
+                raised = torch.where(length > 1, 1.0, RAISED)
+                damping = (damping * torch.where(better, LOWERED, raised)).clamp_min(DAMPING)[going]
+                length = torch.where(cost - after > promise, LONGER * length, 1.0)[going]
                 cost, some = torch.where(better, after, cost)[going], some[going]
                 # The problem's own keeps what it was asked for: few sizes, not ever others.
                 work = Workspace(columns)

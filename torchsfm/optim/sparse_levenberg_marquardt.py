@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.optim.descent import MINIMUM, Options, descend
+from torchsfm.optim.descent import MINIMUM, NEAR, Options, descend
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.normal_equations import NormalEquations
@@ -22,11 +22,13 @@ from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_cos
 
 STRAIGHT = 0.75
 """Steps that lower the cost by less than this part of what they promise left the linear model's reach."""
+SHORT = 0.9
+"""Those that promise less than this part of what they gain were too short: a loss bends down, which Gauss-Newton leaves out."""
 TELLING = 1e4
 """Comparing costs still checks a promise of this many of their rounding errors. Down to there, steps are shortened point by
 point: a single one in a bent valley would hold all others back."""
 ROUNDS = 20
-"""Most steps that eliminated variables take by themselves after a step with the exact Hessian,"""
+"""Most steps that eliminated variables take by themselves after one with the exact Hessian, or one that was too short,"""
 WORTH = 1e-2
 """and the part of what such a step promises, divided by their number, for which they take one."""
 SMALL = 0.75
@@ -265,10 +267,14 @@ class _SparseProblem:
         if not held and bool(step.promise <= TELLING * self.epsilon * here.cost):
             return _Place(engine, x, cost)
         strays = not bool(here.cost - cost >= STRAIGHT * step.promise)
+        # Far from the minimum the others are not where they will be, and the last digits are for Newton steps.
+        crawls = bool(self.epsilon**0.5 * here.cost < step.promise <= NEAR * here.cost)
+        short = crawls and bool(SHORT * (here.cost - cost) > step.promise)
         if not bool(here.cost - cost > POOR * step.promise):
             x = engine.settling.shorten(here.x, step.delta, x)
             cost = engine.cost(x)
-        if here.exact is not None:
+        if here.exact is not None or short:
+            # A few that crawl to where they belong would make as many steps of all.
             x = engine.settling.settle(x, ROUNDS, WORTH * step.promise / self.points)
             cost = engine.cost(x)
         elif strays and bool(cost.isfinite()):
