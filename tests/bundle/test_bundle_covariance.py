@@ -54,6 +54,18 @@ def test_spread_of_many_trials(scene: Scene, generator: torch.Generator) -> None
     assert abs(sum(sigmas) / 40 - 0.2) < 0.01
 
 
+def test_cameras_alone(scene: Scene) -> None:
+    """Without the covariances of points, those of cameras are the same."""
+    problem = BundleProblem.of(*scene)
+    options = {"free": ("focal", "k1"), "sigma": 0.3}
+    whole, alone = (bundle_covariance(problem, points=points, **options) for points in (True, False))
+    torch.testing.assert_close(alone.poses, whole.poses, rtol=1e-6, atol=1e-9 * float(whole.poses.abs().max()))
+    torch.testing.assert_close(alone.cameras, whole.cameras, rtol=1e-6, atol=0.0)
+    assert alone.nullity == whole.nullity == 7
+    assert alone.X.diagonal(dim1=-2, dim2=-1).isinf().all()
+    assert not alone.determined_points.any()
+
+
 def test_gauge(scene: Scene) -> None:
     poses, camera, X, x, view, point = scene
     free = bundle_covariance(BundleProblem.of(poses, camera, X, x, view, point), sigma=1.0, free=())

@@ -50,7 +50,9 @@ class BundleCovariance:
     """Of what is seen besides points, in the order given, each in the coordinates its class names."""
 
 
-def bundle_covariance(problem: BundleProblem, *, sigma: float | None = None, **terms: Unpack[BundleTerms]) -> BundleCovariance:
+def bundle_covariance(
+    problem: BundleProblem, *, sigma: float | None = None, points: bool = True, **terms: Unpack[BundleTerms]
+) -> BundleCovariance:
     """Compute the covariance of an adjusted bundle, by the arguments of `bundle_adjust` at its result.
 
     With a free gauge, the covariance is that in the gauge in which the cameras move least: a spread of shape, not of place.
@@ -61,6 +63,8 @@ def bundle_covariance(problem: BundleProblem, *, sigma: float | None = None, **t
     Args:
         problem: Adjusted poses, cameras and points, and the observations.
         sigma: Standard deviation of an image coordinate of weight 1, pixels; estimated from the residuals if not given.
+        points: Whether covariances of points (and of other structure) are wanted, which are most of the work. Without, theirs
+            are not finite.
         **terms: What was adjusted, held and known; see `BundleTerms`.
 
     Returns:
@@ -78,13 +82,13 @@ def bundle_covariance(problem: BundleProblem, *, sigma: float | None = None, **t
         >>> found.poses.shape, found.X.shape, bool(0.2 < found.sigma < 1)  # pixels
         (torch.Size([4, 6, 6]), torch.Size([50, 3, 3]), True)
     """
-    check_options(sigma=(sigma, "?float > 0"))
+    check_options(sigma=(sigma, "?float > 0"), points=(points, bool))
     bundle = Bundle(problem, **terms)
     with torch.no_grad():
         blocks, residuals = bundle.problem()
-        unit = sparse_covariance(blocks, residuals, eliminate=structure_blocks(bundle))
+        unit = sparse_covariance(blocks, residuals, eliminate=structure_blocks(bundle), of_eliminated=points)
     scale = sigma if sigma is not None else (unit.square_sum / max(unit.redundancy, 1)) ** 0.5
-    pose, camera, points = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
+    pose, camera, X = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
     sensor = None if bundle.rig is None else unit.blocks["sensor"] * scale**2
     structure = tuple(some.covariance(blocks[some.block].x, unit.blocks[some.block] * scale**2) for some in bundle.structure)
     held = 0
@@ -93,4 +97,4 @@ def bundle_covariance(problem: BundleProblem, *, sigma: float | None = None, **t
         switch = blocks["camera"].x[:, -camera.shape[-1] :] > 0
         camera = torch.where(switch[:, :, None] & switch[:, None], camera, 0.0)
         held = int((~switch & (unit.columns["camera"] >= 0)).sum())
-    return BundleCovariance(pose, camera, points, unit.determined["point"], scale, unit.nullity - held, unit, sensor, structure)
+    return BundleCovariance(pose, camera, X, unit.determined["point"], scale, unit.nullity - held, unit, sensor, structure)

@@ -54,7 +54,11 @@ class SparseCovariance:
 
 
 def sparse_covariance(
-    blocks: Mapping[str, Block], terms: Sequence[Term], *, eliminate: str | Sequence[str] | None = None
+    blocks: Mapping[str, Block],
+    terms: Sequence[Term],
+    *,
+    eliminate: str | Sequence[str] | None = None,
+    of_eliminated: bool = True,
 ) -> SparseCovariance:
     """Compute covariances at a minimum.
 
@@ -62,6 +66,8 @@ def sparse_covariance(
         blocks: Variables at the minimum.
         terms: Residuals in units of their standard deviation; those that are not finite are left out.
         eliminate: The blocks to eliminate, as in `sparse_levenberg_marquardt`.
+        of_eliminated: Whether covariances of the eliminated variables are wanted too, which are most of the work. Without,
+            theirs are infinite.
 
     Returns:
         The covariances, float64.
@@ -80,9 +86,10 @@ def sparse_covariance(
         double, counted, _ = prepare(blocks, terms)
         x = {name: b.x for name, b in double.items()}
         layout = lay_out(double, counted, eliminate)
-        engine = Elimination(double, layout, "dense", spread=True)
+        engine = Elimination(double, layout, "dense", spread=of_eliminated)
         inverse = engine.linearize(x).invert()
-        points = zip(layout.families, inverse.point_covariances(), inverse.determined, strict=True)
+        spread = inverse.point_covariances() if of_eliminated else []
+        points = zip(layout.families, spread, inverse.determined, strict=of_eliminated)
         eliminated = {family.name: (of_points, good) for family, of_points, good in points}
         squares = sum((_square_sum(part.term, x) for part in engine.parts), 0.0)
         rows = sum(part.components * part.term.index[0].shape[0] for part in engine.parts)
@@ -100,7 +107,7 @@ def sparse_covariance(
             of_points, good = eliminated[name]
             known[free[good]] = True
             covariance[free[good]] = of_points[good]
-        elif free.numel():
+        elif name in layout.first:
             place[free] = layout.first[name] + torch.arange(free.numel() * width, device=free.device).view(-1, width)
             kept = inverse.kept[place[free][:, :, None], place[free][:, None]]
             known[free] = kept.isfinite().all(-1).all(-1)

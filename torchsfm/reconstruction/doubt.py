@@ -131,6 +131,7 @@ def pose_deviations(
         problem,
         loss=LOSS,
         sigma=measure_noise(mapping, LOSS),
+        points=False,
         **about_cameras(mapping, uncertain, prior),
     )
     view, depth = problem.view, problem.depths()

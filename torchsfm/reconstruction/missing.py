@@ -119,15 +119,17 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
         row = torch.full((v,), -1).index_copy_(0, b, torch.arange(len(b)))[view[first_sighting[p][column] + step]]
         seen = torch.zeros(len(b), len(p), dtype=torch.bool)
         seen[row[row >= 0], column[row >= 0]] = True
-        # Of the points that count, one row each: where the other camera should see them.
+        # Of the points that count, one row each: where the other camera should see them, and does if nothing hides them.
         k, n = (near & (sightings[p] - seen.long() >= 2)).nonzero(as_tuple=True)
-        image, like, x, depth = b[k], mine[n], x[k, n], depth[k, n]
-        found = seen[k, n]
+        image, x, depth = b[k], x[k, n], depth[k, n]
+        bare = nearest.at(image, x) >= BEHIND * depth
+        through = (farthest.at(image, x) > FARTHER * depth) & (beside.at(image, x) > BEHIND * depth)
+        open_to = (bare | through).nonzero()[:, 0]
+        k, n, image, x, bare, through = (t[open_to] for t in (k, n, image, x, bare, through))
+        like, found = mine[n], seen[k, n]
         rest = (~found).nonzero()[:, 0]
         found[rest] = occupied.at(image[rest], x[rest], like[rest])
         chance = occupied.at(image, x + x.new_tensor(BESIDE)[:, None], like).double().mean(0)
-        bare = nearest.at(image, x) >= BEHIND * depth
-        through = (farthest.at(image, x) > FARTHER * depth) & (beside.at(image, x) > BEHIND * depth)
         first, second = _cell(mapping.graph.x[like], mapping.graph.image_size[a]), _cell(x, mapping.graph.image_size[image])
         weights = torch.stack([torch.ones_like(chance), found.double(), chance])
         for table, cell, counts in ((own, first, bare), (other, second, bare), (open_, first, through)):
