@@ -27,8 +27,10 @@ NEAR = 1e-2
 """They do so only once they gain less than this fraction of the cost: before, the exact Hessian is rarely positive."""
 LOOSE = 1e-4
 """And only where no more than this fraction of the cost may be left: Newton steps are for the last digits."""
+FLAT = 1.5
+"""Nor, unless they have been slow for long, where a step gains more than so many times what it promises,"""
 GROWTH = 2.0
-"""Nor where a step gains more than so many times what the last one gained: they are under way along a valley."""
+"""or more than so many times what the last one gained: they are under way along a valley."""
 MINIMUM = 1e-13
 """Relative decrease still promised at which a place is the minimum that a derivative belongs to."""
 LIGHT = 1e-6
@@ -203,7 +205,9 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
         dull = torch.where(plain, torch.where(crawls, dull + 1, 0), dull)
         if bool(crawls.any()):
             far = gain * rate ** (problem.patience + 1) > least * (1 - rate)
-            slow = slow | (crawls & far & ((dull > problem.patience) | (gain <= 100 * least)))
+            # Along a step that gains this much more than it promises the cost is hardly curved, and the Hessian not positive.
+            ends = (gain <= 100 * least) & (gain <= FLAT * promise)
+            slow = slow | (crawls & far & ((dull > problem.patience) | ends))
         slow, curved = slow & ~done, curved & ~accepted
     trust = (gain / promise.clamp_min(torch.finfo(cost.dtype).tiny)).clamp(0, 1)
     shrink = (1 - (2 * trust - 1) ** 3).clamp_min(1 / 3)
