@@ -184,6 +184,19 @@ def test_every_camera_of_a_list(sequence, generator, threshold, calibrated):
     assert found.error.isfinite().all()
 
 
+@pytest.mark.parametrize(
+    ("calibrated", "thickness"), [(False, (1.0, 1.0, 1e-3)), (False, (1.0, 1e-3, 1e-3)), (True, (1.0, 1e-3, 1e-3))]
+)
+def test_cameras_that_nearly_flat_points_leave_open(images, calibrated, thickness):
+    """Nearly a plane, or nearly a line: within their noise other cameras see the points in the same places."""
+    _, X, _, P = images(20, 60, 1.0)
+    X = X[0] * torch.tensor(thickness, dtype=F64)
+    x = project(P, X) + 0.5 * torch.randn(20, 60, 2, generator=seeded(), dtype=F64)
+    K = krt_from_camera(P)[0] if calibrated else None
+    found = resect_cameras(x, X, K, threshold=3.0, generator=seeded())
+    assert (found.status != Status.OK).all()
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_batches_of_lists(sequence, calibrated):
     x, X, K, visible, _ = sequence

@@ -14,7 +14,7 @@ from torchsfm.resection.estimate_camera import estimate_camera
 from torchsfm.resection.estimate_camera_projective import ProjectiveCameraEstimator, estimate_camera_projective
 from torchsfm.resection.moderate_lines import is_segments, line_data, pixel_ends
 from torchsfm.resection.refine_camera import refine_camera
-from torchsfm.robust import check_counts, constant_weights
+from torchsfm.robust import Degeneracy, check_counts, constant_weights
 from torchsfm.robust.moderation import middle_and_size
 
 _STEPS = 8
@@ -124,7 +124,9 @@ def resect_cameras(
             found = estimate_camera(x, X, K, l, L, threshold=threshold, **options)  # type: ignore[arg-type]
         else:
             found = estimate_camera_projective(x, X, threshold=threshold, **options)  # type: ignore[arg-type]
-        model, inliers, status = found.model, found.inliers, found.status.to(torch.int8)
+        open_ = (found.degeneracy != Degeneracy.NONE) & ((found.degeneracy != Degeneracy.PLANAR) | (K is None))
+        status = torch.where((found.status == Status.OK) & open_, int(Status.DEGENERATE), found.status).to(torch.int8)
+        model, inliers = found.model, found.inliers
     elif K is not None:
         model, status = _calibrated(x, X, K, l, L, seen, max_iterations)
         inliers = seen
