@@ -114,6 +114,27 @@ def test_points_on_a_twisted_cubic_with_the_centre(generator):
     assert (found.status == Status.DEGENERATE).all()
 
 
+def test_noisy_points_on_a_twisted_cubic_with_the_centre(make_problem, generator):
+    """Two cameras see them, of different depths: their algebraic errors say nothing of which is nearer to the data."""
+    _, _, P = make_problem(400, n=6)
+    centre = -torch.linalg.solve(P[:, :, :3], P[..., 3:])[..., 0]
+    A = torch.randn(400, 3, 3, generator=generator, dtype=torch.float64) * 0.3
+    s = torch.rand(400, 40, 1, generator=generator, dtype=torch.float64) * 2 + 0.5
+    forward = torch.nn.functional.normalize(P[:, 2, :3], dim=-1)[:, None]
+    X = centre[:, None] + 4 * s**3 * forward + torch.cat((s, s**2, s**3), -1) @ A
+    x = project(P, X)
+    x = x + 0.5 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    assert (camera_dlt(x, X).status != Status.OK).all()
+
+
+def test_a_noisy_plane_and_one_point_off_it(make_problem):
+    """The matrix that takes the plane to nothing and the point to its image fits exactly, and is no camera."""
+    x, X, P = make_problem(100, n=20)
+    X[:, 1:, 2] = 0.2 * X[:, 1:, 0]
+    x = project(P, X) + 0.5 * torch.randn(x.shape, generator=seeded(), dtype=torch.float64)
+    assert (camera_dlt(x, X).status == Status.DEGENERATE).all()
+
+
 def test_bad_elements_touch_no_neighbour(make_problem):
     x, X, _ = make_problem(7, n=9, noise=0.5)
     good = camera_dlt(x, X)

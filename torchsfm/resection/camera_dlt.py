@@ -8,12 +8,14 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry import normalizing_similarity
-from torchsfm.linalg import cross, eigh, unit_scale, usable
+from torchsfm.linalg import cross, eigh, eigvalsh, svdvals, unit_scale, usable
 
 FLAT = 1e-6
 """Singular value, over the largest, at which a second null vector is taken for exact (a plane, in float32 coordinates)."""
 BLURRED = 3.0
-"""How much larger than the smallest singular value, which is noise, the second smallest must be."""
+"""How much larger than the smallest singular value, which is noise, the second smallest must be; so for distances of cameras."""
+RANK = 1e-6
+"""Smallest singular value of a camera, over its largest, at which it is none: all it sees lies in a plane or on a line."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,10 @@ def camera_dlt(
     p, singular = _null_vector(A)
     equations = (A.detach() != 0).any(-1).sum(-1)
     degenerate = (singular[..., 1] <= FLAT * singular[..., -1]) | (singular[..., 1] <= BLURRED * singular[..., 0])
+    degenerate = degenerate | _blurred(A.detach())
+    # A plane and one point off it: the matrix that takes the plane to nothing and the point to its image.
+    sees = svdvals(p.detach().reshape(*batch, 3, 4))[0]
+    degenerate = degenerate | (sees[..., 2] <= RANK * sees[..., 0])
     P = torch.linalg.solve_ex(T, p.reshape(*batch, 3, 4) @ S)[0]
     P = _scaled(P, everything, both).to(dtype)
     # Points so far away that numbers of this kind hold no camera that sees them.
@@ -193,6 +199,20 @@ def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
     # Eigenvalues know small singular values only to the square root of rounding; products with A know them better.
     singular = torch.linalg.vector_norm(A.detach() @ torch.cat((p.detach()[..., None], others), -1), dim=-2)
     return p, torch.cat((singular[..., :1], singular[..., 1:].sort(-1).values), -1)
+
+
+def _blurred(A: Tensor) -> Tensor:
+    """Whether cameras of two third rows are as near to the data, in the image.
+
+    Noise in the image enters every equation with its depth: of two solutions that of smaller depths leaves less of A p, however
+    wrong it is. So what the best first two rows leave is measured by the depths.
+    """
+    N = A.mT @ A
+    depths = N[..., :4, :4] + N[..., 4:8, 4:8]
+    left = N[..., 8:, 8:] - N[..., 8:, :8] @ torch.linalg.solve_ex(N[..., :8, :8], N[..., :8, 8:])[0]
+    unit = torch.linalg.inv_ex(torch.linalg.cholesky_ex(depths)[0])[0]
+    distance = eigvalsh(unit @ left @ unit.mT)[0]
+    return distance[..., 1] <= BLURRED**2 * distance[..., 0]
 
 
 def _scaled(P: Tensor, X: Tensor, w: Tensor) -> Tensor:
