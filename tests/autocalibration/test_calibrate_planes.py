@@ -104,6 +104,20 @@ def test_what_cannot_be_known_is_said(generator):
     assert torch.allclose(alone.camera.K, found.camera.K[1], rtol=1e-9)
 
 
+@pytest.mark.parametrize("model", [NoDistortion, Radial, BrownConrady])
+def test_parallel_planes_leave_the_camera_open(generator, model):
+    """A lens that bends lines seems to tell the rest, by what is noise."""
+    X, parallel = grid(), rotation_from_rotvec(torch.tensor([0.5, 0.1, 0.0], dtype=torch.float64))
+    t = torch.randn(20, 5, 3, generator=generator, dtype=torch.float64) * 0.5 + torch.tensor([-3.0, -2.0, 14.0])
+    flat = torch.cat((X, torch.zeros(len(X), 1, dtype=torch.float64)), -1)
+    K = torch.tensor([[900.0, 0.0, 520.0], [0.0, 900.0, 390.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    x = Camera(K).project(flat @ parallel.mT + t[..., None, :])
+    x = x + 0.3 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    found = calibrate_planes(x, X, image_size=SIZE, distortion=model)
+    assert (found.status != Status.OK).all()
+    assert (calibrate_planes(x[:, :1], X, image_size=SIZE, distortion=model, free=("focal",)).status == Status.OK).all()
+
+
 def test_one_view_gives_a_focal_length(generator):
     X = grid()
     R = rotation_from_rotvec(torch.tensor([0.5, -0.4, 0.2], dtype=torch.float64))

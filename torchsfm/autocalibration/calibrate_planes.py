@@ -6,7 +6,7 @@ reprojection error.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
@@ -185,12 +185,18 @@ def calibrate_planes(
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
         focal = settled.row[..., FOCAL].abs().clamp_min(1e-12)
-        unsure = ~(covariance[..., 0, 0].reshape(batch).clamp_min(0).sqrt() <= MAX_DEVIATION * focal)
+        # What the lens bends tells of the camera, too, but along a valley that no covariance shows: the planes must do without.
+        head = sum(column < HEAD for column in columns)
+        unbent = replace(
+            flat[0], row=torch.where(torch.arange(flat[0].row.shape[-1], device=x.device) < HEAD, flat[0].row, 0.0)
+        )
+        _, J = problem.linearize(unbent, flat[1], flat[2])
+        straight, _ = _covariance(residual, torch.cat((J[..., :head], J[..., q:]), -1), trust, head, v, used.reshape(-1, v))
+        deviations = torch.stack((covariance[..., 0, 0], straight[..., 0, 0])).clamp_min(0).sqrt()
+        unsure = ~(deviations.amax(0).reshape(batch) <= MAX_DEVIATION * focal)
         measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
         held = [torch.isfinite(c.to(x.dtype)).flatten(1).all(-1).reshape(batch) for c in (covariance, pose_covariance)]
         unsure = unsure | ~(held[0] & held[1])
-        # A plane tells two numbers of a camera; what the lens bends tells more, but along a valley that no covariance shows.
-        unsure = unsure | (2 * used.sum(-1) < sum(column < HEAD for column in columns))
         status = torch.where(unsure, int(Status.DEGENERATE), result.status)
         status = torch.where((measured < unknowns) | ~used.any(-1), int(Status.TOO_FEW), status).to(torch.int8)
     dtype = x.dtype
