@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 from chance import assert_share, seeded
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from torchsfm._types import tensor_map
@@ -98,6 +98,7 @@ def test_every_ray_of_the_domain_is_found_again(name, seed, spread):
 
 
 @settings(deadline=None, max_examples=100)
+@example([1.0, 5.45966123444489e-265, 0.0, 5.45966123444489e-265])
 @given(st.lists(st.floats(-2, 2, allow_subnormal=False), min_size=1, max_size=4))
 def test_valid_radius_is_the_first_fold(coefficients):
     cls = {1: SimpleRadial, 2: Radial, 3: BrownConrady, 4: KannalaBrandt}[len(coefficients)]

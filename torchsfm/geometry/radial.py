@@ -129,6 +129,8 @@ def first_fold(coefficients: Sequence[Tensor]) -> Tensor:
             good = exist & (terms.sum(0).abs() <= 1e-9 * terms.abs().sum(0))
             w = torch.where(good, roots, 0.0).amax(-1)
         else:
+            # Coefficients next to nothing change no root that counts, and keep others from being found.
+            c = torch.where(c.abs() < 1e-100, 0.0, c)
             companion = torch.diag_embed(c.new_ones(count - 1), offset=-1).expand(*c.shape, count).clone()
             companion[..., 0, :] = -c
             values, ok = eigvals(companion)
