@@ -16,8 +16,9 @@ import numpy as np
 from beartype import beartype
 from torch import Tensor
 
-_ARRAYS, _VALUES = (Tensor, np.ndarray), (str, int, type)
 _CHECKS: dict[tuple[str, str, int], "_Checks"] = {}
+_PLAIN: set[type] = set()
+"""Types of which annotations tell no more than the type."""
 
 
 def install() -> None:
@@ -75,17 +76,24 @@ class _Checks:
 def _kind(x: Any) -> Hashable:
     """All that annotations can tell of a value; one that holds others unseen is like no other."""
     what = type(x)
-    if what is Tensor or isinstance(x, _ARRAYS):
-        return what, x.shape, x.dtype
+    if what is Tensor:
+        return x.shape, x.dtype
+    if what in _PLAIN:
+        return what
+    if isinstance(x, (str, int, type)):
+        return what, x
     if isinstance(x, tuple):
         return what, *[_kind(value) for value in x]
     if isinstance(x, dict):
         return what, *[(_kind(key), _kind(value)) for key, value in x.items()]
-    if isinstance(x, _VALUES):
-        return what, x
     if isinstance(x, list | set | frozenset):
         return what, frozenset(map(_kind, x))
-    return object() if isinstance(x, Collection) else what
+    if isinstance(x, Tensor | np.ndarray):
+        return what, x.shape, x.dtype
+    if isinstance(x, Collection):
+        return object()
+    _PLAIN.add(what)
+    return what
 
 
 def _arguments(function: Callable[..., Any]) -> Callable[..., None]:
