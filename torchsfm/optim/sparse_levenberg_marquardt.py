@@ -24,6 +24,8 @@ STRAIGHT = 0.75
 """Steps that lower the cost by less than this part of what they promise left the linear model's reach."""
 SHORT = 0.9
 """Those that promise less than this part of what they gain were too short: a loss bends down, which Gauss-Newton leaves out."""
+PART = 0.1
+"""Eliminated variables go on settling after it if their first steps gain at least this part of what it promises."""
 TELLING = 1e4
 """Comparing costs still checks a promise of this many of their rounding errors. Down to there, steps are shortened point by
 point: a single one in a bent valley would hold all others back."""
@@ -273,13 +275,14 @@ class _SparseProblem:
         if not bool(here.cost - cost > POOR * step.promise):
             x = engine.settling.shorten(here.x, step.delta, x)
             cost = engine.cost(x)
+        if here.exact is None and (short or (strays and bool(cost.isfinite()))):
+            # The linear model reaches no farther than this, but with the eliminated variables settled it may.
+            moved, x = cost, engine.settling.settle(x)
+            cost = engine.cost(x)
+            short = short and bool(moved - cost > PART * step.promise)
         if here.exact is not None or short:
             # A few that crawl to where they belong would make as many steps of all.
             x = engine.settling.settle(x, ROUNDS, WORTH * step.promise / self.points)
-            cost = engine.cost(x)
-        elif strays and bool(cost.isfinite()):
-            # The linear model reaches no farther than this, but with the eliminated variables settled it may.
-            x = engine.settling.settle(x)
             cost = engine.cost(x)
         there = _Place(engine, x, cost)
         there.strayed = strays and not bool(here.cost - cost >= STRAIGHT * step.promise)
