@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.optim.descent import MINIMUM, NEAR, Options, descend
+from torchsfm.optim.descent import MINIMUM, NEAR, SLOW, Options, descend
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.normal_equations import NormalEquations
@@ -204,6 +204,8 @@ class _Place:
         self.exact: NormalEquations | None = None
         self.strayed = False
         """Whether the step that led here left the linear model's reach."""
+        self.promise = math.inf
+        """Of the step that led here."""
         self.damping = 0.0
         """Of the last step asked for."""
         self._system: NormalEquations | None = None
@@ -270,7 +272,8 @@ class _SparseProblem:
             return _Place(engine, x, cost)
         strays = not bool(here.cost - cost >= STRAIGHT * step.promise)
         # Far from the minimum the others are not where they will be, and the last digits are for Newton steps.
-        crawls = bool(self.epsilon**0.5 * here.cost < step.promise <= NEAR * here.cost)
+        close = bool(self.epsilon**0.5 * here.cost < step.promise <= NEAR * here.cost)
+        crawls = close and bool(step.promise > SLOW * here.promise)
         short = crawls and bool(SHORT * (here.cost - cost) > step.promise)
         if not bool(here.cost - cost > POOR * step.promise):
             x = engine.settling.shorten(here.x, step.delta, x)
@@ -285,6 +288,7 @@ class _SparseProblem:
             x = engine.settling.settle(x, ROUNDS, WORTH * step.promise / self.points)
             cost = engine.cost(x)
         there = _Place(engine, x, cost)
+        there.promise = float(step.promise)
         there.strayed = strays and not bool(here.cost - cost >= STRAIGHT * step.promise)
         return self._bent(here, there, step) if here.strayed and strays and here.exact is None else there
 
