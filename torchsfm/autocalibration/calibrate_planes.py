@@ -71,9 +71,9 @@ class PlaneCalibration:
     iterations: Int[Tensor, "*batch"]
     """Steps tried."""
     status: Int8[Tensor, "*batch"]
-    """OK; DEGENERATE: the views do not determine the focal length (all parallel to the image, for instance, or fewer than one
-    for two of the free parameters, those of the lens aside), or a pose so badly that the dtype cannot hold its covariance;
-    TOO_FEW: no view, or fewer measurements than unknowns; NOT_CONVERGED."""
+    """OK; DEGENERATE: the views do not determine the focal length, or would not if the lens were known not to bend (all
+    parallel to the image or to each other, for instance, or too few for the free parameters), or a pose so badly that the
+    dtype cannot hold its covariance; TOO_FEW: no view, or fewer measurements than unknowns; NOT_CONVERGED."""
 
     @property
     def deviation(self) -> Float[Tensor, "*batch q"]:
@@ -185,13 +185,7 @@ def calibrate_planes(
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
         focal = settled.row[..., FOCAL].abs().clamp_min(1e-12)
-        # What the lens bends tells of the camera, too, but along a valley that no covariance shows: the planes must do without.
-        head = sum(column < HEAD for column in columns)
-        unbent = replace(
-            flat[0], row=torch.where(torch.arange(flat[0].row.shape[-1], device=x.device) < HEAD, flat[0].row, 0.0)
-        )
-        _, J = problem.linearize(unbent, flat[1], flat[2])
-        straight, _ = _covariance(residual, torch.cat((J[..., :head], J[..., q:]), -1), trust, head, v, used.reshape(-1, v))
+        straight = _without_lens(problem, flat[:3], residual, trust, used.reshape(-1, v))
         deviations = torch.stack((covariance[..., 0, 0], straight[..., 0, 0])).clamp_min(0).sqrt()
         unsure = ~(deviations.amax(0).reshape(batch) <= MAX_DEVIATION * focal)
         measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
@@ -290,6 +284,22 @@ def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
     values, _ = eigvalsh(D.mT @ D)
     spans: Tensor = values[..., 0] > 1e-10 * values[..., 1].clamp_min(1e-300)
     return spans
+
+
+def _without_lens(
+    problem: _Problem, at: tuple[CameraAndPoses, Tensor, Tensor], residual: Tensor, w: Tensor, used: Tensor
+) -> Tensor:
+    """The covariance that the intrinsics had for such residuals if the lens were known not to bend.
+
+    What a lens bends tells of the camera, too, but along a valley that no covariance shows: planes must do without.
+    """
+    u, x, X = at
+    columns = torch.arange(u.row.shape[-1], device=u.row.device)
+    _, J = problem.linearize(replace(u, row=torch.where(columns < HEAD, u.row, 0.0)), x, X)
+    free = problem.projection.free
+    head = sum(column < HEAD for column in free)
+    J = torch.cat((J[..., :head], J[..., len(free) :]), -1)
+    return _covariance(residual, J, w, head, x.shape[1], used)[0]
 
 
 def _covariance(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, used: Tensor) -> tuple[Tensor, Tensor]:

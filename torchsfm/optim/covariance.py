@@ -88,9 +88,10 @@ def sparse_covariance(
         layout = lay_out(double, counted, eliminate)
         engine = Elimination(double, layout, "dense", spread=of_eliminated)
         inverse = engine.linearize(x).invert()
-        spread = inverse.point_covariances() if of_eliminated else []
-        points = zip(layout.families, spread, inverse.determined, strict=of_eliminated)
-        eliminated = {family.name: (of_points, good) for family, of_points, good in points}
+        eliminated = {}
+        if of_eliminated:
+            points = zip(layout.families, inverse.point_covariances(), inverse.determined, strict=True)
+            eliminated = {family.name: (of_points, good) for family, of_points, good in points}
         squares = sum((_square_sum(part.term, x) for part in engine.parts), 0.0)
         rows = sum(part.components * part.term.index[0].shape[0] for part in engine.parts)
     found: dict[str, Tensor] = {}

@@ -103,8 +103,7 @@ class PairCoupling:
         mine = Y[:, :, common]
         total = mine.new_zeros((self._rows.points, *mine.shape[1:])).index_add_(0, self._rows.point, mine)
         others = total[self._rows.point] - mine
-        ends = self._slots
-        met = torch.stack([Y[a:b].flatten(0, 1).mT @ others[a:b].flatten(0, 1) for a, b in ends])
+        met = torch.stack([Y[a:b].flatten(0, 1).mT @ others[a:b].flatten(0, 1) for a, b in self._slots])
         squares[:, :-1, common] += met
         squares[:, common[:, None], own] += met[:, own].mT
 

@@ -13,7 +13,8 @@ from torchsfm.linalg import cross, eigh, eigvalsh, svdvals, unit_scale, usable
 FLAT = 1e-6
 """Singular value, over the largest, at which a second null vector is taken for exact (a plane, in float32 coordinates)."""
 BLURRED = 3.0
-"""How much larger than the smallest singular value, which is noise, the second smallest must be; so of distances."""
+"""How much larger than the smallest singular value, which is noise, the second smallest must be. The same holds of how far two
+cameras are from the data in the image."""
 RANK = 1e-6
 """Smallest singular value of a camera, over its largest, at which it is none: all it sees lies in a plane or on a line."""
 
