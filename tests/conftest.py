@@ -46,7 +46,8 @@ def pytest_collection(session: pytest.Session) -> None:
     if device != "cpu":
         # What modules make when they are imported stays on the CPU, as where nobody sets a default.
         for room in pkgutil.iter_modules(torchsfm.__path__):
-            importlib.import_module(f"torchsfm.{room.name}")
+            if room.ispkg:
+                importlib.import_module(f"torchsfm.{room.name}")
         torch.set_default_device(device)
 
 

@@ -2,7 +2,7 @@
 
 They compute on the CPU. What they find is a constant made without `device=`, a mask or an index left behind, numbers taken to
 the CPU and back. Single numbers may be read (`.item()`, `bool()`), and CPU tensors of no dimension take part, as they do on
-real devices.
+real devices. As on CUDA, a division by a single number is a product with its reciprocal, which is rounded twice.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,6 +20,7 @@ from torchsfm.linalg.constants import Constant
 ELSEWHERE = torch.device("meta")
 """The name of the device; nothing else uses it here."""
 INDEXING = (torch.ops.aten.index.Tensor, torch.ops.aten.index_put_.default, torch.ops.aten.index_put.default)
+DIVISIONS = (torch.ops.aten.div.Tensor, torch.ops.aten.div_.Tensor, torch.ops.aten.div.Scalar, torch.ops.aten.div_.Scalar)
 CONSTANT = 2000
 """Numbers of a table, written in the program, that may be taken along: between brackets, or by `.to(device)`."""
 
@@ -76,6 +77,9 @@ def compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     args, kwargs = _changed(_numbers, args), {name: _changed(_numbers, v) for name, v in kwargs.items()}
     if wanted is not None:
         kwargs["device"] = torch.device("cpu")
+    if func in DIVISIONS and len(own) == 1 and own[0] is leaves[0] and args[0].is_floating_point():
+        func = torch.ops.aten.mul_.Tensor if func._schema.is_mutable else torch.ops.aten.mul.Tensor
+        args = args[0], 1 / torch.as_tensor(args[1], dtype=args[0].dtype)
     found = func(*args, **kwargs)
     if func is torch.ops.aten._local_scalar_dense.default:
         return found

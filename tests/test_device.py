@@ -22,6 +22,7 @@ from bench.fuzz.functions import EXCEPTIONS, FUNCTIONS, Function, public_functio
 from bench.fuzz.promises import tensors
 from bench.fuzz.scene import Scene
 from torchsfm._types import tensor_map
+from torchsfm.linalg import real_roots
 from torchsfm.robust import ransac, soft_ransac
 
 STEPS = 8
@@ -117,6 +118,12 @@ def test_estimators(kind: type, device: Device) -> None:
         lambda a: soft_ransac(a[0], *a[2], threshold=3e-3, hypotheses=8, generator=seeded(1)),
     ):
         device.compare(call, arguments, call(arguments))
+
+
+@pytest.mark.parametrize("number", [49, 98, 103, 107])
+def test_roots_where_a_division_is_rounded_twice(number: int, device: Device) -> None:
+    c = torch.randn(number, 6, dtype=torch.float64, generator=seeded())
+    device.compare(real_roots, c, real_roots(c))
 
 
 def test_the_pretended_device_tells() -> None:

@@ -131,8 +131,9 @@ def _cut(where: Parts, to_parts: Tensor, width: float) -> Parts:
 
 
 def _row_and_column(place: Int[Tensor, " k"], columns: int) -> tuple[Tensor, Tensor]:
-    # Faster than a division of integers, and exact.
-    row = (place.double() / max(columns, 1)).long()
+    # Faster than a division of integers. The half keeps what is rounded away from whole numbers: some devices multiply by the
+    # reciprocal instead.
+    row = place.double().add_(0.5).div_(max(columns, 1)).long()
     return row, place.sub(row, alpha=columns)
 
 
