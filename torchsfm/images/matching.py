@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
 from torchsfm.images.features import Features, check_features
+from torchsfm.linalg.portions import portions
 
 _ROWS = 128
 """Rows of one block of similarities: 128 x 8192 integers stay in a processor's cache through all that is done with them."""
@@ -213,14 +214,14 @@ def _top_two(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         part = b[left : left + width]
         columns = part.shape[0]
         packed = torch.empty(a.shape[0], min(2, columns), dtype=torch.int32, device=a.device)
-        for start in range(0, a.shape[0], _ROWS):
-            block = _products(a[start : start + _ROWS], part, bound)
+        for some in portions(a.shape[0], _ROWS, a.device):
+            block = _products(a[some], part, bound)
             torch.add(counter[:columns], block, alpha=width, out=block)  # among equal products the first column is the largest
             top = block.amax(1)
-            packed[start : start + _ROWS, 0] = top
+            packed[some, 0] = top
             if columns > 1:
                 block.scatter_(1, (width - 1 - (top & (width - 1))).long()[:, None], torch.iinfo(torch.int32).min)
-                packed[start : start + _ROWS, 1] = block.amax(1)
+                packed[some, 1] = block.amax(1)
         values.append(packed >> bits)
         indices.append(width - 1 - (packed & (width - 1)).long() + left)
     return _merge(values, indices)
@@ -232,8 +233,8 @@ def _top_two_float(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     for left in range(0, b.shape[0], width):
         part = b[left : left + width].mT
         value, index = [], []
-        for start in range(0, a.shape[0], _ROWS):
-            block = a[start : start + _ROWS] @ part
+        for some in portions(a.shape[0], _ROWS, a.device):
+            block = a[some] @ part
             first, where = block.max(1, keepdim=True)
             value.append(first)
             index.append(where)

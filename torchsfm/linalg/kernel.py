@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchsfm.linalg.portions import portions
+
 Rows = tuple[Tensor, ...]
 
 
@@ -16,16 +18,16 @@ def kernel(*, chunk: int = 4096) -> Callable[[Callable[..., Rows]], Callable[...
     The elements of its batch must not depend on each other.
 
     Args:
-        chunk: How many problems.
+        chunk: How many problems, on a CPU.
     """
 
     def decorate(function: Callable[..., Rows]) -> Callable[..., Rows]:
         @wraps(function)
         def in_pieces(*rows: Tensor, **options: Any) -> Rows:
-            batch = rows[0].shape[-1]
-            if batch <= chunk:
+            some = portions(rows[0].shape[-1], chunk, rows[0].device)
+            if len(some) == 1:
                 return function(*rows, **options)
-            pieces = [function(*(row[..., i : i + chunk] for row in rows), **options) for i in range(0, batch, chunk)]
+            pieces = [function(*(row[..., part] for row in rows), **options) for part in some]
             return tuple(torch.cat(parts, -1) for parts in zip(*pieces, strict=True))
 
         return in_pieces

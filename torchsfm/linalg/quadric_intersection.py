@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.linalg.constants import Constant
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.quadric_pencil import Pencil, determinant
 from torchsfm.linalg.quaternary_forms import (
     CUBIC,
@@ -87,8 +88,8 @@ def _attempt(A: Tensor, B: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     degree = 8 if C.shape[0] == 10 else 12
     nodes, to_coefficients = (t.on(A.device, A.dtype) for t in _circle(degree))
     forms = []
-    for i in range(0, max(A.shape[1], 1), _CHUNK):
-        a, b, c = (q[:, i : i + _CHUNK] for q in (A, B, C))
+    for some in portions(A.shape[1], _CHUNK, A.device):
+        a, b, c = (q[:, some] for q in (A, B, C))
         values = determinant(Pencil.of(a, b).multiply(c, nodes[0][:, None], nodes[1][:, None]))
         forms.append(combine_rows(values, to_coefficients.mT[..., None]))
     form = torch.cat(forms, 1)

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.linalg.constants import Constant
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.rows import take_columns
 
 _CELLS = 2
@@ -63,13 +64,13 @@ def root_cells(c: Float[Tensor, "m batch"]) -> tuple[Cells, Cells]:
     degree, batch = c.shape[0] - 1, c.shape[1]
     to_cells, to_parts = (t.on(c.device, c.dtype) for t in _matrices(degree))
     number, rows = [], []
-    for start in range(0, max(batch, 1), _CHUNK):
-        piece = c[:, start : start + _CHUNK]
+    for some in portions(batch, _CHUNK, c.device):
+        piece = c[:, some]
         b = (to_cells @ piece).view(degree + 1, -1)
         place = _with_changes(b).nonzero()[:, 0]
         rows.append(take_columns(b, place))
         cell, item = _row_and_column(place, piece.shape[1])
-        number.append(torch.stack((item.add_(start), cell)))
+        number.append(torch.stack((item.add_(some.start), cell)))
     b = torch.cat(rows, -1)
     where, single, widths = Parts(torch.cat(number, -1), b.new_zeros(b.shape[1]), b), [], []
     for cut in range(_CUTS + 1):

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.linalg import qr
 from torchsfm.linalg.constants import Constant
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.quadric_intersection import intersect_quadrics
 from torchsfm.linalg.quaternary_forms import product_of_forms
 from torchsfm.linalg.rows import combine_rows, take_columns
@@ -77,9 +78,8 @@ def camera_gp3p(
     batch = check_tensors(p=(p, "3 3"), d=(d, "3 3"), X=(X, "3 3"))
     with torch.no_grad():
         rows = [a.detach().double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0) for a in (p, d, X)]
-        size = rows[0].shape[-1]
-        starts = range(0, max(size, 1), _CHUNK)
-        parts = [_solve(torch.finfo(d.dtype).eps, *(r[..., i : i + _CHUNK].contiguous() for r in rows)) for i in starts]
+        some = portions(rows[0].shape[-1], _CHUNK, d.device)
+        parts = [_solve(torch.finfo(d.dtype).eps, *(r[..., part].contiguous() for r in rows)) for part in some]
         model, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         model, valid = model.reshape(*batch, 8, 3, 4).to(d.dtype), valid.reshape(*batch, 8)
         # Numbers of this kind may be too small for them.

@@ -15,6 +15,7 @@ from torchsfm._types import Solutions, broadcast_shapes, check_tensors
 from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.linalg.elimination import least_squares_rows
 from torchsfm.linalg.nullspace import nullspace_rows
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.quadric_intersection import intersect_quadrics
 from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_optimum, wants_derivative
@@ -70,8 +71,7 @@ def camera_p4pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]
     with torch.no_grad():
         image = x.detach().double().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0)
         world = X.detach().double().expand(*batch, 4, 3).reshape(-1, 4, 3).permute(1, 2, 0)
-        starts = range(0, max(image.shape[-1], 1), _CHUNK)
-        parts = [_solve(image[..., i : i + _CHUNK], world[..., i : i + _CHUNK]) for i in starts]
+        parts = [_solve(image[..., some], world[..., some]) for some in portions(image.shape[-1], _CHUNK, x.device)]
         P, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         P, valid = P.reshape(*batch, 1, 3, 4), valid.reshape(*batch, 1)
         # Numbers of the caller's kind may be too small for them.

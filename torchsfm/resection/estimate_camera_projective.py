@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import damped_solve, nullspace_rows
+from torchsfm.linalg.portions import portions
 from torchsfm.optim import UnitSphere, attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.flat_structure import flatness, flatness_suspected
 from torchsfm.resection.focal import incidence_rows
@@ -53,8 +54,8 @@ class ProjectiveCameraEstimator:
         batch = check_tensors(x=(x, "6 2"), X=(X, "6 3"))
         with torch.no_grad():
             rows = [a.detach().double().expand(*batch, 6, k).reshape(-1, 6, k).permute(1, 2, 0) for a, k in ((x, 2), (X, 3))]
-            starts = range(0, max(rows[0].shape[-1], 1), _CHUNK)
-            parts = [_minimal(*(r[..., i : i + _CHUNK] for r in rows)) for i in starts]
+            some = portions(rows[0].shape[-1], _CHUNK, x.device)
+            parts = [_minimal(*(r[..., part] for r in rows)) for part in some]
             P, valid = (torch.cat(part) for part in zip(*parts, strict=True))
             P, valid = P.reshape(*batch, 1, 3, 4).to(x.dtype), valid.reshape(*batch, 1)
         if wants_derivative(x, X):

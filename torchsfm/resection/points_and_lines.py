@@ -14,6 +14,7 @@ from torch import Tensor
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross, usable
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.rows import add_rows, take_columns
 from torchsfm.linalg.vectors import across
 from torchsfm.optim import attach_implicit, for_slots, rotation_exponential, wants_derivative
@@ -123,8 +124,8 @@ def solve_poses(
         flat = [t.detach().double().reshape(number, *t.shape[-2:]) for t in data]
         model = torch.eye(3, 4, dtype=dtype, device=L.device).flatten().repeat(number * slots, 1)
         valid = torch.zeros(number * slots, dtype=torch.bool, device=L.device)
-        for start in range(0, number, _CHUNK):
-            rows = [t[start : start + _CHUNK].permute(2, 1, 0).contiguous() for t in flat]
+        for some in portions(number, _CHUNK, L.device):
+            rows = [t[some].permute(2, 1, 0).contiguous() for t in flat]
             sample = _prepare(rows, torch.finfo(dtype).eps)
             item, slot, pose = _finish(sample, candidates(sample), slots)
             if dtype != pose.dtype:
@@ -132,7 +133,7 @@ def solve_poses(
                 pose = pose.to(dtype)
                 (keep,) = pose.isfinite().all(0).nonzero(as_tuple=True)
                 item, slot, pose = item[keep], slot[keep], pose[:, keep]
-            place = (item + start).mul_(slots).add_(slot)
+            place = (item + some.start).mul_(slots).add_(slot)
             model.index_copy_(0, place, pose.mT)
             valid.index_fill_(0, place, True)
         model, valid = model.reshape(*batch, slots, 3, 4), valid.reshape(*batch, slots)

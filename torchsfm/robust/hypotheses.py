@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
+from torchsfm.linalg.portions import portion
 from torchsfm.robust.estimator import Estimator, is_never_zero
 from torchsfm.robust.models import cast, take_slots, tensors_of
 from torchsfm.robust.problems import Problems
@@ -16,8 +17,8 @@ from torchsfm.robust.scoring import Scoring
 
 M = TypeVar("M")
 
-NUMBERS = {True: 1 << 17, False: 1 << 24}
-"""How many distances to compute at a time, on a CPU and elsewhere."""
+NUMBERS = 1 << 17
+"""How many distances to compute at a time, on a CPU."""
 PREFIXES = (64, 512)
 """Numbers of data on which hypotheses are judged before all data are looked at, where these are four times as many."""
 KEPT = (16, 8)
@@ -134,12 +135,12 @@ def losses(
     (first, *_) = tensors_of(models)
     g, s = first.shape[:2]
     each = s * data[0].shape[-2]
-    portion = max(1, NUMBERS[first.device.type == "cpu"] // max(each, 1))
+    step = max(1, portion(NUMBERS, first.device) // max(each, 1))
     rows = []
-    for i in range(0, g, portion):
-        some = slice(i, i + portion)
+    for i in range(0, g, step):
+        some = slice(i, i + step)
         whole = (estimator, models, tuple(data), limit, counts)
-        own, of, at, edge, part = whole if portion >= g else tensor_map(lambda t: t[some], whole)  # noqa: B023
+        own, of, at, edge, part = whole if step >= g else tensor_map(lambda t: t[some], whole)  # noqa: B023
         rows.append(scoring.cost(squared_residual(own, of, *at), edge, part, own.codimension))
     if not rows:
         return limit.new_zeros(g, s)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
+from torchsfm.linalg.portions import portion
 from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
@@ -289,8 +290,8 @@ def _refined(some: Problems, old: Best, model: Any, reach: Float[Tensor, "g"]) -
 
 
 def _portions(index: Int[Tensor, "g"], each: int, budget: int) -> Iterator[Int[Tensor, "_"]]:
-    """A list of problems in portions that need no more than a budget at a time, of which devices other than CPUs have more."""
-    size = max(1, (budget if index.device.type == "cpu" else 256 * budget) // each)
+    """A list of problems in portions that need no more than a budget at a time."""
+    size = max(1, portion(budget, index.device) // each)
     return (index[i : i + size] for i in range(0, len(index), size))
 
 

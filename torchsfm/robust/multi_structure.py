@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, tensor_map
+from torchsfm.linalg.portions import portion
 from torchsfm.robust.estimator import Estimator, constant_weights
 from torchsfm.robust.hypotheses import solve_samples, squared_residual
 from torchsfm.robust.models import cast, join, tensors_of
@@ -36,7 +37,7 @@ _SHRINKING = (9.0, 4.0, 1.5, 1.0)
 """Squared distances within which data count in the steps of local optimisation."""
 _REFINEMENTS = 6
 _NUMBERS = 1 << 18
-"""Distances to compute at a time."""
+"""Distances to compute at a time, on a CPU."""
 
 
 @dataclass(frozen=True)
@@ -183,10 +184,14 @@ class _Problem:
         models = self.refined(models, ratio, inside)
         return self.joined(models, inside)
 
+    def portion(self) -> int:
+        """How many models to look at at a time."""
+        return max(1, portion(_NUMBERS, self.problems.limit.device) // self.count)
+
     def ratios(self, models: Any) -> Float[Tensor, "h n"]:
         """Squared distances in units of the squared threshold."""
         wide = self.problems.spread()
-        total, step = len(tensors_of(models)[0]), max(1, _NUMBERS // self.count)
+        total, step = len(tensors_of(models)[0]), self.portion()
         rows = []
         for i in range(0, total, step):
             some = tensor_map(lambda t: t[None, i : i + step], models)  # noqa: B023
@@ -197,7 +202,7 @@ class _Problem:
         """The best supported, locally optimised."""
         support = (1 - self.ratios(models).clamp(max=1)).sum(-1)
         chosen = support.argsort(descending=True, stable=True)[:kept]
-        step, done = max(1, _NUMBERS // self.count), []
+        step, done = self.portion(), []
         for i in range(0, len(chosen), step):
             some = tensor_map(lambda t: t[chosen[i : i + step]], models)  # noqa: B023
             for factor in _SHRINKING:

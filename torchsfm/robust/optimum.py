@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import tensor_map
+from torchsfm.linalg.portions import portion
 from torchsfm.optim import attach_optimum, wants_derivative
 from torchsfm.robust.estimator import Estimator
 from torchsfm.robust.hypotheses import NUMBERS, squared_residual
@@ -110,7 +111,7 @@ def derivatives(function: Callable[..., Tensor], *x: Float[Tensor, "*batch _"]) 
     m = value.shape[-1]
     seeds = torch.eye(m, dtype=value.dtype, device=value.device).view(m, *(1,) * (value.ndim - 1), m).expand(m, *value.shape)
     # All rows together are faster until they leave the cache.
-    together = m * sum(t.numel() for t in x) <= NUMBERS[value.device.type == "cpu"]
+    together = m * sum(t.numel() for t in x) <= portion(NUMBERS, value.device)
     rows = torch.func.vmap(pull)(seeds) if together else map(torch.stack, zip(*map(pull, seeds), strict=True))
     return [row.movedim(0, -2) for row in rows]
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.rows import combine_rows
 from torchsfm.motion.three_views.dual_sixth_point import null_3x3, sixth_point
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
@@ -83,8 +84,7 @@ def trifocal_6pt(x: Float[Tensor, "*batch 3 6 2"]) -> Solutions[Float[Tensor, "*
     batch = check_tensors(x=(x, "3 6 2"))
     with torch.no_grad():
         rows = x.detach().double().reshape(-1, 3, 6, 2).permute(2, 1, 3, 0)
-        starts = range(0, max(rows.shape[-1], 1), _CHUNK)
-        chunks = [_solve(rows[..., i : i + _CHUNK]) for i in starts]
+        chunks = [_solve(rows[..., some]) for some in portions(rows.shape[-1], _CHUNK, x.device)]
         P, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
         P = P.permute(4, 1, 0, 2, 3).reshape(*batch, 3, 2, 3, 4)
         valid = good.mT.reshape(*batch, 3)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.real_roots import number_among_equals
 from torchsfm.linalg.rows import take_columns
 from torchsfm.motion.two_views.essential_manifold import combine, from_roots, polish
@@ -147,9 +148,9 @@ def _once(E: Float[Tensor, "problem 20 9"], real: Bool[Tensor, "problem 20"]) ->
 
 
 def _starts(d1: Tensor, d2: Tensor, other_coordinates: bool = False) -> _Candidates:
-    starts = range(0, max(d1.shape[-1], 1), _CHUNK)
-    chunks = [_chunk(d1[..., i : i + _CHUNK], d2[..., i : i + _CHUNK], other_coordinates) for i in starts]
-    return _joined([chunk._replace(item=chunk.item + i) for chunk, i in zip(chunks, starts, strict=True)])
+    some = portions(d1.shape[-1], _CHUNK, d1.device)
+    chunks = [_chunk(d1[..., part], d2[..., part], other_coordinates) for part in some]
+    return _joined([chunk._replace(item=chunk.item + part.start) for chunk, part in zip(chunks, some, strict=True)])
 
 
 def _joined(parts: list[_Candidates]) -> _Candidates:

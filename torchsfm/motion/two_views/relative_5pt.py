@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes
 from torchsfm.linalg.kernel import kernel
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.real_roots import number_among_equals
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.motion.two_views.essential_manifold import combine, polish
@@ -73,10 +74,9 @@ def relative_5pt(
         size = angle.shape[0]
         pose = torch.tensor([1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1], dtype=torch.float64, device=d1.device).repeat(size * 10, 1)
         valid = torch.zeros(size * 10, dtype=torch.bool, device=d1.device)
-        for i in range(0, size, _CHUNK):
-            part = slice(i, i + _CHUNK)
+        for part in portions(size, _CHUNK, d1.device):
             item, found = _poses(rows1[..., part], rows2[..., part], angle[part])
-            place = (item + i) * 10 + number_among_equals(item).clamp_max_(9)
+            place = (item + part.start) * 10 + number_among_equals(item).clamp_max_(9)
             pose.index_copy_(0, place, found.mT)
             valid.index_fill_(0, place, True)
         pose, valid = pose.to(d1.dtype).reshape(*batch, 10, 3, 4), valid.reshape(*batch, 10)
