@@ -1,5 +1,6 @@
 """What all tests share: one thread, seeds by option, real data by environment variable, tolerances by dtype."""
 
+import functools
 import importlib
 import os
 import pkgutil
@@ -49,6 +50,8 @@ def pytest_collection(session: pytest.Session) -> None:
             if room.ispkg:
                 importlib.import_module(f"torchsfm.{room.name}")
         torch.set_default_device(device)
+        # Other programs, with which answers are compared, take them on the CPU.
+        torch.Tensor.numpy = functools.partialmethod(torch.Tensor.numpy, force=True)  # type: ignore[method-assign]
 
 
 def pytest_report_header(config: pytest.Config) -> str:

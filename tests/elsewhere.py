@@ -76,6 +76,8 @@ def compute(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         raise TransferError(f"{func}: a tensor is brought here from the CPU")
     args, kwargs = _changed(_numbers, args), {name: _changed(_numbers, v) for name, v in kwargs.items()}
     if wanted is not None:
+        if kwargs.get("generator") is not None:
+            raise TransferError(f"{func}: a generator of the CPU draws numbers there")
         kwargs["device"] = torch.device("cpu")
     if func in DIVISIONS and len(own) == 1 and own[0] is leaves[0] and args[0].is_floating_point():
         func = torch.ops.aten.mul_.Tensor if func._schema.is_mutable else torch.ops.aten.mul.Tensor

@@ -22,8 +22,12 @@ from bench.fuzz.functions import EXCEPTIONS, FUNCTIONS, Function, public_functio
 from bench.fuzz.promises import tensors
 from bench.fuzz.scene import Scene
 from torchsfm._types import tensor_map
+from torchsfm.bundle import bundle_adjust_model
 from torchsfm.linalg import real_roots
+from torchsfm.linalg.semidefinite import SMALL, pseudo_inverse
+from torchsfm.resection import camera_p35pf
 from torchsfm.robust import ransac, soft_ransac
+from torchsfm.simulation import random_bundle_problem
 
 STEPS = 8
 """Of what is slow."""
@@ -124,6 +128,24 @@ def test_estimators(kind: type, device: Device) -> None:
 def test_roots_where_a_division_is_rounded_twice(number: int, device: Device) -> None:
     c = torch.randn(number, 6, dtype=torch.float64, generator=seeded())
     device.compare(real_roots, c, real_roots(c))
+
+
+def test_the_default_device_is_of_no_account(device: Device) -> None:
+    """Data on the CPU stay there, whatever the default, and what draws numbers of its own draws them."""
+    problem = random_bundle_problem(4, 40, 120, generator=seeded()).problem
+    X, x = problem.X[:4].expand(3, 4, 3), torch.rand(3, 4, 2, dtype=torch.float64, generator=seeded())
+
+    def answers() -> Any:
+        adjusted = bundle_adjust_model(problem, linear_solver="pcg", max_iterations=3).result.cost
+        inverse = pseudo_inverse(torch.eye(SMALL + 1, dtype=torch.float64, device="cpu"), 1e-12).inverse
+        drawn = random_bundle_problem(4, 40, 120, generator=torch.Generator("cpu").manual_seed(0)).problem
+        return drawn, torch.tensor(adjusted, device="cpu"), camera_p35pf(x, X), inverse
+
+    expected = answers()
+    with elsewhere() if device.pretended else nullcontext(), torch.device(device.name):
+        found = answers()
+    for (name, wanted), (_, own) in zip(tensors(expected), tensors(found), strict=True):
+        torch.testing.assert_close(own, wanted, rtol=0, atol=0, msg=name)
 
 
 def test_the_pretended_device_tells() -> None:

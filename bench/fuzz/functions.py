@@ -316,7 +316,7 @@ PROJECTIVE = {
     "P": lambda s: _projective(s),
     "X": lambda s: torch.nn.functional.pad(_bundle("X")(s), (0, 1), value=1.0),
 } | {name: _bundle(name) for name in ("x", "view", "point")}  # fmt: skip
-PAIRS = torch.combinations(torch.arange(4))
+PAIRS = torch.combinations(torch.arange(4, device="cpu"))
 BUNDLE_SIZES = {"m": 60, "n": 20, "v": 4, "f": 4, "g": 1, "k": 1}
 TWO_VIEWS = {"estimator": FundamentalEstimator(), "data": lambda s: tuple(s.images(2, 30).unbind(-3))}
 

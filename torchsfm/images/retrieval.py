@@ -113,7 +113,7 @@ def describe_images(
     # Of very many images, some are enough.
     for i in filled[:: max(1, len(filled) * LEAST_SAMPLED // wanted)]:
         f = features[i]
-        chosen = torch.randperm(len(f), generator=generator)[:share].to(device)
+        chosen = torch.randperm(len(f), generator=generator, device=generator.device)[:share].to(device)
         sample.append(unit_descriptors(f.descriptors[chosen]))
     centres = _cluster(torch.cat(sample), words, generator)
     described = centres.new_empty((len(features), centres.numel()))
@@ -131,7 +131,7 @@ def _nearest(x: Tensor, centres: Tensor) -> Tensor:
 
 def _cluster(x: Tensor, count: int, generator: torch.Generator, rounds: int = 15) -> Tensor:
     """Centres of clusters by Lloyd's iteration from random rows; a cluster that has lost its last row stays where it is."""
-    centres = x[torch.randperm(len(x), generator=generator)[:count].to(x.device)]
+    centres = x[torch.randperm(len(x), generator=generator, device=generator.device)[:count].to(x.device)]
     for _ in range(rounds):
         label = _nearest(x, centres)
         total = torch.zeros_like(centres).index_add_(0, label, x)

@@ -121,7 +121,7 @@ def _circle(degree: int) -> tuple[Constant, Constant]:
 def _rotation(number: int) -> tuple[Constant, dict[int, Constant]]:
     """One of a few fixed rotations of 4-space, and what it does to the coefficients of quadrics and cubics, as [from, to]."""
     generator = torch.Generator().manual_seed(number)
-    turn = torch.linalg.qr(torch.randn(4, 4, generator=generator, dtype=torch.float64)).Q
+    turn = torch.linalg.qr(torch.randn(4, 4, generator=generator, dtype=torch.float64, device="cpu")).Q
     quadratic = torch.stack([product_of_forms(turn[i], turn[j]) for i, j in QUADRATIC])
     cubic = torch.stack([cubic_of_forms(product_of_forms(turn[i], turn[j]), turn[k]) for i, j, k in CUBIC])
     return Constant(turn), {10: Constant(quadratic), 20: Constant(cubic)}

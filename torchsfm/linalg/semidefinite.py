@@ -64,7 +64,7 @@ def pseudo_inverse(A: Float[Tensor, "n n"], null: float) -> PseudoInverse:
 
 def _by_factor(A: Float[Tensor, "n n"], null: float) -> PseudoInverse | None:
     """The inverse of a large matrix; None where it is not semidefinite or its null space is not small."""
-    start = torch.randn(len(A), WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(A)
+    start = torch.randn(len(A), WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu").to(A)
     basis = torch.linalg.qr(start)[0]
     for _ in range(ROUNDS):
         basis = torch.linalg.qr(A @ basis)[0]

@@ -117,7 +117,7 @@ class _Level:
         strong = strength >= STRONG * torch.minimum(best[self.i], best[self.j])
         i, j = self.i[strong], self.j[strong]
         own = torch.arange(n, device=device)
-        rank = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(device)
+        rank = torch.randperm(n, generator=torch.Generator().manual_seed(0), device="cpu").to(device)
         member = torch.empty_like(rank).index_copy_(0, rank, own)
         centre = torch.full_like(own, -1)
         while True:

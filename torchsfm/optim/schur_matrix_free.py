@@ -163,7 +163,7 @@ def find_clusters(layout: Layout, couplings: Sequence[RowCoupling]) -> Clusters:
     owner = _owners(layout, device)
     variables = int(owner[-1])
     generator = torch.Generator().manual_seed(0)
-    mark = torch.randint(2**62, (variables + 1,), generator=generator).to(device)
+    mark = torch.randint(2**62, (variables + 1,), generator=generator, device="cpu").to(device)
     # The first column of each variable stands for it.
     head = torch.ones_like(owner, dtype=torch.bool)
     head[1:] = owner[1:] != owner[:-1]

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchsfm._types import check_options
 from torchsfm.geometry import Camera, Pose
+from torchsfm.simulation.randomness import drawn
 from torchsfm.simulation.shapes import fine_samples, photograph
 
 _PAPER, _INK, _ROOM = 0.85, 0.15, 0.5
@@ -74,7 +75,7 @@ def render_board(
         value = torch.where(seen & (away > 0), _board(X, columns, rows, radius), _ROOM)
         images.append(photograph(value.reshape(pixel.shape[:2]), width, height, blur, fine))
     clean = torch.stack(images) if images else pixel.new_zeros(0, 1, height, width)
-    return clean + noise * torch.randn(clean.shape, generator=generator, dtype=clean.dtype, device=clean.device)
+    return clean + noise * drawn(torch.randn, clean.shape, clean, generator)
 
 
 def _board(X: Tensor, columns: int, rows: int, radius: float | None) -> Tensor:

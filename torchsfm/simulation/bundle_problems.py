@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import check_options
 from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics
+from torchsfm.simulation.randomness import where_drawn
 from torchsfm.simulation.viewpoints import look_at
 
 NEIGHBOURS = 48
@@ -44,6 +45,7 @@ class SimulatedBundle:
     """Observations that are gross errors."""
 
 
+@where_drawn
 def random_bundle_problem(
     num_cameras: int,
     num_points: int,
@@ -60,7 +62,8 @@ def random_bundle_problem(
     Cameras go along a winding street and look ahead ("path", as Ladybug), or stand around an object at various distances and
     look at it ("dome", as Dubrovnik or Trafalgar). Every point lies in the field of view of some camera, and is seen by that
     one and by others near it that have it in their images, near ones rather than far ones: most tracks are short, some long.
-    The images are 2000 pixels wide, 1500 high, with the principal point at the origin. All is made in float64 on the CPU.
+    The images are 2000 pixels wide, 1500 high, with the principal point at the origin. All is made in float64 on the
+    generator's device, on the CPU where none is given.
 
     Args:
         num_cameras: How many cameras, at least 2.
@@ -108,12 +111,12 @@ def random_bundle_problem(
     truth = replace(truth, x=truth.projections())
     x = truth.x + noise * _normal(generator, len(view), 2)
     outlier = torch.rand(len(view), generator=generator, dtype=torch.float64) < outliers
-    anywhere = (torch.rand(len(view), 2, generator=generator, dtype=torch.float64) - 0.5) * HALF_SIZE * 2
+    anywhere = (torch.rand(len(view), 2, generator=generator, dtype=torch.float64) - 0.5) * x.new_tensor(HALF_SIZE) * 2
     x = torch.where(outlier[:, None], anywhere, x)
     return SimulatedBundle(_disturb(replace(truth, x=x), disturbance, generator), truth, outlier)
 
 
-HALF_SIZE = torch.tensor([1000.0, 750.0], dtype=torch.float64)
+HALF_SIZE = 1000.0, 750.0
 
 
 def _normal(generator: torch.Generator | None, *shape: int) -> Tensor:
@@ -154,7 +157,7 @@ def _points(
         centre = poses[first].centre
         if layout == "path":
             # Houses along the street, from a few steps ahead to far away.
-            ray, valid = cameras[first].unproject((draw[:, None, :2] * 2 - 1) * HALF_SIZE * 0.95)
+            ray, valid = cameras[first].unproject((draw[:, None, :2] * 2 - 1) * draw.new_tensor(HALF_SIZE) * 0.95)
             X[todo] = centre + (4 * torch.exp(2 * draw[:, 2:])) * (ray @ poses[first].R)[:, 0]
         else:
             # On the near side of the sphere of radius 1, with some relief.
@@ -182,7 +185,7 @@ def _see(poses: Pose, cameras: Camera, X: Tensor, view: Tensor, layout: str) -> 
         shape = index.shape
         pose, camera = poses[index.flatten()], cameras[index.flatten()]
         moved = pose.transform(part[:, None].expand(*shape, 3).reshape(-1, 1, 3))
-        inside = (camera.project(moved)[:, 0].abs() <= HALF_SIZE).all(-1) & camera.in_domain(moved)[:, 0]
+        inside = (camera.project(moved)[:, 0].abs() <= moved.new_tensor(HALF_SIZE)).all(-1) & camera.in_domain(moved)[:, 0]
         inside &= moved[:, 0, 2] > 0.5
         if layout == "dome":
             # From behind the object hides its own surface: at most 70 degrees from the normal.

@@ -19,6 +19,7 @@ from torchsfm.geometry import (
     random_rotation,
     rotation_from_rotvec,
 )
+from torchsfm.simulation.randomness import where_drawn
 from torchsfm.simulation.viewpoints import look_at
 
 
@@ -47,6 +48,7 @@ class SimulatedConics:
     """Edge points, spread evenly by the ellipse's parameter, with noise."""
 
 
+@where_drawn
 def simulate_conics(
     shape: Sequence[int],
     *,
@@ -73,7 +75,7 @@ def simulate_conics(
         dtype: Of the numbers.
 
     Returns:
-        The scenes, on the CPU.
+        The scenes, on the generator's device, on the CPU where none is given.
 
     Example:
         >>> import torch, torchsfm

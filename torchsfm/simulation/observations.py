@@ -10,6 +10,7 @@ from torch import Tensor
 from torchsfm._types import check_options, check_tensors
 from torchsfm.geometry.cameras import Camera, intrinsics
 from torchsfm.geometry.poses import Pose
+from torchsfm.simulation.randomness import drawn
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,6 @@ def simulate_images(
         X_cam = X_cam.expand(*x_true.shape[:-1], 3)
     near, far = depth_range
     visible = (depth > near) & (depth <= far) & cameras.in_domain(X_cam)
-    options = {"dtype": X.dtype, "device": X.device}
     if image_size is not None:
         size = X.new_tensor(image_size)
         visible = visible & ((x_true >= -0.5) & (x_true < size - 0.5)).all(-1)
@@ -116,10 +116,10 @@ def simulate_images(
         high = torch.where(shown, exact, -float("inf")).amax(-2, keepdim=True) if X.shape[-2] else exact
         some = torch.isfinite(low) & torch.isfinite(high)
         low, high = torch.where(some, low, 0.0), torch.where(some, high, 0.0)
-    visible = visible & (torch.rand(depth.shape, generator=generator, **options) >= dropout)  # type: ignore[call-overload]
-    x = x_true + noise * torch.randn(x_true.shape, generator=generator, **options)  # type: ignore[call-overload]
-    outlier = torch.rand(depth.shape, generator=generator, **options) < outliers  # type: ignore[call-overload]
-    wild = low + (high - low) * torch.rand(x_true.shape, generator=generator, **options)  # type: ignore[call-overload]
+    visible = visible & (drawn(torch.rand, depth.shape, X, generator) >= dropout)
+    x = x_true + noise * drawn(torch.randn, x_true.shape, X, generator)
+    outlier = drawn(torch.rand, depth.shape, X, generator) < outliers
+    wild = low + (high - low) * drawn(torch.rand, x_true.shape, X, generator)
     outlier = outlier & visible
     x = torch.where(outlier[..., None], wild, x)
     return SimulatedImages(torch.where(visible[..., None], x, 0.0), visible, outlier, x_true, depth)

@@ -13,6 +13,7 @@ from torchsfm.geometry.cameras import Camera, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.poses import Pose
 from torchsfm.images.reading import save_image
+from torchsfm.simulation.randomness import drawn
 from torchsfm.simulation.ray_casting import cast, lit, shade
 from torchsfm.simulation.textured_scene import TexturedScene, courtyard_scene
 from torchsfm.simulation.viewpoints import orbit_poses
@@ -157,7 +158,7 @@ def render_sequence(
     x_points, visible = _see_points(scene, X, poses, cameras, height, width)
     images = clean
     if noise > 0:
-        grain = torch.randn(clean.shape, generator=generator, dtype=clean.dtype, device=clean.device)
+        grain = drawn(torch.randn, clean.shape, clean, generator)
         images = (clean + grain * noise * (0.5 + 0.5 * clean).sqrt()).clamp(0, 1)
     return RenderedSequence(images, depth, surface, cameras, poses, X, color, x_points, visible)
 

@@ -11,6 +11,7 @@ from torch.nn.functional import conv2d
 
 from torchsfm._types import check_options, check_tensors
 from torchsfm.geometry import Ellipse, conic_from_ellipse
+from torchsfm.simulation.randomness import where_drawn
 
 _SAMPLES = 720
 """Points on an outline that say which share of it is seen."""
@@ -45,6 +46,7 @@ class RenderedShapes:
     """The share of each side that is seen."""
 
 
+@where_drawn
 def render_shapes(
     shape: Sequence[int],
     *,
@@ -81,7 +83,7 @@ def render_shapes(
         dtype: Of the numbers.
 
     Returns:
-        Images and truth, on the CPU.
+        Images and truth, on the generator's device, on the CPU where none is given.
 
     Example:
         >>> import torch, torchsfm
