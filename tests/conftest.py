@@ -49,6 +49,7 @@ def pytest_collection(session: pytest.Session) -> None:
         for room in pkgutil.iter_modules(torchsfm.__path__):
             if room.ispkg:
                 importlib.import_module(f"torchsfm.{room.name}")
+        importlib.import_module("bench.fuzz.functions")
         torch.set_default_device(device)
         # Other programs, with which answers are compared, take them on the CPU.
         torch.Tensor.numpy = functools.partialmethod(torch.Tensor.numpy, force=True)  # type: ignore[method-assign]

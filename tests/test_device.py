@@ -149,8 +149,8 @@ def test_the_default_device_is_of_no_account(device: Device) -> None:
 
 
 def test_the_pretended_device_tells() -> None:
-    here = torch.ones(3, 3)
-    with elsewhere():
+    with torch.device("cpu"), elsewhere():
+        here = torch.ones(3, 3)
         there = send(here)
         for wrong in (
             lambda: there + here,
