@@ -6,11 +6,13 @@ one.
 
 import inspect
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
+import small_model
 import torch
 from chance import seeded
 from elsewhere import CONSTANT, ELSEWHERE, TransferError, elsewhere, fetch, send
@@ -23,9 +25,10 @@ from bench.fuzz.promises import tensors
 from bench.fuzz.scene import Scene
 from torchsfm._types import tensor_map
 from torchsfm.bundle import bundle_adjust_model
+from torchsfm.formats.registry import FORMATS_BY_NAME, read_model_or_problem, write_model
 from torchsfm.linalg import real_roots
 from torchsfm.linalg.semidefinite import SMALL, pseudo_inverse
-from torchsfm.resection import camera_p35pf
+from torchsfm.reconstruction import align_models, align_upright
 from torchsfm.robust import ransac, soft_ransac
 from torchsfm.simulation import random_bundle_problem
 
@@ -130,22 +133,64 @@ def test_roots_where_a_division_is_rounded_twice(number: int, device: Device) ->
     device.compare(real_roots, c, real_roots(c))
 
 
-def test_the_default_device_is_of_no_account(device: Device) -> None:
-    """Data on the CPU stay there, whatever the default, and what draws numbers of its own draws them."""
+@contextmanager
+def by_default(device: Device) -> Iterator[None]:
+    """Tensors made without `device=` lie there."""
+    with elsewhere() if device.pretended else nullcontext(), torch.device(device.name):
+        yield
+
+
+def alike(there: Any, here: Any) -> None:
+    for (name, wanted), (_, own) in zip(tensors(here), tensors(there), strict=True):
+        assert own.device.type == "cpu", name
+        torch.testing.assert_close(own, wanted, rtol=0, atol=0, equal_nan=True)
+
+
+INDIFFERENT = (
+    "images.retrieve_pairs", "images.track_points", "images.track_sequence", "motion.essential_5pt",
+    "reconstruction.reconstruct_tracks", "resection.camera_p35pf", "simulation.random_intrinsics", "simulation.random_points",
+    "simulation.random_poses", "simulation.simulate_images",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", INDIFFERENT)
+@pytest.mark.usefixtures("unchecked")
+def test_the_default_device_is_of_no_account(name: str, device: Device) -> None:
+    """Data on the CPU stay there, and what is drawn lies where its generator is."""
+    call = public_functions()[name]
+    arguments, here = agreeable(call, FUNCTIONS.get(name, Function()))
+    with by_default(device):
+        there = apply(call, arguments)
+    alike(there, here)
+
+
+def test_large_systems_take_no_account_of_it(device: Device) -> None:
     problem = random_bundle_problem(4, 40, 120, generator=seeded()).problem
-    X, x = problem.X[:4].expand(3, 4, 3), torch.rand(3, 4, 2, dtype=torch.float64, generator=seeded())
 
     def answers() -> Any:
         adjusted = bundle_adjust_model(problem, linear_solver="pcg", max_iterations=3).result.cost
         inverse = pseudo_inverse(torch.eye(SMALL + 1, dtype=torch.float64, device="cpu"), 1e-12).inverse
         drawn = random_bundle_problem(4, 40, 120, generator=torch.Generator("cpu").manual_seed(0)).problem
-        return drawn, torch.tensor(adjusted, device="cpu"), camera_p35pf(x, X), inverse
+        return drawn, torch.tensor(adjusted, device="cpu"), inverse
 
-    expected = answers()
-    with elsewhere() if device.pretended else nullcontext(), torch.device(device.name):
-        found = answers()
-    for (name, wanted), (_, own) in zip(tensors(expected), tensors(found), strict=True):
-        torch.testing.assert_close(own, wanted, rtol=0, atol=0, msg=name)
+    here = answers()
+    with by_default(device):
+        there = answers()
+    alike(there, here)
+
+
+@pytest.mark.parametrize("name", ["model.npz", "colmap", "reconstruction.json", "bundle.out", "kapture", "problem.txt"])
+def test_files_take_no_account_of_it(name: str, device: Device, tmp_path: Path) -> None:
+    model, kind = small_model.make("radial"), name if name in FORMATS_BY_NAME else None
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    here, there = tmp_path / "a" / name, tmp_path / "b" / name
+    write_model(model, here, kind)
+    with by_default(device):
+        write_model(model, there, kind)
+        alike(read_model_or_problem(there), read_model_or_problem(here))
+        align_models(model, model)
+        align_upright(model)
 
 
 def test_the_pretended_device_tells() -> None:

@@ -26,7 +26,7 @@ ALLOWED: dict[str, set[str]] = {
         "linalg", "optim", "robust", "geometry", "tensors", "images",
         "triangulation", "resection", "motion", "autocalibration", "bundle",
     },
-    "formats": {"geometry", "images", "reconstruction"},
+    "formats": {"linalg", "geometry", "images", "reconstruction"},
     "plot": {"linalg", "geometry", "tensors", "images", "reconstruction"},
 }  # fmt: skip
 FREE = {"__init__", "cli", "__main__"}

@@ -29,11 +29,13 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import FREE_BYTES, MAX_RATIO, whole_file
 
 OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
 
 
+@on_the_cpu
 def read_bal(path: str | Path) -> BundleProblem:
     """Read a problem of Bundle Adjustment in the Large.
 
@@ -102,6 +104,7 @@ def read_bal(path: str | Path) -> BundleProblem:
     )
 
 
+@on_the_cpu
 def write_bal(problem: BundleProblem, path: str | Path) -> None:
     """Write a problem as BAL text, with all digits; what `read_bal` then reads projects to the same residuals.
 

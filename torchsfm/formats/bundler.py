@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from torchsfm.formats.joining import Lens, Rows, centred_cameras, picture_size, reading, symmetric_size, track_rows
 from torchsfm.geometry import Radial
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -22,6 +23,7 @@ LIST = "list.txt"
 TURN = np.diag([1.0, -1.0, -1.0])
 
 
+@on_the_cpu
 def write_bundler(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write a model as Bundler's text, and the names of its images as `list.txt` beside it.
 
@@ -64,6 +66,7 @@ def write_bundler(reconstruction: Reconstruction, path: str | Path) -> None:
     write_whole_files({path.with_name(LIST): names, path: text})
 
 
+@on_the_cpu
 def read_bundler(path: str | Path) -> Reconstruction:
     """Read a model from Bundler's text.
 

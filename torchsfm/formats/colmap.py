@@ -26,6 +26,7 @@ from torchsfm.formats.colmap_model import (
 )
 from torchsfm.formats.joining import Lens, join_cameras
 from torchsfm.geometry import DISTORTION_MODELS, Camera, quaternion_wxyz_from_rotation
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -40,6 +41,7 @@ SPLATTING = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "
 """The camera models that gsplat's reader takes."""
 
 
+@on_the_cpu
 def write_colmap(
     reconstruction: Reconstruction,
     folder: str | Path,
@@ -134,6 +136,7 @@ def _tables(model: Reconstruction, camera_ids: list[int]) -> tuple[dict[int, Col
     return images, points
 
 
+@on_the_cpu
 def read_colmap(folder: str | Path) -> Reconstruction:
     """Read a COLMAP model, binary or, where there is none, text.
 

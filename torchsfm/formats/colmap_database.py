@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchsfm.formats.colmap_model import MAX_SIZE, PARAMETERS
 from torchsfm.formats.joining import reading
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.known_features import KnownFeatures
 from torchsfm.reconstruction.matched import MatchedImages
@@ -45,6 +46,7 @@ CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NUL
 """The tables that are filled; COLMAP makes the others when it opens the file."""
 
 
+@on_the_cpu
 def read_database(path: str | Path) -> MatchedImages:
     """Read keypoints and matches from COLMAP's database, for `reconstruct_matches`.
 
@@ -116,6 +118,7 @@ def read_database(path: str | Path) -> MatchedImages:
         )
 
 
+@on_the_cpu
 def read_features(path: str | Path) -> KnownFeatures:
     """Read keypoints with their descriptors from COLMAP's database, for `register_photographs`.
 
@@ -169,6 +172,7 @@ def read_features(path: str | Path) -> KnownFeatures:
         )
 
 
+@on_the_cpu
 def write_database(matched: MatchedImages, path: str | Path) -> None:
     """Write keypoints and matches as a database that COLMAP opens, verifies (`colmap geometric_verifier`) and maps.
 

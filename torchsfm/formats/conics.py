@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.formats.lines import pieces_as_obj, pieces_as_ply
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.conics import Conics
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -19,6 +20,7 @@ _SEEN = 21
 _ROWS, _COLUMNS = torch.triu_indices(5, 5)
 
 
+@on_the_cpu
 def write_conics(model: Reconstruction, path: str | Path) -> None:
     """Write the ellipses of a model, in the format that the name ends with.
 
@@ -59,6 +61,7 @@ def write_conics(model: Reconstruction, path: str | Path) -> None:
         file.write(content)
 
 
+@on_the_cpu
 def read_conics(path: str | Path) -> Conics:
     """Read what `write_conics` wrote as text.
 

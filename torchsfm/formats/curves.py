@@ -10,11 +10,13 @@ import torch
 from torchsfm._types import check_options
 from torchsfm.formats.drawing import draw_curves, draw_model_curves
 from torchsfm.geometry import Curve
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 
+@on_the_cpu
 def write_curves(curves: Curves | Reconstruction | Curve, path: str | Path, *, image: str | int | None = None) -> None:
     """Write curves in space, or those of an image, in the format that the name ends with.
 

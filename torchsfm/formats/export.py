@@ -19,6 +19,7 @@ from torchsfm.formats.openmvg import write_openmvg
 from torchsfm.formats.opensfm import write_opensfm
 from torchsfm.formats.pictures import picture_names, registered_only, undistorted_model, write_pictures
 from torchsfm.formats.ply import write_ply
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import PARTIAL
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -83,6 +84,7 @@ TARGETS: dict[str, Target] = {
 """The programs by name."""
 
 
+@on_the_cpu
 def export_model(
     model: Reconstruction,
     target: str,

@@ -14,6 +14,7 @@ import numpy as np
 
 from torchsfm.formats.joining import cameras_within
 from torchsfm.geometry import NoDistortion
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -21,6 +22,7 @@ BYTES, FLOATS, POINTS, ARRAY = 5121, 5126, 0, 34962
 """Numbers of glTF for types of values, for points as what is drawn, and for data of vertices."""
 
 
+@on_the_cpu
 def write_gltf(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write the coloured points and the cameras of the images that have a pose, each with the name of its image.
 

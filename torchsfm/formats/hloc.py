@@ -14,10 +14,12 @@ import numpy as np
 import torch
 
 from torchsfm.formats.joining import numbers, picture_size, reading
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import FREE_BYTES, MAX_RATIO
 from torchsfm.reconstruction.matched import MatchedImages
 
 
+@on_the_cpu
 def read_hloc(features: str | Path, matches: str | Path, *, images: str | Path | None = None) -> MatchedImages:
     """Read features and matches of hloc, for `reconstruct_matches`.
 

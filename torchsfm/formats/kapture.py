@@ -17,6 +17,7 @@ from torchsfm.formats.colmap import colmap_parameters, lens_from_colmap
 from torchsfm.formats.colmap_model import PARAMETERS, ColmapCamera
 from torchsfm.formats.joining import Rows, numbers, reading, running_numbers
 from torchsfm.geometry import quaternion_wxyz_from_rotation, rotation_from_quaternion_wxyz
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -32,6 +33,7 @@ Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Rotation and translation."""
 
 
+@on_the_cpu
 def write_kapture(reconstruction: Reconstruction, folder: str | Path) -> None:
     """Write a model as a kapture dataset, without its photographs, which belong into `sensors/records_data`.
 
@@ -106,6 +108,7 @@ def _inside(name: str) -> bool:
     return bool(path.name) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
 
+@on_the_cpu
 def read_kapture(folder: str | Path) -> Reconstruction:
     """Read the cameras, poses, points and observations of a kapture dataset.
 

@@ -16,8 +16,10 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import BrownConrady, BundleProblem, Camera, Pose, intrinsics
+from torchsfm.linalg.devices import on_the_cpu
 
 
+@on_the_cpu
 def read_libmv(path: str | Path) -> BundleProblem:
     """Read a libmv problem: many frames of one camera.
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -19,6 +20,7 @@ HEAD = """# Lines in space and the image segments that show them, one line of th
 """
 
 
+@on_the_cpu
 def write_lines(model: Reconstruction, path: str | Path) -> None:
     """Write the lines of a model, in the format that the name ends with.
 
@@ -56,6 +58,7 @@ def write_lines(model: Reconstruction, path: str | Path) -> None:
         file.write(content)
 
 
+@on_the_cpu
 def read_lines(path: str | Path) -> Lines:
     """Read what `write_lines` wrote as text.
 

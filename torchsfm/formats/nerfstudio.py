@@ -15,6 +15,7 @@ import numpy as np
 from torchsfm.formats.joining import Lens, Rows, numbers, picture_size, reading
 from torchsfm.formats.ply import read_ply, write_ply
 from torchsfm.geometry import Camera, KannalaBrandt
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -26,6 +27,7 @@ TURN = np.diag([1.0, -1.0, -1.0])
 LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
+@on_the_cpu
 def write_nerfstudio(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write the cameras as `transforms.json`, and the points as `points.ply` beside it.
 
@@ -81,6 +83,7 @@ def _describe(camera: Camera, index: int) -> dict[str, Any]:
     return {"camera_model": model, "fl_x": fx, "fl_y": fy, "cx": cx + HALF_PIXEL, "cy": cy + HALF_PIXEL, **values}
 
 
+@on_the_cpu
 def read_nerfstudio(path: str | Path) -> Reconstruction:
     """Read cameras from `transforms.json`, and the points of the PLY file that it names.
 

@@ -24,12 +24,14 @@ from torchsfm.formats.joining import (
 )
 from torchsfm.formats.pictures import registered_only
 from torchsfm.geometry import NoDistortion, quaternion_wxyz_from_rotation, rotation_from_quaternion_wxyz
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 HEADER = "NVM_V3"
 
 
+@on_the_cpu
 def write_nvm(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write a model as NVM_V3. Images without a pose are left out.
 
@@ -66,6 +68,7 @@ def write_nvm(reconstruction: Reconstruction, path: str | Path) -> None:
         file.write("\n".join([*lines, "", "0", ""]).encode("utf-8", "surrogateescape"))
 
 
+@on_the_cpu
 def read_nvm(path: str | Path) -> Reconstruction:
     """Read the first model of an NVM_V3 file.
 

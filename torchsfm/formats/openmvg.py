@@ -12,6 +12,7 @@ import numpy as np
 
 from torchsfm.formats.joining import Lens, Rows, numbers, reading, running_numbers
 from torchsfm.geometry import BrownConrady, Camera, KannalaBrandt, Radial
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -24,6 +25,7 @@ LENSES = {"disto_k1": ("k1",), "disto_k3": ("k1", "k2", "k3"), "disto_t2": ("k1"
 """The arrays of distortion and what they hold; as the fisheye's, k1 to k4."""
 
 
+@on_the_cpu
 def write_openmvg(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write a model as `sfm_data.json`.
 
@@ -104,6 +106,7 @@ def _describe(camera: Camera, index: int, width: int, height: int) -> tuple[str,
     return "pinhole", plain
 
 
+@on_the_cpu
 def read_openmvg(path: str | Path) -> Reconstruction:
     """Read a model from `sfm_data.json`.
 

@@ -21,6 +21,7 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
     rotvec_from_rotation,
 )
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import write_whole_files
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -35,6 +36,7 @@ KINDS: dict[str, tuple[type[Distortion], tuple[str, ...]]] = {
 """Kinds of cameras, and the numbers of their distortion."""
 
 
+@on_the_cpu
 def write_opensfm(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write a model as `reconstruction.json`, and its observations as `tracks.csv` beside it.
 
@@ -99,6 +101,7 @@ def _describe(camera: Camera, index: int, width: int, height: int) -> dict[str, 
     return about | {"projection_type": "brown", **{name: values.get(name, 0.0) for name in BROWN}}
 
 
+@on_the_cpu
 def read_opensfm(path: str | Path) -> Reconstruction:
     """Read the first reconstruction of `reconstruction.json`, with the observations of `tracks.csv` where that lies beside.
 

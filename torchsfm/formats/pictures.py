@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera
 from torchsfm.images import ImageError, Photograph, parse_exif, read_image, save_image, undistort_images, undistorted_cameras
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.parts import with_images
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -28,6 +29,7 @@ def registered_only(model: Reconstruction) -> Reconstruction:
     return with_images(model, model.registered)
 
 
+@on_the_cpu
 def undistorted_model(model: Reconstruction, *, alpha: float = 0.0, centred: bool = False) -> Reconstruction:
     """The model as pinhole cameras in the same places would have found it.
 

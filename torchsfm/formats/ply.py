@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -41,6 +42,7 @@ class PointCloud:
     """Red, green, blue in [0, 1]."""
 
 
+@on_the_cpu
 def write_ply(
     points: Reconstruction | Float[Tensor, "n 3"], path: str | Path, *, color: Float[Tensor, "n 3"] | None = None
 ) -> None:
@@ -100,6 +102,7 @@ def write_ply(
             file.write(records.tobytes())
 
 
+@on_the_cpu
 def read_ply(path: str | Path) -> PointCloud:
     """Read the points of a PLY file, ASCII or binary of either byte order.
 

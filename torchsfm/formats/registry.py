@@ -25,6 +25,7 @@ from torchsfm.formats.ply import write_ply
 from torchsfm.formats.problem import as_reconstruction
 from torchsfm.formats.trajectory import write_kitti, write_tum
 from torchsfm.geometry import BundleProblem
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 HEAD = 2**20
@@ -139,6 +140,7 @@ def read_model_or_problem(path: str | Path) -> BundleProblem:
     return kind.read(place)
 
 
+@on_the_cpu
 def read_model(path: str | Path) -> Reconstruction:
     """Read a model of whatever format this library reads; its content tells which.
 
@@ -183,6 +185,7 @@ def format_for(path: str | Path, name: str | None = None) -> Format:
     return chosen
 
 
+@on_the_cpu
 def write_model(model: BundleProblem, path: str | Path, format: str | None = None) -> None:
     """Write a model in the format that is asked for, or that the name of the file tells.
 

@@ -9,10 +9,12 @@ from pathlib import Path
 import torch
 
 from torchsfm.geometry import quaternion_wxyz_from_rotation
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 
+@on_the_cpu
 def write_tum(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write the poses in the form of TUM, with the number of the image as its time; images without a pose have no line.
 
@@ -39,6 +41,7 @@ def write_tum(reconstruction: Reconstruction, path: str | Path) -> None:
     _write(path, [(float(time), *row) for time, row in zip(times, rows.tolist(), strict=True)])
 
 
+@on_the_cpu
 def write_kitti(reconstruction: Reconstruction, path: str | Path) -> None:
     """Write the poses in the form of KITTI, a line for each image that has one; the lines tell no names and no times.
 

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchsfm.linalg.devices import on_the_cpu
+
 
 @dataclass(frozen=True)
 class VggScene:
@@ -48,6 +50,7 @@ class VggScene:
     L: Float[Tensor, "k 2 3"]
 
 
+@on_the_cpu
 def read_vgg(folder: str | Path) -> VggScene:
     """Read a data set with subfolders 2D and 3D, as "Model House", "Corridor", "Merton College" or "Wadham College".
 

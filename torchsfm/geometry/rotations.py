@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
+from torchsfm.linalg.devices import drawn_on
 
 SERIES = 1e-3
 """Squared angle below which power series replace quotients; four terms are then exact to float64 rounding."""
@@ -205,8 +206,7 @@ def random_rotation(
         >>> R.shape, bool((R @ R.mT).allclose(torch.eye(3, dtype=torch.float64)))
         (torch.Size([100, 3, 3]), True)
     """
-    if device is None and generator is not None:
-        device = generator.device
+    device = drawn_on(generator, device)
     return rotation_from_quaternion_wxyz(torch.randn(*shape, 4, generator=generator, dtype=dtype, device=device))
 
 

@@ -20,6 +20,7 @@ from torchsfm.geometry.splines import fit_spline
 from torchsfm.images.edge_field import EdgeField, edge_field
 from torchsfm.images.edges import Edges
 from torchsfm.linalg import solve
+from torchsfm.linalg.devices import on_the_cpu
 
 _LARGEST = 2**20
 """Sides of images, in pixels: an edge point farther away is none, whatever it says."""
@@ -92,6 +93,7 @@ def _alive(chain: Tensor, first: Tensor, number: Tensor, alive: Bool[Tensor, " k
     return _Pieces(torch.where(alive, chain, 0), torch.where(alive, first, 0), torch.where(alive, number, 1), alive)
 
 
+@on_the_cpu
 def track_curves(
     edges: Edges,
     *,

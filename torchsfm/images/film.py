@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsfm.images.reading import MAX_PIXELS, ImageError
+from torchsfm.linalg.devices import on_the_cpu
 
 RECORD = ".film.json"
 """Beside frames: which film they are of."""
@@ -25,6 +26,7 @@ NEAR = 1e-3
 """Rounding of times, as a fraction of the time between two frames."""
 
 
+@on_the_cpu
 def extract_frames(
     film: str | os.PathLike[str],
     folder: str | os.PathLike[str],

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchsfm._types import check_options
 from torchsfm.images.features import Features, check_features
 from torchsfm.images.matching import unit_descriptors
+from torchsfm.linalg.devices import on_the_cpu
 
 SIMILARITIES = 2**22
 """Similarities of images computed at once."""
@@ -16,6 +17,7 @@ SAMPLED, LEAST_SAMPLED = 256, 16
 """Descriptors among which a visual word is found, and the least number taken from an image that gives any."""
 
 
+@on_the_cpu
 def retrieve_pairs(
     features: Sequence[Features],
     neighbours: int = 20,

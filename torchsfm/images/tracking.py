@@ -13,6 +13,7 @@ from torchsfm._types import broadcast_shapes, check_one_problem, check_options, 
 from torchsfm.images.alignment import align, cut_templates
 from torchsfm.images.corners import box_maximum, detect_corners, to_gray
 from torchsfm.images.reading import Photograph, pixels_of
+from torchsfm.linalg.devices import on_the_cpu
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Tracks:
         return int(self.track[-1]) + 1 if self.track.numel() else 0
 
 
+@on_the_cpu
 def track_points(
     image1: Float[Tensor, "*#batch c h w"],
     image2: Float[Tensor, "*#batch c h w"],
@@ -132,6 +134,7 @@ def _check_tracking(window: int, levels: int, max_error: float) -> None:
     check_options(window=(window, "int >= 3"), levels=(levels, "int >= 1"), max_error=(max_error, "float >= 0"))
 
 
+@on_the_cpu
 def track_sequence(
     images: Iterable[Photograph | Float[Tensor, "c h w"]],
     *,

@@ -10,6 +10,7 @@ from pathlib import Path
 from string import Template
 
 from torchsfm.images import MAX_PIXELS, read_image, save_image
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.plot.page_content import model_content, pairs_content
 from torchsfm.reconstruction.files import whole_file
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -22,6 +23,7 @@ SMALLEST = 48
 """A copy with fewer pixels along its longer side shows nothing."""
 
 
+@on_the_cpu
 def write_page(
     reconstruction: Reconstruction | Sequence[Reconstruction],
     path: str | Path,

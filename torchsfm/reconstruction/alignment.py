@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_one_problem
 from torchsfm.geometry import Similarity
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.evaluation import align_poses
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.similarities import (
@@ -89,6 +90,7 @@ class Alignment:
         return f"{off} and nearly on one line, about which the turn is open by {math.degrees(self.known.turn):.2g} degrees"
 
 
+@on_the_cpu
 def align_models(model: Reconstruction, other: Reconstruction) -> Alignment:
     """The similarity that carries the cameras of a model onto those that another has of the same images.
 
@@ -136,6 +138,7 @@ def align_models(model: Reconstruction, other: Reconstruction) -> Alignment:
     return Alignment(fine, names, distance, used)
 
 
+@on_the_cpu
 def align_to_positions(
     model: Reconstruction,
     names: Sequence[str],
@@ -213,6 +216,7 @@ class ControlPoints:
     point: Int[Tensor, "m"]
 
 
+@on_the_cpu
 def align_to_points(model: Reconstruction, control: ControlPoints) -> Alignment:
     """The similarity that carries a model to where points of it were measured to be.
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options
 from torchsfm.bundle import BundleCovariance, PointPrior, bundle_adjust_model, bundle_covariance
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.optim import Cauchy, Loss
 from torchsfm.reconstruction.alignment import Alignment, ControlPoints, align_to_points
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -83,6 +84,7 @@ class ControlledModel:
         return self.why
 
 
+@on_the_cpu
 def adjust_to_points(
     model: Reconstruction,
     control: ControlPoints,

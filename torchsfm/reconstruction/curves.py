@@ -10,6 +10,7 @@ from torch import Tensor
 from torchsfm._types import check_options, check_tensors
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.curve_fusion import fuse_pieces
 from torchsfm.reconstruction.curve_noise import measured_weights
 from torchsfm.reconstruction.curve_pieces import Pieces, image_pieces
@@ -28,6 +29,7 @@ _AGREE = 4
 """Images, the followed one included, that must see a sample."""
 
 
+@on_the_cpu
 def reconstruct_curves(
     images: Iterable[Float[Tensor, "c h w"] | None],
     cameras: Camera,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm.geometry import enu_from_geodetic, geodetic_from_enu
 from torchsfm.images import parse_exif
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.alignment import Alignment, align_to_positions
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
@@ -65,6 +66,7 @@ class GpsAlignment:
         return self.alignment.fault()
 
 
+@on_the_cpu
 def align_to_gps(model: Reconstruction, images: str | Path) -> GpsAlignment:
     """The similarity that carries a model to metres east, north and up, by the positions in its photographs' Exif or XMP.
 

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.files import load_arrays
 from torchsfm.reconstruction.image_points import camera_label
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -50,6 +51,7 @@ class KnownFeatures:
     labels: tuple[str, ...]
 
 
+@on_the_cpu
 def saved_features(folder: str | Path, model: Reconstruction) -> KnownFeatures | None:
     """The features that a run into a folder saved of the photographs of its model; None where there are none.
 

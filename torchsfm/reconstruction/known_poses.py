@@ -12,6 +12,7 @@ from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, similarity_from_points
 from torchsfm.images import MAX_PIXELS
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS, about_cameras, adjust
 from torchsfm.reconstruction.calibration import choose_free
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
@@ -32,6 +33,7 @@ ROUNDS = 4
 """Of triangulation, completion and adjustment; little changes after the second."""
 
 
+@on_the_cpu
 def triangulate_photographs(
     images: Source,
     poses: Reconstruction,

@@ -8,6 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchsfm.images import MAX_PIXELS, Features, match_features, retrieve_pairs
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.image_points import detect_all
 from torchsfm.reconstruction.known_features import KnownFeatures, observed_features
 from torchsfm.reconstruction.known_poses import place_images, result_of, start_mapping
@@ -21,6 +22,7 @@ from torchsfm.reconstruction.stages import Stages, fingerprint, one_thread
 from torchsfm.reconstruction.view_graph import verify_pairs
 
 
+@on_the_cpu
 def register_photographs(
     images: Source,
     model: Reconstruction,

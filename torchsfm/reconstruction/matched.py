@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.models import build_models
 from torchsfm.reconstruction.report import Progress, SfmResult
 from torchsfm.reconstruction.stages import Stages, one_thread
@@ -55,6 +56,7 @@ class MatchedImages:
     focal: tuple[float | None, ...] | None = None
 
 
+@on_the_cpu
 def reconstruct_matches(
     keypoints: Sequence[Float[Tensor, "_ 2"]],
     pairs: Int[Tensor, "q 2"],

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.geometry import Similarity, rotation_angle, similarity_from_points
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS, adjust, adjust_all
 from torchsfm.reconstruction.alignment import align_models
 from torchsfm.reconstruction.calibration import CameraPrior
@@ -81,6 +82,7 @@ class MergedModel:
         return self.why
 
 
+@on_the_cpu
 def merge_models(a: Reconstruction, b: Reconstruction, *, fixed_cameras: bool = False) -> MergedModel:
     """Join two models that share images, by the names of these, and adjust them together.
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
 from torchsfm.geometry import DISTORTION_MODELS
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
@@ -236,6 +237,7 @@ def image_reports(
     return tuple(reports)
 
 
+@on_the_cpu
 def reconstruct_tracks(
     x: Float[Tensor, "n 2"],
     view: Int[Tensor, "n"],

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.curve_models import reconstruct_from_curves
 from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges
 from torchsfm.reconstruction.find_lines import FoundSegments
@@ -30,6 +31,7 @@ NEIGHBOURS = 20
 """Images each one is matched with when there are many."""
 
 
+@on_the_cpu
 def reconstruct(
     images: Source,
     *,

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.geometry import Similarity, rotation_from_rotvec
 from torchsfm.linalg import eigh
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 CAP = math.radians(15)
@@ -76,6 +77,7 @@ class Levelling:
         return self.why
 
 
+@on_the_cpu
 def align_upright(model: Reconstruction) -> Levelling:
     """Turn a model so that z points up, as far as those who held the camera kept its x axis level.
 
@@ -132,6 +134,7 @@ def align_upright(model: Reconstruction) -> Levelling:
     return Levelling(_upright(up, centre.mean(0)), roll, held, sigma)
 
 
+@on_the_cpu
 def up_direction(model: Reconstruction) -> Float[Tensor, "3"]:
     """Which way is up, for showing a model: as `align_upright` has it or, where that is not known, by the best guess.
 
@@ -170,6 +173,7 @@ def up_direction(model: Reconstruction) -> Float[Tensor, "3"]:
     return torch.nn.functional.normalize(found, dim=0)
 
 
+@on_the_cpu
 def align_to_ground(model: Reconstruction, *, generator: torch.Generator | None = None) -> Levelling:
     """Turn and shift a model so that z points up and z = 0 is the ground on which it stands.
 

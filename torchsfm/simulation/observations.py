@@ -10,6 +10,7 @@ from torch import Tensor
 from torchsfm._types import check_options, check_tensors
 from torchsfm.geometry.cameras import Camera, intrinsics
 from torchsfm.geometry.poses import Pose
+from torchsfm.linalg.devices import drawn_on
 from torchsfm.simulation.randomness import drawn
 
 
@@ -142,7 +143,7 @@ def random_points(
         size: Radius of the ball, half the side of the cube, square or segment, or the standard deviation.
         generator: Source of randomness; torch's own where none is given.
         dtype: Of the points.
-        device: Of the points.
+        device: Of the points; the generator's if not given.
 
     Example:
         >>> import torch, torchsfm
@@ -151,6 +152,7 @@ def random_points(
         (torch.Size([8, 100, 3]), True)
     """
     check_options(kind=(kind, ("ball", "cube", "plane", "line", "gauss")), size=(size, "float"))
+    device = drawn_on(generator, device)
     options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
     if kind == "gauss":
         return size * torch.randn(*shape, 3, **options)  # type: ignore[call-overload, no-any-return]
@@ -182,7 +184,7 @@ def random_intrinsics(
         wobble: Standard deviation of the principal point about the middle of the image, as a share of the width.
         generator: Source of randomness; torch's own where none is given.
         dtype: Of the matrices.
-        device: Of the matrices.
+        device: Of the matrices; the generator's if not given.
 
     Example:
         >>> import torch, torchsfm
@@ -190,6 +192,7 @@ def random_intrinsics(
         >>> K.shape, bool((K[:, 0, 0] > 460).all())
         (torch.Size([5, 3, 3]), True)
     """
+    device = drawn_on(generator, device)
     options: dict[str, object] = {"dtype": dtype, "device": device, "generator": generator}
     angles = (view_angle, "2 float > 0 < 3.1416 radians")
     check_options(image_size=(image_size, "2 int >= 1"), view_angle=angles, wobble=(wobble, "float >= 0"))

@@ -7,6 +7,8 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from torchsfm.linalg.devices import CPU, made_on
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -17,7 +19,7 @@ def where_drawn(function: Callable[P, T]) -> Callable[P, T]:
     @wraps(function)
     def there(*args: P.args, **kwargs: P.kwargs) -> T:
         generator = kwargs.get("generator")
-        with generator.device if isinstance(generator, torch.Generator) else torch.device("cpu"):
+        with made_on(generator.device if isinstance(generator, torch.Generator) else CPU):
             return function(*args, **kwargs)
 
     return there

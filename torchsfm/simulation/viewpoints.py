@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import broadcast_shapes, check_options, check_tensors
 from torchsfm.geometry.poses import Pose
+from torchsfm.linalg.devices import drawn_on
 
 
 def look_at(
@@ -119,7 +120,7 @@ def random_poses(
         roll: Standard deviation of the roll about the optical axis, in radians.
         generator: Source of randomness; torch's own where none is given.
         dtype: Of the poses.
-        device: Of the poses.
+        device: Of the poses; the generator's if not given.
 
     Returns:
         World to camera, with the given batch shape.
@@ -131,7 +132,7 @@ def random_poses(
         (torch.Size([8, 2]), True)
     """
     check_options(distance=(distance, "2 float"), spread=(spread, "float"), wobble=(wobble, "float"), roll=(roll, "float"))
-    options: dict[str, object] = {"dtype": dtype, "device": device}
+    options: dict[str, object] = {"dtype": dtype, "device": drawn_on(generator, device)}
     draw = torch.rand(*shape, 3, generator=generator, **options)  # type: ignore[call-overload]
     normal = torch.randn(*shape, 4, generator=generator, **options)  # type: ignore[call-overload]
     cosine = 1 - draw[..., 0] * (1 - math.cos(spread))

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from torchsfm.formats.colmap import read_colmap, write_colmap
+from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.reconstruction import Reconstruction
 
 
+@on_the_cpu
 def pycolmap_from_model(model: Reconstruction) -> Any:
     """The model as a `pycolmap.Reconstruction`.
 
@@ -34,6 +36,7 @@ def pycolmap_from_model(model: Reconstruction) -> Any:
         return pycolmap.Reconstruction(folder)
 
 
+@on_the_cpu
 def model_from_pycolmap(reconstruction: Any) -> Reconstruction:
     """The model that a `pycolmap.Reconstruction` holds.
 
