@@ -10,11 +10,13 @@ names, is first asked for.
 import ast
 from importlib import import_module
 from pathlib import Path
+from threading import RLock
 from types import ModuleType
 from typing import Any
 
 _LINES = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body
 _HOMES = {alias.name: line.module for line in _LINES if isinstance(line, ast.ImportFrom) for alias in line.names}
+_LOADING = RLock()
 _ROOMS = [name for name, home in _HOMES.items() if home == __name__]
 
 __all__ = sorted(_HOMES)
@@ -42,7 +44,8 @@ def _load(module: str) -> ModuleType:
     """A module, whose constants lie on the CPU and may take part in derivatives wherever it is first asked for."""
     import torch
 
-    with torch.inference_mode(False), torch.device("cpu"):
+    # Threads that load rooms from several ends would wait for each other's modules, which Python ends with an error.
+    with _LOADING, torch.inference_mode(False), torch.device("cpu"):
         return import_module(module)
 
 
