@@ -25,7 +25,7 @@ def kernel(*, chunk: int = 4096) -> Callable[[Callable[..., Rows]], Callable[...
         @wraps(function)
         def in_pieces(*rows: Tensor, **options: Any) -> Rows:
             some = portions(rows[0].shape[-1], chunk, rows[0].device)
-            if len(some) == 1:
+            if len(some) <= 1:
                 return function(*rows, **options)
             pieces = [function(*(row[..., part] for row in rows), **options) for part in some]
             return tuple(torch.cat(parts, -1) for parts in zip(*pieces, strict=True))

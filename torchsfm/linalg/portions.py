@@ -11,6 +11,6 @@ def portion(number: int, device: torch.device) -> int:
 
 
 def portions(total: int, number: int, device: torch.device) -> list[slice]:
-    """Slices of so many things at a time, or of none where there are none."""
+    """Slices of so many things at a time; where there are none, none."""
     step = portion(number, device)
-    return [slice(i, i + step) for i in range(0, max(total, 1), step)]
+    return [slice(i, i + step) for i in range(0, total, step)]

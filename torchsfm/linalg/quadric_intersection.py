@@ -88,7 +88,7 @@ def _attempt(A: Tensor, B: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     degree = 8 if C.shape[0] == 10 else 12
     nodes, to_coefficients = (t.on(A.device, A.dtype) for t in _circle(degree))
     forms = []
-    for some in portions(A.shape[1], _CHUNK, A.device):
+    for some in portions(max(A.shape[1], 1), _CHUNK, A.device):
         a, b, c = (q[:, some] for q in (A, B, C))
         values = determinant(Pencil.of(a, b).multiply(c, nodes[0][:, None], nodes[1][:, None]))
         forms.append(combine_rows(values, to_coefficients.mT[..., None]))

@@ -64,7 +64,7 @@ def root_cells(c: Float[Tensor, "m batch"]) -> tuple[Cells, Cells]:
     degree, batch = c.shape[0] - 1, c.shape[1]
     to_cells, to_parts = (t.on(c.device, c.dtype) for t in _matrices(degree))
     number, rows = [], []
-    for some in portions(batch, _CHUNK, c.device):
+    for some in portions(max(batch, 1), _CHUNK, c.device):
         piece = c[:, some]
         b = (to_cells @ piece).view(degree + 1, -1)
         place = _with_changes(b).nonzero()[:, 0]

@@ -78,7 +78,7 @@ def camera_gp3p(
     batch = check_tensors(p=(p, "3 3"), d=(d, "3 3"), X=(X, "3 3"))
     with torch.no_grad():
         rows = [a.detach().double().expand(*batch, 3, 3).reshape(-1, 3, 3).permute(1, 2, 0) for a in (p, d, X)]
-        some = portions(rows[0].shape[-1], _CHUNK, d.device)
+        some = portions(max(rows[0].shape[-1], 1), _CHUNK, d.device)
         parts = [_solve(torch.finfo(d.dtype).eps, *(r[..., part].contiguous() for r in rows)) for part in some]
         model, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         model, valid = model.reshape(*batch, 8, 3, 4).to(d.dtype), valid.reshape(*batch, 8)

@@ -79,7 +79,7 @@ def camera_p35pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"
     with torch.no_grad():
         image = x.detach().double().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0)
         world = X.detach().double().expand(*batch, 4, 3).reshape(-1, 4, 3).permute(1, 2, 0)
-        parts = [_solve(image[..., some], world[..., some]) for some in portions(image.shape[-1], _CHUNK, x.device)]
+        parts = [_solve(image[..., some], world[..., some]) for some in portions(max(image.shape[-1], 1), _CHUNK, x.device)]
         model, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         model, valid = model.reshape(*batch, _SLOTS, 3, 4).to(x.dtype), valid.reshape(*batch, _SLOTS)
         # Numbers of this kind may be too small for them.

@@ -71,7 +71,7 @@ def camera_p4pf(x: Float[Tensor, "*#batch 4 2"], X: Float[Tensor, "*#batch 4 3"]
     with torch.no_grad():
         image = x.detach().double().expand(*batch, 4, 2).reshape(-1, 4, 2).permute(1, 2, 0)
         world = X.detach().double().expand(*batch, 4, 3).reshape(-1, 4, 3).permute(1, 2, 0)
-        parts = [_solve(image[..., some], world[..., some]) for some in portions(image.shape[-1], _CHUNK, x.device)]
+        parts = [_solve(image[..., some], world[..., some]) for some in portions(max(image.shape[-1], 1), _CHUNK, x.device)]
         P, valid = (torch.cat(part) for part in zip(*parts, strict=True))
         P, valid = P.reshape(*batch, 1, 3, 4), valid.reshape(*batch, 1)
         # Numbers of the caller's kind may be too small for them.

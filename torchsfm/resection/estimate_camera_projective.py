@@ -54,7 +54,7 @@ class ProjectiveCameraEstimator:
         batch = check_tensors(x=(x, "6 2"), X=(X, "6 3"))
         with torch.no_grad():
             rows = [a.detach().double().expand(*batch, 6, k).reshape(-1, 6, k).permute(1, 2, 0) for a, k in ((x, 2), (X, 3))]
-            some = portions(rows[0].shape[-1], _CHUNK, x.device)
+            some = portions(max(rows[0].shape[-1], 1), _CHUNK, x.device)
             parts = [_minimal(*(r[..., part] for r in rows)) for part in some]
             P, valid = (torch.cat(part) for part in zip(*parts, strict=True))
             P, valid = P.reshape(*batch, 1, 3, 4).to(x.dtype), valid.reshape(*batch, 1)

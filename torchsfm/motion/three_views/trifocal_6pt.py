@@ -84,7 +84,7 @@ def trifocal_6pt(x: Float[Tensor, "*batch 3 6 2"]) -> Solutions[Float[Tensor, "*
     batch = check_tensors(x=(x, "3 6 2"))
     with torch.no_grad():
         rows = x.detach().double().reshape(-1, 3, 6, 2).permute(2, 1, 3, 0)
-        chunks = [_solve(rows[..., some]) for some in portions(rows.shape[-1], _CHUNK, x.device)]
+        chunks = [_solve(rows[..., some]) for some in portions(max(rows.shape[-1], 1), _CHUNK, x.device)]
         P, good = (torch.cat(parts, -1) for parts in zip(*chunks, strict=True))
         P = P.permute(4, 1, 0, 2, 3).reshape(*batch, 3, 2, 3, 4)
         valid = good.mT.reshape(*batch, 3)

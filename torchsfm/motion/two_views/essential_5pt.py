@@ -148,7 +148,7 @@ def _once(E: Float[Tensor, "problem 20 9"], real: Bool[Tensor, "problem 20"]) ->
 
 
 def _starts(d1: Tensor, d2: Tensor, other_coordinates: bool = False) -> _Candidates:
-    some = portions(d1.shape[-1], _CHUNK, d1.device)
+    some = portions(max(d1.shape[-1], 1), _CHUNK, d1.device)
     chunks = [_chunk(d1[..., part], d2[..., part], other_coordinates) for part in some]
     return _joined([chunk._replace(item=chunk.item + part.start) for chunk, part in zip(chunks, some, strict=True)])
 
