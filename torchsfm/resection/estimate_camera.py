@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.resection.camera_p3p import camera_p3p
-from torchsfm.resection.flat_structure import flatness, flatness_suspected
+from torchsfm.resection.flat_structure import flatness, flatness_suspected, seen_places
 from torchsfm.resection.moderate_lines import image_rows, kinds, line_data, moderate_structure
 from torchsfm.resection.point_line_camera import PointLineCameraEstimator
 from torchsfm.resection.reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
@@ -62,6 +62,12 @@ class CameraEstimator:
         """Whether two image points coincide."""
         a, b, c = x.unbind(-2)
         return (a == b).all(-1) | (b == c).all(-1) | (c == a).all(-1)
+
+    def places(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n 3"]:
+        """The image points, and how far away the points are."""
+        return seen_places(model, x, X, self._focal(model))
 
     def step(
         self,

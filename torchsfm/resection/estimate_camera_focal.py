@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.resection.camera_p4pf import camera_p4pf
 from torchsfm.resection.estimate_camera import world_pose
-from torchsfm.resection.flat_structure import flatness, flatness_suspected
+from torchsfm.resection.flat_structure import flatness, flatness_suspected, seen_places
 from torchsfm.resection.reprojection_step import camera_step, moved_pose, retracted_pose, squared_reprojection
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.robust.moderation import middle_and_size, moderate, moved_and_scaled, present
@@ -59,6 +59,12 @@ class FocalCameraEstimator:
         pairs = [(i, j) for i in range(4) for j in range(i)]
         same = torch.stack([(x[..., i, :] == x[..., j, :]).all(-1) for i, j in pairs])
         return same.any(0).expand(torch.broadcast_shapes(same.shape[1:], X.shape[:-2]))  # type: ignore[no-untyped-call]
+
+    def places(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n 3"]:
+        """The image points, and how far away the points are."""
+        return seen_places(model, x, X, self._focal(model))
 
     def step(
         self,

@@ -11,7 +11,7 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import damped_solve, nullspace_rows
 from torchsfm.linalg.portions import portions
 from torchsfm.optim import UnitSphere, attach_implicit, for_slots, wants_derivative
-from torchsfm.resection.flat_structure import flatness, flatness_suspected
+from torchsfm.resection.flat_structure import flatness, flatness_suspected, seen_places
 from torchsfm.resection.focal import incidence_rows
 from torchsfm.resection.reprojection_step import normal_equations, squared_reprojection
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
@@ -73,6 +73,12 @@ class ProjectiveCameraEstimator:
         pairs = [(i, j) for i in range(6) for j in range(i)]
         same = torch.stack([(x[..., i, :] == x[..., j, :]).all(-1) for i, j in pairs])
         return same.any(0).expand(torch.broadcast_shapes(same.shape[1:], X.shape[:-2]))  # type: ignore[no-untyped-call]
+
+    def places(
+        self, model: Float[Tensor, "*#batch 3 4"], x: Float[Tensor, "*#batch n 2"], X: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n 3"]:
+        """The image points, and how far away the points are."""
+        return seen_places(model, x, X, self._focal(model))
 
     def step(
         self,

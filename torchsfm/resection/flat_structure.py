@@ -46,6 +46,24 @@ def flatness_suspected(
     return least_number_off(X, inliers, _visible(model, X, focal, threshold)) <= spare
 
 
+def seen_places(
+    model: Float[Tensor, "*batch 3 4"],
+    x: Float[Tensor, "*batch n 2"],
+    X: Float[Tensor, "*batch n 3"],
+    focal: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch n 3"]:
+    """Image points, and the depth of what they show as a distance in the image: that of a step as large across.
+
+    Args:
+        model: The camera.
+        x: The image points.
+        X: The points.
+        focal: How far a point at depth 1 moves in the image with a step of 1 across.
+    """
+    depth = (X @ model[..., 2, :3, None] + model[..., 2:, 3:])[..., 0]
+    return torch.cat((x, (focal[..., None] * depth.log())[..., None]), -1)
+
+
 def _visible(model: Tensor, X: Tensor, focal: Tensor, threshold: Tensor) -> Tensor:
     """How far from a line or plane each point must be to be seen to be."""
     depth = (model[..., 2:, :3] @ X.mT)[..., 0, :] + model[..., 2, 3:]

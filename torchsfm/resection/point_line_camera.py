@@ -114,6 +114,16 @@ class PointLineCameraEstimator:
         a, b, c = x.expand(*batch, 3, 4).unbind(-2)
         return (a == b).all(-1) | (b == c).all(-1) | (c == a).all(-1)
 
+    def places(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        x: Float[Tensor, "*#batch n 4"],
+        X: Float[Tensor, "*#batch n 6"],
+        kind: Float[Tensor, "*#batch n 1"],
+    ) -> Float[Tensor, "*batch n 11"]:
+        """The images, and the structure as seen from the distance of its size."""
+        return torch.cat((x, self._focal()[..., None, None] * torch.cat((X, kind), -1)), -1)
+
     def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],

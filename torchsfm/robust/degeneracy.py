@@ -36,7 +36,7 @@ class Degeneracy(IntEnum):
     NONE = 0
     """Nothing was found."""
     TOO_FEW = 1
-    """No more inliers than a sample: they agree with any model through them."""
+    """No more distinct inliers than a sample: they agree with any model through them."""
     COLLINEAR = 2
     """All points on a line, but for so few as chance explains."""
     PLANAR = 3
@@ -77,6 +77,7 @@ def diagnose(
     solved: Bool[Tensor, "p"],
     doubtful: Bool[Tensor, "p"] | None,
     near: Bool[Tensor, "p width"],
+    number: Int[Tensor, "p"],
     chance: Float[Tensor, "p"],
 ) -> Int[Tensor, "p"]:
     """What the inliers lack, or all data where no sample determined a model: a `Degeneracy` each, as int8.
@@ -87,6 +88,7 @@ def diagnose(
         solved: Whether any sample had a solution.
         doubtful: What a glance has left open; None if there was none yet.
         near: Which data agree with the model.
+        number: How many these are, or no more than a sample where no more are distinct.
         chance: How many data agree by chance.
     """
     code = torch.where(solved, int(Degeneracy.NONE), int(Degeneracy.UNDETERMINED)).to(torch.int8)
@@ -104,5 +106,5 @@ def diagnose(
             found = torch.where(known | (found != Degeneracy.NONE), found, int(Degeneracy.UNDETERMINED))
             code = code.index_copy(0, index, found.to(torch.int8))
     size = problems.estimator.sample_size
-    few = (solved & (near.sum(-1) <= size)) | (problems.count <= size)
+    few = (solved & (number <= size)) | (problems.count <= size)
     return torch.where(few, int(Degeneracy.TOO_FEW), code).to(torch.int8)

@@ -1,7 +1,7 @@
 """What robust estimation needs to know of a problem, and nothing more.
 
-`Estimator` is all that a problem must bring. `NeverZero`, `Mixed`, `Differentiable`, `Diagnosed` and `WithAlternatives` say
-what it may bring besides, each by a few members; an estimator that has them is asked.
+`Estimator` is all that a problem must bring. `NeverZero`, `Mixed`, `Located`, `Differentiable`, `Diagnosed` and
+`WithAlternatives` say what it may bring besides, each by a few members; an estimator that has them is asked.
 """
 
 from collections.abc import Callable
@@ -111,6 +111,38 @@ def is_never_zero(estimator: object) -> bool:
 
 
 _NEVER_ZERO: WeakKeyDictionary[type, bool] = WeakKeyDictionary()
+
+
+@runtime_checkable
+class Located(Protocol):
+    """An estimator that says where its data are, in the unit of the threshold: so data that hardly differ are evidence once.
+
+    Two data count as two where they are farther than twice the threshold from each other; of other estimators where they
+    differ at all.
+
+    Example:
+        >>> import torchsfm
+        >>> isinstance(torchsfm.motion.FundamentalEstimator(), torchsfm.robust.Located)
+        True
+    """
+
+    def places(self, model: Any, *data: Any) -> Float[Tensor, "*batch n _"]:
+        """For each datum some numbers, of which the first is that of the data; a datum moved by so much is as much farther off.
+
+        Data that do not agree with the model may be anywhere.
+        """
+        ...
+
+
+def is_located(estimator: object) -> bool:
+    """Whether an estimator is `Located`: its class decides, and is asked once."""
+    kind = type(estimator)
+    if kind not in _LOCATED:
+        _LOCATED[kind] = isinstance(estimator, Located)
+    return _LOCATED[kind]
+
+
+_LOCATED: WeakKeyDictionary[type, bool] = WeakKeyDictionary()
 
 
 @runtime_checkable

@@ -183,9 +183,9 @@ class Problems:
         return cast(self, dtype)
 
     def scatter(self, values: Tensor, n: int, fill: int = 0) -> Tensor:
-        """Bring a property of the slots, `(p, width)`, back into the caller's order, `(p, n)`."""
-        out = torch.full((len(values), n + 1), fill, dtype=values.dtype, device=values.device)
-        return out.scatter_(1, torch.where(self.inside, self.source, n), values)[:, :n]
+        """Bring properties of the slots, `(..., p, width)`, back into the caller's order, `(..., p, n)`."""
+        out = torch.full((*values.shape[:-1], n + 1), fill, dtype=values.dtype, device=values.device)
+        return out.scatter_(-1, torch.where(self.inside, self.source, n).expand_as(values), values)[..., :n]
 
 
 def pack(

@@ -42,7 +42,8 @@ class RobustResult(Generic[M]):
         iterations: Number of samples drawn.
         status: `OK`; `TOO_FEW` data for a sample; `NOT_FINITE`: too few of the data are finite; `DEGENERATE`: no sample
             determined a model; `NO_CONSENSUS`: no model was supported by more data than its own sample or chance explain, or
-            the threshold is so wide that any would be (model and inliers are then those of the best one).
+            the threshold is so wide that any would be (model and inliers are then those of the best one). Data that repeat
+            others, to twice the threshold in all images, support nothing (see `Located`).
         degeneracy: Whether the inliers, although they agree, leave the model open: a `Degeneracy` each. Which of them are
             looked for is said where the model is estimated.
         covariance: If asked for, that of the model by the scatter of the data around it: of its entries, row by row, unless

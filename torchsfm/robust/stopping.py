@@ -11,6 +11,8 @@ from torchsfm.robust.models import take
 
 ROUNDS = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
 """How many samples a round may draw for a problem."""
+_LEAST = 0.5
+"""How many data there are between two and six thresholds from a model where none is seen."""
 
 
 def rounds(
@@ -48,8 +50,15 @@ def around_model(
     """
     between = ((ratio > 4) & (ratio < 36)).mul(counts).sum(-1)
     # Cast: a count plus a half would have the default dtype, whatever the data's.
-    expected: Tensor = (between.to(ratio.dtype) + 0.5) / (6**codimension - 2**codimension)
+    expected: Tensor = (between.to(ratio.dtype) + _LEAST) / (6**codimension - 2**codimension)
     return expected
+
+
+def around_fewer(
+    expected: Float[Tensor, "*batch"], share: Float[Tensor, "*batch"], codimension: int
+) -> Float[Tensor, "*batch"]:
+    """The same if of the data only a share counted."""
+    return torch.lerp(torch.full_like(expected, _LEAST / (6**codimension - 2**codimension)), expected, share)
 
 
 def beyond_chance(
@@ -69,7 +78,10 @@ def beyond_chance(
     n = (count - size).to(support.dtype)
     q = ((support - size) / n.clamp(min=1)).clamp(1e-9, 1 - 1e-9)
     p = (expected / count).to(support.dtype).clamp(1e-4, 1 - 1e-9)
-    entropy = torch.where(q > p, q * (q / p).log() + (1 - q) * ((1 - q) / (1 - p)).log(), 0)
-    samples = torch.lgamma(n + size + 1.0) - torch.lgamma(n + 1.0) - math.lgamma(size + 1)
+    # What is less than chance explains as little as what is as much.
+    share = torch.maximum(q, p)
+    rest = 1 - share
+    entropy = torch.addcmul(share * (share / p).log(), rest, (rest / (1 - p)).log())
+    samples = torch.lgamma(n + (size + 1.0)) - torch.lgamma(n + 1.0) - math.lgamma(size + 1)
     # Where nearly all data agree, there is no other explanation, however few they are.
     return (n * entropy > samples) | (q > 0.9)

@@ -9,9 +9,11 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.robust.degeneracy import Degeneracy, diagnose
+from torchsfm.robust.evidence import count_distinct, repeats_suspected
 from torchsfm.robust.improvement import Best
+from torchsfm.robust.models import take
 from torchsfm.robust.problems import Flat, Problems
-from torchsfm.robust.stopping import around_model, beyond_chance
+from torchsfm.robust.stopping import around_fewer, around_model, beyond_chance
 
 M = TypeVar("M")
 
@@ -61,31 +63,54 @@ def judge(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: 
         n: How many data the caller has.
     """
     size, limit, reach = problems.estimator.sample_size, best.limit, best.reach
+    threshold = limit.sqrt()
     ratio = torch.where(problems.inside, squared / limit[:, None], torch.inf).nan_to_num_(nan=torch.inf)
     near = ratio < 1
     soft = (1 - ratio).clamp_(min=0)
     number, expected = near.sum(-1), around_model(ratio, problems.inside, problems.estimator.codimension)
     if problems.weight is None:
-        support = soft.sum(-1)
-        likely = beyond_chance(support, problems.count, expected, size)
+        total, around = problems.count, expected
     else:
-        weight = problems.weight
-        support = (soft * weight).sum(-1)
-        weighed = around_model(ratio, weight, problems.estimator.codimension)
-        likely = beyond_chance(support, weight.sum(-1), weighed, size)
-    agreed = (number > size) & likely
-    fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
-    optimal = agreed & best.solved & (reach > 0)
+        soft, total = soft * problems.weight, problems.weight.sum(-1)
+        around = around_model(ratio, problems.weight, problems.estimator.codimension)
+    support = soft.sum(-1)
+    agreed = (number > size) & beyond_chance(support, total, around, size) & best.solved
+    # Data that repeat others are no evidence.
+    index = (agreed & repeats_suspected(problems, near, number, threshold)).nonzero()[:, 0]
+    if len(index):
+        some, known = take((problems, best), index, len(near)), (near, number, support, total, around)
+        enough, few = _distinct(*some, *(t[index] for t in known))
+        agreed, number = agreed.index_copy(0, index, enough), number.index_copy(0, index, few)
+    optimal = agreed & (reach > 0)
     reach = torch.where(optimal, reach, 1)
-    judged = replace(problems, limit=limit)
+    fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
+    selected = (ratio < (reach / limit)[:, None]) & optimal[:, None]
+    inliers, selected = problems.scatter(torch.stack((near, selected)), n).unbind(0)
     return Verdict(
         best.model,
-        problems.scatter(near, n),
+        inliers,
         support,
-        limit.sqrt(),
+        threshold,
         best.iterations,
         torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8),
-        diagnose(judged, best.model, best.solved, best.doubtful, near, expected),
-        problems.scatter((ratio < (reach / limit)[:, None]) & optimal[:, None], n),
+        diagnose(replace(problems, limit=limit), best.model, best.solved, best.doubtful, near, number, expected),
+        selected,
         reach,
     )
+
+
+def _distinct(
+    some: Problems,
+    best: Best,
+    near: Bool[Tensor, "g width"],
+    number: Int[Tensor, "g"],
+    support: Float[Tensor, "g"],
+    total: Tensor,
+    around: Float[Tensor, "g"],
+) -> tuple[Bool[Tensor, "g"], Int[Tensor, "g"]]:
+    """Whether models have more support than chance if data that repeat others count once, and by how many inliers at most."""
+    size, codimension = some.estimator.sample_size, some.estimator.codimension
+    inliers, data = count_distinct(some, best.model, near, best.limit)
+    own, of_all = ((few / every.to(support.dtype)) for few, every in ((inliers, number), (data, some.count)))
+    likely = beyond_chance(support * own, total * of_all, around_fewer(around, of_all, codimension), size)
+    return (inliers > size) & likely, torch.minimum(number, inliers)

@@ -88,6 +88,16 @@ class TrifocalEstimator:
         same = [(x[..., 0, :] == x[..., 1, :]).all(-1) for x in (x1, x2, x3)]
         return same[0] | same[1] | same[2]
 
+    def places(
+        self,
+        model: Float[Tensor, "*#batch 2 3 4"],
+        x1: Float[Tensor, "*#batch n 2"],
+        x2: Float[Tensor, "*#batch n 2"],
+        x3: Float[Tensor, "*#batch n 2"],
+    ) -> Float[Tensor, "*batch n 6"]:
+        """All three points."""
+        return torch.cat((x1, x2, x3), -1)
+
     def step(
         self,
         model: Float[Tensor, "*#batch 2 3 4"],

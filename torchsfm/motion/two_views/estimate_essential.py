@@ -68,6 +68,12 @@ class RelativePoseEstimator:
         """Whether the first two rays coincide in an image."""
         return ((d1[..., 0, :] == d1[..., 1, :]).all(-1)) | ((d2[..., 0, :] == d2[..., 1, :]).all(-1))
 
+    def places(
+        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n 6"]:
+        """Both rays."""
+        return torch.cat((d1, d2), -1)
+
     def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],
@@ -171,7 +177,8 @@ def estimate_essential(
     def back(model: Tensor) -> Tensor:
         return essential_from_pose(model[..., :3], model[..., 3])
 
-    return estimate_robustly(estimator, unit_rays(d1), unit_rays(d2), threshold=threshold, dtype=d1.dtype, back=back, **options)
+    d1, d2, dtype = *both_unit_rays(d1, d2), d1.dtype
+    return estimate_robustly(estimator, d1, d2, threshold=threshold, dtype=dtype, back=back, **options)
 
 
 def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:
@@ -179,6 +186,14 @@ def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:
     if isinstance(threshold, Tensor):
         return threshold.double()
     return torch.tensor(_SLACK if threshold is None else threshold, dtype=torch.float64, device=like.device)
+
+
+def both_unit_rays(d1: Tensor, d2: Tensor) -> tuple[Tensor, Tensor]:
+    """`unit_rays` of both cameras, at once where they come in one shape."""
+    if d1.shape != d2.shape:
+        return unit_rays(d1), unit_rays(d2)
+    first, second = unit_rays(torch.stack((d1, d2))).unbind()
+    return first, second
 
 
 def unit_rays(d: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch n 3"]:

@@ -63,6 +63,12 @@ class FundamentalEstimator:
         """Whether the first two points coincide in an image."""
         return ((x1[..., 0, :] == x1[..., 1, :]).all(-1)) | ((x2[..., 0, :] == x2[..., 1, :]).all(-1))
 
+    def places(
+        self, model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
+    ) -> Float[Tensor, "*batch n 4"]:
+        """Both points."""
+        return torch.cat((x1, x2), -1)
+
     def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],

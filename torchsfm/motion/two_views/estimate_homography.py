@@ -80,6 +80,12 @@ class HomographyEstimator:
         a, b, c, d = (one * other for one, other in zip(*areas, strict=True))
         return torch.minimum(torch.minimum(a, b), torch.minimum(c, d)) <= 0
 
+    def places(
+        self, H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
+    ) -> Float[Tensor, "*batch n 4"]:
+        """Both points."""
+        return torch.cat((x1, x2), -1)
+
     def step(
         self,
         H: Float[Tensor, "*#batch 3 3"],

@@ -71,6 +71,12 @@ class UprightPoseEstimator:
         """Whether the first two rays coincide in an image."""
         return ((d1[..., 0, :] == d1[..., 1, :]).all(-1)) | ((d2[..., 0, :] == d2[..., 1, :]).all(-1))
 
+    def places(
+        self, model: Float[Tensor, "*#batch 3 4"], d1: Float[Tensor, "*#batch n 3"], d2: Float[Tensor, "*#batch n 3"]
+    ) -> Float[Tensor, "*batch n 6"]:
+        """Both rays."""
+        return torch.cat((d1, d2), -1)
+
     def step(
         self,
         model: Float[Tensor, "*#batch 3 4"],

@@ -1,0 +1,89 @@
+"""How many of the data that agree on a model are evidence: what repeats another datum says nothing new.
+
+Of data nearer to each other than twice the threshold, whatever goes through the middle between them has all for inliers: they
+are evidence once. A detector that gives one corner several times, or a list of matches joined with itself, is no consensus.
+A glance at some of the inliers comes first, and nearly always suffices.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.robust.estimator import Located, is_located
+from torchsfm.robust.problems import Problems
+from torchsfm.robust.sampling import hash_integers
+
+_GLANCE, _MANY, _MOST = 64, 25, 0.75
+"""How many data a glance looks at; how many inliers that it tells apart, or which part of all, are evidence enough."""
+_REACH = 2.0
+"""How far from each other data are evidence twice, in thresholds."""
+_EQUAL = 1e-12
+"""Part of the largest number by which rows that are equal may differ, where an estimator does not say where its data are."""
+_FAR = 1e15
+"""Cells from the origin, at most."""
+
+
+def repeats_suspected(
+    problems: Problems, near: Bool[Tensor, "p width"], number: Int[Tensor, "p"], threshold: Float[Tensor, "p"]
+) -> Bool[Tensor, "p"]:
+    """Where some of the inliers leave open that most repeat others; what is not suspected is not so.
+
+    Args:
+        problems: The problems.
+        near: Which data agree with the model.
+        number: How many these are.
+        threshold: The largest distance of an inlier.
+    """
+    reach = _REACH * threshold[:, None] if is_located(problems.estimator) else 0
+    # Data that one coordinate tells apart are apart; beyond the inliers infinities follow.
+    first = torch.where(near[:, :_GLANCE], problems.data[0][..., 0][:, :_GLANCE], torch.inf).sort().values
+    gaps = (first[:, 1:] - first[:, :-1] > reach).sum(-1)
+    return gaps < (_MOST * number).clamp(problems.estimator.sample_size + 1, _MANY)
+
+
+def count_distinct(
+    problems: Problems, model: object, near: Bool[Tensor, "p width"], limit: Float[Tensor, "p"]
+) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+    """How many inliers, and data, there are if those that repeat others count once.
+
+    Args:
+        problems: The problems.
+        model: The model of each.
+        near: Which data agree with it, at least one.
+        limit: Squared threshold.
+    """
+    estimator, inside = problems.estimator, problems.inside
+    if isinstance(estimator, Located):
+        place, reach = estimator.places(model, *problems.data), _REACH * limit.sqrt()
+    else:
+        place = torch.cat(problems.data, -1)
+        reach = _EQUAL * torch.where(inside[..., None], place, 0).abs().amax((-1, -2))
+    place = place / reach.clamp(min=1e-300)[:, None, None]
+    place = torch.where(inside[..., None], place, 0).nan_to_num(0, _FAR, -_FAR).clamp(-_FAR, _FAR)
+    inliers = _apart(place, near)
+    # Cells may part what is near, but are few for all.
+    inliers = torch.where(inliers > _MANY, torch.maximum(inliers, _cells(place, near)), inliers)
+    return inliers, inliers + _cells(place, inside & ~near)
+
+
+def _apart(place: Float[Tensor, "p n k"], near: Bool[Tensor, "p n"]) -> Int[Tensor, "p"]:
+    """How many, of the first so many, are farther than 1 from each other, taking the farthest each time (Gonzalez 1985)."""
+    n = near.shape[-1]
+    slot = torch.where(near, torch.arange(n, device=near.device), n - 1).amin(-1)
+    least = torch.full_like(place[..., 0], torch.inf)
+    number = torch.ones_like(slot)
+    for _ in range(_MANY):
+        chosen = place.gather(1, slot[:, None, None].expand(-1, 1, place.shape[-1]))
+        least = torch.minimum(least, (place - chosen).square().sum(-1))
+        farthest, slot = torch.where(near, least, -1).max(-1)
+        number = number + (farthest > 1)
+    return number
+
+
+def _cells(place: Float[Tensor, "p n k"], counted: Bool[Tensor, "p n"]) -> Int[Tensor, "p"]:
+    """How many cells of a grid hold the data that count."""
+    axis = torch.arange(1, place.shape[-1] + 1, device=place.device)
+    key = hash_integers(hash_integers(place.floor().long()) + axis).sum(-1)
+    last = torch.iinfo(torch.int64).max
+    key = torch.where(counted, key, last).sort().values
+    return (key[:, 1:] != key[:, :-1]).sum(-1) + (key[:, -1] != last)
