@@ -288,3 +288,54 @@ def test_a_real_image(pose6dscene):
     assert found.status == Status.OK
     assert torch.rad2deg(turn(found.model, truth[:, :3])) < 1
     assert found.error < 5e-3
+
+
+ALL = pytest.mark.parametrize("solve", [camera_pnp, camera_epnp, camera_planar])
+
+
+def seen_by(generator, X, noise):
+    R = random_rotation(*X.shape[:-2], generator=generator, dtype=F64)
+    Y = X @ R.mT + torch.tensor([0.0, 0, 6])
+    return Y / Y[..., 2:] + noise * torch.randn(Y.shape, generator=generator, dtype=F64)
+
+
+@ALL
+@pytest.mark.parametrize("noise", [0.0, 1e-5, 1e-3])
+@pytest.mark.parametrize("n", [4, 5, 30])
+def test_three_points_often_are_three(generator, solve, noise, n):
+    X = torch.randn(40, 3, 3, generator=generator, dtype=F64)[:, torch.arange(n) % 3]
+    assert (solve(seen_by(generator, X, noise), X).status != Status.OK).all()
+
+
+@ALL
+@pytest.mark.parametrize("n", [20, 200])
+def test_off_a_line_by_less_than_noise(generator, solve, n):
+    along = torch.nn.functional.normalize(torch.randn(40, 1, 3, generator=generator, dtype=F64), dim=-1)
+    X = (2 * torch.rand(40, n, 1, generator=generator, dtype=F64) - 1) * along
+    off = torch.randn(X.shape, generator=generator, dtype=F64)
+    if solve is camera_planar:
+        across = torch.linalg.cross(along, torch.randn(along.shape, generator=generator, dtype=F64))
+        off = off[..., :1] * torch.nn.functional.normalize(across, dim=-1)
+    assert (solve(seen_by(generator, X + 1e-3 * off, 3e-3), X + 1e-3 * off).status == Status.DEGENERATE).all()
+    # Much more than the noise determines it.
+    d = seen_by(generator, X + 0.3 * off, 1e-4)
+    assert_share(solve(d, X + 0.3 * off).status == Status.OK, 0.98)
+
+
+def test_a_plane_wants_two_points_off_every_line(generator):
+    X = torch.zeros(40, 10, 3, dtype=F64)
+    X[..., 0] = torch.randn(40, 10, generator=generator, dtype=F64)
+    X[:, 3, 1] = 1
+    for noise in (0.0, 1e-4):
+        assert (camera_planar(seen_by(generator, X, noise), X).status != Status.OK).all()
+    X[:, 4, 1] = 0.5
+    assert_share(camera_planar(seen_by(generator, X, 0.0), X).status == Status.OK, 0.9)
+
+
+@ALL
+@pytest.mark.parametrize("noise", [1e-5, 3e-4, 2.5e-3])
+def test_points_apart_are_enough(generator, solve, noise):
+    for n in (10, 100, 1000):
+        X = torch.randn(100, n, 3, generator=generator, dtype=F64)
+        X[..., 2] *= solve is not camera_planar
+        assert_share(solve(seen_by(generator, X, noise), X).status == Status.OK, 0.98)

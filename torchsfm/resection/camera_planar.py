@@ -11,6 +11,7 @@ from torchsfm.geometry import Pose
 from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
 from torchsfm.resection.angles import Rays, attach, determined, gauss_newton, in_pieces, status_of
+from torchsfm.resection.spread_points import tells_pose
 
 _STEPS = 12
 _SAME = 1e-6
@@ -44,7 +45,8 @@ class PlanarPoses:
     tell which of the poses is right."""
     status: Int8[Tensor, "*batch"]
     """OK; NOT_FINITE: data with weight are not finite, or a ray is zero; TOO_FEW: fewer than four points; DEGENERATE: points or
-    rays in a line, points that are in no plane; BEHIND: half of the weight or more is behind the camera."""
+    rays in a line, all of them or all but one, as far as the error lets anybody see; three points several times each; points
+    that are in no plane; BEHIND: half of the weight or more is behind the camera."""
 
     @property
     def pose(self) -> Pose:
@@ -104,7 +106,8 @@ def _solve(data: Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     R, N = (a.gather(1, order[..., None, None].expand_as(a)) for a in (R, N))
     t, promise = t.gather(1, order[..., None].expand_as(t)), promise.gather(1, order)
     full = determined(data, N)
-    status = status_of(data, R[:, :1], t[:, :1], full[:, 0] & flat, 4)
+    told = tells_pose(data, R[:, 0], t[:, 0], value[:, 0], N[:, 0], plane=True)
+    status = status_of(data, R[:, :1], t[:, :1], full[:, 0] & flat & told, 4)
     model = data.world(R, t)
     finite = torch.isfinite(model).all(-1).all(-1)
     fine = (status == Status.OK) | (status == Status.BEHIND)

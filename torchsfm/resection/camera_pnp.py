@@ -12,6 +12,7 @@ from torchsfm.geometry import Pose
 from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
 from torchsfm.resection.angles import Rays, attach, cost, determined, gauss_newton, in_pieces, status_of
+from torchsfm.resection.spread_points import tells_pose
 
 _STARTS = 4
 """Eigenvectors, each with both signs: four points, and points in a plane, leave a null space of four dimensions."""
@@ -42,7 +43,8 @@ class PoseEstimate:
     """Weighted root-mean-square of the sine of the angle between a ray and its point."""
     status: Int8[Tensor, "*batch"]
     """OK; NOT_FINITE: data with weight are not finite, or a ray is zero; TOO_FEW: fewer than four points; DEGENERATE: the pose
-    is not determined (points in a line, rays that coincide); BEHIND: half of the weight or more is behind the camera."""
+    is not determined, or not beyond the noise that the error tells of (points in a line or nearly, rays that coincide, three
+    points several times each); BEHIND: half of the weight or more is behind the camera."""
 
     @property
     def pose(self) -> Pose:
@@ -126,7 +128,8 @@ def _solve(data: Rays, R: Tensor, t: Tensor, steps: int) -> tuple[Tensor, Tensor
     R, t = R.gather(1, best[..., None, None].expand(-1, 1, 3, 3)), t.gather(1, best[..., None].expand(-1, 1, 3))
     R, t, value, N, _ = gauss_newton(data, R, t, steps)
     value = value[:, 0]
-    status = status_of(data, R, t, determined(data, N)[:, 0], 4)
+    told = tells_pose(data, R[:, 0], t[:, 0], value, N[:, 0])
+    status = status_of(data, R, t, determined(data, N)[:, 0] & told, 4)
     total = data.w.sum(-1)
     error = (value / torch.where(total > 0, total, 1.0)).sqrt()
     usable = (status == Status.OK) | (status == Status.BEHIND) | (status == Status.DEGENERATE)

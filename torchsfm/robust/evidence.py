@@ -60,24 +60,33 @@ def count_distinct(
         reach = _EQUAL * torch.where(inside[..., None], place, 0).abs().amax((-1, -2))
     place = place / reach.clamp(min=1e-300)[:, None, None]
     place = torch.where(inside[..., None], place, 0).nan_to_num(0, _FAR, -_FAR).clamp(-_FAR, _FAR)
-    inliers = _apart(place, near)
+    inliers = 1 + (farthest_points(place, near, _MANY)[1] > 1).sum(-1)
     # Cells may part what is near, but are few for all.
     inliers = torch.where(inliers > _MANY, torch.maximum(inliers, _cells(place, near)), inliers)
     return inliers, inliers + _cells(place, inside & ~near)
 
 
-def _apart(place: Float[Tensor, "p n k"], near: Bool[Tensor, "p n"]) -> Int[Tensor, "p"]:
-    """How many, of the first so many, are farther than 1 from each other, taking the farthest each time (Gonzalez 1985)."""
+def farthest_points(
+    place: Float[Tensor, "p n k"], near: Bool[Tensor, "p n"], most: int
+) -> tuple[Int[Tensor, "p most"], Float[Tensor, "p most"]]:
+    """So many points, each the farthest from those before (Gonzalez 1985), and how far from them the next one is, squared.
+
+    Args:
+        place: Points.
+        near: Which of them count, one of each row at least.
+        most: How many to take. Those after the last that is apart are arbitrary.
+    """
     n = near.shape[-1]
     slot = torch.where(near, torch.arange(n, device=near.device), n - 1).amin(-1)
     least = torch.full_like(place[..., 0], torch.inf)
-    number = torch.ones_like(slot)
-    for _ in range(_MANY):
+    slots, squares = [], []
+    for _ in range(most):
+        slots.append(slot)
         chosen = place.gather(1, slot[:, None, None].expand(-1, 1, place.shape[-1]))
         least = torch.minimum(least, (place - chosen).square().sum(-1))
         farthest, slot = torch.where(near, least, -1).max(-1)
-        number = number + (farthest > 1)
-    return number
+        squares.append(farthest)
+    return torch.stack(slots, -1), torch.stack(squares, -1)
 
 
 def _cells(place: Float[Tensor, "p n k"], counted: Bool[Tensor, "p n"]) -> Int[Tensor, "p"]:
