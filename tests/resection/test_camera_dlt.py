@@ -3,7 +3,8 @@ import torch
 from chance import seeded
 
 from torchsfm._types import Status
-from torchsfm.resection import camera_dlt
+from torchsfm.resection import camera_dlt, estimate_camera_projective
+from torchsfm.robust import Degeneracy
 
 
 @pytest.fixture
@@ -114,17 +115,31 @@ def test_points_on_a_twisted_cubic_with_the_centre(generator):
     assert (found.status == Status.DEGENERATE).all()
 
 
-def test_noisy_points_on_a_twisted_cubic_with_the_centre(make_problem, generator):
-    """Two cameras see them, of different depths: their algebraic errors say nothing of which is nearer to the data."""
-    _, _, P = make_problem(400, n=6)
+def twisted_cubics(make_problem, generator, number, noise):
+    _, _, P = make_problem(number, n=6)
     centre = -torch.linalg.solve(P[:, :, :3], P[..., 3:])[..., 0]
-    A = torch.randn(400, 3, 3, generator=generator, dtype=torch.float64) * 0.3
-    s = torch.rand(400, 40, 1, generator=generator, dtype=torch.float64) * 2 + 0.5
+    A = torch.randn(number, 3, 3, generator=generator, dtype=torch.float64) * 0.3
+    s = torch.rand(number, 40, 1, generator=generator, dtype=torch.float64) * 2 + 0.5
     forward = torch.nn.functional.normalize(P[:, 2, :3], dim=-1)[:, None]
     X = centre[:, None] + 4 * s**3 * forward + torch.cat((s, s**2, s**3), -1) @ A
     x = project(P, X)
-    x = x + 0.5 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    return x + noise * torch.randn(x.shape, generator=generator, dtype=torch.float64), X
+
+
+def test_noisy_points_on_a_twisted_cubic_with_the_centre(make_problem, generator):
+    """Two cameras see them, of different depths: their algebraic errors say nothing of which is nearer to the data."""
+    x, X = twisted_cubics(make_problem, generator, 400, 0.5)
     assert (camera_dlt(x, X).status != Status.OK).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.5])
+def test_robustly_points_on_a_twisted_cubic_leave_the_camera_open(make_problem, generator, noise):
+    x, X = twisted_cubics(make_problem, generator, 40, noise)
+    found = estimate_camera_projective(x, X, threshold=3.0, max_iterations=300, generator=generator)
+    assert ((found.degeneracy != Degeneracy.NONE) | (found.status != Status.OK)).all()
+    x, X, _ = make_problem(40, n=40, noise=noise)
+    found = estimate_camera_projective(x, X, threshold=3.0, max_iterations=300, generator=generator)
+    assert (found.degeneracy == Degeneracy.NONE).all()
 
 
 def test_a_noisy_plane_and_one_point_off_it(make_problem):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int8
+from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
@@ -203,7 +203,13 @@ def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _blurred(A: Tensor) -> Tensor:
-    """Whether cameras of two third rows are as near to the data, in the image.
+    """Whether cameras of two third rows are as near to the data, in the image."""
+    distance = _squared_distances(A)
+    return distance[..., 1] <= BLURRED**2 * distance[..., 0]
+
+
+def _squared_distances(A: Tensor) -> Tensor:
+    """How near cameras of four third rows are to the data in the image, from the nearest on: mean squares of a coordinate.
 
     Noise in the image enters every equation with its depth: of two solutions that of smaller depths leaves less of A p, however
     wrong it is. So what the best first two rows leave is measured by the depths.
@@ -212,8 +218,29 @@ def _blurred(A: Tensor) -> Tensor:
     depths = N[..., :4, :4] + N[..., 4:8, 4:8]
     left = N[..., 8:, 8:] - N[..., 8:, :8] @ torch.linalg.solve_ex(N[..., :8, :8], N[..., :8, 8:])[0]
     unit = torch.linalg.inv_ex(torch.linalg.cholesky_ex(depths)[0])[0]
-    distance = eigvalsh(unit @ left @ unit.mT)[0]
-    return distance[..., 1] <= BLURRED**2 * distance[..., 0]
+    return eigvalsh(unit @ left @ unit.mT)[0]
+
+
+def other_camera(
+    x: Float[Tensor, "*#batch n 2"],
+    X: Float[Tensor, "*#batch n 3"],
+    present: Bool[Tensor, "*#batch n"],
+    exact: Float[Tensor, "*#batch"],
+    factor: float = BLURRED,
+) -> Bool[Tensor, "*batch"]:
+    """Whether a second camera is as near to points as the best is, in the image.
+
+    Args:
+        x: Image points.
+        X: The points; both of moderate size around 0.
+        present: Which of them count.
+        exact: The least distance that is not rounding.
+        factor: How much farther the second must be.
+    """
+    w = present.to(x.dtype)[..., None].expand(*present.shape, 2)
+    x, X = (torch.where(present[..., None], t, 0) for t in (x, X))
+    distance = _squared_distances(_point_rows(x, X, w))
+    return distance[..., 1] <= factor**2 * torch.maximum(distance[..., 0], exact.square())
 
 
 def _scaled(P: Tensor, X: Tensor, w: Tensor) -> Tensor:

@@ -11,13 +11,18 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg import damped_solve, nullspace_rows
 from torchsfm.linalg.portions import portions
 from torchsfm.optim import UnitSphere, attach_implicit, for_slots, wants_derivative
+from torchsfm.resection.camera_dlt import BLURRED, other_camera
 from torchsfm.resection.flat_structure import flatness, flatness_suspected, seen_places
 from torchsfm.resection.focal import incidence_rows
 from torchsfm.resection.reprojection_step import normal_equations, squared_reprojection
-from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
+from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 from torchsfm.robust.moderation import moderate, present
 
 _CHUNK = 4096
+_EXACT = 1e-3
+"""Part of the threshold within which two cameras agree with data that have no noise."""
+_GLANCE = 2.0
+"""How much farther than from all data another camera must be from a part of them."""
 
 
 @dataclass(frozen=True)
@@ -112,8 +117,9 @@ class ProjectiveCameraEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Bool[Tensor, "*batch"]:
-        """Whether the inliers may be in a plane."""
-        return flatness_suspected(model, X, self._focal(model), inliers, threshold, 4 + chance)
+        """Whether the inliers may be in a plane, or near to another camera."""
+        flat = flatness_suspected(model, X, self._focal(model), inliers, threshold, 4 + chance)
+        return flat | other_camera(x, X, inliers, _EXACT * threshold, _GLANCE * BLURRED)
 
     def degeneracy(
         self,
@@ -125,8 +131,14 @@ class ProjectiveCameraEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
-        """COLLINEAR or PLANAR: all inliers but so few as chance explains are on a line or a plane, as far as can be seen."""
-        return flatness(model, X, self._focal(model), inliers, threshold, 4 + chance)
+        """What the inliers have in common, as far as can be seen.
+
+        COLLINEAR or PLANAR: all but so few as chance explains are on a line or a plane; UNDETERMINED: a second camera is nearly
+        as near to them, as where they are on a twisted cubic with the centre.
+        """
+        code = flatness(model, X, self._focal(model), inliers, threshold, 4 + chance)
+        other = other_camera(x, X, inliers, _EXACT * threshold) & (code == Degeneracy.NONE)
+        return torch.where(other, int(Degeneracy.UNDETERMINED), code).to(torch.int8)
 
     @staticmethod
     def _focal(model: Tensor) -> Tensor:
@@ -187,7 +199,8 @@ def estimate_camera_projective(
 
     Returns:
         Cameras with `|P[2, :3]| = 1` and inliers at positive third coordinates; inliers, support, iterations, status,
-        degeneracy (COLLINEAR, PLANAR: neither determines the camera), covariance (12 x 12, of rank 11). The cameras carry their
+        degeneracy (COLLINEAR, PLANAR: neither determines the camera; UNDETERMINED: a second camera agrees as well, as of points
+        on a twisted cubic through the centre), covariance (12 x 12, of rank 11). The cameras carry their
         derivatives with respect to the inliers (see `ransac`).
 
     Raises:
