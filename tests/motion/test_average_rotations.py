@@ -186,6 +186,60 @@ def test_covariance_is_that_of_the_errors() -> None:
     assert_unit_variance(torch.stack(squares))
 
 
+def test_covariance_counts_loops_alone(generator: torch.Generator) -> None:
+    """Edges that close no loop agree with themselves: they tell nothing of how large their errors are."""
+    chain = torch.stack((torch.arange(9), torch.arange(1, 10)), 1)
+    short = torch.cat((chain, torch.tensor([[0, 2], [1, 3], [2, 4], [0, 3], [1, 4], [0, 4]])))
+    rotations = random_rotation(10, generator=generator, dtype=torch.float64)
+    squares, told, scales = [], [], []
+    for stream in range(40):
+        graph = with_edges(rotations, chain, 0.01, 0.0, seeded(stream))
+        deviation = 1e-4 * torch.eye(3, dtype=torch.float64).expand(9, 3, 3)
+        found = average_rotations(graph.R, chain, views=10, deviation=deviation, covariance=True)
+        assert found.covariance is not None
+        w = rotvec_from_rotation(graph.answer[1:] @ found.model[1:].mT)
+        whitening = torch.linalg.inv(torch.linalg.cholesky(found.covariance[1:]))
+        squares.append((whitening @ w[..., None])[8, :, 0])
+        assert float(found.scale) == 1
+        nothing = average_rotations(graph.R, chain, views=10, covariance=True).covariance
+        assert nothing is not None
+        assert bool(nothing[1:].diagonal(dim1=-2, dim2=-1).isinf().all())
+        assert bool((nothing[0] == 0).all())
+        graph = with_edges(rotations, short, 0.01, 0.0, seeded(100 + stream))
+        scales.append(average_rotations(graph.R, short, views=10).scale)
+        told.append(average_rotations(graph.R, short, views=10, covariance=True).covariance)
+    assert_unit_variance(torch.stack(squares))
+    # Six loops of three components each in every graph, less what a loss that spares outliers gives away.
+    variance = float(torch.stack(scales).square().mean()) / 1e-4
+    assert 0.75 < variance < 1.3
+    assert all(bool(t is not None and t.isfinite().all()) for t in told)
+
+
+@pytest.mark.parametrize(("views", "count"), [(6, 15), (12, 48), (30, 200), (60, 600)])
+def test_unrelated_rotations_are_no_consensus(views: int, count: int, generator: torch.Generator) -> None:
+    for _ in range(3):
+        edges = torch.combinations(torch.arange(views))
+        edges = edges[torch.randperm(len(edges), generator=generator)[:count]]
+        R = random_rotation(count, generator=generator, dtype=torch.float64)
+        found = average_rotations(R, edges, views=views, covariance=True)
+        counted = torch.zeros(views, dtype=torch.bool).index_fill_(0, edges.flatten(), True)
+        assert bool((found.status[counted] == Status.NO_CONSENSUS).all())
+        assert found.covariance is not None
+        assert bool(found.covariance.diagonal(dim1=-2, dim2=-1).isinf().all())
+
+
+@pytest.mark.parametrize(("views", "reach", "noise", "wrong"), [(3, 1, 0.05, 0), (8, 2, 0.1, 0), (30, 6, 0.02, 0.3)])
+def test_loops_that_close_are_consensus(views: int, reach: int, noise: float, wrong: float, generator: torch.Generator) -> None:
+    """Also where parts are joined by edges that close none, and beside a part that is none."""
+    graph = ring(views, reach, noise, wrong, generator)
+    bad = torch.combinations(torch.arange(views, views + 8))
+    R = torch.cat((graph.R, random_rotation(len(bad), generator=generator, dtype=torch.float64)))
+    found = average_rotations(R, torch.cat((graph.edges, bad)), views=views + 8)
+    right = found.status[:views] == Status.OK
+    assert int(right.sum()) >= views - 1
+    assert bool((found.status[views:] == Status.NO_CONSENSUS).all())
+
+
 def test_derivatives_are_those_of_the_minimum(generator: torch.Generator) -> None:
     graph = ring(6, 2, 0.05, 0.0, generator)
     turn = torch.zeros(len(graph.R), 3, dtype=torch.float64, requires_grad=True)

@@ -8,6 +8,7 @@ a sparse problem of three unknowns a camera, turns of the world seen by it: equa
 what `optim.multigrid` makes use of.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -35,6 +36,10 @@ AGREES = 4.0
 """Standard deviations within which an edge agrees: 0.1 % of right ones do not."""
 EXACT = 1e-4
 """Radians that all edges are taken to be off at least: sharper losses find no way, and gain nothing."""
+CHANCE, WIDER = 0.03, 1.5
+"""How often unrelated rotations might pass for related ones, if loops lacked so many times more than they do."""
+REACHES = tuple(1e-3 * 2**k for k in range(10))
+"""Angles in radians within which edges may agree."""
 NOT_A_ROTATION = 1e-2
 """By how much entries of `R R'` may differ from those of the identity."""
 
@@ -46,16 +51,17 @@ class AveragedRotations:
     Attributes:
         model: Rotations from the world to the cameras. The world is the smallest camera of each component.
         status: OK; TOO_FEW: no edge of this camera counts; NO_CONSENSUS: of several edges at most one
-            agrees with the rest; NOT_CONVERGED: the iteration
-            limit came first, the rotations are the best seen.
+            agrees with the rest, or loops close no better than those of unrelated rotations might; NOT_CONVERGED: the
+            iteration limit came first, the rotations are the best seen.
         component: The smallest camera that each is connected with through edges that agree. Rotations of different components
             have nothing to do with each other.
         angle: By how much each edge disagrees with the model, in radians; pi for edges that do not count.
         inliers: Edges that agree to within four standard deviations.
-        scale: Standard deviation of the right edges in each of three directions, as estimated from their scatter: in radians,
-            or in units of what `deviation` says.
+        scale: Standard deviation of the right edges in each of three directions, as the loops that they close tell: in radians,
+            or in units of what `deviation` says, 1 where there are no loops.
         covariance: If asked for, that of each rotation, for a turn `exp(w) R` in the frame of the camera, relative to the
-            smallest camera of its component; infinite for cameras that are not OK.
+            smallest camera of its component; infinite for cameras that are not OK, and for all but the first of each component
+            where no loop, and no `deviation`, tells how large the errors are.
 
     Example:
         >>> import torch, torchsfm
@@ -162,11 +168,20 @@ def average_rotations(
         angle[kept] = turn_angle(graph.disagreement(plain)).to(R.dtype)
         inliers[kept] = graph.square(plain).sqrt() <= AGREES * scale
         status = _status(edges, counts, inliers, views, found.status)
+        unlikely = graph.by_chance(plain) & (status != int(Status.TOO_FEW))
+        status = torch.where(unlikely, int(Status.NO_CONSENSUS), status).to(torch.int8)
         sure = inliers & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
         component = components(edges[sure], views)
+        told = graph.loops(component, sure[kept]).sum()
+        if bool(told > 0):
+            square = graph.square(plain)[sure[kept]].sum() / (3 * told)
+            scale = max(float(square.sqrt()), graph.least())
+        elif deviation is not None:
+            scale = 1.0
         spread = None
         if covariance:
-            spread = graph.covariance(plain, component, status, loss, scale).to(R.dtype)
+            known = scale if bool(told > 0) or deviation is not None else torch.inf
+            spread = graph.covariance(plain, component, status, loss, known).to(R.dtype)
     model = (model @ model[component].mT).to(R.dtype)
     return AveragedRotations(model, status, component, angle, inliers, R.new_tensor(scale), spread)
 
@@ -240,10 +255,48 @@ class _Graph:
         """The standard deviation of the right edges, if a quarter of those that do not merely fix the model are right."""
         if not len(self.R):
             return EXACT
-        least = EXACT * float(torch.linalg.matrix_norm(self._whitening()).median()) / 3**0.5
+        least = self.least()
         fixing = min(self.views - 1, len(self.R) - 1)
         rank = fixing + (len(self.R) - fixing - 1) // 4
         return max(float((self.square(model).kthvalue(rank + 1).values / QUARTILE).sqrt()), least)
+
+    def least(self) -> float:
+        """The standard deviation that there is at least."""
+        return EXACT * float(torch.linalg.matrix_norm(self._whitening()).median()) / 3**0.5
+
+    def loops(self, component: Int[Tensor, "v"], chosen: Bool[Tensor, "e"]) -> Int[Tensor, "v"]:
+        """How many loops some edges close in each component, counted with its smallest camera: all others follow from them."""
+        number = torch.bincount(component[self.edges[chosen, 0]], minlength=self.views)
+        size = torch.bincount(component, minlength=self.views)
+        return number - (size - 1).clamp(min=0)
+
+    def by_chance(self, model: Float[Tensor, "v 3 3"]) -> Bool[Tensor, "v"]:
+        """Cameras of connected parts with loops where unrelated rotations may close as many as well.
+
+        A wrong edge closes a loop within an angle with the share of rotations that turn by less; of all edges any may be chosen
+        to agree, and within any angle. A part without loops contradicts nothing.
+        """
+        part = components(self.edges, self.views)
+        ones, of_edge = self.R.new_ones(self.views), part[self.edges[:, 0]]
+        angle = turn_angle(self.disagreement(model))
+
+        def of_part(values: Tensor, place: Tensor = of_edge) -> Tensor:
+            return torch.zeros_like(ones).index_add_(0, place, values)
+
+        every, size = of_part(torch.ones_like(angle)), of_part(ones, part)
+        related = every < size
+        for reach in REACHES:
+            agree = (angle <= reach).to(angle.dtype)
+            inner = components(self.edges[angle <= reach], self.views)
+            pieces = of_part((inner == torch.arange(self.views, device=inner.device)).to(angle.dtype), part)
+            number = of_part(agree)
+            closed = number - size + pieces
+            # What a loop lacks is shared by its edges, whatever others have.
+            lack = (WIDER * of_part(agree * angle) / closed.clamp(min=1)).clamp(reach, torch.pi)
+            share = (lack - lack.sin()) / torch.pi
+            ways = torch.lgamma(every + 1) - torch.lgamma(number + 1) - torch.lgamma(every - number + 1)
+            related = related | (-closed * share.log() > ways - math.log(CHANCE))
+        return ~related[part]
 
     def terms(self, loss: Loss) -> list[Term]:
         """All edges."""
@@ -260,9 +313,12 @@ class _Graph:
         held = (component == torch.arange(self.views, device=component.device)) | (status != int(Status.OK))
         within = (component[self.edges[:, 0]] == component[self.edges[:, 1]]).nonzero()[:, 0]
         terms = [term.select(within) for term in self.terms(loss)]
+        unknown = torch.diag(model.new_full((3,), torch.inf))
+        if scale == torch.inf:
+            known = component == torch.arange(self.views, device=component.device)
+            return torch.where((known & (status == int(Status.OK)))[:, None, None], 0, unknown)
         spread = scale**2 * marginal_covariance({"R": Block(model.mT.flatten(1), Rotation(), held)}, terms, "R")
         spread = model @ spread @ model.mT
-        unknown = torch.diag(spread.new_full((3,), torch.inf))
         known = (status == int(Status.OK))[:, None, None]
         return torch.where(known, spread, unknown)
 
