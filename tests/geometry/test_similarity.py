@@ -54,6 +54,25 @@ def test_mirrored_points_still_give_a_rotation(generator):
     torch.testing.assert_close(torch.linalg.det(found.R), torch.tensor(1.0, dtype=torch.float64))
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 0.03])
+def test_mirrored_points_are_told(noise, generator):
+    X = torch.randn(200, 20, 3, generator=generator, dtype=torch.float64)
+    truth = make(200, generator=generator)
+
+    def status(X, Y):
+        error = noise * truth.scale[:, None, None] * torch.randn(X.shape, generator=generator, dtype=torch.float64)
+        return similarity_from_points(X, Y + error).status
+
+    mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    assert (status(X, truth.transform(X * mirror)) == Status.DEGENERATE).all()
+    assert (status(X, truth.transform(X)) == Status.OK).all()
+    # A plane is its own mirror image, and so is what is thinner than its noise.
+    for thickness in (0.0, 0.2 * noise):
+        flat = X * torch.tensor([1.0, 1.0, thickness], dtype=torch.float64)
+        assert (status(flat, truth.transform(flat)) == Status.OK).all()
+        assert (status(flat, truth.transform(flat * mirror)) == Status.OK).all()
+
+
 def test_gradients_of_exact_and_noisy_and_isotropic_points(generator):
     X = torch.randn(2, 6, 3, generator=generator, dtype=torch.float64)
     corners = torch.tensor([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=torch.float64)

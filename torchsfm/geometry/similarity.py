@@ -3,12 +3,15 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry.poses import Pose
 from torchsfm.linalg import nearest_rotation, svdvals
+
+_MIRRORED = 3.0
+"""How much farther a rotation leaves points from each other than a reflection where one is the mirror image of the other."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ def similarity_from_points(
 
     Returns:
         The similarity, with status: TOO_FEW for fewer than three pairs, DEGENERATE where the points of either set lie on one
-        line (the rotation is then one of many, or the identity).
+        line (the rotation is then one of many, or the identity), or where Y is the mirror image of X: a reflection leaves less
+        than a third of the distances.
 
     Example:
         >>> import torch, torchsfm
@@ -93,7 +97,26 @@ def similarity_from_points(
     scale = torch.where(spread & (scale > 0), scale, 1.0)
     t = y_mean.squeeze(-2) - scale[..., None] * (R @ x_mean.mT).squeeze(-1)
     singular, _ = svdvals(covariance.detach())
-    degenerate = ~(singular[..., 1] > 64 * torch.finfo(X.dtype).eps * singular[..., 0])
+    rounding = 64 * torch.finfo(X.dtype).eps
+    degenerate = ~(singular[..., 1] > rounding * singular[..., 0])
+    degenerate = degenerate | _mirrored(
+        covariance.detach(), singular, variance.detach(), (w * y.square()).sum((-2, -1)).detach(), rounding
+    )
     status = torch.where(degenerate, int(Status.DEGENERATE), int(Status.OK))
     status = torch.where(used.squeeze(-1).sum(-1) < 3, int(Status.TOO_FEW), status).to(torch.int8)
     return Similarity(scale, R, t, status)
+
+
+def _mirrored(
+    covariance: Float[Tensor, "*batch 3 3"],
+    singular: Float[Tensor, "*batch 3"],
+    x_variance: Float[Tensor, "*batch"],
+    y_variance: Float[Tensor, "*batch"],
+    rounding: float,
+) -> Bool[Tensor, "*batch"]:
+    """Whether the best reflection leaves far smaller distances than the best rotation; never so of points in a plane."""
+    first, last = singular[..., 0] + singular[..., 1], singular[..., 2]
+    x = torch.where(x_variance > 0, x_variance, 1.0)
+    turned, reflected = (y_variance - square / x for square in ((first - last).square(), (first + last).square()))
+    far = turned > _MIRRORED**2 * torch.maximum(reflected, rounding * y_variance)
+    return far & (torch.linalg.det(covariance) < 0)
