@@ -119,4 +119,5 @@ def _mirrored(
     x = torch.where(x_variance > 0, x_variance, 1.0)
     turned, reflected = (y_variance - square / x for square in ((first - last).square(), (first + last).square()))
     far = turned > _MIRRORED**2 * torch.maximum(reflected, rounding * y_variance)
-    return far & (torch.linalg.det(covariance) < 0)
+    mirrored: Tensor = far & (torch.linalg.det(covariance) < 0)
+    return mirrored
