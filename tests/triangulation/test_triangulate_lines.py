@@ -193,6 +193,54 @@ def test_what_leaves_no_line_is_told(make_scene, image_of, generator):
     assert int(behind.status[0]) == Status.BEHIND
 
 
+@pytest.mark.parametrize("v", [2, 3, 8])
+@pytest.mark.parametrize("sigma", [1.0, 0.1])
+def test_segments_of_points_are_no_lines(make_scene, generator, v, sigma):
+    """What noise alone has drawn apart; and what is exact and short all the same is a line."""
+    x, P, _ = make_scene(v=v, n=200)
+    l = x[..., None, :] + sigma * torch.randn((*x.shape[:2], 2, 2), generator=generator, dtype=F64)  # noqa: E741
+    found = triangulate_lines(l, P, weights=torch.full(l.shape[:2], sigma**-2, dtype=F64))
+    assert_share(found.status == Status.DEGENERATE, 0.98)
+
+
+def test_short_segments_are_lines_where_little_noise_is_in_them(make_scene, image_of, generator):
+    _, P, X = segments(make_scene, image_of, v=5, n=200)
+    X = X[:, :1] + torch.stack((torch.zeros_like(X[:, 0]), 0.01 * torch.nn.functional.normalize(X[:, 1] - X[:, 0], dim=-1)), 1)
+    l = image_of(P, X.flatten(0, 1)).unflatten(-2, (200, 2))  # noqa: E741
+    found = triangulate_lines(l, P)
+    assert_share(found.status == Status.OK, 0.9)
+    assert ((found.model - pluecker(X)).norm(dim=-1) < 1e-4)[found.status == Status.OK].all()
+    noisy = triangulate_lines(l + torch.randn(l.shape, generator=generator, dtype=F64), P)
+    assert_share(noisy.status == Status.DEGENERATE, 0.97)
+    assert bool((noisy.fault[noisy.status == Status.DEGENERATE] == LineFault.SHORT).any())
+
+
+@pytest.mark.parametrize("v", [3, 8])
+def test_directions_are_no_farther_off_than_is_said(make_scene, image_of, generator, v):
+    """Segments of a few pixels, where noise makes lines seem to point at a camera."""
+    _, P, X = segments(make_scene, image_of, v=v, n=600)
+    long = torch.logspace(-2, 0, 600, dtype=F64)[:, None]
+    X = X[:, :1] + torch.stack((torch.zeros_like(X[:, 0]), long * torch.nn.functional.normalize(X[:, 1] - X[:, 0], dim=-1)), 1)
+    l = image_of(P, X.flatten(0, 1)).unflatten(-2, (600, 2))  # noqa: E741
+    found = triangulate_lines(l + torch.randn(l.shape, generator=generator, dtype=F64), P)
+
+    def directions(delta: Tensor) -> Tensor:
+        return torch.nn.functional.normalize(Line3D().retract(found.model[:, None], delta)[..., :3], dim=-1)
+
+    delta = 1e-6 * torch.eye(4, dtype=F64).expand(600, 4, 4)
+    J = (directions(delta) - directions(-delta)).mT / 2e-6
+    d, wanted = found.model[:, :3], pluecker(X)[:, :3]
+    wanted = wanted * torch.where((d * wanted).sum(-1, keepdim=True) < 0, -1, 1)
+    across = torch.nn.functional.normalize(wanted - d * (d * wanted).sum(-1, keepdim=True), dim=-1)
+    e = across * torch.acos((d * wanted).sum(-1, keepdim=True).clamp(max=1))
+    inverse = torch.linalg.pinv(J @ found.covariance @ J.mT, hermitian=True, rtol=1e-9)
+    # Of two degrees of freedom hardly one in ten billion is as much, but in angles errors are not quite normal.
+    square = (e[:, None] @ inverse @ e[..., None])[:, 0, 0]
+    good = found.status == Status.OK
+    assert good[long[:, 0] > 0.5].double().mean() > 0.9
+    assert_share((square < 50)[good], 0.97)
+
+
 def test_bad_values_are_told_and_spoil_nothing(make_scene, image_of):
     l, P, _ = segments(make_scene, image_of, v=4, n=7, noise=0.2)  # noqa: E741
     good = triangulate_lines(l, P)

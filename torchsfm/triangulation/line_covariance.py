@@ -8,6 +8,7 @@ from torchsfm.linalg.vectors import cross
 from torchsfm.optim.batched_cholesky import factor
 from torchsfm.triangulation.line_chart import Chart
 from torchsfm.triangulation.line_problem import UPPER, Rows, blocks
+from torchsfm.triangulation.line_views import LineViews
 
 _SINGULAR = 1e13
 """Trace of the inverse of normal equations of unit diagonal from which on they are singular but for rounding."""
@@ -55,6 +56,34 @@ def place_covariance(C: Square, chart: Chart, d: Tensor, t: Tensor) -> tuple[Ten
     left, right = left * unit, right * unit
     found = torch.addcmul(left[:, None] * u[None, :, None], right[:, None], v[None, :, None])
     return found.permute(3, 2, 0, 1), trace
+
+
+def turn_variance(C: Square, chart: Chart, point: Tensor, d: Tensor, views: LineViews) -> Tensor:
+    """The variance (n) of directions as the views see them: in two coordinates, over that of what is across the rays to them.
+
+    Angles to lines that point at the cameras are small because noise made them seem to: what says that the direction is known is
+    not that its angle varies little, but that its slope along the rays does.
+
+    Args:
+        C: That of the parameters.
+        chart: The frames.
+        point: Points of the lines (3, n).
+        d: Directions (3, n), as the chart gives them.
+        views: The views.
+    """
+    square = combine_rows(d, d)
+    used = views.used.to(square.dtype)
+    rays = torch.where(views.near, views.centre - point[:, None], views.centre)
+    along = combine_rows(rays, d[:, None])
+    share = used / (combine_rows(rays, rays) * add_rows(used).clamp_min(1)).clamp_min(1e-300)
+    across = (1 - combine_rows(along * along, share) / square).clamp_min(1e-12)
+    leaning = torch.stack([combine_rows(row, share * along) for row in rays.unbind(0)])
+    u, v = (axis - d * (combine_rows(axis, d) / square) for axis in chart.axes[:2].unbind(0))
+    gu, gv = combine_rows(leaning, u), combine_rows(leaning, v)
+    C22, C23, C33 = C[2][2], C[2][3], C[3][3]
+    plain = C22 * combine_rows(u, u) + 2 * C23 * combine_rows(u, v) + C33 * combine_rows(v, v)
+    leant = C22 * gu * gu + 2 * C23 * gu * gv + C33 * gv * gv
+    return (plain + leant / (square * across * across)) / (square * across)
 
 
 def step_covariance(C: Square, chart: Chart, point: Tensor, d: Tensor, model: Tensor) -> Tensor:

@@ -42,17 +42,19 @@ class LineFault(IntEnum):
     """More centres, all in one line, and the line lies in a plane with them."""
     PLANE_OF_CENTRES = 5
     """The line lies in the one plane of all centres."""
+    SHORT = 6
+    """Segments so short, for their noise and for how far the views are apart, that they leave its direction open."""
 
 
-def faults(views: LineViews, lost: Tensor) -> Tensor:
-    """The fault of lines that are lost (n), 0 elsewhere."""
+def faults(views: LineViews, lost: Tensor, short: Tensor) -> Tensor:
+    """The fault of lines that are lost (n), some of them as their segments are short (n), 0 elsewhere."""
     fault = torch.zeros_like(lost, dtype=torch.int64)
     (at,) = lost.nonzero(as_tuple=True)
-    return fault.index_put((at,), _why(views.some(at).by_line())) if len(at) else fault
+    return fault.index_put((at,), _why(views.some(at).by_line(), short[at])) if len(at) else fault
 
 
-def _why(views: ByLine) -> Tensor:
-    """The fault of lines whose planes of sight are one, from the centres of the views (n)."""
+def _why(views: ByLine, short: Tensor) -> Tensor:
+    """The fault of lines whose segments are short (n), or whose planes of sight are one, from the centres of the views (n)."""
     centre, finite = views.centre, views.near
     counted = (finite & views.used)[..., None]
     number = counted.sum(1).clamp_min(1)
@@ -66,6 +68,7 @@ def _why(views: ByLine) -> Tensor:
     distinct = _number_of_centres(centre, views.used, values[:, 2])
     fault = torch.where(collinear, int(LineFault.COLLINEAR_CENTRES), int(LineFault.PLANE_OF_CENTRES))
     fault = torch.where(distinct <= 2, int(LineFault.EPIPOLAR_PLANE), fault)
+    fault = torch.where(short, int(LineFault.SHORT), fault)
     fault = torch.where(several, fault, int(LineFault.ONE_CENTRE))
     return torch.where(views.used.sum(1) < 2, int(LineFault.TOO_FEW), fault)
 

@@ -12,7 +12,7 @@ from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.linalg.vectors import cross
 from torchsfm.optim import Loss, wants_derivative
 from torchsfm.triangulation.line_chart import places
-from torchsfm.triangulation.line_covariance import parameter_covariance, place_covariance, step_covariance
+from torchsfm.triangulation.line_covariance import parameter_covariance, place_covariance, step_covariance, turn_variance
 from torchsfm.triangulation.line_faults import LineFault, faults, one_plane
 from torchsfm.triangulation.line_fit import fit, fit_from
 from torchsfm.triangulation.line_layout import lay_out
@@ -25,6 +25,14 @@ _EXACT = 1e-11
 """Error, over the size of the coordinates, that is rounding's."""
 _UNSURE = 0.3
 """Deviation across the line, over its distance from the cameras, at which noise of one unit leaves no line."""
+_POINT = 5.0
+"""Root-mean-square length of segments, in deviations of their ends, that says nothing: of points it is 2."""
+_LONG = 16.0
+"""The same from which on noise makes no segments seem longer than they are."""
+_SLOPE = 1.0
+"""Deviation of a line's slope along the rays at which noise leaves its direction open,"""
+_SLOPE_OF_LONG = 4.0
+"""and that of long segments, where it is the views that are near each other."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,7 @@ class LineTriangulation:
     """The part of the line that the segments show together; with four views or more without the farthest of each quarter."""
     status: Int8[Tensor, "*batch n"]
     """OK; NOT_FINITE: a wanted observation is not finite; TOO_FEW: fewer than two; DEGENERATE: the planes of sight are one or
-    parallel, but for noise of a unit (one over the root of the weight); BEHIND: what is seen of it is not in front of all
+    parallel, or segments too short to show a direction, but for noise of a unit (one over the root of the weight); BEHIND: what is seen of it is not in front of all
     views that see it; NOT_CONVERGED."""
     fault: Int8[Tensor, "*batch n"]
     """Why there is no line where the status is TOO_FEW or DEGENERATE, a `LineFault`."""
@@ -160,7 +168,12 @@ def _solve(views: LineViews, segments: bool, loss: Loss | None, max_iterations: 
         end_covariance, trace = place_covariance(C, chart, d, span)
         # The weights say what noise is; without any it is a unit.
         blurred = trace > _UNSURE**2 * (2 + combine_rows(d, d) * span.square())
-        fault = faults(fixed, begin.lost | ~determined | blurred[0] | blurred[1] | one_plane(fixed))
+        lost = begin.lost | ~determined | blurred[0] | blurred[1] | one_plane(fixed)
+        noise = _noise(error, number)
+        length = _square_length(fixed, number) / noise
+        limit = torch.where(length < _LONG**2, _SLOPE**2, _SLOPE_OF_LONG**2)
+        short = (length <= _POINT**2) | (~lost & (noise * turn_variance(C, chart, point, d, fixed) > limit))
+        fault = faults(fixed, lost | short, short)
         # What is exact but for rounding is a minimum, whatever steps promise.
         size = combine_rows(combine_rows(fixed.ends.flatten(0, 1), fixed.ends.flatten(0, 1)), fixed.w)
         status = _status(views, fault, in_front, (status == Status.NOT_CONVERGED) & ~(error <= _EXACT * size.sqrt()))
@@ -178,6 +191,21 @@ def _error(r: Tensor, w: Tensor, number: Tensor) -> Tensor:
     some = square > 0
     error: Tensor = (torch.where(some, square, 1.0) / (2 * number.clamp_min(1))).sqrt() * some
     return error
+
+
+def _square_length(views: LineViews, number: Tensor) -> Tensor:
+    """The mean square of the lengths of segments (n), in units of the noise of their ends."""
+    away = views.ends[:, 0] - views.ends[:, 1]
+    return combine_rows(combine_rows(away, away), views.w) / number.clamp_min(1)
+
+
+def _noise(error: Tensor, number: Tensor) -> Tensor:
+    """The variance of noise (n): a unit, or the most of which one in twenty lines of so many views has such errors, if less."""
+    free = 2 * number - 4
+    some = free.clamp_min(2)
+    # The quantile of chi-square, after Wilson and Hilferty.
+    least = some * (1 - 2 / (9 * some) - 1.645 * (2 / (9 * some)).sqrt()) ** 3
+    return torch.where(free > 0, (2 * number * error.square() / least).clamp(1e-20, 1), 1.0)
 
 
 def _extent(t: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
