@@ -193,6 +193,49 @@ def test_a_plane_seen_from_nearly_one_place_is_told(generator):
     assert_share(~(wrong & (found.status == Status.OK)), 0.95)
 
 
+def arcs(scene: SimulatedConics, degrees: float, sigma: float, generator: torch.Generator) -> Tensor:
+    """Edge points (*batch, v, n, 60, 2) of arcs that begin anywhere."""
+    ellipse, _ = ellipse_from_conic(scene.C)
+    begin = torch.rand(*ellipse.angle.shape, 1, generator=generator, dtype=F64) * (2 * math.pi)
+    t = begin + torch.linspace(0, math.radians(degrees), 60, dtype=F64)
+    cos, sin = ellipse.angle.cos()[..., None], ellipse.angle.sin()[..., None]
+    u, v = ellipse.semi_axes[..., :1] * t.cos(), ellipse.semi_axes[..., 1:] * t.sin()
+    x = ellipse.centre[..., None, :] + torch.stack((u * cos - v * sin, u * sin + v * cos), -1)
+    return x + sigma * torch.randn(x.shape, generator=generator, dtype=F64)
+
+
+@pytest.mark.parametrize("views", [2, 3, 5])
+@pytest.mark.parametrize("degrees", [46.0, 140.0])
+@pytest.mark.parametrize("given", ["x", "covariance"])
+def test_arcs_of_noisy_points_give_no_wrong_ellipse(views, degrees, given, generator):
+    """Of short arcs next to nothing is known, and fits end anywhere; of longer ones hardly an answer is refused."""
+    sigma = 0.5
+    scene = simulate_conics((200,), views=views, generator=generator)
+    x = arcs(scene, degrees, sigma, generator)
+    fits = fit_ellipse(x)
+    noise = {"x": x, "weights": torch.full(x.shape[:-1], sigma**-2, dtype=F64)}
+    options = noise if given == "x" else {"covariance": sigma**2 * fits.covariance}
+    found = triangulate_conics(conic_from_ellipse(fits.model), scene.P, **options)
+    good = (found.status == Status.OK)[:, 0]
+    e = coordinates(scene.model, found.model) - coordinates(found.model, found.model)
+    square = (e * torch.linalg.solve(found.covariance + 1e-30 * torch.eye(8, dtype=F64), e[..., None])[..., 0]).sum(-1)
+    wrong = good & (square[:, 0] > 100)
+    if degrees > 90:
+        assert_share(good, 0.8)
+    # Eight degrees of freedom: 100 is far out, but what covariances of ellipses say is true only near them.
+    assert_share(~wrong, 0.97)
+
+
+def test_images_of_different_ellipses_are_no_ellipse(generator):
+    scene = simulate_conics((100,), conics=3, views=3, noise=0.5, generator=generator)
+    wrong = torch.arange(3)[:, None] + torch.arange(3)
+    x = torch.stack([scene.x[:, v, wrong[v] % 3] for v in range(3)], 1)
+    fits = fit_ellipse(x)
+    C = conic_from_ellipse(fits.model)
+    assert_share(triangulate_conics(C, scene.P, x=x).status != Status.OK, 0.999)
+    assert_share(triangulate_conics(C, scene.P, covariance=fits.covariance).status != Status.OK, 0.95)
+
+
 def test_the_world_may_move_and_cameras_have_any_scale(generator):
     scene = simulate_conics((20,), views=3, noise=0.3, points=20, generator=generator)
     found = triangulate_conics(scene.C, scene.P, x=scene.x)

@@ -35,6 +35,8 @@ class ConicImages:
     """Where something that is wanted is not finite."""
     ready: Bool[Tensor, "*batch"]
     """Where all images are ellipses, and their centres meet somewhere."""
+    measured: bool
+    """Whether edge points were given, or covariances: not only the ellipses."""
 
 
 def prepare(
@@ -80,7 +82,10 @@ def prepare(
         counts = torch.where(seen[..., None], counts, 0.0)
         sights = Sights(P, torch.where((counts.detach() > 0)[..., None], y, 0.0), unit)
     ready = placed & (ellipses | ~seen).all(-1)
-    return ConicImages(P, N @ dual @ N.mT, seen, sights, counts.flatten(-2), origin, scale, broken, ready)
+    return ConicImages(
+        P, N @ dual @ N.mT, seen, sights, counts.flatten(-2), origin, scale, broken, ready,
+        x is not None or covariance is not None,
+    )  # fmt: skip
 
 
 def _place(P: Tensor, centre: Tensor, D: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:

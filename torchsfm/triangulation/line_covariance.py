@@ -61,8 +61,8 @@ def place_covariance(C: Square, chart: Chart, d: Tensor, t: Tensor) -> tuple[Ten
 def turn_variance(C: Square, chart: Chart, point: Tensor, d: Tensor, views: LineViews) -> Tensor:
     """The variance (n) of directions as the views see them: in two coordinates, over that of what is across the rays to them.
 
-    Angles to lines that point at the cameras are small because noise made them seem to: what says that the direction is known is
-    not that its angle varies little, but that its slope along the rays does.
+    Lines seem to point at the cameras where noise is much, and then their angles vary little: what says that the direction is
+    known is that its slope along the rays does.
 
     Args:
         C: That of the parameters.

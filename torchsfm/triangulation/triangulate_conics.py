@@ -11,6 +11,7 @@ from torchsfm.geometry import Ellipsoid, PlaneConic, dual_quadric_from_ellipsoid
 from torchsfm.geometry.quadrics import dual_of_shape
 from torchsfm.linalg import eigh, inverse
 from torchsfm.optim import levenberg_marquardt
+from torchsfm.triangulation.conic_evidence import contradicted, evidence
 from torchsfm.triangulation.conic_images import ConicImages, first_guess, prepare
 from torchsfm.triangulation.conics_2view import in_front
 from torchsfm.triangulation.outlines import Shape
@@ -47,7 +48,8 @@ class ConicTriangulation:
     status: Int8[Tensor, "*batch n"]
     """OK; NOT_FINITE: a wanted conic, edge point or camera is not finite; TOO_FEW: fewer than two views (three for ellipsoids);
     DEGENERATE: an image is no ellipse, or the views do not determine the shape or its plane (no baseline to speak of, a plane
-    through the centres);
+    through the centres, arcs: of two or three views, or any number with covariances, two must show their ellipse by themselves),
+    or it is clearly farther from edge points than the conics of their own images are: none was found that all belong to;
     BEHIND: not wholly in front of all views that see it; NOT_CONVERGED."""
     covariance: Float[Tensor, "*batch n k k"]
     """For independent noise of variance 1 / weight in every edge point (1 pixel where no weights are given), or as given with
@@ -231,12 +233,19 @@ def _judge(images: ConicImages, shape: Shape, squares: Tensor, converged: Tensor
     front = in_front(images.P, dual[..., None, :, :])
     # Of exact data the cost is rounding, and no step lowers it any more.
     rounding = (_ROUNDING * images.sights.unit).square().amax(-1) * w.sum(-1)
+    views = images.seen.sum(-1)
+    alone = evidence(images)
+    # Two or three views have little to spare by which they would tell which of several answers it is; and what covariances of
+    # ellipses say is true near ellipses that are known.
+    several = views > 3 if images.sights.white is None else torch.zeros_like(guessed)
+    vague = ~several & ((alone.known & images.seen).sum(-1) < 2)
+    false = contradicted(alone, squares, (5 * views - shape.size).to(w.dtype), rounding)
     status = torch.full(squares.shape, int(Status.OK), dtype=torch.int8, device=w.device)
     for condition, code in (
         (~converged & (squares > rounding), Status.NOT_CONVERGED),
         (~(front | ~images.seen).all(-1), Status.BEHIND),
-        (~images.ready | ~guessed | ~regular | unsure | flat, Status.DEGENERATE),
-        (images.seen.sum(-1) < m, Status.TOO_FEW),
+        (~images.ready | ~guessed | ~regular | unsure | flat | vague | false, Status.DEGENERATE),
+        (views < m, Status.TOO_FEW),
         (images.broken, Status.NOT_FINITE),
     ):
         status = torch.where(condition, int(code), status)

@@ -56,8 +56,8 @@ class LineTriangulation:
     """The part of the line that the segments show together; with four views or more without the farthest of each quarter."""
     status: Int8[Tensor, "*batch n"]
     """OK; NOT_FINITE: a wanted observation is not finite; TOO_FEW: fewer than two; DEGENERATE: the planes of sight are one or
-    parallel, or segments too short to show a direction, but for noise of a unit (one over the root of the weight); BEHIND: what is seen of it is not in front of all
-    views that see it; NOT_CONVERGED."""
+    parallel, or segments too short to show a direction, but for noise of a unit (one over the root of the weight); BEHIND: what
+    is seen of it is not in front of all views that see it; NOT_CONVERGED."""
     fault: Int8[Tensor, "*batch n"]
     """Why there is no line where the status is TOO_FEW or DEGENERATE, a `LineFault`."""
     in_front: Bool[Tensor, "*batch n"]
