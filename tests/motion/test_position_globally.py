@@ -188,3 +188,55 @@ def test_wrong_arguments_are_named(unchecked: None, generator: torch.Generator) 
         position_globally(rays.d, rays.view[:3], rays.point, rays.R, points=20)
     with pytest.raises(ValueError, match="points"):
         position_globally(rays.d, rays.view, rays.point, rays.R, points=-1)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize("shared", ["one point", "one camera", "pairs"])
+def test_parts_of_free_size_are_open(shared: str, noise: float, generator: torch.Generator) -> None:
+    """Whose points and cameras all together are known but for one number."""
+    c, X = (torch.randn(n, 3, generator=generator, dtype=torch.float64) * size for n, size in ((12, 1.5), (120, 2.0)))
+    X = X + torch.tensor([0.0, 0.0, 10.0])
+    visible = torch.rand(12, 120, generator=generator) < 0.7
+    visible[:6, 60:], visible[6:, :60] = False, False
+    if shared == "one point":
+        visible[:, 0] = True
+    elif shared == "one camera":
+        visible[5] = True
+    else:
+        # Each point from two cameras, one after the other in a line.
+        c = torch.arange(12, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.2, 0.0])
+        first = torch.arange(120) % 11
+        visible = torch.zeros(12, 120, dtype=torch.bool)
+        visible[first, torch.arange(120)] = visible[first + 1, torch.arange(120)] = True
+    view, point = visible.nonzero(as_tuple=True)
+    d = torch.nn.functional.normalize(X[point] - c[view], dim=-1)
+    d = d + noise * torch.randn(d.shape, generator=generator, dtype=torch.float64)
+    R = torch.eye(3, dtype=torch.float64).expand(12, 3, 3)
+    found = position_globally(d, view, point, R, points=120)
+    assert (found.component == 0).all()
+    ok = found.status == Status.OK
+    # What is close to where the parts meet may be known well enough.
+    assert ok.sum() < 10
+    assert (found.status[~ok] == Status.DEGENERATE).all()
+    # A point or camera more holds it.
+    if shared == "one camera":
+        visible[6] = True
+        view, point = visible.nonzero(as_tuple=True)
+        d = torch.nn.functional.normalize(X[point] - c[view], dim=-1)
+        assert (position_globally(d, view, point, R, points=120).status == Status.OK).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_rays_to_one_place_leave_cameras_open(noise: float, generator: torch.Generator) -> None:
+    """Each camera may be anywhere on its line, whatever noise makes of the points."""
+    c = torch.randn(12, 3, generator=generator, dtype=torch.float64)
+    X = torch.tensor([0.0, 0.0, 10.0], dtype=torch.float64).expand(100, 3)
+    rays = see(c, X, 7, noise, 0.0, generator)
+    assert (rays.solve().status == Status.DEGENERATE).all()
+
+
+def test_wrong_rays_do_not_place_cameras_that_only_turned(generator: torch.Generator) -> None:
+    X = torch.randn(100, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 10.0])
+    for _ in range(5):
+        rays = see(torch.zeros(12, 3, dtype=torch.float64), X, 7, 1e-3, 0.2, generator)
+        assert (rays.solve().status == Status.OK).sum() <= 1

@@ -48,8 +48,8 @@ class ConicTriangulation:
     status: Int8[Tensor, "*batch n"]
     """OK; NOT_FINITE: a wanted conic, edge point or camera is not finite; TOO_FEW: fewer than two views (three for ellipsoids);
     DEGENERATE: an image is no ellipse, or the views do not determine the shape or its plane (no baseline to speak of, a plane
-    through the centres, arcs: of two or three views, or any number with covariances, two must show their ellipse by themselves),
-    or it is clearly farther from edge points than the conics of their own images are: none was found that all belong to;
+    through the centres, arcs: of two or three views, or any with covariances, two must show their ellipse by themselves), or
+    it is clearly farther from edge points than the conics of their own images are: none was found that all belong to;
     BEHIND: not wholly in front of all views that see it; NOT_CONVERGED."""
     covariance: Float[Tensor, "*batch n k k"]
     """For independent noise of variance 1 / weight in every edge point (1 pixel where no weights are given), or as given with

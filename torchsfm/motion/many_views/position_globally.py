@@ -42,7 +42,10 @@ HUBER = 1.5
 HELD = 1e3
 """By how much more exactly the extent is held than what the rays leave open, to say how well they determine the rest."""
 PARALLAX, NEEDED = 8.0, 3
-"""Standard deviations by which so many rays of a camera must differ from where points at infinity would be."""
+"""Standard deviations by which so many rays of a camera must differ from where points at infinity would be, and two from where
+all points were one."""
+CHANCE = 0.2
+"""How many more for each wrong ray: those pull points nearer, where right rays still agree."""
 FAR = 1e4
 """Points so far away, in extents of the component, or so near, say nothing of centres."""
 OPEN = 0.3
@@ -61,8 +64,9 @@ class GlobalPositions:
         X: The points; 0 where not `valid`.
         valid: Points with two agreeing rays or more from cameras that are OK.
         status: OK; TOO_FEW: no point that another camera sees, too; DEGENERATE: the rays leave the centre open (cameras that
-            only turned, or hang on too few points); NOT_CONVERGED: the iteration limit came first, the centres are the best
-            seen.
+            only turned, hang on too few points, see points in one place alone, or belong to a part whose size is free, as it
+            has one camera or one point in common with the others, or as two cameras each see its points); NOT_CONVERGED: the
+            iteration limit came first, the centres are the best seen.
         component: The smallest camera that each is connected with through points. Components have nothing to do with each
             other.
         deviation: Standard deviation of each centre in its component, by the scatter of the rays; infinite where it is not
@@ -171,7 +175,7 @@ def position_globally(
         inliers = torch.zeros_like(good).index_put_((kept,), off <= AGREES * scale)
         deviation = rays.deviations(c, X, component, scale)
         seen = torch.bincount(rays.view, minlength=v)
-        known = (deviation < OPEN) & (rays.parallaxes(off <= AGREES * scale, scale) >= NEEDED)
+        known = (deviation < OPEN) & rays.tell(off <= AGREES * scale, scale)
         code = torch.where(known, int(found.status), int(Status.DEGENERATE))
         status = torch.where(seen == 0, int(Status.TOO_FEW), code).to(torch.int8)
         ok = status == int(found.status)
@@ -234,17 +238,25 @@ class _Rays:
         at = torch.zeros(self.points, dtype=torch.long, device=X.device).index_put_((self.point,), component[self.view])
         return (c - c[component]) / extent[component], (X - c[at]) / extent[at]
 
-    def parallaxes(self, inliers: Bool[Tensor, "m"], scale: float) -> Int[Tensor, "v"]:
-        """How many rays of each camera differ from the mean direction of their point by more than noise: some are near."""
-        mean = torch.zeros(self.points, 3, dtype=self.v.dtype, device=self.v.device)
-        mean = mean.index_add_(0, self.point[inliers], self.v[inliers])[self.point]
-        apart = torch.atan2(torch.linalg.cross(self.v, mean).norm(dim=-1), (self.v * mean).sum(-1))
-        return torch.bincount(self.view[inliers & (apart > PARALLAX * scale)], minlength=self.views)
+    def tell(self, inliers: Bool[Tensor, "m"], scale: float) -> Bool[Tensor, "v"]:
+        """Whether some rays of each camera differ by more than noise from the mean direction of their point, and of the camera.
+
+        Else all points are far, or in one place, of which noise makes several that seem to tell where the camera is.
+        """
+        known = torch.ones(self.views, dtype=torch.bool, device=self.v.device)
+        wrong = torch.bincount(self.view[~inliers], minlength=self.views)
+        for index, number in ((self.point, self.points), (self.view, self.views)):
+            mean = torch.zeros(number, 3, dtype=self.v.dtype, device=self.v.device)
+            mean = mean.index_add_(0, index[inliers], self.v[inliers])[index]
+            apart = torch.atan2(torch.linalg.cross(self.v, mean).norm(dim=-1), (self.v * mean).sum(-1))
+            count = torch.bincount(self.view[inliers & (apart > PARALLAX * scale)], minlength=self.views)
+            known = known & (count >= (NEEDED + CHANCE * wrong if index is self.point else 2))
+        return known
 
     def deviations(self, c: Tensor, X: Tensor, component: Tensor, scale: float) -> Float[Tensor, "v"]:
         """Of each centre, with the first camera of its component held, and how far the one farthest away is from it.
 
-        What the rays leave open has the deviation 1 of what is expected without any.
+        What the rays leave open has the deviation of what is expected without any: 1 where all of a component is open.
         """
         if not len(self.v) or int(torch.bincount(component).amax()) > LARGEST:
             return c.new_zeros(self.views)
@@ -258,13 +270,19 @@ class _Rays:
         apart = c[last] - c[first]
         distance = (X[self.point] - c[self.view]).norm(dim=-1)
         near = ((distance > 1 / FAR) & (distance < FAR)).nonzero()[:, 0]
+        # All of a component may be open together, as the size of a part of it that hangs on one camera: then what is expected
+        # of each would add up to something that is known.
+        share = torch.bincount(component, minlength=self.views) + torch.bincount(
+            component[self.view[near]], minlength=self.views
+        )
+        share = share.to(c.dtype).rsqrt()[component]
         direction = HELD * torch.nn.functional.normalize(apart, dim=-1)
         # A point is as uncertain as it is far away.
-        of_points = (self.point[near],), (X[self.point[near]], 1 / distance[near])
+        of_points = (self.point[near],), (X[self.point[near]], share[self.view[near]] / distance[near])
         terms = [
             self._sines(scale, 1 / scale).select(near),
-            Term(lambda a, expected: a - expected, ("c",), (own,), (c,)),
-            Term(lambda a, expected, weight: weight[:, None] * (a - expected), ("X",), *of_points),
+            Term(_apart, ("c",), (own,), (c, share)),
+            Term(_apart, ("X",), *of_points),
             Term(_length, ("c", "c"), (first, last), (direction, HELD * apart.norm(dim=-1))),
         ]
         blocks = {"c": Block(c, fixed=component == own), "X": Block(X)}
@@ -328,6 +346,10 @@ def _store(J: Tensor, out: list[Tensor | None], residual: Tensor) -> Tensor:
     if out[1] is not None:
         out[1].copy_(J)
     return residual
+
+
+def _apart(a: Tensor, expected: Tensor, weight: Tensor) -> Tensor:
+    return weight[:, None] * (a - expected)
 
 
 def _length(a: Tensor, b: Tensor, direction: Tensor, length: Tensor) -> Tensor:
