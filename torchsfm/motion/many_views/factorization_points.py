@@ -44,8 +44,9 @@ _NUMBERS = 1 << 25
 """Numbers in the largest array of the problems solved at a time."""
 _SCALES = (8.0, 6.0, 4.0, 3.0)
 """Where the robust loss lets go, in medians of the sines, one after the other."""
-_UNDETERMINED = 0.3
-"""Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined."""
+_UNDETERMINED = 0.08
+"""Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined: noise of points that leave a camera
+open makes of it ones of a tenth and more, as it spreads them."""
 _FLAT_STEPS = 15
 """Most steps of the homographies that are fitted for comparison: where they do not fit, their minimum does not matter."""
 
@@ -66,7 +67,8 @@ class Factorization:
         used_view: Views with at least six points that other views see too.
         used_point: Points in at least two used views.
         status: `OK`; `NOT_CONVERGED`; `TOO_FEW` views or points; `DEGENERATE`: the data leave cameras undetermined (points in
-            a plane, views without baseline, parts that hang together too loosely).
+            a plane but for one, on two lines, in four places or five; views without baseline; parts that hang together too
+            loosely), but for noise.
 
     Example:
         >>> import torch, torchsfm
