@@ -39,7 +39,7 @@ class Evidence(NamedTuple):
 def evidence(images: ConicImages) -> Evidence:
     """The evidence of ellipses that were measured."""
     sights, seen = images.sights, images.seen
-    w = images.weights.unflatten(-1, sights.y.shape[-3:-1])
+    w = images.weights.reshape(*images.weights.shape[:-1], *sights.y.shape[-3:-1])
     centre, D, _ = shape_of_dual_conic(images.dual)
     root = square_root(D)
     away = sights.y - centre[..., None, :]

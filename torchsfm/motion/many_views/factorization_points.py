@@ -45,8 +45,8 @@ _NUMBERS = 1 << 25
 _SCALES = (8.0, 6.0, 4.0, 3.0)
 """Where the robust loss lets go, in medians of the sines, one after the other."""
 _UNDETERMINED = 0.08
-"""Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined: noise that spreads points which leave
-it open makes a tenth of it and more."""
+"""Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined. Where points leave it open, noise
+that spreads them makes a tenth of it and more."""
 _FLAT_STEPS = 15
 """Most steps of the homographies that are fitted for comparison: where they do not fit, their minimum does not matter."""
 
