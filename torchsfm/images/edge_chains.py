@@ -53,64 +53,91 @@ def link_edgels(
     b, h, w = shape
     n = len(x)
     own = torch.arange(n, device=x.device)
-    at = torch.full((b * h * w,), -1, dtype=torch.long, device=x.device)
-    at[place] = own
-    steps = [(dx, dy) for dy in range(-2, 3) for dx in range(-2, 3) if dx or dy]
-    dx, dy = torch.tensor(steps, device=x.device).unbind(-1)
-    column, row = place % w, place // w % h
-    inside = (column[:, None] + dx >= 0) & (column[:, None] + dx < w) & (row[:, None] + dy >= 0) & (row[:, None] + dy < h)
-    who = at[torch.where(inside, place[:, None] + dy * w + dx, 0)]
-    who = torch.where(inside, who, -1)
-    other = who.clamp_min(0)
-    d = x[other] - x[:, None]
-    distance = d.square().sum(-1)
-    its = gradient[other]
-    side = gradient[:, None, 0] * d[..., 1] - gradient[:, None, 1] * d[..., 0]
-    its_side = its[..., 0] * d[..., 1] - its[..., 1] * d[..., 0]
-    alike = (who >= 0) & ((its * gradient[:, None]).sum(-1) > 0) & (distance <= _REACH**2)
-    front, back = alike & (side > 0) & (its_side > 0), alike & (side < 0) & (its_side < 0)
+    start, end, distance = _steps(x.detach(), gradient.detach(), place, b, h, w)
     following, preceding = own.clone(), own.clone()
     for _ in range(_ROUNDS):
-        ends, starts = following == own, preceding == own
-        ahead = _nearest(distance, front & ends[:, None] & starts[other], other)
-        behind = _nearest(distance, back & starts[:, None] & ends[other], other)
-        mutual = (ahead >= 0) & (behind[ahead.clamp_min(0)] == own)
-        following = torch.where(mutual, ahead, following)
-        mutual = (behind >= 0) & (ahead[behind.clamp_min(0)] == own)
-        preceding = torch.where(mutual, behind, preceding)
+        ahead = _nearest(distance, start, end, n)
+        behind = _nearest(distance, end, start, n)
+        chosen = (ahead[start] == end) & (behind[end] == start)
+        following[start[chosen]], preceding[end[chosen]] = end[chosen], start[chosen]
+        left = (following[start] == start) & (preceding[end] == end)
+        start, end, distance = start[left], end[left], distance[left]
     return following, preceding
 
 
-def _nearest(distance: Tensor, candidate: Tensor, who: Tensor) -> Tensor:
-    """The nearest candidate, -1 where there is none."""
-    least, column = torch.where(candidate, distance, torch.inf).min(-1)
-    return torch.where(least < torch.inf, who.gather(-1, column[:, None])[:, 0], -1)
+def _steps(x: Tensor, gradient: Tensor, place: Tensor, b: int, h: int, w: int) -> tuple[Tensor, Tensor, Tensor]:
+    """All steps forwards from one edge point to another, and their squared lengths."""
+    # With two pixels around each image nothing within reach is beyond the map; numbers of 32 bits keep it small.
+    wide = w + 4
+    at = torch.full((b * (h + 4) * wide,), -1, dtype=torch.int32, device=x.device)
+    column, row, image = place % w, place // w % h, place // (h * w)
+    here = (image * (h + 4) + row + 2) * wide + column + 2
+    at[here] = torch.arange(len(x), dtype=torch.int32, device=x.device)
+    firsts, seconds = [], []
+    # Each pair once: the second comes later in the list.
+    for dy, dx in [(0, 1), (0, 2), *((dy, dx) for dy in (1, 2) for dx in range(-2, 3))]:
+        other = at[here + (dy * wide + dx)]
+        first = (other >= 0).nonzero()[:, 0]
+        firsts.append(first)
+        seconds.append(other[first])
+    first, second = torch.cat(firsts), torch.cat(seconds).long()
+    (px, py), (qx, qy) = x[first].unbind(-1), x[second].unbind(-1)
+    (gx, gy), (kx, ky) = gradient[first].unbind(-1), gradient[second].unbind(-1)
+    dx, dy = qx - px, qy - py
+    distance = dx.square() + dy.square()
+    side, its_side = gx * dy - gy * dx, kx * dy - ky * dx
+    ahead, behind = (side > 0) & (its_side > 0), (side < 0) & (its_side < 0)
+    alike = (gx * kx + gy * ky > 0) & (distance <= _REACH**2) & (ahead | behind)
+    first, second, forwards, distance = first[alike], second[alike], ahead[alike], distance[alike]
+    return torch.where(forwards, first, second), torch.where(forwards, second, first), distance
+
+
+def _nearest(distance: Tensor, one: Tensor, other: Tensor, n: int) -> Tensor:
+    """The nearest other of each one of n, the first in the list where several are; n where there is none."""
+    least = distance.new_full((n,), torch.inf).scatter_reduce(0, one, distance, "amin")
+    near = distance == least[one]
+    return torch.full((n,), n, device=one.device).scatter_reduce(0, one[near], other[near], "amin")
 
 
 def order_chains(preceding: Int[Tensor, " n"], image: Int[Tensor, " n"]) -> Chains:
     """Chains of linked edge points, image by image, the longest first."""
     n = len(preceding)
     own = torch.arange(n, device=preceding.device)
-    rounds = max(1, n).bit_length()
+    rank, first, least = (preceding != own).long(), preceding.clone(), own.clone()
+    ring = _walk_back(preceding, rank, first, least, rank.nonzero()[:, 0])
     # A ring starts at its smallest number.
-    least, jump = own, preceding
-    for _ in range(rounds):
-        least = torch.minimum(least, least[jump])
-        jump = jump[jump]
-    ring = preceding[jump] != jump
-    preceding = torch.where(ring & (least == own), own, preceding)
-    rank, jump = (preceding != own).long(), preceding
-    for _ in range(rounds):
-        rank = rank + rank[jump]
-        jump = jump[jump]
-    length = torch.zeros_like(own).index_add(0, jump, torch.ones_like(own))[jump]
+    head = ring[least[ring] == ring]
+    preceding = preceding.index_copy(0, head, head)
+    rank[ring], first[ring] = (preceding[ring] != ring).long(), preceding[ring]
+    _walk_back(preceding, rank, first, least, ring)
+    closed = torch.zeros(n, dtype=torch.bool, device=own.device).index_fill(0, head, True)
+    length = torch.zeros_like(own).index_add(0, first, torch.ones_like(own))
     # By image, then by falling length, then by where the chain starts, then along it.
-    order = own
-    for key in (rank, jump, -length, image):
-        order = order[key[order].argsort(stable=True)]
-    length, rank = length[order], rank[order]
-    start = own - rank
-    return Chains(order, (rank == 0).cumsum(0) - 1, start, length, ring[order])
+    chains = (first == own).nonzero()[:, 0]
+    for key in (-length, image):
+        chains = chains[key[chains].argsort(stable=True)]
+    length, closed = length[chains], closed[chains]
+    start = length.cumsum(0) - length
+    begins = torch.empty_like(own).index_copy(0, chains, start)
+    order = torch.empty_like(own).index_copy(0, begins[first] + rank, own)
+    start, each, closed = (v.repeat_interleave(length) for v in (start, length, closed))
+    number = torch.arange(len(chains), device=own.device).repeat_interleave(length)
+    return Chains(order, number, start, each, closed)
+
+
+def _walk_back(preceding: Tensor, rank: Tensor, first: Tensor, least: Tensor, active: Tensor) -> Tensor:
+    """Let `first`, which is `rank` steps back, become the start of each one's chain; those in rings, who have none.
+
+    Steps double in each round. `least` becomes the smallest number of a ring. All but `preceding` are changed in place.
+    """
+    for _ in range(max(1, len(preceding)).bit_length()):
+        before = first[active]
+        rank[active] += rank[before]
+        least[active] = torch.minimum(least[active], least[before])
+        before = first[before]
+        first[active] = before
+        active = active[preceding[before] != before]
+    return active
 
 
 def chain_curvature(x: Float[Tensor, "n 2"], chains: Chains) -> Float[Tensor, " n"]:

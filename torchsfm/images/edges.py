@@ -216,15 +216,17 @@ def _filters(blur: float) -> _Filters:
 
 def _noise(gray: Tensor, broken: Tensor) -> Tensor:
     """The noise of each image (b), from second differences in both directions, which edges hardly change on the whole."""
-    d = gray[:, :-2] - 2 * gray[:, 1:-1] + gray[:, 2:]
-    d = d[..., :-2] - 2 * d[..., 1:-1] + d[..., 2:]
+    d = gray[:, :-2].sub(gray[:, 1:-1], alpha=2).add_(gray[:, 2:])
+    d = d[..., :-2].sub(d[..., 1:-1], alpha=2).add_(d[..., 2:]).abs_()
     spoiled = _near(broken, 1)[:, 1:-1, 1:-1]
-    middle = torch.where(spoiled, torch.nan, d.abs()).flatten(1).nanmedian(-1).values
+    middle = d.masked_fill_(spoiled, torch.nan).flatten(1).nanmedian(-1).values
     return torch.where(middle.isnan(), 0.0, middle / (6 * 0.67449))
 
 
 def _near(mask: Tensor, reach: int) -> Tensor:
     """Where anything within a square of `reach` pixels to each side is true."""
+    if not bool(mask.any()):
+        return mask
     size = 2 * reach + 1
     return torch.nn.functional.max_pool2d(mask[:, None].float(), size, stride=1, padding=reach)[:, 0] > 0
 
