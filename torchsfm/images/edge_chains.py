@@ -58,10 +58,11 @@ def link_edgels(
     for _ in range(_ROUNDS):
         ahead = _nearest(distance, start, end, n)
         behind = _nearest(distance, end, start, n)
-        chosen = (ahead[start] == end) & (behind[end] == start)
-        following[start[chosen]], preceding[end[chosen]] = end[chosen], start[chosen]
-        left = (following[start] == start) & (preceding[end] == end)
-        start, end, distance = start[left], end[left], distance[left]
+        mutual = (ahead.index_select(0, start) == end) & (behind.index_select(0, end) == start)
+        one, other = _chosen(mutual, start, end)
+        following[one], preceding[other] = other, one
+        left = (following.index_select(0, start) == start) & (preceding.index_select(0, end) == end)
+        start, end, distance = _chosen(left, start, end, distance)
     return following, preceding
 
 
@@ -76,27 +77,34 @@ def _steps(x: Tensor, gradient: Tensor, place: Tensor, b: int, h: int, w: int) -
     firsts, seconds = [], []
     # Each pair once: the second comes later in the list.
     for dy, dx in [(0, 1), (0, 2), *((dy, dx) for dy in (1, 2) for dx in range(-2, 3))]:
-        other = at[here + (dy * wide + dx)]
+        other = at.index_select(0, here + (dy * wide + dx))
         first = (other >= 0).nonzero()[:, 0]
         firsts.append(first)
-        seconds.append(other[first])
+        seconds.append(other.index_select(0, first))
     first, second = torch.cat(firsts), torch.cat(seconds).long()
-    (px, py), (qx, qy) = x[first].unbind(-1), x[second].unbind(-1)
-    (gx, gy), (kx, ky) = gradient[first].unbind(-1), gradient[second].unbind(-1)
+    values = (*x.unbind(-1), *gradient.unbind(-1))
+    px, py, gx, gy = (v.index_select(0, first) for v in values)
+    qx, qy, kx, ky = (v.index_select(0, second) for v in values)
     dx, dy = qx - px, qy - py
     distance = dx.square() + dy.square()
     side, its_side = gx * dy - gy * dx, kx * dy - ky * dx
     ahead, behind = (side > 0) & (its_side > 0), (side < 0) & (its_side < 0)
     alike = (gx * kx + gy * ky > 0) & (distance <= _REACH**2) & (ahead | behind)
-    first, second, forwards, distance = first[alike], second[alike], ahead[alike], distance[alike]
+    first, second, forwards, distance = _chosen(alike, first, second, ahead, distance)
     return torch.where(forwards, first, second), torch.where(forwards, second, first), distance
+
+
+def _chosen(which: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+    """Those of each list; several at once, as looking for them takes longest."""
+    rows = which.nonzero()[:, 0]
+    return tuple(v.index_select(0, rows) for v in values)
 
 
 def _nearest(distance: Tensor, one: Tensor, other: Tensor, n: int) -> Tensor:
     """The nearest other of each one of n, the first in the list where several are; n where there is none."""
     least = distance.new_full((n,), torch.inf).scatter_reduce(0, one, distance, "amin")
-    near = distance == least[one]
-    return torch.full((n,), n, device=one.device).scatter_reduce(0, one[near], other[near], "amin")
+    one, other = _chosen(distance == least.index_select(0, one), one, other)
+    return torch.full((n,), n, device=one.device).scatter_reduce(0, one, other, "amin")
 
 
 def order_chains(preceding: Int[Tensor, " n"], image: Int[Tensor, " n"]) -> Chains:
@@ -131,12 +139,12 @@ def _walk_back(preceding: Tensor, rank: Tensor, first: Tensor, least: Tensor, ac
     Steps double in each round. `least` becomes the smallest number of a ring. All but `preceding` are changed in place.
     """
     for _ in range(max(1, len(preceding)).bit_length()):
-        before = first[active]
-        rank[active] += rank[before]
-        least[active] = torch.minimum(least[active], least[before])
-        before = first[before]
+        before = first.index_select(0, active)
+        rank[active] += rank.index_select(0, before)
+        least[active] = torch.minimum(least.index_select(0, active), least.index_select(0, before))
+        before = first.index_select(0, before)
         first[active] = before
-        active = active[preceding[before] != before]
+        active = active[preceding.index_select(0, before) != before]
     return active
 
 
@@ -146,7 +154,7 @@ def chain_curvature(x: Float[Tensor, "n 2"], chains: Chains) -> Float[Tensor, " 
     That of the circle through an edge point and the fourth to each side, averaged over five neighbours; near the ends that of
     the first place with so many to each side, and zero in chains that are too short.
     """
-    before, after = x[chains.neighbour(-_HALF)], x[chains.neighbour(_HALF)]
+    before, after = (x.index_select(0, chains.neighbour(steps)) for steps in (-_HALF, _HALF))
     a, b = x - before, after - x
     area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     sides = a.square().sum(-1) * b.square().sum(-1) * (a + b).square().sum(-1)

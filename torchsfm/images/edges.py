@@ -138,7 +138,8 @@ def detect_edges(
     _, preceding = link_edgels(found.x, found.gradient, found.place, (len(gray), height, width))
     chains = order_chains(preceding, image_of)
     x, gradient, sigma, spread, image_of, top, cosine = (
-        v[chains.order] for v in (found.x, found.gradient, sigma, found.width, image_of, found.top, found.cosine)
+        v.index_select(0, chains.order)
+        for v in (found.x, found.gradient, sigma, found.width, image_of, found.top, found.cosine)
     )
     curvature, drawn = chain_curvature(x, chains), 0.5 * _drawn_in(spread, cosine)
     # The radius comes out smaller by the shift.
@@ -150,11 +151,12 @@ def detect_edges(
     strong = torch.zeros_like(chains.chain).index_add(0, chains.chain, strong.long())[chains.chain] > 0
     keep = strong & (chains.length >= min_edgels)
     slot, fits, left_out = _slots(keep, image_of, chains.start + chains.length - 1, len(gray), max_edgels)
-    place = (image_of * max_edgels + slot)[fits]
+    rows = fits.nonzero()[:, 0]
+    place = (image_of * max_edgels + slot).index_select(0, rows)
 
     def lay(values: Tensor, empty: float | int = 0) -> Tensor:
         out = values.new_full((len(gray) * max_edgels, *values.shape[1:]), empty)
-        return out.index_copy(0, place, values[fits]).reshape(*batch, max_edgels, *values.shape[1:])
+        return out.index_copy(0, place, values.index_select(0, rows)).reshape(*batch, max_edgels, *values.shape[1:])
 
     number = _numbers(chains.chain, fits, image_of, len(gray))
     return Edges(
@@ -258,8 +260,7 @@ def _maxima(gx: Tensor, gy: Tensor, magnitude: Tensor, allowed: Tensor) -> _Edge
     place = (allowed & (magnitude > before) & (magnitude >= after)).flatten().nonzero()[:, 0]
     height, width = gx.shape[-2:]
     column, row = place % width, place // width % height
-    a, b, c = (m.flatten()[place] for m in (before, magnitude, after))
-    level = flat.flatten()[place]
+    a, b, c, level = (m.flatten().index_select(0, place) for m in (before, magnitude, after, flat))
     tiny = 1e-3 * b
     a, c = torch.maximum(a, tiny), torch.maximum(c, tiny)
     la, lb, lc = a.log(), b.log(), c.log()
@@ -267,7 +268,9 @@ def _maxima(gx: Tensor, gy: Tensor, magnitude: Tensor, allowed: Tensor) -> _Edge
     offset = (0.5 * (lc - la) / bend).clamp(-0.5, 0.5)
     step = torch.where(level, 1, width) * torch.where(offset < 0, -1, 1)
     share = offset.abs()
-    gradient = torch.stack([torch.lerp(g.flatten()[place], g.flatten()[place + step], share) for g in (gx, gy)], -1)
+    gradient = torch.stack(
+        [torch.lerp(*(g.flatten().index_select(0, p) for p in (place, place + step)), share) for g in (gx, gy)], -1
+    )
     top = gradient.square().sum(-1).sqrt()
     cosine = torch.where(level, gradient[:, 0], gradient[:, 1]).abs() / top
     x = torch.stack((column, row), -1).to(gx.dtype)
