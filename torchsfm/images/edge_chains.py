@@ -76,8 +76,8 @@ def _steps(x: Tensor, gradient: Tensor, place: Tensor, b: int, h: int, w: int) -
     at[here] = torch.arange(len(x), dtype=torch.int32, device=x.device)
     firsts, seconds = [], []
     # Each pair once: the second comes later in the list.
-    for dy, dx in [(0, 1), (0, 2), *((dy, dx) for dy in (1, 2) for dx in range(-2, 3))]:
-        other = at.index_select(0, here + (dy * wide + dx))
+    for down, right in [(0, 1), (0, 2), *((j, i) for j in (1, 2) for i in range(-2, 3))]:
+        other = at.index_select(0, here + (down * wide + right))
         first = (other >= 0).nonzero()[:, 0]
         firsts.append(first)
         seconds.append(other.index_select(0, first))

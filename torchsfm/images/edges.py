@@ -80,6 +80,9 @@ def detect_edges(
     is moved outwards by what smoothing moves a bent edge inwards. A chain is kept where one of its
     points has a strong gradient.
 
+    Smoothing draws the sides of thin bars apart: each by 0.06 px where a bar is 4 px wide, by 0.23 at 3 and by 0.53 at 2; with
+    a `blur` of 0.5 by 0.004, 0.06 and 0.27 (in an image that a lens blurred by 0.6 px).
+
     Args:
         image: Grey (c = 1) or red, green, blue images.
         max_edgels: The number of slots for each image; whole chains fill them, the longest first.
@@ -268,8 +271,9 @@ def _maxima(gx: Tensor, gy: Tensor, magnitude: Tensor, allowed: Tensor) -> _Edge
     offset = (0.5 * (lc - la) / bend).clamp(-0.5, 0.5)
     step = torch.where(level, 1, width) * torch.where(offset < 0, -1, 1)
     share = offset.abs()
+    beside = place + step
     gradient = torch.stack(
-        [torch.lerp(*(g.flatten().index_select(0, p) for p in (place, place + step)), share) for g in (gx, gy)], -1
+        [torch.lerp(g.flatten().index_select(0, place), g.flatten().index_select(0, beside), share) for g in (gx, gy)], -1
     )
     top = gradient.square().sum(-1).sqrt()
     cosine = torch.where(level, gradient[:, 0], gradient[:, 1]).abs() / top
