@@ -5,8 +5,9 @@ import torch
 from scenes import make_scene
 
 from torchsfm._types import Status
+from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.motion import RelativePoseEstimator, UprightPoseEstimator, estimate_essential, estimate_upright
-from torchsfm.robust import constant_weights
+from torchsfm.robust import Degeneracy, constant_weights
 from torchsfm.tensors import essential_from_pose
 
 
@@ -53,3 +54,21 @@ def test_dtype_bad_input_and_arguments(generator: torch.Generator, unchecked: No
     assert torch.isfinite(found.model).all()
     with pytest.raises(ValueError, match="gravity2"):
         estimate_upright(d1, d2, up1, up2[..., :2], threshold=3e-3)
+
+
+def test_cameras_that_only_turned_are_told(generator: torch.Generator) -> None:
+    """Every translation fits them; those that moved are not among them."""
+    down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    R = rotation_from_rotvec(0.3 * down)
+    X = torch.randn(20, 60, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 6.0])
+    centre = torch.nn.functional.normalize(torch.randn(20, 1, 3, generator=generator, dtype=torch.float64), dim=-1)
+
+    def found(centre: torch.Tensor) -> torch.Tensor:
+        rays = [torch.nn.functional.normalize(d, dim=-1) for d in (X, (X - centre) @ R.mT)]
+        noisy = [d + 1e-3 * torch.randn(d.shape, generator=generator, dtype=torch.float64) for d in rays]
+        result = estimate_upright(*noisy, down, down, threshold=3e-3, generator=generator)
+        assert (result.status == Status.OK).all()
+        return result.degeneracy
+
+    assert (found(0 * centre) == Degeneracy.ROTATION).all()
+    assert (found(centre) == Degeneracy.NONE).all()

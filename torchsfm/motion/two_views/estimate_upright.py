@@ -4,17 +4,19 @@ from dataclasses import dataclass
 from typing import ClassVar, Unpack
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
 from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.linalg import cross
+from torchsfm.motion.two_views.epipolar_fit import sphere_rows
 from torchsfm.motion.two_views.estimate_essential import RelativePoseEstimator, pose_slack, unit_rays
+from torchsfm.motion.two_views.plane_and_parallax import more_than_chance, squared_transfer
 from torchsfm.motion.two_views.relative_upright_3pt import relative_upright_3pt
 from torchsfm.motion.two_views.sampson_sphere import pose_step, step_equations, turned
 from torchsfm.optim import UnitSphere, rotation_exponential
-from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
+from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,35 @@ class UprightPoseEstimator:
         t = UnitSphere(3).retract(model[..., 3].expand(R.shape[:-1]), step[..., 1:])
         return torch.cat((R, t[..., None]), -1)
 
+    def may_be_degenerate(
+        self,
+        model: Float[Tensor, "p 3 4"],
+        d1: Float[Tensor, "p n 3"],
+        d2: Float[Tensor, "p n 3"],
+        *,
+        inliers: Bool[Tensor, "p n"],
+        threshold: Float[Tensor, "p"],
+        chance: Float[Tensor, "p"],
+    ) -> Bool[Tensor, "p"]:
+        """Whether R alone may relate all inliers but so few as chance explains; `degeneracy` takes hardly longer."""
+        return self.degeneracy(model, d1, d2, inliers=inliers, threshold=threshold, chance=chance) != int(Degeneracy.NONE)
+
+    def degeneracy(
+        self,
+        model: Float[Tensor, "*#batch 3 4"],
+        d1: Float[Tensor, "*#batch n 3"],
+        d2: Float[Tensor, "*#batch n 3"],
+        *,
+        inliers: Bool[Tensor, "*#batch n"],
+        threshold: Float[Tensor, "*#batch"],
+        chance: Float[Tensor, "*#batch"],
+    ) -> Int[Tensor, "*batch"]:
+        """ROTATION: R alone relates the inliers but so few as chance explains, so that t is open."""
+        h1, h2 = sphere_rows(d1), sphere_rows(d2)
+        turned = inliers & (squared_transfer(model[..., :3], h1, h2, sphere=True) < (4 * threshold * threshold)[..., None])
+        rotation = turned.any(-1) & ~more_than_chance((inliers & ~turned).sum(-1), chance, 2)
+        return torch.where(rotation, int(Degeneracy.ROTATION), int(Degeneracy.NONE)).to(torch.int8)
+
 
 def estimate_upright(
     d1: Float[Tensor, "*#batch n 3"],
@@ -133,8 +164,8 @@ def estimate_upright(
 
     Returns:
         [R | t] with |t| = 1; inliers, support, iterations, status (NOT_FINITE also where a vertical has no direction),
-        covariance (12 x 12, of rank 3). The pose carries its derivatives with respect to the inliers and the verticals
-        (see `ransac`).
+        degeneracy (ROTATION: a rotation relates all inliers but so few as chance explains, and t means nothing), covariance
+        (12 x 12, of rank 3). The pose carries its derivatives with respect to the inliers and the verticals (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
