@@ -14,6 +14,8 @@ _APART, _OFF = 5.0, 2.0
 """How far apart points are two, and how far they are off a line, in root mean squares of the angles between rays and points."""
 _ROUNDING, _LARGE = 1e-9, 3e-3
 """Least noise, and most of four points, in radians: more of them is the error of a minimum that is not the least."""
+_MISFIT = 1e-2
+"""More noise is that of points that do not fit, as landmarks that are being learnt: it does not say that they are one."""
 _OPEN = 0.2
 """Standard deviation of a rotation that is not known, in radians."""
 
@@ -49,7 +51,7 @@ def tells_pose(
     away = torch.linalg.vector_norm(Y, dim=1).clamp_min(1e-300)
     place = torch.cat((data.u.mT, away.log()[..., None]), -1)
     picked, squares = farthest_points(place, counts, _POINTS - 1)
-    enough = squares[:, -1] > (_APART * noise).square()
+    enough = squares[:, -1] > (_APART * noise.clamp_max(_MISFIT)).square()
     # What the rotation is known by where the translation is free.
     A, B, C = N[:, :3, :3], N[:, :3, 3:], N[:, 3:, 3:]
     known = eigvalsh(A - B @ torch.linalg.solve_ex(C, B.mT)[0])[0][:, 0]
