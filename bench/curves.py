@@ -86,6 +86,8 @@ def pavilion(folder: Path, out: Path | None) -> None:
     """Precision against recall, by how many images must have found a sample."""
     files = sorted((folder / "images").iterdir())
     P = torch.stack([torch.from_numpy(np.loadtxt(folder / "cameras" / f"{f.stem}.projmatrix")) for f in files])
+    # Its pixels begin at their corners: true points lie beside their edges by half a pixel otherwise.
+    P = torch.tensor([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]], dtype=P.dtype) @ P
     K, R, t = krt_from_camera(P)
     truth = np.loadtxt(folder / "gt-points.txt")
     low, high = truth.min(0), truth.max(0)
