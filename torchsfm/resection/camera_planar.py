@@ -46,7 +46,7 @@ class PlanarPoses:
     status: Int8[Tensor, "*batch"]
     """OK; NOT_FINITE: data with weight are not finite, or a ray is zero; TOO_FEW: fewer than four points; DEGENERATE: points or
     rays in a line, all of them or all but one, as far as the error lets anybody see; three points several times each; points
-    that are in no plane; BEHIND: half of the weight or more is behind the camera."""
+    that are in no plane, or that no pose fits to 0.2 radians; BEHIND: half of the weight or more is behind the camera."""
 
     @property
     def pose(self) -> Pose:

@@ -44,7 +44,8 @@ class PoseEstimate:
     status: Int8[Tensor, "*batch"]
     """OK; NOT_FINITE: data with weight are not finite, or a ray is zero; TOO_FEW: fewer than four points; DEGENERATE: the pose
     is not determined, or not beyond the noise that the error tells of (points in a line or nearly, rays that coincide, three
-    points several times each); BEHIND: half of the weight or more is behind the camera."""
+    points several times each), or of five points and more none fits to 0.2 radians; BEHIND: half of the weight or more is
+    behind the camera."""
 
     @property
     def pose(self) -> Pose:

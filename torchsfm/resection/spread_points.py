@@ -12,10 +12,11 @@ _POINTS = 4
 """Fewer points have several poses."""
 _APART, _OFF = 5.0, 2.0
 """How far apart points are two, and how far they are off a line, in root mean squares of the angles between rays and points."""
-_ROUNDING, _LARGE = 1e-9, 3e-3
-"""Least noise, and most of four points, in radians: more of them is the error of a minimum that is not the least."""
-_MISFIT = 1e-2
-"""More noise is that of points that do not fit, as landmarks that are being learnt: it does not say that they are one."""
+_ROUNDING, _LARGE, _LARGE_OF_FOUR = 1e-9, 3e-2, 3e-3
+"""Least and most noise, in radians: more is the misfit of wrong points, as of landmarks that are being learnt, or, of four
+points, that of a minimum that is not the least."""
+_NO_FIT = 0.2
+"""Misfit in radians of a pose that fits nothing."""
 _OPEN = 0.2
 """Standard deviation of a rotation that is not known, in radians."""
 
@@ -29,7 +30,7 @@ def tells_pose(
     *,
     plane: bool = False,
 ) -> Bool[Tensor, "b"]:
-    """Whether there are four points apart from each other, and the noise leaves no rotation open.
+    """Whether there are four points apart from each other that the pose fits, and the noise leaves no rotation open.
 
     Points nearly on a line may turn about it, and three points, however often they are seen, have up to four poses.
 
@@ -44,21 +45,23 @@ def tells_pose(
     counts, total = data.w > 0, data.w.sum(-1).clamp_min(1e-300)
     free = (2 * data.number - 6).clamp(min=1)
     # Of one coordinate of an angle, where the weight is 1; and of the average angle, both coordinates.
-    most = torch.where(data.number > _POINTS, torch.inf, _LARGE**2 * total / (2 * data.number))
-    variance = torch.minimum(value / free, most)
-    noise = (2 * variance * data.number / total).sqrt().clamp_min(_ROUNDING)
+    unit = 2 * data.number / total
+    misfit = (value / free * unit).sqrt()
+    noise = torch.where(data.number > _POINTS, misfit.clamp_max(_LARGE), misfit.clamp_max(_LARGE_OF_FOUR)).clamp_min(_ROUNDING)
+    variance = noise.square() / unit
     Y = seen(data, R[:, None], t[:, None])[:, 0]
     away = torch.linalg.vector_norm(Y, dim=1).clamp_min(1e-300)
     place = torch.cat((data.u.mT, away.log()[..., None]), -1)
     picked, squares = farthest_points(place, counts, _POINTS - 1)
-    enough = squares[:, -1] > (_APART * noise.clamp_max(_MISFIT)).square()
+    enough = squares[:, -1] > (_APART * noise).square()
     # What the rotation is known by where the translation is free.
     A, B, C = N[:, :3, :3], N[:, :3, 3:], N[:, 3:, 3:]
     known = eigvalsh(A - B @ torch.linalg.solve_ex(C, B.mT)[0])[0][:, 0]
     fixed = variance <= _OPEN**2 * known
     if plane:
         fixed = fixed & (_number_off(data.X, away, picked, counts, _OFF * noise) > 1)
-    return enough & fixed
+    fits = (misfit < _NO_FIT) | (data.number <= _POINTS)
+    return enough & fixed & fits
 
 
 def _number_off(X: Tensor, away: Tensor, picked: Tensor, counts: Tensor, reach: Tensor) -> Tensor:
