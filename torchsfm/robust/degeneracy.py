@@ -107,4 +107,4 @@ def diagnose(
             code = code.index_copy(0, index, found.to(torch.int8))
     size = problems.estimator.sample_size
     few = (solved & (number <= size)) | (problems.count <= size)
-    return torch.where(few, int(Degeneracy.TOO_FEW), code).to(torch.int8)
+    return code.masked_fill(few, int(Degeneracy.TOO_FEW))

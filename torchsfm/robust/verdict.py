@@ -83,7 +83,7 @@ def judge(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: 
         agreed, number = agreed.index_copy(0, index, enough), number.index_copy(0, index, few)
     optimal = agreed & (reach > 0)
     reach = torch.where(optimal, reach, 1)
-    fate = torch.where(agreed, int(Status.OK), int(Status.NO_CONSENSUS))
+    fault = torch.where(best.solved, int(Status.NO_CONSENSUS), int(Status.DEGENERATE))
     selected = (ratio < (reach / limit)[:, None]) & optimal[:, None]
     inliers, selected = problems.scatter(torch.stack((near, selected)), n).unbind(0)
     return Verdict(
@@ -92,7 +92,7 @@ def judge(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: 
         support,
         threshold,
         best.iterations,
-        torch.where(best.solved, fate, int(Status.DEGENERATE)).to(torch.int8),
+        fault.masked_fill(agreed, int(Status.OK)).to(torch.int8),
         diagnose(replace(problems, limit=limit), best.model, best.solved, best.doubtful, near, number, expected),
         selected,
         reach,
