@@ -72,14 +72,15 @@ def test_conjugate_gradients_end_with_newton_steps(outliers: float, monkeypatch:
 
 
 def test_points_settle_between_newton_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Points that wrong data pull about do not hold back cameras: fewer steps to the same minima."""
+    """Points that wrong data pull about do not hold back cameras: fewer steps to minima as low."""
     options = {"free": FREE, "loss": Cauchy(1.0), "tolerance": 1e-13, "max_iterations": 200}
     made = problems(25, 0.1)
     found = [bundle_adjust_model(problem, **options).result for problem in made]
     monkeypatch.setattr(Settling, "settle", lambda self, x, *_: x)
     plain = [bundle_adjust_model(problem, **options).result for problem in made]
     assert sum(result.iterations for result in found) < 0.95 * sum(result.iterations for result in plain)
-    assert sum(abs(a.cost / b.cost - 1) < 1e-9 for a, b in zip(found, plain, strict=True)) >= 20
+    # With wrong data there are several minima, and steps of another kind may well end in a lower one.
+    assert sum(a.cost < (1 + 1e-9) * b.cost for a, b in zip(found, plain, strict=True)) >= 20
 
 
 def test_points_settle_after_steps_that_were_too_short(monkeypatch: pytest.MonkeyPatch) -> None:
