@@ -8,6 +8,8 @@ that warms up; on the CPU they hold for the given number of threads.
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
 from typing import Any, TypeVar
 
 import torch
@@ -53,7 +55,7 @@ def least(call: Callable[[], T], device: str, repeats: int) -> tuple[float, T]:
     return best, found
 
 
-def solver(case: Case, device: str, dtype: torch.dtype, batch: int, repeats: int) -> str:
+def solver(case: Case, batch: int, repeats: int, device: str, dtype: torch.dtype) -> str:
     """Microseconds a sample, and the share of samples whose model is found."""
     sample, truth = drawn(case, "random", batch, torch.float64)
     there = send(sample, device, dtype)
@@ -62,7 +64,7 @@ def solver(case: Case, device: str, dtype: torch.dtype, batch: int, repeats: int
     return f"{1e6 * seconds / batch:9.4f} us a sample, found {share:.4f}"
 
 
-def robust(model: str, device: str, dtype: torch.dtype, pairs: int, inliers: float, repeats: int) -> str:
+def robust(model: str, pairs: int, inliers: float, repeats: int, device: str, dtype: torch.dtype) -> str:
     """Milliseconds a pair, and the errors as in `bench.ransac`."""
     scene = ransac.scenes(model, pairs, inliers, 0)
     x1, x2, K = send((scene.x1, scene.x2, ransac.K), device, dtype)
@@ -84,13 +86,13 @@ def robust(model: str, device: str, dtype: torch.dtype, pairs: int, inliers: flo
     return f"{1e3 * seconds / pairs:9.4f} ms a pair, {error.median():.4f} {unit}, p95 {error.quantile(0.95):.4f}"
 
 
-def bundle(name: str, device: str, repeats: int) -> str:
+def bundle(name: str, device: str, dtype: torch.dtype) -> str:
     """Seconds of a whole adjustment, and the cost it ends at."""
     *counts, layout = PROBLEMS[name]
     problem = random_bundle_problem(*counts, layout=layout, generator=torch.Generator().manual_seed(0)).problem  # type: ignore[arg-type]
-    there = send(problem, device, torch.float64)
+    there = send(problem, device, dtype)
     seconds, found = least(
-        lambda: bundle_adjust_model(there, free=("focal", "k1", "k2"), loss=Huber(1.0), tolerance=1e-6).result, device, repeats
+        lambda: bundle_adjust_model(there, free=("focal", "k1", "k2"), loss=Huber(1.0), tolerance=1e-6).result, device, 1
     )
     return f"{seconds:9.3f} s, {found.iterations} steps, cost {found.cost:.6g}"
 
@@ -98,24 +100,13 @@ def bundle(name: str, device: str, repeats: int) -> str:
 def tasks(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[str, torch.dtype], str], tuple[torch.dtype, ...]]]:
     """What is timed, by name, and in which dtypes."""
     both = (torch.float64, torch.float32)
-    repeats = options.repeats
     for case in (case for case in CASES if case.name in SOLVERS):
         for batch in options.samples:
-            yield (
-                f"{case.name} {batch}",
-                lambda device, dtype, case=case, batch=batch: solver(case, device, dtype, batch, repeats),  # type: ignore[misc]
-                both,
-            )
-    for model in options.models:
-        for pairs in options.pairs:
-            for inliers in options.inliers:
-                yield (
-                    f"{model} {pairs} pairs, {inliers:g} inliers",
-                    lambda device, dtype, a=(model, pairs, inliers): robust(a[0], device, dtype, a[1], a[2], repeats),  # type: ignore[misc]
-                    both,
-                )
+            yield f"{case.name} {batch}", partial(solver, case, batch, options.repeats), both
+    for model, pairs, inliers in product(options.models, options.pairs, options.inliers):
+        yield f"{model} {pairs} pairs, {inliers:g} inliers", partial(robust, model, pairs, inliers, options.repeats), both
     for name in options.problems:
-        yield f"bundle {name}", lambda device, dtype, name=name: bundle(name, device, 1), both[:1]  # type: ignore[misc]
+        yield f"bundle {name}", partial(bundle, name), both[:1]
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -5,8 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.linalg import eigvalsh
+from torchsfm.linalg.farthest_points import farthest_points
 from torchsfm.resection.angles import Rays, seen
-from torchsfm.robust.evidence import farthest_points
 
 _POINTS = 4
 """Fewer points have several poses."""

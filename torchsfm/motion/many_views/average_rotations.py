@@ -8,7 +8,6 @@ a sparse problem of three unknowns a camera, turns of the world seen by it: equa
 what `optim.multigrid` makes use of.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +18,7 @@ from torchsfm._types import Status, check_index, check_one_problem, check_option
 from torchsfm.geometry import cross_matrix, rotvec_from_rotation
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.components import components
+from torchsfm.motion.many_views.rotation_loops import close_by_chance, count_loops
 from torchsfm.motion.many_views.spanning_rotations import spanning_rotations
 from torchsfm.motion.many_views.triplets import find_triplets, pairs_within, turn_angle
 from torchsfm.optim import Block, GemanMcClure, Huber, Loss, Rotation, SparseResult, Term, marginal_covariance
@@ -36,10 +36,6 @@ AGREES = 4.0
 """Standard deviations within which an edge agrees: 0.1 % of right ones do not."""
 EXACT = 1e-4
 """Radians that all edges are taken to be off at least: sharper losses find no way, and gain nothing."""
-CHANCE, WIDER = 0.03, 1.5
-"""How often unrelated rotations might pass for related ones, if loops lacked so many times more than they do."""
-REACHES = tuple(1e-3 * 2**k for k in range(10))
-"""Angles in radians within which edges may agree."""
 NOT_A_ROTATION = 1e-2
 """By how much entries of `R R'` may differ from those of the identity."""
 
@@ -165,22 +161,23 @@ def average_rotations(
     with torch.no_grad():
         plain = model.detach()
         angle, inliers = R.new_full((len(R),), torch.pi), torch.zeros_like(counts)
-        angle[kept] = turn_angle(graph.disagreement(plain)).to(R.dtype)
+        off = turn_angle(graph.disagreement(plain))
+        angle[kept] = off.to(R.dtype)
         inliers[kept] = graph.square(plain).sqrt() <= AGREES * scale
         status = _status(edges, counts, inliers, views, found.status)
-        unlikely = graph.by_chance(plain) & (status != int(Status.TOO_FEW))
+        unlikely = close_by_chance(off, graph.edges, views) & (status != int(Status.TOO_FEW))
         status = torch.where(unlikely, int(Status.NO_CONSENSUS), status).to(torch.int8)
         sure = inliers & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
         component = components(edges[sure], views)
-        told = graph.loops(component, sure[kept]).sum()
-        if bool(told > 0):
+        told = count_loops(edges[sure], component)
+        if told:
             square = graph.square(plain)[sure[kept]].sum() / (3 * told)
             scale = max(float(square.sqrt()), graph.least())
         elif deviation is not None:
             scale = 1.0
         spread = None
         if covariance:
-            known = scale if bool(told > 0) or deviation is not None else torch.inf
+            known = scale if told or deviation is not None else torch.inf
             spread = graph.covariance(plain, component, status, loss, known).to(R.dtype)
     model = (model @ model[component].mT).to(R.dtype)
     return AveragedRotations(model, status, component, angle, inliers, R.new_tensor(scale), spread)
@@ -264,40 +261,6 @@ class _Graph:
         """The standard deviation that there is at least."""
         return EXACT * float(torch.linalg.matrix_norm(self._whitening()).median()) / 3**0.5
 
-    def loops(self, component: Int[Tensor, "v"], chosen: Bool[Tensor, "e"]) -> Int[Tensor, "v"]:
-        """How many loops some edges close in each component, counted with its smallest camera: all others follow from them."""
-        number = torch.bincount(component[self.edges[chosen, 0]], minlength=self.views)
-        size = torch.bincount(component, minlength=self.views)
-        return number - (size - 1).clamp(min=0)
-
-    def by_chance(self, model: Float[Tensor, "v 3 3"]) -> Bool[Tensor, "v"]:
-        """Cameras of connected parts with loops where unrelated rotations may close as many as well.
-
-        A wrong edge closes a loop within an angle with the share of rotations that turn by less; of all edges any may be chosen
-        to agree, and within any angle. A part without loops contradicts nothing.
-        """
-        part = components(self.edges, self.views)
-        ones, of_edge = self.R.new_ones(self.views), part[self.edges[:, 0]]
-        angle = turn_angle(self.disagreement(model))
-
-        def of_part(values: Tensor, place: Tensor = of_edge) -> Tensor:
-            return torch.zeros_like(ones).index_add_(0, place, values)
-
-        every, size = of_part(torch.ones_like(angle)), of_part(ones, part)
-        related = every < size
-        for reach in REACHES:
-            agree = (angle <= reach).to(angle.dtype)
-            inner = components(self.edges[angle <= reach], self.views)
-            pieces = of_part((inner == torch.arange(self.views, device=inner.device)).to(angle.dtype), part)
-            number = of_part(agree)
-            closed = number - size + pieces
-            # What a loop lacks is shared by its edges, whatever others have.
-            lack = (WIDER * of_part(agree * angle) / closed.clamp(min=1)).clamp(reach, torch.pi)
-            share = (lack - lack.sin()) / torch.pi
-            ways = torch.lgamma(every + 1) - torch.lgamma(number + 1) - torch.lgamma(every - number + 1)
-            related = related | (-closed * share.log() > ways - math.log(CHANCE))
-        return ~related[part]
-
     def terms(self, loss: Loss) -> list[Term]:
         """All edges."""
         i, j = self.edges.unbind(-1)
@@ -310,17 +273,15 @@ class _Graph:
 
     def covariance(self, model: Tensor, component: Tensor, status: Tensor, loss: Loss, scale: float) -> Float[Tensor, "v 3 3"]:
         """That of each rotation, with the first cameras of all components held."""
-        held = (component == torch.arange(self.views, device=component.device)) | (status != int(Status.OK))
+        first = component == torch.arange(self.views, device=component.device)
+        known, unknown = status == int(Status.OK), torch.diag(model.new_full((3,), torch.inf))
+        if scale == torch.inf:
+            return torch.where((first & known)[:, None, None], 0, unknown)
         within = (component[self.edges[:, 0]] == component[self.edges[:, 1]]).nonzero()[:, 0]
         terms = [term.select(within) for term in self.terms(loss)]
-        unknown = torch.diag(model.new_full((3,), torch.inf))
-        if scale == torch.inf:
-            known = component == torch.arange(self.views, device=component.device)
-            return torch.where((known & (status == int(Status.OK)))[:, None, None], 0, unknown)
-        spread = scale**2 * marginal_covariance({"R": Block(model.mT.flatten(1), Rotation(), held)}, terms, "R")
-        spread = model @ spread @ model.mT
-        known = (status == int(Status.OK))[:, None, None]
-        return torch.where(known, spread, unknown)
+        block = Block(model.mT.flatten(1), Rotation(), first | ~known)
+        spread = scale**2 * marginal_covariance({"R": block}, terms, "R")
+        return torch.where(known[:, None, None], model @ spread @ model.mT, unknown)
 
     def _whitening(self) -> Float[Tensor, "e 3 3"]:
         """W with `W' W` the inverse of the covariance of each edge."""
