@@ -102,7 +102,9 @@ class Scene:
 
     @cached_property
     def _points(self) -> Tensor:
-        n = max(self.size("n"), 16)
+        return self._scattered(max(self.size("n"), 16))
+
+    def _scattered(self, n: int) -> Tensor:
         X = self.rand(n, 3, low=-2.0, high=2.0) + torch.tensor([0.0, 0.0, 7.0], dtype=F64)
         if self.planar:
             plane = self.plane()[..., None, :]
@@ -125,9 +127,14 @@ class Scene:
         return d / d.norm(dim=-1, keepdim=True)
 
     def space_lines(self, n: int) -> tuple[Tensor, Tensor]:
-        """Two points on each of n lines in space."""
-        X = self.points(2 * n) if 2 * n <= self._points.shape[-2] else self.rand(2 * n, 3) + 5
-        return X[..., :n, :], X[..., n : 2 * n, :]
+        """Two points on each of n lines in space; always the same first ones."""
+        a, b = self._line_points
+        return a[..., :n, :], b[..., :n, :]
+
+    @cached_property
+    def _line_points(self) -> tuple[Tensor, Tensor]:
+        n = max(self.size("n"), 16)
+        return self._scattered(n), self._scattered(n)
 
     def lines(self, view: int, n: int) -> Tensor:
         """Image lines in one view."""
