@@ -1,6 +1,7 @@
 """Lines from many views of which some are wrong."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Unpack
 
 import torch
@@ -12,13 +13,14 @@ from torchsfm.geometry import point_line_distance, project_lines, to_homogeneous
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.linalg import cross, damped_solve, determinant_3x3
 from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
+from torchsfm.triangulation.agreed_views import solve_agreed
 from torchsfm.triangulation.line_layout import lay_out
 from torchsfm.triangulation.line_residuals import image_rows, in_world, line_forms, slopes_along, through_centre
 from torchsfm.triangulation.line_views import frame_of_centres, observe
-from torchsfm.triangulation.triangulate_lines import triangulate_lines
+from torchsfm.triangulation.triangulate_lines import LineTriangulation, triangulate_lines
 
-_ROUNDED = 2.0
-"""Thresholds that an inlier may be off the line that is returned: the least squares of all of them moves it."""
+_ROUNDED = 1.001
+"""Thresholds that an inlier may be off the line that is returned, which may be in single precision."""
 _PARALLEL = 1e-12
 """Squared sine of the angle of two planes that are one."""
 
@@ -160,7 +162,8 @@ class RobustLineTriangulation:
     ends: Float[Tensor, "*batch n 2 3"]
     """The part of the line that the inliers show together; with four or more without the farthest of each quarter."""
     inliers: Bool[Tensor, "*batch v n"]
-    """Which segments are nearer to the image of the line than the threshold."""
+    """Of which segments the line is the least squares: those of the search that are nearer than the threshold to its image,
+    too."""
     support: Float[Tensor, "*batch n"]
     """Sum over the views of max(0, 1 - squared distance / squared threshold)."""
     threshold: Float[Tensor, "*batch n"]
@@ -261,22 +264,20 @@ def triangulate_lines_robust(
 
     wanted = torch.ones_like(used) if visible is None else by_line(visible)
     assert wanted is not None
-    number, seen = found.inliers.sum(-1), used.sum(-1)
+    limit = by_problem(found.threshold)
+    final, inliers = solve_agreed(
+        lambda own, P, used, w: triangulate_lines(own, P, visible=used, weights=w), partial(_distances, trailing), l,
+        trailing, P, by_problem(found.inliers).mT, weights, _ROUNDED * limit,
+    )  # fmt: skip
+    number, seen = inliers.sum(-2), by_problem(used.sum(-1))
+    status = by_problem(found.status)
     # What there is, is not finite.
-    status = torch.where((found.status == Status.TOO_FEW) & (wanted.sum(-1) >= 2), int(Status.NOT_FINITE), found.status)
+    status = torch.where((status == Status.TOO_FEW) & (by_problem(wanted.sum(-1)) >= 2), int(Status.NOT_FINITE), status)
     # Two planes always meet, so out of more than two a third must confirm the line.
     agreed = (number >= 2) & ((number >= 3) | (seen == 2))
     status = torch.where((status == Status.NO_CONSENSUS) & agreed, int(Status.OK), status)
-    status = by_problem(torch.where((status == Status.OK) & ~agreed, int(Status.NO_CONSENSUS), status))
-    inliers = by_problem(found.inliers).mT
-    final = triangulate_lines(l, P, visible=inliers, weights=weights)
+    status = torch.where((status == Status.OK) & ~agreed, int(Status.NO_CONSENSUS), status)
     status = torch.where(status == Status.OK, final.status, status)
-    if segments:
-        # In single precision a line far from the origin may be rounded to one that its segments do not support.
-        image = project_lines(P.detach().double(), final.model.detach().double()[..., None, :, :])
-        distance = point_line_distance(l.detach().double(), image[..., None, :]).amax(-1)
-        lost = (inliers & ~(distance <= _ROUNDED * by_problem(found.threshold)[..., None, :])).any(-2)
-        status = torch.where((status == Status.OK) & lost, int(Status.NO_CONSENSUS), status)
     settled = status == Status.OK
     rough = by_problem(in_world(found.model, origin.mT, unit)).to(dtype)
 
@@ -288,7 +289,7 @@ def triangulate_lines_robust(
         ends=final.ends,
         inliers=inliers,
         support=by_problem(found.support).clamp(max=torch.finfo(dtype).max).to(dtype),
-        threshold=by_problem(found.threshold).to(dtype),
+        threshold=limit.to(dtype),
         iterations=by_problem(found.iterations),
         status=status,
         fault=final.fault,
@@ -297,3 +298,13 @@ def triangulate_lines_robust(
         end_covariance=kept(final.end_covariance),
         error=kept(final.error),
     )
+
+
+def _distances(trailing: int, found: LineTriangulation, l: Tensor, P: Tensor) -> Tensor:  # noqa: E741
+    """The roots of the sums of the squared distances of both ends from the images of the lines."""
+    batch, (v, n) = found.model.shape[:-2], l.shape[-trailing - 2 : -trailing]
+    ends = observe(*lay_out(batch, l.detach(), trailing, P.detach(), None, None)).ends[:, :, :v]
+    ends = ends.permute(2, 3, 1, 0).reshape(v, *batch, n, 2, 2).movedim(0, -4)
+    image = project_lines(P.detach().double(), found.model.detach().double()[..., None, :, :])
+    distance: Tensor = point_line_distance(ends, image[..., None, :]).norm(dim=-1)
+    return distance

@@ -11,9 +11,11 @@ from torch import Tensor
 from torchsfm._types import Solutions, Status, broadcast_shapes
 from torchsfm.geometry.image_distance import positive_depth, squared_in_front
 from torchsfm.geometry.projection import quotient_slope
+from torchsfm.geometry.residuals import reprojection_distance
 from torchsfm.linalg import damped_solve
 from torchsfm.robust import SearchOptions, Weigh, check_door, ransac
-from torchsfm.triangulation.triangulate_points import triangulate_points
+from torchsfm.triangulation.agreed_views import solve_agreed
+from torchsfm.triangulation.triangulate_points import Triangulation, triangulate_points
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,8 @@ class RobustTriangulation:
     model: Float[Tensor, "*batch n 3"]
     """The points, finite always; where `status` is not OK they may mean little."""
     inliers: Bool[Tensor, "*batch v n"]
-    """Which observations are nearer to the image of the point than the threshold."""
+    """Of which observations the point is the least squares: those of the search that are nearer than the threshold to its
+    image, too."""
     support: Float[Tensor, "*batch n"]
     """Sum over the views of max(0, 1 - squared distance / squared threshold)."""
     threshold: Float[Tensor, "*batch n"]
@@ -249,7 +252,10 @@ def triangulate_points_robust(
         PointEstimator(), x.detach().expand(*batch, v, n, 2).transpose(-3, -2), data[..., None, :, :].expand(*batch, n, v, 12),
         threshold=limit, min_iterations=16, **every,
     )  # fmt: skip
-    inliers = found.inliers.mT
+    final, inliers = solve_agreed(
+        lambda x, P, used, w: triangulate_points(x, P, visible=used, weights=w), _distances, x, 1, P, found.inliers.mT,
+        weights, found.threshold,
+    )  # fmt: skip
     number = inliers.sum(-2)
     seen = torch.isfinite(x).all(-1) & torch.isfinite(data).all(-1)[..., None]
     seen = seen if visible is None else seen & visible
@@ -258,7 +264,6 @@ def triangulate_points_robust(
     agreed = (number >= 2) & ((number >= 3) | (seen.sum(-2) == 2))
     status = torch.where((found.status == Status.NO_CONSENSUS) & agreed, int(Status.OK), found.status)
     status = torch.where((status == Status.OK) & ~agreed, int(Status.NO_CONSENSUS), status)
-    final = triangulate_points(x, P, visible=inliers, weights=weights)
     status = torch.where(status == Status.OK, final.status, status)
     settled = status == Status.OK
 
@@ -273,3 +278,8 @@ def triangulate_points_robust(
         covariance=torch.where(settled[..., None, None], final.covariance, 0).to(dtype),
         error=torch.where(settled, final.error, 0).to(dtype),
     )
+
+
+def _distances(found: Triangulation, x: Tensor, P: Tensor) -> Tensor:
+    """Reprojection errors."""
+    return reprojection_distance(P.detach(), found.model.detach()[..., None, :, :], x.detach())
