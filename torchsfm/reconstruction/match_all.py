@@ -13,6 +13,7 @@ from torchsfm.images import Features, match_features, preview_matches, promising
 from torchsfm.images.preemptive import PARTNERS
 from torchsfm.reconstruction.image_points import SHARDS, ImagePoints, SavedFeatures
 from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.overlays import Overlays, find_overlays
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.sequence import Corners, sequence_pairs, track_corners
 from torchsfm.reconstruction.stages import Arrays, Shards, Stages, one_thread
@@ -79,6 +80,33 @@ class PairShards:
         return range(each * shard, min(each * (shard + 1), self.match_shards))
 
 
+@dataclass(frozen=True)
+class FoundMatches:
+    """Matches of all pairs, a shard of verification at a time."""
+
+    work: PairShards
+    pairs: Int[Tensor, "q 2"]
+    matched: Shards
+    features: list[int]
+    """How many each image has; the corners come after them."""
+    corners: Corners | None
+
+    def of(self, shard: int) -> dict[int, Tensor]:
+        """Those of the pairs of a shard, by the number of the pair."""
+        matches: dict[int, Tensor] = {}
+        for number in self.work.match_shards_of(shard):
+            saved = self.matched[number]
+            matches |= zip(
+                self.work.matched(number).tolist(), torch.split(saved["match"], saved["count"].tolist()), strict=True
+            )
+        if self.corners is not None:
+            for q in matches:
+                i, j = self.pairs[q].tolist()
+                before = torch.tensor([self.features[i], self.features[j]])
+                matches[q] = torch.cat([matches[q], before + self.corners.matches(i, j)])
+        return matches
+
+
 def match_all(
     points: ImagePoints,
     stages: Stages,
@@ -118,34 +146,43 @@ def match_all(
     matched = _compared("match", _matches, pairs, features, stages, progress)
     x, color, corners = points.x, points.color, None
     if sequence:
-        found = stages.run("track", lambda: track_corners(points, max_pixels, progress, masks))
-        corners = Corners.of(found, len(points.names))
+        tracked = stages.run("track", lambda: track_corners(points, max_pixels, progress, masks))
+        corners = Corners.of(tracked, len(points.names))
         x = tuple(torch.cat(both) for both in zip(points.x, corners.x, strict=True))
         color = tuple(torch.cat(both) for both in zip(points.color, corners.color, strict=True))
     x = tuple(a.double() for a in x)
 
+    found = FoundMatches(work, pairs, matched, [len(a) for a in points.x], corners)
+
+    def look_for_overlays(_: int) -> Arrays:
+        every = map(found.of, range(work.verify_shards))
+        again = torch.Generator().manual_seed(seed)
+        return {"cells": find_overlays(points.image_size, x, pairs, every, generator=again).cells}
+
+    after = f"{work.digest} {seed}"
+    with one_thread():
+        overlays = Overlays(stages.shards("overlays", 1, look_for_overlays, after=after)[0]["cells"])
+
     def verify(shard: int) -> Arrays:
         progress("verify", work.verified(shard).start, len(pairs))
-        matches: dict[int, Tensor] = {}
-        for number in work.match_shards_of(shard):
-            saved = matched[number]
-            matches |= zip(work.matched(number).tolist(), torch.split(saved["match"], saved["count"].tolist()), strict=True)
-        if corners is not None:
-            for q in matches:
-                i, j = pairs[q].tolist()
-                before = torch.tensor([len(points.x[i]), len(points.x[j])])
-                matches[q] = torch.cat([matches[q], before + corners.matches(i, j)])
+        matches, still = found.of(shard), 0
+        for q, match in matches.items():
+            i, j = pairs[q].tolist()
+            kept = overlays.admit(points.image_size[pairs[q]], x[i][match[:, 0]], x[j][match[:, 1]])
+            matches[q], still = match[kept], still + int((~kept).sum())
         chosen = work.verified(shard)
         some = [matches[q] for q in range(len(pairs))[chosen]]
         # What a pair gets depends on the seed and the pair alone.
-        found = verify_pairs(points.image_size, x, pairs[chosen], some, generator=torch.Generator().manual_seed(seed))
+        verified = verify_pairs(points.image_size, x, pairs[chosen], some, generator=torch.Generator().manual_seed(seed))
         progress("verify", min(chosen.stop, len(pairs)), len(pairs))
-        return {field.name: getattr(found, field.name) for field in fields(found)}
+        return {field.name: getattr(verified, field.name) for field in fields(verified)} | {"still": torch.tensor(still)}
 
     with one_thread():
-        shards = stages.shards("verify", work.verify_shards, verify, after=f"{work.digest} {seed}")
-    verified = VerifiedPairs.join([VerifiedPairs(**shard) for shard in shards])
-    graph = verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
+        shards = stages.shards("verify", work.verify_shards, verify, after=after)
+    parts = [dict(shard) for shard in shards]
+    still = sum(int(part.pop("still")) for part in parts)
+    verified = VerifiedPairs.join([VerifiedPairs(**part) for part in parts])
+    graph = replace(verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs), still=still)
     # Corners that were tracked through a sequence have no descriptors.
     return graph if sequence else replace(graph, descriptors=lambda: torch.cat([f.descriptors for f in features]))
 

@@ -176,8 +176,9 @@ def build_models(
     images = image_reports(graph, [(model, standing) for model, standing, _ in found], reasons, failures, order)
     calibrations = tuple(calibration for _, _, calibration in found)
     course = Report(
-        images, pairs, dict(stages.seconds), source, tuple(autocalibration), calibrations=calibrations, method=method
-    )
+        images, pairs, dict(stages.seconds), source, tuple(autocalibration), calibrations=calibrations, method=method,
+        still=graph.still,
+    )  # fmt: skip
     return SfmResult(tuple(model for model, _, _ in found), course)
 
 

@@ -16,6 +16,9 @@ Progress = Callable[[str, int, int], None]
 """Called with the stage, the number of items done and the number of all."""
 
 
+STILL = "they stand still where the scene moves, as a watermark or a part of the vehicle does"
+
+
 class ReconstructionError(ValueError):
     """The input cannot be used; the message is one line for people.
 
@@ -125,6 +128,7 @@ class Report:
         method: How the models were made: "incremental", "projective", "global", "windows" or "curves"; empty where the cameras
             were given.
         refusal: Why there is no model, where the method can tell; empty else.
+        still: Matches left out because they stand still where the scene moves: of watermarks, dates, parts of a vehicle.
 
     Example:
         >>> import torch, torchsfm
@@ -149,6 +153,7 @@ class Report:
     calibrations: tuple[Calibration, ...] = ()
     method: str = ""
     refusal: str = ""
+    still: int = 0
 
     def compared_names(self) -> list[str]:
         """Names of the images that could be read, by the numbers that `pairs` has for them."""
@@ -165,6 +170,8 @@ class Report:
             names = {Verdict.GENERAL: "general", Verdict.PLANAR: "planar", Verdict.ROTATION: "pure rotation"}
             kinds = ", ".join(f"{self.pairs.count(kind)} {name}" for kind, name in names.items())
             lines.append(f"{len(self.pairs.pairs)} pairs compared: {kinds}, {self.pairs.count(Verdict.UNRELATED)} unrelated")
+        if self.still:
+            lines.append(f"{self.still} matches left out: {STILL}")
         if self.method:
             lines.append(f"method: {self.method}")
         if self.focal_source:

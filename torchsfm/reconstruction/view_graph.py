@@ -76,6 +76,7 @@ class ViewGraph:
         match: Verified matches, as indices into `x`.
         match_pair: Pair of each verified match.
         descriptors: Reads what the image points look like; None where that is not known of all.
+        still: Matches left out because they stand still where the scene moves, see `find_overlays`.
     """
 
     names: tuple[str, ...]
@@ -92,6 +93,7 @@ class ViewGraph:
     match: Int[Tensor, "k 2"]
     match_pair: Int[Tensor, "k"]
     descriptors: Callable[[], UInt8[Tensor, "n d"]] | None = None
+    still: int = 0
 
     def only(self, kept: Bool[Tensor, "q"]) -> "ViewGraph":
         """The graph in which the other pairs have nothing in common."""
@@ -151,6 +153,11 @@ class ViewGraph:
         verdict = torch.where(flat, int(Verdict.PLANAR), int(Verdict.GENERAL))
         verdict = torch.where(flat & (spread < 0.05), int(Verdict.ROTATION), verdict)
         return torch.where(related, verdict, int(Verdict.UNRELATED))
+
+
+def scale_of_images(image_size: Int[Tensor, "*v 2"]) -> Float[Tensor, "*v"]:
+    """How many times as many pixels as in images of 1600 pixels or less, along the longer side, a distance has."""
+    return image_size.amax(dim=-1).double().div(1600).clamp(min=1)
 
 
 @dataclass(frozen=True)
@@ -232,7 +239,7 @@ def verify_pairs(
     F, H = (torch.eye(3, dtype=dtype).repeat(q, 1, 1) for _ in range(2))
     num_F, num_H = torch.zeros(q, dtype=torch.long), torch.zeros(q, dtype=torch.long)
     kept: dict[int, Tensor] = {}
-    scale = image_size.amax(dim=-1).to(dtype).div(1600).clamp(min=1)
+    scale = scale_of_images(image_size).to(dtype)
     seed = draw_seed(generator)
     for block in _blocks(counts):
         slots = int(counts[block].max())

@@ -12,7 +12,7 @@ from torchsfm._types import Status
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import SfmResult, printable
+from torchsfm.reconstruction.report import STILL, SfmResult, printable
 from torchsfm.reconstruction.view_graph import Verdict
 
 Record = dict[str, Any]
@@ -33,8 +33,8 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         **more: Further entries, such as the options of the run; `truth` is a dict that `report_markdown` shows as a table.
 
     Returns:
-        `models`, `images`, `pairs`, `seconds`, `method`, `focal_source`, `autocalibration`, `skipped` and the further
-        entries.
+        `models`, `images`, `pairs`, `seconds`, `method`, `focal_source`, `autocalibration`, `still_matches`, `skipped` and the
+        further entries.
     """
     report = result.report
     observed: dict[str, tuple[int, float]] = {}
@@ -70,6 +70,7 @@ def report_record(result: SfmResult, **more: Any) -> Record:
         "method": report.method,
         "focal_source": list(report.focal_source),
         "autocalibration": list(report.autocalibration),
+        "still_matches": report.still,
         "skipped": [{"name": name, "reason": reason} for name, reason in report.skipped],
         **more,
     }
@@ -104,6 +105,8 @@ def report_markdown(record: Record) -> str:
     related = [pair for pair in record["pairs"] if pair["verdict"] != "unrelated"]
     lines += ["", "## Pairs", ""]
     lines += [f"{len(record['pairs'])} pairs were compared, {len(record['pairs']) - len(related)} have too little in common."]
+    if still := record.get("still_matches"):
+        lines += [f"{still} matches were left out: {STILL}."]
     lines += ["Matches, and how many of them one fundamental matrix and one homography explain:", ""]
     lines += _table(
         ["image", "image", "matches", "F", "H", "verdict"],

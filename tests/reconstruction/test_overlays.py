@@ -1,0 +1,102 @@
+"""What is fixed to the images is told from what the camera sees, and nothing else is."""
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import camera_from_krt, intrinsics, project_points, rotation_from_rotvec
+from torchsfm.reconstruction import reconstruct
+from torchsfm.reconstruction.overlays import Overlays, find_overlays
+
+SIZE = torch.tensor([1000, 750])
+K = intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
+PAIRS = torch.combinations(torch.arange(6))
+
+
+def scene(generator: torch.Generator, points: int = 120) -> Tensor:
+    """Images (6, n, 2) of points, by cameras that move and turn a little."""
+    kind = {"generator": generator, "dtype": torch.float64}
+    X = 2 * torch.randn(points, 3, **kind) + torch.tensor([0.0, 0.0, 9.0], dtype=torch.float64)
+    R, centre = rotation_from_rotvec(0.1 * torch.randn(6, 3, **kind)), torch.randn(6, 3, **kind)
+    return project_points(camera_from_krt(K, R, -(R @ centre[..., None])[..., 0]), X)
+
+
+def found(x: Tensor, sizes: Tensor | None = None) -> Overlays:
+    """Of images whose points match by their numbers."""
+    sizes = SIZE.repeat(len(x), 1) if sizes is None else sizes
+    same = torch.arange(x.shape[1])[:, None].expand(-1, 2)
+    matches = [dict.fromkeys(range(len(PAIRS)), same)]
+    return find_overlays(sizes, list(x), PAIRS, matches, generator=torch.Generator().manual_seed(0))
+
+
+def left_out(overlays: Overlays, x: Tensor, i: int = 0, j: int = 1) -> Tensor:
+    return ~overlays.admit(SIZE.repeat(2, 1), x[i], x[j])
+
+
+def overlay(generator: torch.Generator, points: int = 60) -> Tensor:
+    """Places in a corner, the same in six images but for noise."""
+    place = torch.rand(points, 2, generator=generator, dtype=torch.float64) * torch.tensor([300.0, 80.0]) + 20
+    return place + 0.2 * torch.randn(6, points, 2, generator=generator, dtype=torch.float64)
+
+
+def test_an_overlay_is_left_out_and_nothing_else(generator):
+    x = torch.cat((scene(generator), overlay(generator)), 1)
+    overlays = found(x)
+    for i, j in PAIRS.tolist():
+        out = left_out(overlays, x, i, j)
+        assert out[120:].double().mean() > 0.95
+        assert not out[:120].any()
+
+
+def test_more_of_an_overlay_than_of_the_scene(generator):
+    x = torch.cat((scene(generator, 60), overlay(generator, 400)), 1)
+    assert left_out(found(x), x)[60:].double().mean() > 0.95
+
+
+def test_scenes_have_none(generator):
+    assert not len(found(scene(generator)).cells)
+
+
+def test_images_of_a_camera_that_stands_still_have_none(generator):
+    x = scene(generator)[:1].expand(6, -1, -1)
+    assert not len(found(x + 0.2 * torch.randn(x.shape, generator=generator, dtype=x.dtype)).cells)
+
+
+def test_a_camera_that_rests_while_something_moves_has_none(generator):
+    """In two of six images only, before which a car passes: elsewhere the background moves."""
+    x = torch.cat((scene(generator), scene(generator, 40)), 1)
+    x[1, :120] = x[0, :120]
+    assert not len(found(x).cells)
+
+
+def test_other_sizes_of_images_have_other_places(generator):
+    x = torch.cat((scene(generator), overlay(generator)), 1)
+    overlays = found(x)
+    other = torch.tensor([[1000, 750], [900, 750]])
+    assert overlays.admit(other, x[0], x[1]).all()
+    assert overlays.admit(other[1:].expand(2, 2), x[0], x[1]).all()
+    assert not len(found(x, SIZE + torch.arange(6)[:, None]).cells)
+
+
+def test_photographs_with_a_large_logo(courtyard, tmp_path):
+    """The same model as of photographs without it."""
+    logo = np.random.default_rng(0).integers(0, 255, (14, 40, 3)).astype(np.uint8)
+    plain = reconstruct(courtyard)
+    for path in sorted(courtyard.iterdir()):
+        image = cv2.imread(str(path))
+        if image is None:
+            continue
+        h, w = image.shape[:2]
+        image[-h // 5 :, : w // 2] = cv2.resize(logo, (w // 2, h // 5), interpolation=cv2.INTER_NEAREST)
+        cv2.imwrite(str(tmp_path / f"{path.stem}.png"), image)
+    result = reconstruct(tmp_path)
+    assert result.report.still > 100
+    assert plain.report.still == 0
+    assert "stand still" in result.report.summary()
+    model, wanted = result.model, plain.model
+    assert model.registered.all()
+    R, other = model.poses.R, wanted.poses.R
+    relative = (R @ R[:1].mT) @ (other @ other[:1].mT).mT
+    angle = ((relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).arccos().rad2deg()
+    assert (angle < 0.3).all()
