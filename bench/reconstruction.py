@@ -54,6 +54,7 @@ def run_torchsfm(photographs: PhotographSet, threads: int, seed: int, lines: boo
         "look": "match",
         "match": "match",
         "track": "match",
+        "overlays": "verify",
         "verify": "verify",
     }
     seconds = dict.fromkeys(STAGES, 0.0)

@@ -413,7 +413,8 @@ def test_a_wrong_option_is_wrong_usage(courtyard: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stage", "saved"), [("features", []), ("match", ["features", "pairs"]), ("verify", ["features", "match", "pairs"])]
+    ("stage", "saved"),
+    [("features", []), ("match", ["features", "pairs"]), ("verify", ["features", "match", "overlays", "pairs"])],
 )
 def test_an_interrupted_run_goes_on_where_it_was(
     stage: str, saved: list[str], finished: tuple[Path, str], courtyard: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

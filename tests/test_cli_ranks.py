@@ -68,7 +68,7 @@ def test_a_helper_makes_the_stages_and_leaves_the_rest(
         patched.setattr(Started, "begin", lambda started, folder, resume: True)
         patched.setattr(Started, "by", classmethod(lambda cls: cls(1, 2)))
         assert torchsfm(*words, "--out", tmp_path / "out") == (0, "", "")
-    assert saved_stages(tmp_path / "out") == ["features", "match", "pairs", "verify"]
+    assert saved_stages(tmp_path / "out") == ["features", "match", "overlays", "pairs", "verify"]
     assert not (tmp_path / "out/model.npz").exists()
     status, _, stderr = torchsfm(*words, "--out", tmp_path / "out", "--resume")
     assert status == 0
@@ -103,7 +103,7 @@ def test_ranks_killed_at_any_moment(courtyard: Path, tmp_path: Path) -> None:
     """In whatever stage a rank is killed the run ends with the same model, and what was saved is not made again."""
     words, chance = ("reconstruct", courtyard, "--max-features", 600), random.Random(stream_seed())
     assert torchsfm(*words, "--out", tmp_path / "alone")[0] == 0
-    last = {"features": 1, "pairs": 5, "match": 6, "verify": 7, "map": 8}
+    last = {"features": 1, "pairs": 5, "match": 6, "overlays": 7, "verify": 8, "map": 9}
     for k in range(KILLS):
         out = tmp_path / str(k)
         with launch(2, *words, "--out", out) as process:
