@@ -70,6 +70,25 @@ def test_a_focal_length_twice_the_expected_one(generator: torch.Generator) -> No
     assert abs(math.log(float(found.focal) / (2 * FOCAL))) < 0.04
 
 
+def test_curves_are_not_moved_past_their_ends(generator: torch.Generator) -> None:
+    # Joints of a floor and edges above it, all straight: past the ends of what a frame shows they fit any motion.
+    generator.manual_seed(5)
+    poses = arc(FRAMES, generator, step=8.0)
+    along = (torch.arange(32) % 2).to(F64)
+    at = 3.0 * (torch.rand(32, 2, generator=generator, dtype=F64) - 0.5)
+    middle = torch.stack((at[:, 0], torch.full_like(along, 0.6), at[:, 1]), -1)
+    above = 1.5 * (torch.rand(8, 3, generator=generator, dtype=F64) - 0.5)
+    way = torch.nn.functional.normalize(torch.randn(8, 3, generator=generator, dtype=F64), dim=-1)
+    way = torch.cat((torch.stack((along, 0 * along, 1 - along), -1), way))
+    X = torch.cat((middle, above))[:, None] + torch.linspace(-0.5, 0.5, 40, dtype=F64)[:, None] * way[:, None]
+    x = project_points((K @ poses.matrix())[:, None], X)
+    # What is wrong with an edge is wrong with all of it.
+    noise = 0.3 * torch.randn(*x.shape[:2], 1, 2, dtype=F64, generator=generator)
+    found = first_cameras(curve_from_samples(x + noise, closed=False), 2, K[0, 0], CENTRE, 0.02)
+    assert found.refusal == ""
+    assert turned(found.poses, poses).max() < 3.0
+
+
 def test_curves_that_move_each_by_itself_are_not_followed(generator: torch.Generator) -> None:
     curves = images(rings(10, generator), arc(FRAMES, generator), generator)
     shift = torch.randn(FRAMES, 10, 1, 2, dtype=F64, generator=generator) * 12

@@ -30,7 +30,7 @@ from torchsfm.reconstruction.similarities import DEVIATION
 
 _DIRECTIONS = 8
 """Axes of rotation that are tried, parallel to the first image."""
-_TURNS = (1.5, 5.0)
+_TURNS = (1.5, 5.0, 15.0)
 """Degrees from a frame to the next that are tried."""
 _STEPS = 8
 """Of each descent, after which it is seen anew which samples a frame shows."""
@@ -57,7 +57,9 @@ _SAMPLES = 16
 _FEWEST = 60
 """Samples in each frame, on average, that must agree, and"""
 _AGREE = 0.7
-"""what share of all."""
+"""what share of all that frames show by their motion, and"""
+_SHOWN = 0.7
+"""what share these must be of those that they show: past their ends curves, straight ones best, fit any motion."""
 _PARALLAX = 2.0
 """Pixels, at least, by which near samples move more than far ones."""
 _UNLIKELY = 3.0
@@ -240,7 +242,10 @@ def first_cameras(
         # What is expected counts as much as distances do, that are so large, in pixels.
         now = replace(problem, weight=weight, scale=scale, sigma=sigma / noise, flat=_FLAT * noise**2)
         found = descend(now, motion, Options(steps, 1e-4))
-        return found.x, found.cost
+        # Where curves leave what frames show of them they have no distance, which is no merit.
+        counted, seen = weight.sum((1, 2)), problem.inside(found.x.place).sum((1, 2))
+        lost = scale**2 * (shown.sum() - seen)
+        return found.x, (found.cost * counted.clamp_min(1) + lost) / shown.sum().clamp_min(1)
 
     for scale in _SCALES:
         motion, cost = descent(scale, _STEPS)
@@ -271,6 +276,8 @@ def first_cameras(
         refusal = f"{int(good.sum())} samples of curves followed through {v} frames agree with one motion, too few"
     elif int(good.sum()) < _AGREE * int(counts.sum()):
         refusal = f"only {int(good.sum())} of {int(counts.sum())} samples of curves agree with one motion"
+    elif int(counts.sum()) < _SHOWN * int(shown.sum()):
+        refusal = f"only {int(counts.sum())} of {int(shown.sum())} samples are where frames show their curves"
     elif float((depths[1] - depths[0]) * motion.t[k].norm(dim=-1).amax() * focal) < _PARALLAX:
         refusal = "the camera hardly moved, or only turned, which gives no depth"
     elif bool(rivals.any()):
