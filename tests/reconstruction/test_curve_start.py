@@ -1,12 +1,23 @@
 """Cameras of a few frames from curves that were followed through them, and of one more from curves in space."""
 
 import math
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from torchsfm.geometry import Curve, Pose, curve_from_samples, intrinsics, project_points, rotation_angle, rotation_from_rotvec
+from torchsfm.geometry import (
+    Curve,
+    Pose,
+    curve_from_samples,
+    intrinsics,
+    krt_from_camera,
+    project_points,
+    rotation_angle,
+    rotation_from_rotvec,
+)
 from torchsfm.images.edge_field import edge_field
 from torchsfm.reconstruction.curve_resection import pose_from_edges
 from torchsfm.reconstruction.curve_start import first_cameras
@@ -87,6 +98,25 @@ def test_curves_are_not_moved_past_their_ends(generator: torch.Generator) -> Non
     found = first_cameras(curve_from_samples(x + noise, closed=False), 2, K[0, 0], CENTRE, 0.02)
     assert found.refusal == ""
     assert turned(found.poses, poses).max() < 3.0
+
+
+def test_frames_far_apart(data: Path, generator: torch.Generator) -> None:
+    # The longest marked lines of the Barcelona pavilion that five frames have inside, 13 to 19 degrees from one to the next.
+    folder = data / "curves/pavilion"
+    P = torch.stack([torch.from_numpy(np.loadtxt(file)) for file in sorted((folder / "cameras").iterdir())[8:13]])
+    marks = torch.from_numpy(np.loadtxt(folder / "gt-edges.txt")).long().reshape(-1, 2) - 1
+    ends = torch.from_numpy(np.loadtxt(folder / "gt-points.txt"))[marks]
+    s = torch.linspace(0, 1, 40, dtype=F64)[:, None]
+    x = project_points(P[:, None], ends[:, :1] * (1 - s) + ends[:, 1:] * s)
+    K, R, t = krt_from_camera(P)
+    in_front = (ends @ R[:, None, 2, :, None])[..., 0] + t[:, None, None, 2] > 0
+    inside = ((x > 0) & (x < torch.tensor([640.0, 360.0]))).flatten(2).all(-1) & in_front.all(-1)
+    length = torch.where(inside.all(0), (x[:, :, -1] - x[:, :, 0]).norm(dim=-1).amin(0), 0)
+    x = x[:, length.argsort(descending=True, stable=True)[:60]]
+    x = x + 0.3 * torch.randn(*x.shape[:2], 1, 2, generator=generator.manual_seed(0), dtype=F64)
+    found = first_cameras(curve_from_samples(x, closed=False), 2, K[0, 0, 0], K[0, :2, 2], 0.02)
+    assert found.refusal == ""
+    assert turned(found.poses, Pose(R, t)).max() < 3.0
 
 
 def test_curves_that_move_each_by_itself_are_not_followed(generator: torch.Generator) -> None:
