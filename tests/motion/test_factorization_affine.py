@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from chance import seeded
+from chance import assert_share, seeded
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import random_rotation, similarity_from_points
+from torchsfm.geometry import random_rotation, rotation_from_rotvec, rotvec_from_rotation, similarity_from_points
 from torchsfm.motion import AffineFactorization, factorize_affine
 
 MODELS = ("orthographic", "weak_perspective", "paraperspective")
@@ -119,6 +119,46 @@ def test_data_that_do_not_determine_the_answer_say_so() -> None:
     torch.testing.assert_close(alone.error, found.error[5], rtol=0, atol=1e-8)
     assert factorize_affine(x[:0]).X.shape == (0, 20, 3)
     assert factorize_affine(x.float()).X.dtype == torch.float32
+
+
+@pytest.mark.parametrize("views", [3, 8])
+@pytest.mark.parametrize("model", ["orthographic", "weak_perspective"])
+@pytest.mark.parametrize("kind", ["plane", "two orientations", "thin", "small turns", "line"])
+def test_noise_that_leaves_the_shape_open_is_told(kind: str, model: str, views: int) -> None:
+    g = seeded(7)
+    draw = {"generator": g, "dtype": torch.float64}
+    X = torch.rand(40, 30, 3, **draw) * 2 - 1
+    R = rotation_from_rotvec(0.4 * torch.randn(40, views, 3, **draw))
+    if kind == "plane":
+        X[..., 2] = 0.3 * X[..., 0]
+    if kind == "line":
+        X = X[..., :1] * torch.randn(40, 1, 3, **draw)
+    if kind == "thin":
+        X[..., 2] *= 0.01
+    if kind == "two orientations":
+        R = R[:, [i % 2 for i in range(views)]]
+    if kind == "small turns":
+        R = rotation_from_rotvec(0.004 * torch.randn(40, views, 3, **draw))
+    x = (X[:, None] @ R.mT)[..., :2] + 0.01 * torch.randn(40, views, 30, 2, **draw)
+    # Noise may be less than it seems once in twenty times.
+    assert_share(factorize_affine(x, model=model).status != Status.OK, 0.95)
+
+
+@pytest.mark.parametrize(("views", "n"), [(3, 4), (3, 30), (8, 5), (8, 30)])
+@pytest.mark.parametrize("noise", [0.003, 0.01])
+def test_rotations_are_as_near_as_is_said(views: int, n: int, noise: float) -> None:
+    x, _, R, _ = scene("weak_perspective", 200, views, n, noise=noise)
+    found = factorize_affine(x)
+    mirror = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    relative, truth = found.R[:, 1:] @ found.R[:, :1].mT, R[:, 1:] @ R[:, :1].mT
+    turns = [rotvec_from_rotation(relative @ T.mT).norm(dim=-1) for T in (truth, mirror @ truth @ mirror)]
+    error = torch.where((turns[0].amax(-1) < turns[1].amax(-1))[:, None], *turns)
+    told = (found.deviation[:, 1:].square() + found.deviation[:, :1].square()).sqrt()
+    good = found.status == Status.OK
+    assert_share((error < 4 * told).all(-1)[good], 0.98)
+    if n == 30:
+        assert_share(good, 0.98)
+        assert told[good].median() < 3 * error[good].median()
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -15,10 +15,15 @@ from torch import Tensor
 from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.geometry.homogeneous import finite_or_zero
 from torchsfm.linalg import eigh, inverse, qr, solve, svd, svdvals
+from torchsfm.motion.many_views.affine_evidence import metric_equations, sharpen_metric, stretch_deviation, turn_deviation
 from torchsfm.motion.many_views.bilinear_fit import Rays, core, fit_with_prior
+from torchsfm.optim.likely_noise import likely_variance
 
 AffineModel = Literal["orthographic", "weak_perspective", "paraperspective"]
 
+MAX_DEVIATION = 0.15
+"""Standard deviation beyond which it is not determined: of the stretch of the points in any direction against others, or of a
+rotation in radians."""
 _STIFF = 1e3
 """Weight of the third row of the cameras, which must be (0, 0, 0, 1), over that of the measurements."""
 _CHANCE = 1.3
@@ -36,13 +41,16 @@ class AffineFactorization:
         X: Points, about their centroid; zero where `used_point` is False.
         R: Rotation of each view, cam_from_world.
         scale: Length in the image of a unit across the line of sight, for each view.
+        deviation: Standard deviation of the rotation of each view against the others, in radians, by the noise that the images
+            show; one redundant measurement shows little, and much noise is then possible.
         singular_values: Those of the reprojected measurements about their centroids: three, largest first; the third is near
             the noise where the scene is a plane or the camera did not turn.
         error: Distance of each observed point from its reprojection; inf where not observed.
         used_view: Views with at least four points that other views see too.
         used_point: Points in at least two used views.
-        status: `OK`; `NOT_CONVERGED`; `TOO_FEW` points, or views (three are needed); `DEGENERATE`: planar scene, no turning, or
-            cameras that are not of the kind asked for (P and X are then some affine frame's, R and scale mean nothing);
+        status: `OK`; `NOT_CONVERGED`; `TOO_FEW` points, or views (three are needed); `DEGENERATE`: planar scene, no turning,
+            two orientations only, so little of depth or turns that the noise leaves the shape or a rotation open, or cameras
+            that are not of the kind asked for (P and X are then some affine frame's, R and scale mean nothing);
             `NOT_FINITE`: numbers beyond what the dtype holds, all fields are zero.
 
     Example:
@@ -63,6 +71,7 @@ class AffineFactorization:
     X: Float[Tensor, "*batch n 3"]
     R: Float[Tensor, "*batch v 3 3"]
     scale: Float[Tensor, "*batch v"]
+    deviation: Float[Tensor, "*batch v"]
     singular_values: Float[Tensor, "*batch 3"]
     error: Float[Tensor, "*batch v n"]
     used_view: Bool[Tensor, "*batch v"]
@@ -122,6 +131,7 @@ def factorize_affine(
         M, t, X, steady = _affine(finite_or_zero(flat), w, max_iterations)
         A, metric = _metric(M, t, view, model)
         M, X = M @ A[:, None], solve(A, X.mT)[0].mT
+        M, X, misfit, information = sharpen_metric(M, t, X, w, view, model)
         R, scale, unit = _rotations(M, t, model)
         # Orthographic scales are 1 by definition; else the mean scale is made 1.
         if model != "orthographic":
@@ -130,14 +140,21 @@ def factorize_affine(
         fitted = X[:, None] @ M.mT
         error = torch.linalg.vector_norm(fitted + t[:, :, None] - flat.nan_to_num(), dim=-1)
         seen = w > 0
-        sigma = ((w * error.square()).sum((-2, -1)) / (2 * seen.sum((-2, -1))).clamp(min=1)).sqrt()
+        rows, columns, measured = 2 * view.sum(-1), point.sum(-1), 2 * seen.sum((-2, -1))
+        # Noise shows where the points are not affine, and where the cameras are not metric.
+        unknown = (5 if model == "orthographic" else 6) * view.sum(-1) + 3 * columns - (6 if model == "orthographic" else 7)
+        squares = (w * error.square()).sum((-2, -1)) + misfit
+        rounding = torch.finfo(x.dtype).eps * flat.nan_to_num().abs().masked_fill(~seen[..., None], 0).flatten(1).amax(-1)
+        sigma = torch.maximum(likely_variance(squares, measured - unknown).sqrt(), rounding)
+        stretch = sigma * stretch_deviation(information)
+        turn = (sigma[:, None] * turn_deviation(M, X, w, information)).nan_to_num(torch.inf).clamp(max=torch.pi) * view
         stacked = (M * view[..., None, None]).flatten(1, 2) @ (X * point[..., None]).mT
         values, _ = svdvals(stacked)
         values = torch.nn.functional.pad(values, (0, 3))[:, :3]
-        rows, columns = 2 * view.sum(-1), point.sum(-1)
         chance = _CHANCE * sigma * (rows.double().sqrt() + columns.double().sqrt())
         loose = (values[:, 2] <= torch.maximum(chance, 1e-10 * values[:, 0])) | ~metric | ~(unit | ~view).all(-1)
-        few = (view.sum(-1) < 3) | (columns < 4) | (2 * seen.sum((-2, -1)) < 4 * rows + 3 * columns - 12)
+        loose = loose | ~(torch.maximum(stretch, turn.amax(-1)) <= MAX_DEVIATION)
+        few = (view.sum(-1) < 3) | (columns < 4) | (measured < 4 * rows + 3 * columns - 12)
         status = torch.where(steady, int(Status.OK), int(Status.NOT_CONVERGED))
         status = torch.where(loose, int(Status.DEGENERATE), status)
         status = torch.where(few, int(Status.TOO_FEW), status).to(torch.int8)
@@ -145,7 +162,7 @@ def factorize_affine(
         last[..., 3] = 1
         P = torch.cat((torch.cat((M, t[..., None]), -1), last), -2) * view[..., None, None]
         error = torch.where(seen, error, 0)
-        numbers = [f.to(x.dtype) for f in (P, X * point[..., None], R, scale * view, values, error)]
+        numbers = [f.to(x.dtype) for f in (P, X * point[..., None], R, scale * view, turn, values, error)]
         held = torch.stack([torch.isfinite(f).flatten(1).all(-1) for f in numbers]).all(0)
         status = torch.where(held, status, int(Status.NOT_FINITE)).to(torch.int8)
         *numbers, error = (torch.where(held.reshape(-1, *(1,) * (f.ndim - 1)), f, 0) for f in numbers)
@@ -187,26 +204,17 @@ def _affine(x: Tensor, w: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor, T
 
 def _metric(M: Tensor, t: Tensor, view: Tensor, model: AffineModel) -> tuple[Tensor, Tensor]:
     """A with M A metric, and whether there is one: Q = A A' solves what the model says of M Q M'."""
-    m, n = M.unbind(-2)
-    weight = (view / torch.linalg.matrix_norm(M).square().clamp_min(1e-300))[..., None]
-
-    def form(a: Tensor, b: Tensor) -> Tensor:
-        i, j = torch.triu_indices(3, 3, device=M.device)
-        return torch.where(i == j, a[..., i] * b[..., j], a[..., i] * b[..., j] + a[..., j] * b[..., i])
-
+    told = metric_equations(M, t, model)
     if model == "orthographic":
         # Not scaled: the equations are inhomogeneous.
-        rows = torch.cat((form(m, m), form(n, n), form(m, n)), -2) * view.repeat(1, 3)[..., None]
-        right = torch.cat((torch.ones_like(m[..., 0]), torch.ones_like(m[..., 0]), torch.zeros_like(m[..., 0])), -1)
-        right = right * view.repeat(1, 3)
+        rows, right = (told.rows * view[..., None, None]).flatten(1, 2), (told.right * view[..., None]).flatten(1)
         size = rows.square().sum((-2, -1)).clamp_min(1e-300).sqrt()[:, None, None]
         normal = (rows / size).mT @ (rows / size)
         q, fine = solve(normal, (rows / size).mT @ right[..., None])
         q = q[..., 0] / size[..., 0]
     else:
-        a, b = (t[..., :1], t[..., 1:]) if model == "paraperspective" else (0 * t[..., :1], 0 * t[..., :1])
-        mm, nn = form(m, m) / (1 + a * a), form(n, n) / (1 + b * b)
-        rows = torch.cat(((mm - nn) * weight, (form(m, n) - a * b * (mm + nn) / 2) * weight), -2)
+        weight = view / torch.linalg.matrix_norm(M).square().clamp_min(1e-300)
+        rows = (told.rows * weight[..., None, None]).flatten(1, 2)
         values, vectors, _ = eigh(rows.mT @ rows)
         q = vectors[..., 0]
         fine = values[..., 1] > 1e-12 * values[..., -1]
