@@ -107,6 +107,26 @@ def test_constant_intrinsics_of_exact_cameras(generator, method, assume, options
     assert right[found.status == Status.OK].all()
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.parametrize("motion", ["orbital", "translation"])
+def test_two_views_that_leave_the_focal_length_open(generator, motion, noise):
+    scene = stack([projective_scene(generator, 2, motion=motion, noise=noise, offset=0.0) for _ in range(10)])
+    found = constant_intrinsics(scene.P, scene.X, image_size=SIZE, visible=scene.visible, assume=FOCAL)
+    error = (found.K[:, 0, 0] / scene.K[:, 0, 0, 0]).log().abs()
+    # One redundant equation may fit by luck, but is then said to tell little.
+    assert not ((found.status == Status.OK) & (error > 6 * found.deviation)).any()
+    if noise == 0:
+        assert (found.status != Status.OK).all()
+
+
+def test_two_views_in_general(generator):
+    scene = stack([projective_scene(generator, 2, noise=0.3, offset=0.0) for _ in range(20)])
+    found = constant_intrinsics(scene.P, scene.X, image_size=SIZE, visible=scene.visible, assume=FOCAL)
+    good = found.status == Status.OK
+    assert good.sum() >= 14
+    assert ((found.K[:, 0, 0] / scene.K[:, 0, 0, 0]).log().abs() < 6 * found.deviation)[good].all()
+
+
 @pytest.mark.parametrize("assume", [FOCAL, ALL])
 def test_kruppa_with_exact_pairs(generator, assume):
     scenes = [projective_scene(generator, 6, offset=0.0) for _ in range(6)]

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-from chance import seeded
+from chance import assert_share, seeded
 from torch import Tensor
 
 from torchsfm import Status
-from torchsfm.geometry import Similarity, random_rotation, similarity_from_points
+from torchsfm.geometry import Similarity, random_rotation, rotation_from_rotvec, similarity_from_points
 from torchsfm.motion import average_similarities
 from torchsfm.motion.many_views.triplets import turn_angle
 
@@ -164,3 +164,18 @@ def test_scales_beyond_all_numbers_are_told() -> None:
     good = found.status == Status.OK
     assert bool((found.model.scale[good].isfinite() & (found.model.scale[good] > 0)).all())
     assert not bool(good.all())
+
+
+@pytest.mark.parametrize(("wrong", "noise"), [(0, 0.01), (1, 0.0), (8, 0.01)])
+def test_one_loop_that_does_not_close_is_told(wrong: int, noise: float) -> None:
+    g, told = seeded(wrong), []
+    for _ in range(8):
+        world = random_rotation(8, generator=g, dtype=torch.float64)
+        i, j = torch.arange(8), torch.arange(1, 9) % 8
+        R = world[j].mT @ world[i] @ rotation_from_rotvec(noise * torch.randn(8, 3, generator=g, dtype=torch.float64))
+        R[:wrong] = random_rotation(wrong, generator=g, dtype=torch.float64)
+        t = noise * torch.randn(8, 3, generator=g, dtype=torch.float64)
+        found = average_similarities(Similarity(torch.ones_like(t[:, 0]), R, t), torch.stack((i, j), 1), models=8)
+        told.append((found.status == (Status.NO_CONSENSUS if wrong else Status.OK)).all())
+    # Nobody knows how large the noise is, but unrelated models would close a loop as well; few do so by chance.
+    assert_share(torch.stack(told), 0.95)

@@ -13,9 +13,14 @@ from torchsfm.autocalibration.intrinsics_model import Assumption
 from torchsfm.autocalibration.projective_input import image_scaling
 from torchsfm.geometry.intrinsic_parameters import intrinsics_from_relative
 from torchsfm.optim import levenberg_marquardt
+from torchsfm.optim.likely_noise import likely_variance
 
 MAX_DEVIATION = 0.15
 """Standard deviation of the logarithm of the focal length, from the residuals, beyond which it is not determined."""
+_APART = 0.15
+"""Focal lengths this far apart in logarithm are told apart by the constraints, or the focal length is not determined,"""
+_CLEAR = 9.0
+"""by so many variances in their sum of squares."""
 _PRIOR = 1e-5
 """Weight of what is expected of the intrinsics: enough to hold what the data do not determine, too little to pull what they
 do."""
@@ -42,12 +47,13 @@ class IntrinsicsEstimate:
     K: Float[Tensor, "*batch 3 3"]
     """The intrinsics, in pixels."""
     deviation: Float[Tensor, "*batch"]
-    """Standard deviation of the logarithm of the focal length, as the residuals tell it; 1 where nothing is known."""
+    """Standard deviation of the logarithm of the focal length, as the residuals tell it, with the most noise that these make
+    likely: few say little; 1 where nothing is known."""
     cost: Float[Tensor, "*batch"]
     """Sum of squares of the constraints, without unit."""
     status: Int8[Tensor, "*batch"]
-    """OK; DEGENERATE: the constraints do not determine the focal length; TOO_FEW of them; NOT_FINITE. Where it is not OK, K is
-    the best found and not to be relied on."""
+    """OK; DEGENERATE: the constraints do not determine the focal length, or determine two; TOO_FEW of them; NOT_FINITE. Where
+    it is not OK, K is the best found and not to be relied on."""
 
 
 def check_shared(assume: Assumption, image_size: tuple[float, float]) -> None:
@@ -117,7 +123,6 @@ def fit_intrinsics(
     J = torch.nan_to_num(torch.stack(columns, -1))[:, : -q if q else None]
     J = torch.nan_to_num(J)
     total = 2 * cost[rows, best]
-    redundancy = (count - u).clamp_min(1)
     finite = torch.isfinite(total)
     total = torch.where(finite, total, 0.0)
     scale = J.norm(dim=1).clamp_min(1e-12)
@@ -125,14 +130,33 @@ def fit_intrinsics(
     eye = torch.eye(u, dtype=x.dtype, device=x.device)
     inverse = torch.linalg.inv_ex(A + 1e-13 * eye).inverse / (scale[:, :, None] * scale[:, None])
     # Rounding is the least of errors.
-    noise = total / redundancy + 1e-20
+    noise = total / (count - u).clamp_min(1) + 1e-20
     first = next(i for i, (p, _) in enumerate(assume.columns(1)) if p == 0)
-    deviation = torch.nan_to_num((inverse[:, first, first].clamp_min(0) * noise).sqrt(), 1.0).clamp_max(1.0)
+    unit = inverse[:, first, first].clamp_min(0)
+    seeming = torch.nan_to_num((unit * noise).sqrt(), 1.0)
+    deviation = torch.nan_to_num((unit * (likely_variance(total, count - u) + 1e-20)).sqrt(), 1.0).clamp_max(1.0)
     T = image_scaling(image_size)
     K = torch.linalg.inv_ex(T).inverse @ intrinsics_from_relative((x[:, :q] @ spread.mT).clamp(-20, 20))
     K = K / K[:, 2:, 2:]
     status = torch.full((b,), int(Status.OK), dtype=torch.int8, device=x.device)
-    outside = (x[:, first].abs() > 3.7) | (deviation > MAX_DEVIATION)
+    # Other focal lengths that fit as well, found or asked for, leave the question open, as linear as that may look here.
+    limit = (total + _CLEAR * noise)[:, None]
+    others = torch.nan_to_num((result.x[..., first] - x[:, None, first]).abs())
+    rival = (2 * cost < limit) & (others > _APART)
+    held = x[:, None].expand(b, 2, u).clone()
+    held[..., first] += held.new_tensor((-_APART, _APART))
+
+    def pinned(free: Tensor, place: Tensor, *tensors: Tensor) -> Tensor:
+        return residual(torch.cat((free[..., :first], place, free[..., first:]), -1), *tensors)
+
+    rest = torch.cat((held[..., :first], held[..., first + 1 :]), -1)
+    two = tuple(t[:, None].expand(b, 2, *t.shape[1:]) for t in data)
+    if u > 1:
+        away = levenberg_marquardt(pinned, rest, held[..., first : first + 1], *two, max_iterations=60)
+        flat = 2 * torch.nan_to_num(away.cost, torch.inf) < limit
+    else:
+        flat = torch.nan_to_num(residual(held, *two)[..., 0].square().sum(-1), torch.inf) < limit
+    outside = (x[:, first].abs() > 3.7) | (seeming > MAX_DEVIATION) | rival.any(-1) | flat.any(-1)
     for condition, code in ((outside, Status.DEGENERATE), (~finite, Status.NOT_FINITE), (count < u, Status.TOO_FEW)):
         status = torch.where(condition, int(code), status)
     return IntrinsicsEstimate(K, torch.where(finite, deviation, 1.0), total, status.to(torch.int8)), x

@@ -16,10 +16,11 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_index, check_one_problem, check_options
-from torchsfm.geometry import Similarity
+from torchsfm.geometry import Similarity, rotvec_from_rotation
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.average_rotations import average_rotations
 from torchsfm.motion.many_views.components import components
+from torchsfm.motion.many_views.rotation_loops import close_by_chance
 from torchsfm.optim import Block, GemanMcClure, Huber, Loss, Term, rotation_exponential
 from torchsfm.optim import sparse_levenberg_marquardt as minimise
 
@@ -45,7 +46,8 @@ class AveragedSimilarities:
 
     Attributes:
         model: From the models to the world, which is the smallest model of each component.
-        status: OK; TOO_FEW: no edge of this model counts; NO_CONSENSUS: none of its edges agrees; NOT_CONVERGED: the iteration
+        status: OK; TOO_FEW: no edge of this model counts; NO_CONSENSUS: none of its edges agrees, or one of several, or
+            the loops are closed so badly, and so few, that unrelated models close theirs as well; NOT_CONVERGED: the iteration
             limit came first.
         component: The smallest model that each is connected with through edges that agree. Worlds of different components have
             nothing to do with each other.
@@ -154,7 +156,10 @@ def average_similarities(
         inliers = counts & (distance <= AGREES * scatter)
         component = components(edges[inliers], models)
         counted, agreeing = (torch.bincount(edges[e].flatten(), minlength=models) for e in (counts, inliers))
-        code = torch.where(agreeing == 0, int(Status.NO_CONSENSUS), int(course))
+        # One edge of several supports nothing but itself, and unrelated models may be as near to closing as few loops.
+        alone = (agreeing < 2) & (agreeing < counted)
+        unrelated = close_by_chance(graph.angle(x), graph.edges, models)
+        code = torch.where(alone | unrelated, int(Status.NO_CONSENSUS), int(course))
         status = torch.where(counted == 0, int(Status.TOO_FEW), code).to(torch.int8)
     scale, R, t = _parts(x)
     # The world is the first model of each component.
@@ -243,6 +248,12 @@ class _Graph:
         """The root mean square residual of each edge's places."""
         i, j = self.edges.unbind(-1)
         return _residual(x[i], x[j], *self._data).square().mean(-1).sqrt()
+
+    def angle(self, x: Float[Tensor, "n 13"]) -> Float[Tensor, "e"]:
+        """By how much each edge's rotation disagrees, in radians."""
+        i, j = self.edges.unbind(-1)
+        R = _parts(x)[1]
+        return torch.linalg.vector_norm(rotvec_from_rotation(R[j].mT @ R[i] @ self.S.R.mT), dim=-1)
 
     def scatter(self, x: Float[Tensor, "n 13"]) -> float:
         """The standard deviation of the right edges, if half of those that do not merely fix the models are right."""
