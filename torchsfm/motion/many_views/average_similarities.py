@@ -253,7 +253,8 @@ class _Graph:
         """By how much each edge's rotation disagrees, in radians."""
         i, j = self.edges.unbind(-1)
         R = _parts(x)[1]
-        return torch.linalg.vector_norm(rotvec_from_rotation(R[j].mT @ R[i] @ self.S.R.mT), dim=-1)
+        off: Tensor = rotvec_from_rotation(R[j].mT @ R[i] @ self.S.R.mT).norm(dim=-1)
+        return off
 
     def scatter(self, x: Float[Tensor, "n 13"]) -> float:
         """The standard deviation of the right edges, if half of those that do not merely fix the models are right."""
