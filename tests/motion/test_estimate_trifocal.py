@@ -10,8 +10,10 @@ from oxford import lines_of, read
 from torch import Tensor
 
 from torchsfm._types import Status
+from torchsfm.geometry import Pose, project_points
 from torchsfm.motion import TrifocalEstimator, estimate_trifocal, quadrifocal_6pt, trifocal_7pt
 from torchsfm.robust import Degeneracy
+from torchsfm.simulation import random_poses
 from torchsfm.tensors import (
     quadrifocal_from_cameras,
     transfer_points_quadrifocal,
@@ -113,6 +115,26 @@ def test_a_plane_does_not_win_over_points_off_it(generator: torch.Generator) -> 
     assert_share(found.degeneracy == Degeneracy.NONE, 0.9)
     held = images(P, points(30, n=40, generator=generator))
     assert_share(transfer_error(found.model, held).median(-1).values < 3, 0.85)
+
+
+@pytest.mark.parametrize("kind", ["general", "two lines", "centres"])
+def test_points_that_leave_a_change_unseen_say_so(kind: str, generator: torch.Generator) -> None:
+    draw = {"generator": generator, "dtype": torch.float64}
+    X = 2 * torch.rand(10, 60, 3, **draw) - 1
+    poses = random_poses(10, 3, generator=generator)
+    if kind == "two lines":
+        along = torch.linspace(-1, 1, 30, dtype=torch.float64)[:, None]
+        X = torch.cat([0.6 * along * torch.randn(10, 1, 3, **draw) + 0.4 * torch.randn(10, 1, 3, **draw) for _ in range(2)], 1)
+    if kind == "centres":
+        # The second camera stands where the first does.
+        t = poses.t.clone()
+        t[:, 1] = (poses.R[:, 1] @ poses.R[:, 0].mT @ t[:, 0, :, None])[..., 0]
+        poses = Pose(poses.R, t)
+    x = project_points(poses.matrix(), X[:, None])
+    for noise in (1e-3, 3e-3):
+        found = estimate_trifocal(x + noise * torch.randn(x.shape, **draw), threshold=0.01, generator=generator)
+        fine = (found.status == Status.OK) & (found.degeneracy == Degeneracy.NONE)
+        assert_share(fine == (kind == "general"), 0.9)
 
 
 def test_bad_problems_and_scale_of_the_threshold(generator: torch.Generator) -> None:

@@ -1,5 +1,6 @@
 """Three projective cameras from correspondences over three images of which many are wrong."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Unpack
 
@@ -14,6 +15,7 @@ from torchsfm.motion.three_views.point_line_trifocal import PointLineTrifocalEst
 from torchsfm.motion.three_views.three_view_parallax import alternatives_of_plane, planar, planar_suspected
 from torchsfm.motion.three_views.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.three_views.trifocal_reprojection import linear_depths, normal_equations, squared_distance
+from torchsfm.motion.three_views.unseen_change import change_unseen
 from torchsfm.motion.two_views.collinear import collinear, collinear_suspected
 from torchsfm.motion.two_views.normalization import common_scale_of_views
 from torchsfm.motion.two_views.plane_and_parallax import more_than_chance, most_by_chance
@@ -24,10 +26,14 @@ from torchsfm.robust import (
     Weigh,
     check_counts,
     check_door,
+    constant_weights,
     estimate_robustly,
 )
 from torchsfm.tensors import canonical_cameras
 from torchsfm.tensors.canonical import canonical_frame
+
+_CLEAR, _FINE = 3.0, 0.05
+"""How far points must move for a change of cameras to be seen: so many standard deviations, and so much of the threshold."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +158,8 @@ class TrifocalEstimator:
     ) -> Bool[Tensor, "p"]:
         """Whether half of the inliers may be in one plane, or all but so few as chance explains, there or on a line."""
         flat = planar_suspected(model, (x1, x2, x3), inliers, threshold * threshold, most_by_chance(chance, 2))
-        return flat | collinear_suspected((x1, x2, x3), inliers, threshold, chance)
+        few = collinear_suspected((x1, x2, x3), inliers, threshold, chance)
+        return flat | few | _unseen(model, (x1, x2, x3), inliers, threshold, 2 + chance)
 
     def degeneracy(
         self,
@@ -168,12 +175,27 @@ class TrifocalEstimator:
         """What all inliers but so few as chance explains have in common, so that the cameras are open.
 
         PLANAR: homographies from the first image relate them to both others. COLLINEAR: in an image they are on a line.
+        UNDETERMINED: they leave a large change of the cameras unseen for another reason.
         """
         on = planar(model, (x1, x2, x3), inliers, threshold * threshold)
         flat = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
-        code = torch.where(flat, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
+        unseen = _unseen(model, (x1, x2, x3), inliers, threshold, 2 + chance)
+        code = torch.where(unseen, int(Degeneracy.UNDETERMINED), int(Degeneracy.NONE))
+        code = torch.where(flat, int(Degeneracy.PLANAR), code)
         lined = collinear((x1, x2, x3), inliers, threshold, chance)
         return torch.where(lined, int(Degeneracy.COLLINEAR), code).to(torch.int8)
+
+
+def _unseen(model: Tensor, x: Sequence[Tensor], inliers: Tensor, threshold: Tensor, spare: Tensor) -> Tensor:
+    """Whether the inliers leave a large change of the cameras unseen."""
+    # Noise may be far less than the threshold allows.
+    squared, _ = squared_distance(model, [_rows(y) for y in x])
+    mean = torch.where(inliers, squared, 0.0).sum(-1) / inliers.sum(-1).clamp(min=1)
+    noise = (mean.to(threshold.dtype) / 3).sqrt()
+    threshold = torch.minimum(torch.maximum(_CLEAR * noise, _FINE * threshold), threshold)
+    one = constant_weights(torch.ones_like(inliers, dtype=model.dtype)[..., None])
+    alone, _ = normal_equations(model[..., None, :, :, :], [_rows(y[..., None, :]) for y in x], one)
+    return change_unseen(model, alone, inliers, threshold, spare)
 
 
 def _rows(x: Tensor) -> list[Tensor]:
@@ -209,9 +231,9 @@ def estimate_trifocal(
     Returns:
         Cameras (*batch, view, 3, 4) in the frame of `canonical_cameras`; inliers, support, iterations, status, degeneracy
         (PLANAR: homographies relate all inliers but so few as chance explains; COLLINEAR: so many are on a line in an image;
-        with lines UNDETERMINED: a large change of the cameras is not seen by more than so few; the cameras are then some of
-        many), covariance (36 x 36, of rank 18). The cameras carry their derivatives with respect to the inliers (see
-        `ransac`).
+        UNDETERMINED: a large change of the cameras is not seen by more than so few, as of points on two lines or where
+        centres coincide; the cameras are then some of many), covariance (36 x 36, of rank 18). The cameras carry their
+        derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit.

@@ -10,18 +10,17 @@ from torch import Tensor
 
 from torchsfm._types import Solutions, Status, broadcast_shapes
 from torchsfm.geometry import line_from_points
-from torchsfm.linalg import damped_solve, eigh
+from torchsfm.linalg import damped_solve
 from torchsfm.motion.three_views.line_reprojection import line_equations, squared_line_distance
 from torchsfm.motion.three_views.multilinear_fit import frame_directions, free_directions
 from torchsfm.motion.three_views.trifocal_4p3l import trifocal_4p3l
 from torchsfm.motion.three_views.trifocal_6pt import trifocal_6pt
 from torchsfm.motion.three_views.trifocal_7pt import trifocal_7pt
 from torchsfm.motion.three_views.trifocal_reprojection import linear_depths, normal_equations, squared_distance
+from torchsfm.motion.three_views.unseen_change import change_unseen
 from torchsfm.robust import Degeneracy, Weigh, constant_weights
 from torchsfm.tensors.canonical import canonical_frame
 
-_MOTION = 0.3
-"""A change of the cameras, of norm 1 each, that should be seen."""
 _FIT_STEPS = 4
 """Steps from the linear tensor of lines to the nearest that three cameras have."""
 
@@ -270,14 +269,4 @@ def _unseen(model: Tensor, views: Sequence[Tensor], line: Tensor, inliers: Tenso
     """Whether no more inliers than can be spared see the change of the cameras that they see least."""
     one = constant_weights(torch.ones_like(inliers, dtype=model.dtype)[..., None])
     alone, _ = _normal_equations(model[..., None, :, :, :], [x[..., None, :] for x in views], line[..., None], one)
-    D = free_directions(model)[..., None, :, :]
-    A = torch.where(inliers[..., None, None], D.mT @ alone @ D, 0.0).nan_to_num(0, 0, 0)
-    weights = inliers.to(A.dtype)
-    seen = torch.zeros_like(weights)
-    for _ in range(4):
-        _, vectors, _ = eigh((A * weights.square()[..., None, None]).sum(-3))
-        v = vectors[..., None, :, :1]
-        seen = _MOTION * (v.mT @ A @ v)[..., 0, 0].clamp(min=0).sqrt()
-        weights = torch.where(inliers, threshold[..., None] / (seen + threshold[..., None]), 0.0)
-    unseen: Tensor = (inliers & (seen > threshold[..., None])).sum(-1) <= spare
-    return unseen
+    return change_unseen(model, alone, inliers, threshold, spare)
