@@ -311,3 +311,14 @@ def test_noise_does_not_make_up_what_points_leave_open(layout: str, v: int, gene
 
     assert (factorize_points(images(X)).status == Status.OK).double().mean() < 0.15
     assert (factorize_points(images(general)).status == Status.OK).double().mean() > 0.9
+
+
+@pytest.mark.parametrize("views", [2, 3])
+@pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
+def test_six_points_often_are_six(views: int, noise: float) -> None:
+    x, _ = scene(40, views, 6)
+    x = x.repeat(1, 1, 5, 1)
+    x = x + noise * torch.randn(x.shape, generator=seeded(1), dtype=torch.float64)
+    assert (factorize_points(x).status == Status.DEGENERATE).all()
+    # Thirty that are apart are enough.
+    assert_share(factorize_points(scene(20, views, 30, noise=noise)[0]).status == Status.OK, 0.9)

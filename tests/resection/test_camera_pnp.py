@@ -339,3 +339,37 @@ def test_points_apart_are_enough(generator, solve, noise):
         X = torch.randn(100, n, 3, generator=generator, dtype=F64)
         X[..., 2] *= solve is not camera_planar
         assert_share(solve(seen_by(generator, X, noise), X).status == Status.OK, 0.98)
+
+
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp])
+def test_four_points_lead_to_the_least_minimum(generator, solve):
+    """Three of them have up to four poses."""
+    d = torch.randn(400, 4, 3, generator=generator, dtype=F64)
+    R = random_rotation(400, generator=generator, dtype=F64)
+    Y = d + torch.tensor([0.0, 0, 6])
+    found = solve(Y, Y @ R)
+    assert_share((turn(found.model, R) < 1e-5) & (found.status == Status.OK), 0.98)
+    # Other points that count for nothing change nothing.
+    more = [torch.cat((torch.randn(400, 2, 3, generator=generator, dtype=F64), a), 1) for a in (Y, Y @ R)]
+    weights = torch.tensor([0.0, 0, 1, 1, 1, 1], dtype=F64)
+    assert_share(turn(solve(*more, weights=weights).model, R) < 1e-5, 0.98)
+
+
+@pytest.mark.parametrize("solve", [camera_pnp, camera_epnp])
+def test_a_second_pose_that_fits_as_well_is_told(generator, solve):
+    """A plane that is far away has two; so have three points, one of them seen twice, if noise parts them."""
+    X = torch.rand(400, 6, 3, generator=generator, dtype=F64) - 0.5
+    X[..., 2] = 0
+    R = random_rotation(400, generator=generator, dtype=F64)
+    Y = X @ R.mT + torch.tensor([0.0, 0, 10])
+    noisy = Y / Y[..., 2:] + 3e-3 * torch.randn(Y.shape, generator=generator, dtype=F64)
+    found = solve(noisy, X)
+    good = found.status == Status.OK
+    assert (good & (turn(found.model, R) > 0.5)).sum() <= 0.1 * 400
+    # Near enough, they are one.
+    Y = 4 * X @ R.mT + torch.tensor([0.0, 0, 6])
+    found = solve(Y / Y[..., 2:] + 3e-4 * torch.randn(Y.shape, generator=generator, dtype=F64), 4 * X)
+    assert_share(found.status == Status.OK, 0.9)
+
+    X = torch.randn(400, 3, 3, generator=generator, dtype=F64)[:, [0, 1, 2, 0]]
+    assert_share(solve(seen_by(generator, X, 1e-2), X).status != Status.OK, 0.95)

@@ -40,9 +40,8 @@ def camera_epnp(
     The control points in the camera's frame are combinations of up to four eigenvectors; the products of the coefficients are
     found in three approximations, the coefficients by Gauss-Newton on the distances between control points (Lepetit,
     Moreno-Noguer & Fua, "EPnP: an accurate O(n) solution to the PnP problem", IJCV 2009). The best of the three poses goes on
-    to the least sum of squared sines of the angles between rays and points, as those of `camera_pnp` do, which begins from more
-    places: of four points in no plane this ends in another minimum for one sample in six, which `error` tells, of more points
-    hardly ever. Computed in float64; the derivative is that of the minimum.
+    to the least sum of squared sines of the angles between rays and points, as those of `camera_pnp` do; of four points also
+    the poses of three of them are tried. Computed in float64; the derivative is that of the minimum.
 
     Args:
         d: Rays in the camera frame, of any length, pointing from the camera towards the points.

@@ -12,6 +12,7 @@ from torchsfm.geometry import Pose
 from torchsfm.linalg import eigh
 from torchsfm.optim import wants_derivative
 from torchsfm.resection.angles import Rays, attach, cost, determined, gauss_newton, in_pieces, status_of
+from torchsfm.resection.other_poses import beside_others, with_poses_of_three
 from torchsfm.resection.spread_points import tells_pose
 
 _STARTS = 4
@@ -44,7 +45,8 @@ class PoseEstimate:
     status: Int8[Tensor, "*batch"]
     """OK; NOT_FINITE: data with weight are not finite, or a ray is zero; TOO_FEW: fewer than four points; DEGENERATE: the pose
     is not determined, or not beyond the noise that the error tells of (points in a line or nearly, rays that coincide, three
-    points several times each), or of five points and more none fits to 0.2 radians; BEHIND: half of the weight or more is
+    points several times each), or another, well apart, fits as well (some four points, planes far away), or of five points and
+    more none fits to 0.2 radians; BEHIND: half of the weight or more is
     behind the camera."""
 
     @property
@@ -124,12 +126,14 @@ def least_sines(
 
 
 def _solve(data: Rays, R: Tensor, t: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
-    R, t, value, _, _ = gauss_newton(data, R, t, 2)
+    R, t, value, _, _ = gauss_newton(data, *with_poses_of_three(data, R, t), 2)
     best = value.argmin(-1)[:, None]
+    near, starts = value, (R, t)
     R, t = R.gather(1, best[..., None, None].expand(-1, 1, 3, 3)), t.gather(1, best[..., None].expand(-1, 1, 3))
     R, t, value, N, _ = gauss_newton(data, R, t, steps)
+    R, t, value, N, alone = beside_others(data, R, t, value, N, *starts, near, steps)
     value = value[:, 0]
-    told = tells_pose(data, R[:, 0], t[:, 0], value, N[:, 0])
+    told = tells_pose(data, R[:, 0], t[:, 0], value, N[:, 0]) & alone
     status = status_of(data, R, t, determined(data, N)[:, 0] & told, 4)
     total = data.w.sum(-1)
     error = (value / torch.where(total > 0, total, 1.0)).sqrt()

@@ -23,6 +23,7 @@ from torchsfm.geometry import to_homogeneous
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.shape import balanced_frame
 from torchsfm.linalg import eigh, solve
+from torchsfm.linalg.farthest_points import farthest_points
 from torchsfm.motion.many_views.bilinear_fit import (
     Fit,
     Rays,
@@ -36,6 +37,7 @@ from torchsfm.motion.many_views.bilinear_fit import (
     with_derivative,
 )
 from torchsfm.optim import wants_derivative
+from torchsfm.optim.likely_noise import QUARTER, likely_variance
 
 _PRIORS = (1.0, 0.1, 0.01, 0.001)
 _ENOUGH = 6
@@ -47,6 +49,12 @@ _SCALES = (8.0, 6.0, 4.0, 3.0)
 _UNDETERMINED = 0.08
 """Standard deviation of a camera matrix of norm 1 beyond which it is taken for undetermined. Where points leave it open, noise
 that spreads them makes a tenth of it and more."""
+_DISTINCT = 8
+"""Points, apart from each other, that determine two cameras and more,"""
+_APART = 6.0
+"""by so many standard deviations in the root mean square over the images."""
+_SMALLEST = 1e-24
+"""Variance of the noise at least, over the square of the largest coordinate: rounding."""
 _FLAT_STEPS = 15
 """Most steps of the homographies that are fitted for comparison: where they do not fit, their minimum does not matter."""
 
@@ -68,7 +76,8 @@ class Factorization:
         used_point: Points in at least two used views.
         status: `OK`; `NOT_CONVERGED`; `TOO_FEW` views or points; `DEGENERATE`: the data leave cameras undetermined (points in
             a plane but for one, on two lines, in four places or five; views without baseline; parts that hang together too
-            loosely), but for noise.
+            loosely), but for noise, which few redundant observations tell little of; or fewer points that are apart than the
+            cameras need.
 
     Example:
         >>> import torch, torchsfm
@@ -183,6 +192,8 @@ def _factorize(x: Tensor, w: Tensor, robust: bool, steps: int) -> tuple[Tensor, 
     X = u.mT * point[..., None]
     y = (P.detach() @ X.detach().mT[:, None]).mT
     error = torch.linalg.vector_norm(divide_safely(y[..., :2], y[..., 2]) - x.detach(), dim=-1)
+    repeated = _repeated(x.detach(), error.detach(), counts & (trust > 0.5), point, unknowns)
+    status = torch.where((status != Status.TOO_FEW) & repeated, int(Status.DEGENERATE), status).to(torch.int8)
     return P, X, y[..., 2] * counts, proximity, torch.where(counts, error, torch.inf), rays.w * trust, view, point, status
 
 
@@ -235,9 +246,28 @@ def _undetermined(rays: Rays, fit: Fit, view: Tensor, unknowns: Tensor) -> Tenso
     # Absent views have zeros only, and fifteen directions of space are free.
     first = (15 + 12 * (~view).sum(-1)).clamp(max=values.shape[-1] - 1)
     least = values.gather(-1, first[:, None])[:, 0]
-    redundancy = (2 * (rays.w > 0).sum((-2, -1)) - unknowns).clamp(min=1)
-    variance = fit.cost * rays.w.sum((-2, -1)) / redundancy
+    variance = likely_variance(fit.cost * rays.w.sum((-2, -1)), 2 * (rays.w > 0).sum((-2, -1)) - unknowns, QUARTER)
     return (least <= 1e-11 * values[:, -1]) | (variance > _UNDETERMINED**2 * least) | ~torch.isfinite(least)
+
+
+def _repeated(x: Tensor, error: Tensor, counts: Tensor, point: Tensor, unknowns: Tensor) -> Tensor:
+    """Whether the points that are apart, as far as the noise tells, are no more than any cameras agree with.
+
+    Points that not all images see are taken to be apart. Distances are in the images as they came, each with its own noise.
+    """
+    seen = counts.any(-1)
+    v = seen.sum(-1)
+    whole = (counts | ~seen[..., None]).all(1) & point
+    square = torch.where(counts, error.square(), 0.0)
+    measured = 2 * counts.sum((-2, -1))
+    share = (measured - unknowns).clamp(min=1) / measured.clamp(min=1)
+    variance = square.sum(-1) / (2 * counts.sum(-1)).clamp(min=1) / share[:, None]
+    scaled = x / (variance + _SMALLEST * x.square().amax((-2, -1))).clamp_min(1e-300).sqrt()[..., None, None]
+    place = torch.where(whole[:, None, :, None] & seen[..., None, None], scaled, 0).transpose(1, 2).flatten(2)
+    # Where none is, the first is one of none.
+    squares = farthest_points(place, whole | ~whole.any(-1, keepdim=True), _DISTINCT - 1)[1]
+    number = whole.any(-1) + (squares > (_APART**2 * v)[:, None]).sum(-1) + (point & ~whole).sum(-1)
+    return (number < _DISTINCT) & (2 * v * number <= 11 * v + 3 * number - 15)
 
 
 def _flat(rays: Rays, fit: Fit, v: Tensor, n: Tensor) -> Tensor:
