@@ -18,6 +18,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from torchsfm.geometry.intrinsic_parameters import row_from_camera
+from torchsfm.geometry.projection import PixelProjection
 from torchsfm.reconstruction.mapping import Mapping
 
 MAX_ANGLE = 0.35
@@ -107,30 +109,40 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     occupied = _Occupied.of(mapping)
     nearest, farthest = _DepthMap.of(mapping, FINE, "amin"), _DepthMap.of(mapping, FINER, "amax")
     beside = _DepthMap.of(mapping, FINER, "amin")
+    lens = PixelProjection(type(mapping.cameras.distortion), skew=bool((mapping.cameras.K[:, 0, 1] != 0).any()))
+    rows_of_cameras = row_from_camera(mapping.cameras).mT
     for a in torch.unique(directed[:, 0]).tolist():
         rows = (directed[:, 0] == a).nonzero()[:, 0]
         b = directed[rows, 1]
         mine = node[view == a]
         p = mapping.point[mine]
-        x, depth, near = _predicted(mapping, p, a, b)
+        near, ray = _looked_at(mapping, p, a, b)
         # Observations are sorted by point.
         column = torch.arange(len(p)).repeat_interleave(sightings[p])
         step = torch.arange(len(column)) - (sightings[p].cumsum(0) - sightings[p])[column]
         row = torch.full((v,), -1).index_copy_(0, b, torch.arange(len(b)))[view[first_sighting[p][column] + step]]
+        row, column = row[row >= 0], column[row >= 0]
         seen = torch.zeros(len(b), len(p), dtype=torch.bool)
-        seen[row[row >= 0], column[row >= 0]] = True
+        seen[row, column] = True
+        near &= sightings[p] >= 2
+        near[row, column] &= sightings[p[column]] >= 3
         # Of the points that count, one row each: where the other camera should see them, and does if nothing hides them.
-        k, n = (near & (sightings[p] - seen.long() >= 2)).nonzero(as_tuple=True)
-        image, x, depth = b[k], x[k, n], depth[k, n]
-        bare = nearest.at(image, x) >= BEHIND * depth
-        through = (farthest.at(image, x) > FARTHER * depth) & (beside.at(image, x) > BEHIND * depth)
-        open_to = (bare | through).nonzero()[:, 0]
-        k, n, image, x, bare, through = (t[open_to] for t in (k, n, image, x, bare, through))
+        k, n = near.nonzero(as_tuple=True)
+        image, ray = b[k], ray.flatten(1).index_select(1, k * len(p) + n)
+        x, depth = lens.pixels(ray, rows_of_cameras[:, mapping.camera_index[image]]), ray[2]
+        inside = ((x >= 0) & (x <= (mapping.graph.image_size.mT - 1)[:, image])).all(0)
+        fine, finer = (_cell(x.mT, mapping.graph.image_size[image], grid) for grid in (FINE, FINER))
+        bare = nearest.at(image, fine) >= BEHIND * depth
+        through = (farthest.at(image, finer) > FARTHER * depth) & (beside.at(image, finer) > BEHIND * depth)
+        open_to = (inside & (bare | through)).nonzero()[:, 0]
+        k, n, image, bare, through = (t[open_to] for t in (k, n, image, bare, through))
+        x = x[:, open_to]
         like, found = mine[n], seen[k, n]
+        place = x.round().long()
         rest = (~found).nonzero()[:, 0]
-        found[rest] = occupied.at(image[rest], x[rest], like[rest])
-        chance = occupied.at(image, x + x.new_tensor(BESIDE)[:, None], like).double().mean(0)
-        first, second = _cell(mapping.graph.x[like], mapping.graph.image_size[a]), _cell(x, mapping.graph.image_size[image])
+        found[rest] = occupied.at(image[rest], place[:, rest], like[rest])
+        chance = occupied.at(image, place[:, None] + torch.tensor(BESIDE).mT[:, :, None], like).double().mean(0)
+        first, second = _cell(mapping.graph.x[like], mapping.graph.image_size[a]), _cell(x.mT, mapping.graph.image_size[image])
         weights = torch.stack([torch.ones_like(chance), found.double(), chance])
         for table, cell, counts in ((own, first, bare), (other, second, bare), (open_, first, through)):
             flat = table.new_zeros(3, len(b) * cells).index_add_(1, (cell + k * cells)[counts], weights[:, counts])
@@ -193,12 +205,12 @@ class _Occupied:
         looks = None if graph.descriptors is None else _Looks.of(graph.descriptors())
         return cls(pixel[order], some, order // 9, looks, width, height)
 
-    def at(self, view: Int[Tensor, "n"], x: Float[Tensor, "*k n 2"], like: Int[Tensor, "n"]) -> Bool[Tensor, "*k n"]:
-        """Whether an image has a point at a place, within a pixel or so, that looks like a given one where that is known."""
-        place = x.nan_to_num(-9.0).clamp(-9, max(self.width, self.height) + 9).round().long() + 1
-        inside = (place >= 0).all(-1) & (place[..., 0] < self.width) & (place[..., 1] < self.height)
-        pixel = (view * self.height + place[..., 1]) * self.width + place[..., 0]
-        found = inside & self.some[pixel & (len(self.some) - 1)]
+    def at(self, view: Int[Tensor, "n"], place: Int[Tensor, "2 *k n"], like: Int[Tensor, "n"]) -> Bool[Tensor, "*k n"]:
+        """Whether an image has a point at a pixel, or beside it, that looks like a given one where that is known."""
+        column, row = place + 1
+        inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        pixel = (view * self.height + row) * self.width + column
+        found: Tensor = inside & self.some[pixel & (len(self.some) - 1)]
         maybe = found.nonzero(as_tuple=True)
         pixel, like = pixel[maybe], like[maybe[-1]]
         last, there = len(self.pixel) - 1, torch.searchsorted(self.pixel, pixel)
@@ -240,7 +252,6 @@ class _DepthMap:
     """How near, or how far, the points are that each image sees in and around each small part of it."""
 
     table: Float[Tensor, "v columns rows"]
-    size: Int[Tensor, "v 2"]
 
     @classmethod
     def of(cls, mapping: Mapping, grid: tuple[int, int], extreme: Literal["amin", "amax"]) -> "_DepthMap":
@@ -253,11 +264,11 @@ class _DepthMap:
         place = (view * rows * columns) + _cell(mapping.graph.x[node], size[view], grid)
         table = depth.new_full((len(size) * rows * columns,), -torch.inf).scatter_reduce(0, place, sign * depth, "amax")
         around = torch.nn.functional.max_pool2d(table.reshape(-1, 1, columns, rows), 3, 1, 1)[:, 0]
-        return cls(sign * around, size)
+        return cls(sign * around)
 
-    def at(self, view: Int[Tensor, "n"], x: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-        """The depth at or beside a place; infinite with the other sign where nothing is seen."""
-        return self.table.flatten(1)[view, _cell(x, self.size[view], (self.table.shape[1], self.table.shape[2]))]
+    def at(self, view: Int[Tensor, "n"], cell: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """The depth in or beside a part of an image; infinite with the other sign where nothing is seen."""
+        return self.table.flatten().index_select(0, view * self.table[0].numel() + cell)
 
 
 def _like_viewpoints(mapping: Mapping) -> Int[Tensor, "q 2"]:
@@ -273,19 +284,18 @@ def _like_viewpoints(mapping: Mapping) -> Int[Tensor, "q 2"]:
     return pairs
 
 
-def _predicted(
+def _looked_at(
     mapping: Mapping, point: Int[Tensor, "n"], a: int, b: Int[Tensor, "k"]
-) -> tuple[Float[Tensor, "k n 2"], Float[Tensor, "k n"], Bool[Tensor, "k n"]]:
-    """Where and at which depth other cameras should see the points of one, and whether they look at them as it does."""
-    X, poses = mapping.X[point], mapping.poses[b]
-    X_cam = poses.transform(X.expand(len(b), -1, -1))
-    x = mapping.cameras[mapping.camera_index[b]].project(X_cam)
-    from_a, from_b = X - mapping.poses.centre[a], X - poses.centre[:, None]
-    near, far = (torch.linalg.vector_norm(d, dim=-1).clamp(min=1e-12) for d in (from_a, from_b))
-    cosine, zoom = (from_a * from_b).sum(-1) / (near * far), near / far
-    size = mapping.graph.image_size[b][:, None]
-    inside = (X_cam[..., 2] > 0) & ((x >= 0) & (x <= size - 1)).all(-1)
-    return x, X_cam[..., 2], inside & (cosine > math.cos(MAX_ANGLE)) & (zoom > 1 / MAX_ZOOM) & (zoom < MAX_ZOOM)
+) -> tuple[Bool[Tensor, "k n"], Float[Tensor, "3 k n"]]:
+    """Whether other cameras, if they see the points of one, look at them as it does; and the points in their frames."""
+    X, poses = mapping.X[point].mT, mapping.poses[b]
+    ray = (poses.R.flatten(0, 1) @ X).view(len(b), 3, len(point)).movedim(1, 0) + poses.t.mT[:, :, None]
+    from_a = X - mapping.poses.centre[a, :, None]
+    # Several times as fast as norms along the first dimension, and as quotients.
+    near, far = (torch.addcmul(torch.addcmul(x * x, y, y), z, z).sqrt_() for x, y, z in (from_a, ray))
+    along = (from_a * X).sum(0) - poses.centre @ from_a
+    alike = (along > math.cos(MAX_ANGLE) * near * far) & (MAX_ZOOM * far > near) & (far < MAX_ZOOM * near)
+    return alike & (ray[2] > 0), ray
 
 
 def _cell(x: Float[Tensor, "*batch 2"], size: Int[Tensor, "*#batch 2"], grid: tuple[int, int] = CELLS) -> Int[Tensor, "*batch"]:
