@@ -244,11 +244,11 @@ def _differentiate(term: Term, arguments: list[Tensor], lifts: dict[str, Tensor 
     with torch.enable_grad():
         value = term.residual(*(leaf.mT for leaf in leaves), *term.data)
         components = value.unbind(-1)
-        ones = torch.ones_like(components[0])
         for k, component in enumerate(components):
             if component.requires_grad:
                 last = k + 1 == len(components)
-                slopes = torch.autograd.grad(component, follow, ones, retain_graph=not last, materialize_grads=True)
+                # Sums, since the first call with factors of its own imports for half a second.
+                slopes = torch.autograd.grad(component.sum(), follow, retain_graph=not last, materialize_grads=True)
             else:
                 slopes = tuple(torch.zeros_like(leaf) for leaf in follow)
             rows = iter(slopes)
@@ -269,9 +269,8 @@ def lift_of(block: Block, x: Float[Tensor, "n k"]) -> Tensor | None:
     with torch.enable_grad():
         delta = x.new_zeros((x.shape[0], block.tangent)).requires_grad_()
         moved = block.retract(x.detach(), delta).unbind(-1)
-        ones = torch.ones_like(moved[0])
         rows = [
-            torch.autograd.grad(c, delta, ones, retain_graph=True, materialize_grads=True)[0]
+            torch.autograd.grad(c.sum(), delta, retain_graph=True, materialize_grads=True)[0]
             if c.requires_grad
             else torch.zeros_like(delta)
             for c in moved
