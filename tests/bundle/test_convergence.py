@@ -51,6 +51,17 @@ def test_forty_steps_to_the_minimum(outliers: float, loss: Cauchy | None, share:
     check_convergence(outliers, loss, 6, share)
 
 
+def test_little_damping_saves_steps_where_cameras_stand() -> None:
+    """From near the minimum; whatever it begins with, that is where it ends."""
+    few, many = 0, 0
+    for problem in problems(6, 0.0):
+        near = bundle_adjust_model(problem, free=FREE, tolerance=1e-3).model
+        free, held = (bundle_adjust(near, free=FREE, tolerance=1e-9, initial_damping=d) for d in (1e-8, 1e-1))
+        assert free.cost == pytest.approx(held.cost, rel=1e-6)
+        few, many = few + free.iterations, many + held.iterations
+    assert few < many
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("outliers", "loss", "share"), [(0.0, None, 1.0), (0.0, Cauchy(1.0), 1.0), (0.1, Cauchy(1.0), 0.94)])
 def test_forty_steps_to_the_minimum_in_fifty_problems(outliers: float, loss: Cauchy | None, share: float) -> None:

@@ -76,6 +76,7 @@ def bundle_adjust(
     gauge: Gauge = "free",
     max_iterations: int = 50,
     tolerance: float = 1e-6,
+    initial_damping: float = 1e-4,
     linear_solver: Solver = "auto",
     hessian: Hessian = "exact",
     progress: Callable[[int, float], bool | None] | None = None,
@@ -98,6 +99,8 @@ def bundle_adjust(
             from it keeps its distance. Only where nothing else holds the world.
         max_iterations: Most steps tried.
         tolerance: End when a step lowers the cost by less than this fraction.
+        initial_damping: Of the first step, relative to the diagonal of the normal equations. Less saves steps where cameras
+            are about where they should be already: it is the last to let long rows of cameras bend.
         linear_solver: "dense", "pcg" (for thousands of cameras), or "auto"; see `sparse_levenberg_marquardt`.
         hessian: Used for derivatives only: "exact", or "gauss-newton", cheaper and some percent off where residuals are large.
         progress: Called with the number of steps and the cost after each; False, or an interrupt, ends it with the best so far.
@@ -134,6 +137,7 @@ def bundle_adjust(
         eliminate=cheapest_elimination(blocks, residuals, structure_blocks(bundle)),
         max_iterations=max_iterations,
         function_tolerance=tolerance,
+        initial_damping=initial_damping,
         linear_solver=linear_solver,
         hessian=hessian,
         progress=progress,
