@@ -7,16 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
-from torchsfm.reconstruction.adjust import adjust
-from torchsfm.reconstruction.calibration import CameraPrior
+from torchsfm.reconstruction.adjust import LOSS, adjust
+from torchsfm.reconstruction.calibration import CameraPrior, calibration_of
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions
-from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.mapping import Adjustment, Mapping
 from torchsfm.reconstruction.missing import missing_correspondences
 from torchsfm.reconstruction.models import matches_across
 from torchsfm.reconstruction.settle import settle
@@ -162,6 +163,23 @@ def test_conflicts_that_are_known_are_those_that_are_found(generator: torch.Gene
     assert given.doubt == judged(mapping)
     none = missing_correspondences(scene(generator, v=len(mapping.registered)))
     assert not any("look alike" in reason for reason in examine(mapping, conflicts=none, **known).doubt)  # type: ignore[arg-type]
+
+
+def test_deviations_of_cameras_do_not_depend_on_where_their_covariance_comes_from(generator: torch.Generator) -> None:
+    names = ("focal", "k1", "k2", "principal_point")
+    mapping = scene(generator)
+    free = {name: torch.ones(1, dtype=torch.bool) for name in names}
+    mapping = replace(mapping, adjustment=Adjustment(Status.OK, 3, free))
+    prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), 0.5, dtype=torch.float64))
+    known = examine(mapping, open_numbers=names, prior=prior, threshold=4.0).intrinsics
+    assert known is not None
+    plain = calibration_of(mapping, prior, loss=LOSS)
+    given = calibration_of(mapping, prior, loss=LOSS, covariance=(names, known))
+    assert bool((plain.deviation > 0).all())
+    assert given.deviation.allclose(plain.deviation, rtol=1e-4)
+    # Of other numbers it says nothing.
+    other = calibration_of(mapping, prior, loss=LOSS, covariance=(("focal",), torch.eye(1).double()))
+    assert other.deviation.equal(plain.deviation)
 
 
 def test_what_hides_points_explains_that_they_are_missing(generator: torch.Generator) -> None:
@@ -312,7 +330,7 @@ def test_a_contradicted_camera_is_put_right(generator: torch.Generator) -> None:
     for _ in range(3):
         mapping = scene(generator)
         wrong = misplaced(mapping, [3], generator)
-        settled, parted = settle(wrong, torch.zeros(8, dtype=torch.bool), options(mapping), lambda n, v: None)
+        settled, parted, _ = settle(wrong, torch.zeros(8, dtype=torch.bool), options(mapping), lambda n, v: None)
         assert settled.registered.all()
         assert not parted
         errors = pose_errors(settled.poses, mapping.poses)
@@ -333,7 +351,7 @@ def test_a_model_of_two_halves_is_parted(generator: torch.Generator) -> None:
         shuffled[own] = b[own[torch.randperm(len(own), generator=generator)]]
     graph = replace(mapping.graph, match=torch.stack([a, shuffled], 1))
     assert wrong.any()
-    settled, parted = settle(
+    settled, parted, _ = settle(
         replace(mapping, graph=graph), torch.zeros(10, dtype=torch.bool), options(mapping), lambda n, v: None
     )
     assert settled.registered.tolist() == [False] * 4 + [True] * 6

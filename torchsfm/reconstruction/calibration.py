@@ -107,13 +107,20 @@ class Calibration:
         return words + [f"camera {k}: {text}" for k in range(len(self.values)) for text in self.camera_doubts(k)]
 
 
-def calibration_of(mapping: Mapping, prior: CameraPrior, *, loss: Cauchy) -> Calibration:
+def calibration_of(
+    mapping: Mapping,
+    prior: CameraPrior,
+    *,
+    loss: Cauchy,
+    covariance: tuple[Sequence[str], Float[Tensor, "g k k"]] | None = None,
+) -> Calibration:
     """How the cameras of an adjusted mapping were found.
 
     Args:
         mapping: The finished model.
         prior: What was expected of the cameras.
         loss: The loss of the adjustment.
+        covariance: Numbers of cameras, and their covariance by the noise of the image points, where that is known.
     """
     labels = intrinsic_labels(type(mapping.cameras.distortion))
     names = tuple(name for name in labels if name not in ("aspect", "skew"))
@@ -126,7 +133,8 @@ def calibration_of(mapping: Mapping, prior: CameraPrior, *, loss: Cauchy) -> Cal
     adjusted = mapping.adjustment or Adjustment(Status.OK, 0, {})
     noise = measure_noise(mapping, loss)
     if adjusted.free:
-        known = _information(mapping, tuple(adjusted.free), prior, loss)
+        given = covariance[1] if covariance is not None and set(covariance[0]) == set(adjusted.free) else None
+        known = _information(mapping, tuple(adjusted.free), prior, loss, given)
         chosen = torch.zeros(known.prior.shape, dtype=torch.bool)
         for name, mask in adjusted.free.items():
             chosen[:, known.places(name)] = mask[:, None]
@@ -196,18 +204,25 @@ class _Information:
         return noise + (lean * self.prior[:, None]) @ lean.mT
 
 
-def _information(mapping: Mapping, names: Sequence[str], prior: CameraPrior, loss: Cauchy) -> _Information:
+def _information(
+    mapping: Mapping,
+    names: Sequence[str],
+    prior: CameraPrior,
+    loss: Cauchy,
+    covariance: Float[Tensor, "g k k"] | None = None,
+) -> _Information:
     used = images_of_cameras(mapping) > 0
     noise = measure_noise(mapping, loss)
     model = type(mapping.cameras.distortion)
     columns = free_columns(names, model)
-    covariance = noise**2 * intrinsics_covariance(
-        mapping.problem(),
-        free=names,
-        loss=loss,
-        intrinsics_sigma=prior.in_units_of(noise, names),
-        intrinsics_mean=prior.mean,
-    )
+    if covariance is None:
+        covariance = noise**2 * intrinsics_covariance(
+            mapping.problem(),
+            free=names,
+            loss=loss,
+            intrinsics_sigma=prior.in_units_of(noise, names),
+            intrinsics_mean=prior.mean,
+        )
     before = torch.zeros(len(used), len(columns), dtype=covariance.dtype)
     for name in names:
         scale = prior.mean.K[:, 0, 0] if name == "focal" else 1.0

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
-from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
+from torchsfm.reconstruction.consistency import PairAgreement, excess_scatter, pair_agreement
 from torchsfm.reconstruction.groups import outvoted_groups
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
@@ -36,11 +36,14 @@ class Standing:
             grows with what the matches of a pair have in common, see `excess_scatter`.
         position_sigma: Standard deviation of each camera's place over the median depth of the points that it sees; likewise.
         doubt: Why each camera may be wrong; empty where nothing says so, and of images that are not registered.
+        intrinsics: Covariance of the numbers of each distinct camera that were open, in the order of `intrinsics_covariance`,
+            by the noise of the image points alone; None where it was not asked for.
     """
 
     rotation_sigma: Float[Tensor, "v"]
     position_sigma: Float[Tensor, "v"]
     doubt: tuple[str, ...]
+    intrinsics: Float[Tensor, "g k k"] | None = None
 
 
 def examine(
@@ -51,6 +54,7 @@ def examine(
     threshold: float,
     uncertain: Bool[Tensor, "v"] | None = None,
     conflicts: Conflicts | None = None,
+    agreement: PairAgreement | None = None,
     elsewhere: Int[Tensor, "v"] | None = None,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
@@ -62,14 +66,15 @@ def examine(
         threshold: Largest reprojection error of an observation, in pixels.
         uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
         conflicts: What missing correspondences say of this model where that is known; else it is found.
+        agreement: How all pairs agree with this model where that is known; else it is found.
         elsewhere: How many verified matches each image has with images of other models.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
-    rotation, position = pose_deviations(mapping, open_numbers, prior)
+    rotation, position, intrinsics = pose_deviations(mapping, open_numbers, prior)
     excess = excess_scatter(mapping, threshold=threshold) ** 0.5
     rotation, position = rotation * excess, position * excess
-    agreement = pair_agreement(mapping, threshold=threshold)
+    agreement = agreement or pair_agreement(mapping, threshold=threshold)
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
     matches, agreeing = (agreement.per_view(one > 0, n, v) for n in (agreement.matches, agreement.agreeing))
@@ -117,13 +122,13 @@ def examine(
         # Which images are right is then not known: the others agree with too few.
         few = "most images of its model are doubtful"
         doubts = [known or few if mapping.registered[i] else "" for i, known in enumerate(doubts)]
-    return Standing(rotation, position, tuple(doubts))
+    return Standing(rotation, position, tuple(doubts), intrinsics)
 
 
 def pose_deviations(
     mapping: Mapping, open_numbers: Sequence[str], prior: CameraPrior
-) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"]]:
-    """Standard deviations of rotations (degrees) and of places (over the median depth), as in `Standing`."""
+) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"], Float[Tensor, "g k k"]]:
+    """Standard deviations of rotations (degrees) and of places (over the median depth), and intrinsics, as in `Standing`."""
     problem = mapping.problem()
     # A number that was held where it was expected is as uncertain as it was expected to be.
     uncertain = {name: torch.ones(len(mapping.cameras.K), dtype=torch.bool) for name in open_numbers}
@@ -144,4 +149,4 @@ def pose_deviations(
     known = mapping.registered & (seen > 0)
     variance = covariance.poses.diagonal(dim1=-2, dim2=-1)
     rotation, position = variance[:, :3].sum(-1).sqrt().rad2deg(), variance[:, 3:].sum(-1).sqrt() / median
-    return torch.where(known, rotation, torch.inf), torch.where(known, position, torch.inf)
+    return torch.where(known, rotation, torch.inf), torch.where(known, position, torch.inf), covariance.cameras

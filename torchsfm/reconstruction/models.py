@@ -16,6 +16,7 @@ from torchsfm.reconstruction.adjust import LOSS
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.choose_mapper import choose_mapper
+from torchsfm.reconstruction.consistency import PairAgreement
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
@@ -101,7 +102,7 @@ def build_models(
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, options.focal_sigma[camera_index])
         empty = Mapping.start(graph, track, cameras, camera_index)
-        made: list[tuple[Reconstruction, Mapping, MappingOptions, Unfolded | None]] = []
+        made: list[tuple[Reconstruction, Mapping, MappingOptions, Unfolded | None, PairAgreement | None]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
         taken = given_up = empty.registered
@@ -132,7 +133,8 @@ def build_models(
                     break
                 mapped, known = grown, options
             model, failed = mapped
-            model, parted = settle(model, taken, known, report)
+            model, parted, agreement = settle(model, taken, known, report)
+            settled = model
             failed |= parted
             unfolded = None
             if matched and method != "projective":
@@ -152,11 +154,12 @@ def build_models(
             if not made:
                 reasons |= failed
             taken = taken | model.registered
-            made.append((replace(model.reconstruction(), lines=lines, curves=curves), model, known, unfolded))
+            finished = replace(model.reconstruction(), lines=lines, curves=curves)
+            made.append((finished, model, known, unfolded, agreement if model is settled else None))
             if stages.folder is not None:
                 _save_model(made[-1][0], stages.folder, len(made) - 1)
         found: list[tuple[Reconstruction, Standing, Calibration]] = []
-        for finished, model, known, unfolded in made:
+        for finished, model, known, unfolded, agreement in made:
             prior, threshold = known.prior(model), options.reprojection
             uncertain = None if unfolded is None else unfolded.uncertain
             # Lines move the cameras.
@@ -165,9 +168,10 @@ def build_models(
                 uncertain = uncertain | hanging_on_copies(graph, model, taken & ~model.registered, threshold=threshold)
             standing = examine(
                 model, open_numbers=free, prior=prior, threshold=threshold, uncertain=uncertain, conflicts=conflicts,
-                elsewhere=matches_across(graph, model.registered, taken & ~model.registered),
+                agreement=agreement, elsewhere=matches_across(graph, model.registered, taken & ~model.registered),
             )  # fmt: skip
-            found.append((finished, standing, calibration_of(model, prior, loss=LOSS)))
+            covariance = None if standing.intrinsics is None else (free, standing.intrinsics)
+            found.append((finished, standing, calibration_of(model, prior, loss=LOSS, covariance=covariance)))
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", len(graph.names), len(graph.names))
     unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[camera_index]

@@ -18,7 +18,7 @@ ROUNDS = 3
 
 def settle(
     model: Mapping, elsewhere: Bool[Tensor, "v"], options: MappingOptions, progress: Callable[[int, int], None]
-) -> tuple[Mapping, dict[int, str]]:
+) -> tuple[Mapping, dict[int, str], PairAgreement | None]:
     """Move cameras to where their pairs agree with the model, as long as that makes more matches agree.
 
     A camera whose place is contradicted by pairs with more matches than agree with it is taken out with its observations and
@@ -32,7 +32,8 @@ def settle(
         progress: Called with the number of registered images and of all.
 
     Returns:
-        The mapping, and for each image that was taken out for good the reason.
+        The mapping, for each image that was taken out for good the reason, and how all pairs agree with the mapping if that is
+        known.
     """
     agreement = pair_agreement(model, threshold=options.reprojection)
     for _ in range(ROUNDS):
@@ -47,10 +48,10 @@ def settle(
         model, agreement = trial, tried
     apart = _apart(model, agreement)
     if not bool(apart.any()):
-        return model, {}
+        return model, {}, agreement
     reason = "the pairs of images that agree with its place contradict the rest of the model"
     model, _ = extend_model(_without_images(model, apart), elsewhere | apart, options, progress)
-    return model, dict.fromkeys(apart.nonzero()[:, 0].tolist(), reason)
+    return model, dict.fromkeys(apart.nonzero()[:, 0].tolist(), reason), None
 
 
 def _support(agreement: PairAgreement) -> int:
