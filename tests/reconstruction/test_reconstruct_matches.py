@@ -7,7 +7,7 @@ import torch
 from chance import seeded
 from test_reconstruct_tracks import Scene, make_scene
 
-from torchsfm.reconstruction import MatchedImages, SfmResult, doubt, reconstruct_matches, unfold
+from torchsfm.reconstruction import MatchedImages, SfmResult, adjust, doubt, incremental, reconstruct_matches, unfold
 from torchsfm.reconstruction.evaluation import pose_errors
 
 
@@ -66,6 +66,29 @@ def test_missing_correspondences_are_looked_for_once(monkeypatch: pytest.MonkeyP
     spy(doubt)
     assert bool(run(m).model.registered.all())
     assert looks == [unfold.__name__]
+
+
+def test_how_pairs_agree_and_what_cameras_are_known_to_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was found of the same model before serves to judge it, and to say how well its cameras are known."""
+    m, looks = matched(make_scene(points=300, outliers=0.0)), list[str]()
+
+    def spy(room: ModuleType, name: str) -> None:
+        find = getattr(room, name)
+        monkeypatch.setattr(room, name, lambda *given, **options: (looks.append(name), find(*given, **options))[1])
+
+    spy(doubt, "pair_agreement")
+    spy(adjust, "choose_free")
+    result = run(m)
+    assert bool(result.model.registered.all())
+    assert "pair_agreement" not in looks
+    (found,) = result.report.calibrations
+    assert found.estimated.all()
+    # Each time as it grows, and once of the whole, which hardly changes between its last adjustments.
+    grown = looks.count("choose_free")
+    monkeypatch.setattr(incremental, "_refine", lambda model, options: model)
+    looks.clear()
+    run(m)
+    assert grown == looks.count("choose_free") + 1
 
 
 def test_order_of_pairs_and_matches_that_are_absent_do_not_matter() -> None:

@@ -18,6 +18,7 @@ from torchsfm.reconstruction.calibration import (
     cameras_free,
     choose_free,
     folded_cameras,
+    images_of_cameras,
     measure_noise,
 )
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
@@ -37,6 +38,7 @@ def adjust(
     moving: Bool[Tensor, "v"] | None = None,
     max_iterations: int = 30,
     tolerance: float = 1e-5,
+    initial_damping: float = 1e-4,
 ) -> Mapping:
     """Minimise the robust reprojection error.
 
@@ -48,6 +50,7 @@ def adjust(
         moving: Images whose poses move; the points they see move with them, everything else is held. All images when None.
         max_iterations: Limit on the steps of the optimiser.
         tolerance: Relative decrease of the cost at which it stops.
+        initial_damping: Of the first step; see `bundle_adjust`.
     """
     node = mapping.observations()
     fixed_poses = fixed_points = None
@@ -64,6 +67,7 @@ def adjust(
         loss=LOSS,
         max_iterations=max_iterations,
         tolerance=tolerance,
+        initial_damping=initial_damping,
         **about_cameras(mapping, free, prior),
     )
     if result.status == Status.INTERRUPTED:
@@ -73,7 +77,15 @@ def adjust(
     return replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X, adjustment=adjustment)
 
 
-def adjust_all(mapping: Mapping, names: Sequence[str], prior: CameraPrior, *, lone: bool = False, **limits: Any) -> Mapping:
+def adjust_all(
+    mapping: Mapping,
+    names: Sequence[str],
+    prior: CameraPrior,
+    *,
+    lone: bool = False,
+    settled: bool = False,
+    **limits: Any,
+) -> Mapping:
     """Adjust everything, and of the cameras what the images determine; the rest is held where it was expected.
 
     A lens that comes out folded over was none: it is held as expected, too.
@@ -83,9 +95,14 @@ def adjust_all(mapping: Mapping, names: Sequence[str], prior: CameraPrior, *, lo
         names: Numbers of the cameras that may be estimated.
         prior: What is expected of the cameras.
         lone: Whether cameras that took a single photograph count as those of many; see `choose_free`.
+        settled: Whether the model has been adjusted so before, and has hardly changed since. Where the images determined all
+            numbers then, that is not found out again.
         **limits: When to stop; see `adjust`.
     """
-    free = choose_free(mapping, names, prior, loss=LOSS, lone=lone)
+    free = dict(mapping.adjustment.free) if settled and mapping.adjustment is not None else {}
+    used = images_of_cameras(mapping) > 0
+    if set(free) != set(names) or not all(bool(mask[used].all()) for mask in free.values()):
+        free = choose_free(mapping, names, prior, loss=LOSS, lone=lone)
     adjusted = adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
     folded = folded_cameras(adjusted)
     if not bool(folded.any()):

@@ -30,6 +30,9 @@ UNKNOWN_FOCAL = 0.4
 """Focal lengths more uncertain than this fraction are searched for when the first image of a camera is registered."""
 LAST_ITERATIONS, LAST_TOLERANCE = 300, 1e-7
 """The last adjustment goes to the minimum, to a small part of the standard deviations; there it is given up."""
+STANDING = 1e-6
+"""Damping of the first step of an adjustment of cameras that stand about where they should: more would only hold back what is
+left, long rows of cameras that bend as a whole."""
 
 
 @dataclass(frozen=True)
@@ -184,17 +187,19 @@ def _drop_unsupported(model: Mapping, failed: dict[int, str]) -> Mapping:
 
 def _refine(model: Mapping, options: MappingOptions) -> Mapping:
     """Alternate global bundle adjustment with filtering, merging, completion and re-triangulation until little changes."""
+    settled = False
     for _ in range(4):
-        model = options.adjust(model, last=True, max_iterations=20, tolerance=3e-4)
+        model = options.adjust(model, last=True, max_iterations=20, tolerance=3e-4, initial_damping=STANDING)
         before = model.point
         model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
         model = merge_points(model, threshold=options.reprojection)
         model = complete_tracks(model, threshold=options.reprojection)
         model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
         changed = int(((before >= 0) != (model.point >= 0)).sum())
-        if changed <= 0.01 * max(1, int((before >= 0).sum())):
+        settled = changed <= 0.01 * max(1, int((before >= 0).sum()))
+        if settled:
             break
-    model = options.adjust(model, last=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
+    model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
     if "principal_point" in options.free and bool((images_of_cameras(model) == 1).any()):
         freed = options.adjust(model, last=True, lone=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
         model = freed if lone_cameras_plausible(freed, options.prior(freed)) else model
