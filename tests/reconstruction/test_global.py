@@ -2,13 +2,16 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from chance import seeded
+from test_pair_poses import mapping_of
 from test_reconstruct_tracks import SIZE, Scene, make_scene, run, turning
 
-from torchsfm.geometry import Camera, Pose, intrinsics
+from torchsfm.geometry import Camera, Pose, intrinsics, rotation_from_rotvec
+from torchsfm.reconstruction import global_start
 from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses, simulate_images
@@ -40,6 +43,44 @@ def test_a_ring_seen_from_far_closes(stream: int) -> None:
     model = run(scene, method="global", focal=2400.0).model
     assert bool(model.registered.all())
     assert float(pose_errors(model.poses, poses, model.registered).image_rotation.max()) < 3
+
+
+def test_all_is_done_once_where_pairs_agree_with_what_comes_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A focal length that was far off is mended by adjusting; only a model that its pairs contradict is made anew."""
+    scene, count = make_scene(), list[int]()
+    start = global_start.relative_poses
+
+    def counted(*given: Any) -> Any:
+        count.append(1)
+        return start(*given)
+
+    monkeypatch.setattr(global_start, "relative_poses", counted)
+    model = run(scene, method="global", focal=850.0).model
+    assert len(count) == 1
+    assert bool(model.registered.all())
+    assert abs(float(model.cameras.K[0, 0, 0]) / 1100 - 1) < 0.02
+    monkeypatch.setattr(global_start, "_holds", lambda *given: False)
+    other = run(scene, method="global", focal=850.0).model
+    assert len(count) >= 3
+    assert (
+        float(pose_errors(model.poses, scene.poses).pose.max())
+        < 1.2 * float(pose_errors(other.poses, scene.poses).pose.max()) + 0.05
+    )
+
+
+def test_a_model_that_its_pairs_contradict_does_not_hold() -> None:
+    views = 12
+    scene = make_scene(orbit_poses(views, radius=5.0, sweep=2.0), distortion=0.0)
+    mapping, options = mapping_of(scene, 1100.0)
+    right = replace(mapping, poses=scene.poses, registered=torch.ones(views, dtype=torch.bool))
+    right = global_start.fill(right, options)
+    every = torch.ones(views, dtype=torch.bool)
+    assert global_start._holds(right, every, 4.0)
+    turn = rotation_from_rotvec(torch.tensor([0.0, 0.0, 0.1]).double())
+    some = torch.arange(views) > 7
+    turned = replace(scene.poses, R=torch.where(some[:, None, None], turn @ scene.poses.R, scene.poses.R))
+    assert not global_start._holds(replace(right, poses=turned), every, 4.0)
+    assert not global_start._holds(replace(right, registered=~(torch.arange(views) == 3)), every, 4.0)
 
 
 def test_two_unrelated_scenes_give_two_models() -> None:

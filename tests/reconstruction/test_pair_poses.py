@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from itertools import combinations
+from types import ModuleType
 
 import pytest
 import torch
@@ -11,8 +12,8 @@ from hypothesis import strategies as st
 from test_reconstruct_tracks import Scene, make_scene, run
 from torch import Tensor
 
-from torchsfm.geometry import Camera, Radial, intrinsics
-from torchsfm.reconstruction import global_start, pair_poses
+from torchsfm.geometry import BundleProblem, Camera, Radial, intrinsics
+from torchsfm.reconstruction import adjust, global_start, pair_poses
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.pair_poses import FORESTS, relative_poses, strongest_pairs
@@ -94,22 +95,28 @@ def test_work_before_cameras_stand_is_in_proportion_to_the_images(monkeypatch: p
     """However many pairs and points there are, rotations and first adjustments are of few of them."""
     pairs: list[int] = []
     points: list[int] = []
-    poses, adjust, fill = global_start.relative_poses, global_start.bundle_adjust, global_start.fill
+    poses, fill = global_start.relative_poses, global_start.fill
+    adjusts = {room: room.bundle_adjust for room in (global_start, adjust)}
 
     def counted_poses(mapping: Mapping, chosen: Tensor, options: MappingOptions) -> object:
         pairs.append(len(chosen))
         return poses(mapping, chosen, options)
 
-    def counted_adjust(problem: object, **options: object) -> object:
-        points.append(len(problem.X))  # type: ignore[attr-defined]
-        return adjust(problem, **options)
+    def counted(room: ModuleType) -> Callable[..., object]:
+        def counted_adjust(problem: BundleProblem, **options: object) -> object:
+            if -1 not in points:
+                points.append(len(problem.X))
+            return adjusts[room](problem, **options)
+
+        return counted_adjust
 
     def counted_fill(model: Mapping, options: MappingOptions) -> Mapping:
         points.append(-1)
         return fill(model, options)
 
     monkeypatch.setattr(global_start, "relative_poses", counted_poses)
-    monkeypatch.setattr(global_start, "bundle_adjust", counted_adjust)
+    for room in adjusts:
+        monkeypatch.setattr(room, "bundle_adjust", counted(room))
     monkeypatch.setattr(global_start, "fill", counted_fill)
     monkeypatch.setattr(global_start, "TRACKS_PER_VIEW", 30)
     views = 24
@@ -120,6 +127,7 @@ def test_work_before_cameras_stand_is_in_proportion_to_the_images(monkeypatch: p
     assert len(mapping.graph.pairs) == views * (views - 1) // 2
     # Once, with a focal length nearly right; and all points are triangulated once, in the end.
     assert len(pairs) == 1
+    assert points.count(-1) == 1
     assert pairs[0] <= FORESTS * (views - 1)
     assert points[-1] == -1
     assert 0 < max(points) <= 30 * views / 2

@@ -7,6 +7,7 @@ few tracks of each image; all matches are looked at once, in the end.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,7 +21,8 @@ from torchsfm.motion.many_views.triplets import turn_angle
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA
 from torchsfm.reconstruction.consistency import pair_agreement
-from torchsfm.reconstruction.incremental import MappingOptions
+from torchsfm.reconstruction.groups import outvoted_groups
+from torchsfm.reconstruction.incremental import STANDING, MappingOptions
 from torchsfm.reconstruction.initialize import MIN_POINTS
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.pair_poses import relative_poses, strongest_pairs
@@ -31,7 +33,7 @@ from torchsfm.reconstruction.view_graph import MIN_INLIERS
 TRACKS_PER_VIEW = 150
 """Longest tracks of each image that are positioned: enough for its centre."""
 ROUNDS = 3
-"""Adjustments with poses and points alone, at most, each with a loss half as wide as the last, until that is a pixel."""
+"""Adjustments with poses and points alone, at most, each with a loss half as wide as the last, while that exceeds a pixel."""
 WIDEST = 16.0
 """Scale of the first of their losses in pixels, at most."""
 ROUGH = 1e-3
@@ -46,7 +48,7 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
 
     Relative rotations are in proportion to what the focal length is taken to be, more or less: with a wrong one, those along a
     ring of images do not add up to a turn, and the ring is torn or folded where it is weakest. What fits together locally still
-    tells the focal length. All is then done again with that one, until it stays.
+    tells the focal length. Where adjusting has not mended what was torn, all is then done again with that one, until it stays.
 
     Args:
         mapping: An empty mapping; its cameras are taken as they are at first.
@@ -63,7 +65,7 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
             break
         used = torch.unique(model.camera_index[model.registered])
         before, after = (m.cameras.K[used, 0, 0] for m in (mapping, model))
-        if not bool(((after / before).log().abs() > CHANGED).any()):
+        if not bool(((after / before).log().abs() > CHANGED).any()) or _holds(model, available, options.reprojection):
             break
         K = mapping.cameras.K.clone()
         K[used, :2, :2] = model.cameras.K[used, :2, :2]
@@ -82,8 +84,7 @@ def _at_once(
 ) -> Mapping | None:
     """The start with the cameras as they are, and as uncertain as they are said to be."""
     graph, v = mapping.graph, len(mapping.registered)
-    related = (graph.fundamental_inliers >= MIN_INLIERS) & available[graph.pairs].all(-1)
-    chosen = related.nonzero()[:, 0]
+    chosen = _related(mapping, available)
     chosen = chosen[strongest_pairs(graph.pairs[chosen], graph.fundamental_inliers[chosen], v)]
     if not len(chosen):
         return None
@@ -118,6 +119,22 @@ def _at_once(
     return tighten(start, min(float(placed.scale * focal), WIDEST), options)
 
 
+def _holds(model: Mapping, available: Bool[Tensor, "v"], threshold: float) -> bool:
+    """Whether all images have a place, and their pairs contradict neither that of one nor how groups of them stand."""
+    pairs = _related(model, available)
+    linked = torch.zeros_like(available).index_fill(0, model.graph.pairs[pairs].flatten(), True)
+    if not bool(model.registered[linked].all()):
+        return False
+    agreement = pair_agreement(model, threshold=threshold)
+    outvoted = agreement.balance(len(available)) < 0
+    return not bool((outvoted | outvoted_groups(agreement, model.registered)).any())
+
+
+def _related(mapping: Mapping, available: Bool[Tensor, "v"]) -> Int[Tensor, "q"]:
+    """The pairs of available images that have enough in common."""
+    return ((mapping.graph.fundamental_inliers >= MIN_INLIERS) & available[mapping.graph.pairs].all(-1)).nonzero()[:, 0]
+
+
 def largest(component: Int[Tensor, "v"], usable: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:
     """The usable members of the component that has most of them."""
     number = torch.bincount(component[usable], minlength=len(component))
@@ -140,10 +157,13 @@ def _longest_tracks(track: Int[Tensor, "n"], view: Int[Tensor, "n"], views: int)
 def tighten(model: Mapping, width: float, options: MappingOptions) -> Mapping:
     """Adjust poses and points with losses that become narrower, then the cameras, too."""
     for k in range(ROUNDS):
-        model = _adjust(model, max(width / 2**k, 1.0))
         if width / 2**k <= 1:
             break
-    return options.adjust(model, max_iterations=20, tolerance=ROUGH)
+        model = _adjust(model, width / 2**k)
+    limits: dict[str, Any] = {"max_iterations": 20, "tolerance": ROUGH}
+    if width <= 1:
+        limits["initial_damping"] = STANDING
+    return options.adjust(model, **limits)
 
 
 def fill(model: Mapping, options: MappingOptions) -> Mapping:

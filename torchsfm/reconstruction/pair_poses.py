@@ -22,7 +22,7 @@ from torchsfm.tensors import essential_from_fundamental, pose_from_essential
 
 FORESTS = 8
 """Every two parts of the images stay connected by so many pairs, or by all that there are."""
-MATCHES = 200
+MATCHES = 100
 """Matches of a pair that its relative pose is estimated from: those in excess say little more of it."""
 VOTERS = 32
 """Matches of a pair that choose among the four poses of an essential matrix."""
