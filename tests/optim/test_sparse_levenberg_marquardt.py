@@ -1,4 +1,5 @@
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from torchsfm.optim import (
     Huber,
     RigidMotion,
     SoftL1,
+    SparseResult,
     Term,
     UnitSphere,
     layout,
@@ -359,3 +361,21 @@ def test_a_residual_of_two_families_is_refused() -> None:
     term = Term(lambda a, b: a + b, ("a", "b"), (one, one))
     with pytest.raises(ValueError, match="'a' and 'b'"):
         sparse_levenberg_marquardt(blocks, [term], eliminate=("a", "b"))
+
+
+def test_steps_are_lengthened_where_the_loss_bends_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Next to the minimum between two groups of data, nine tenths of the Gauss-Newton curvature are not there."""
+    y = torch.tensor([0.9, -0.9], dtype=torch.float64).repeat(50)[:, None]
+    term = Term(lambda x, y: x - y, ("x",), (torch.zeros(100, dtype=torch.int64),), (y,), loss=Cauchy(1.0))
+    start = {"x": Block(torch.full((1, 1), 0.2, dtype=torch.float64))}
+    engine = sys.modules[sparse_levenberg_marquardt.__module__]
+
+    def minimum() -> SparseResult:
+        return sparse_levenberg_marquardt(start, [term], function_tolerance=1e-7)
+
+    found = minimum()
+    monkeypatch.setattr(engine, "FARTHEST", 1.0)
+    plain = minimum()
+    assert found.status == Status.OK
+    assert found.cost < (1 + 1e-7) * plain.cost
+    assert found.iterations <= plain.iterations / 2

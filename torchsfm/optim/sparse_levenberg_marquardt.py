@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
-from torchsfm.optim.descent import MINIMUM, NEAR, SLOW, Options, descend
+from torchsfm.optim.descent import FLAT, MINIMUM, NEAR, SLOW, Options, descend
 from torchsfm.optim.implicit import wants_derivative
 from torchsfm.optim.layout import lay_out
 from torchsfm.optim.normal_equations import NormalEquations
@@ -33,6 +33,8 @@ ROUNDS = 20
 """Most steps that eliminated variables take by themselves after one with the exact Hessian, or one that was too short,"""
 WORTH = 1e-2
 """and the part of what such a step promises, divided by their number, for which they take one."""
+FARTHEST = 10.0
+"""Most that steps are lengthened by."""
 SMALL = 0.75
 """Most that an acceleration changes a step by, relative to it: beyond, the third derivatives matter."""
 POOR = 0.25
@@ -274,6 +276,8 @@ class _SparseProblem:
         # Far from the minimum the others are not where they will be, and the last digits are for Newton steps.
         close = bool(self.epsilon**0.5 * here.cost < step.promise <= NEAR * here.cost)
         crawls = close and bool(step.promise > SLOW * here.promise)
+        if close and here.exact is None and bool(here.cost - cost > FLAT * step.promise):
+            x, cost = self._farther(here, step, x, cost)
         short = crawls and bool(SHORT * (here.cost - cost) > step.promise)
         if not bool(here.cost - cost > POOR * step.promise):
             x = engine.settling.shorten(here.x, step.delta, x)
@@ -291,6 +295,17 @@ class _SparseProblem:
         there.promise = float(step.promise)
         there.strayed = strays and not bool(here.cost - cost >= STRAIGHT * step.promise)
         return self._bent(here, there, step) if here.strayed and strays and here.exact is None else there
+
+    def _farther(self, here: _Place, step: Step, x: dict[str, Tensor], cost: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """Where a step would end that goes on to the minimum of the cost along it, if the cost is less there.
+
+        Gauss-Newton leaves out how a loss bends down: where that is most of the curvature, steps fall as a geometric series.
+        """
+        engine, slope = self.engine, here.along(step.delta)
+        length = (slope / (2 * (here.cost + slope - cost)).clamp_max(slope / FARTHEST)).clamp(1, FARTHEST)
+        longer = move(engine.blocks, engine.layout, here.x, {name: length * delta for name, delta in step.delta.items()})
+        after = engine.cost(longer)
+        return (longer, after) if bool(after < cost) else (x, cost)
 
     def _bent(self, here: _Place, there: _Place, step: Step) -> _Place:
         """Where a step leads that follows a curved valley, if the cost is less there."""
