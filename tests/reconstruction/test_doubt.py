@@ -178,7 +178,7 @@ def test_deviations_of_cameras_do_not_depend_on_where_their_covariance_comes_fro
     assert bool((plain.deviation > 0).all())
     assert given.deviation.allclose(plain.deviation, rtol=1e-4)
     # Of other numbers it says nothing.
-    other = calibration_of(mapping, prior, loss=LOSS, covariance=(("focal",), torch.eye(1).double()))
+    other = calibration_of(mapping, prior, loss=LOSS, covariance=(("focal",), torch.eye(1).double()[None]))
     assert other.deviation.equal(plain.deviation)
 
 
