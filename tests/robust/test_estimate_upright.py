@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from chance import assert_share
 from scenes import make_scene
 
 from torchsfm._types import Status
@@ -72,3 +73,33 @@ def test_cameras_that_only_turned_are_told(generator: torch.Generator) -> None:
 
     assert (found(0 * centre) == Degeneracy.ROTATION).all()
     assert (found(centre) == Degeneracy.NONE).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_points_of_a_line_are_told(noise: float, generator: torch.Generator) -> None:
+    """Several upright poses fit them."""
+    draw = {"generator": generator, "dtype": torch.float64}
+    down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    R = rotation_from_rotvec(0.3 * down)
+    along = torch.linspace(-1, 1, 60, dtype=torch.float64)[:, None]
+    X = along * 0.6 * torch.randn(20, 1, 3, **draw) + 0.3 * torch.randn(20, 1, 3, **draw) + torch.tensor([0.0, 0.0, 5.0])
+    X[:10, :1] += 0.5 * torch.randn(10, 1, 3, **draw)  # one point off it changes nothing
+    t = torch.nn.functional.normalize(torch.randn(20, 1, 3, **draw), dim=-1)
+    rays = [torch.nn.functional.normalize(d, dim=-1) + noise * torch.randn(X.shape, **draw) for d in (X, X @ R.mT + t)]
+    found = estimate_upright(*rays, down, down, threshold=5e-3, generator=generator)
+    assert not ((found.status == Status.OK) & (found.degeneracy == Degeneracy.NONE)).any()
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.3])
+def test_rays_that_contradict_the_verticals_are_told(wrong: float, generator: torch.Generator) -> None:
+    scene = make_scene(UprightPoseEstimator, (40,), 100, generator, 1e-3)
+    bad = torch.rand(40, 100, generator=generator) < wrong
+    d1, d2 = scene.spoil(scene.data, bad, generator) if wrong else scene.data
+    up1, up2 = scene.estimator.gravity1, scene.estimator.gravity2
+    off = torch.linalg.cross(up2, torch.randn(up2.shape, generator=generator, dtype=up2.dtype))
+    off = torch.nn.functional.normalize(off, dim=-1)
+    for angle, right in ((0.005, 1.0), (0.15, 0.0)):
+        tilted = torch.nn.functional.normalize(up2 + angle * off, dim=-1)
+        found = estimate_upright(d1, d2, up1, tilted, threshold=5e-3, generator=generator)
+        good = (found.status == Status.OK) == bool(right)
+        assert_share(good, 0.8)

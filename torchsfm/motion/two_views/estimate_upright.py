@@ -1,13 +1,13 @@
 """The relative pose of two cameras that know the vertical, from corresponding rays of which many are wrong."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions
+from torchsfm._types import Solutions, Status
 from torchsfm.geometry import rotation_from_rotvec
 from torchsfm.linalg import cross
 from torchsfm.motion.two_views.epipolar_fit import sphere_rows
@@ -15,6 +15,7 @@ from torchsfm.motion.two_views.estimate_essential import RelativePoseEstimator, 
 from torchsfm.motion.two_views.plane_and_parallax import more_than_chance, squared_transfer
 from torchsfm.motion.two_views.relative_upright_3pt import relative_upright_3pt
 from torchsfm.motion.two_views.sampson_sphere import pose_step, step_equations, turned
+from torchsfm.motion.two_views.vertical_evidence import contradicts_verticals, off_great_circle
 from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
@@ -119,7 +120,7 @@ class UprightPoseEstimator:
         threshold: Float[Tensor, "p"],
         chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
-        """Whether R alone may relate all inliers but so few as chance explains; `degeneracy` takes hardly longer."""
+        """Whether `degeneracy` may find something; it takes hardly longer."""
         return self.degeneracy(model, d1, d2, inliers=inliers, threshold=threshold, chance=chance) != int(Degeneracy.NONE)
 
     def degeneracy(
@@ -132,11 +133,17 @@ class UprightPoseEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
-        """ROTATION: R alone relates the inliers but so few as chance explains, so that t is open."""
+        """ROTATION: R alone relates the inliers but so few as chance explains, so that t is open.
+
+        COLLINEAR: all but so few are on a line in an image; several poses then fit, if not more.
+        """
         h1, h2 = sphere_rows(d1), sphere_rows(d2)
         turned = inliers & (squared_transfer(model[..., :3], h1, h2, sphere=True) < (4 * threshold * threshold)[..., None])
         rotation = turned.any(-1) & ~more_than_chance((inliers & ~turned).sum(-1), chance, 2)
-        return torch.where(rotation, int(Degeneracy.ROTATION), int(Degeneracy.NONE)).to(torch.int8)
+        aside = torch.stack([off_great_circle(d, inliers, threshold) for d in (d1, d2)])
+        lined = (~more_than_chance(aside, chance, 2) & (2 * aside <= inliers.sum(-1))).any(0)
+        code = torch.where(lined, int(Degeneracy.COLLINEAR), int(Degeneracy.NONE))
+        return torch.where(rotation, int(Degeneracy.ROTATION), code).to(torch.int8)
 
 
 def estimate_upright(
@@ -163,9 +170,11 @@ def estimate_upright(
         **options: See `RansacOptions`.
 
     Returns:
-        [R | t] with |t| = 1; inliers, support, iterations, status (NOT_FINITE also where a vertical has no direction),
-        degeneracy (ROTATION: a rotation relates all inliers but so few as chance explains, and t means nothing), covariance
-        (12 x 12, of rank 3). The pose carries its derivatives with respect to the inliers and the verticals (see `ransac`).
+        [R | t] with |t| = 1; inliers, support, iterations, status (NOT_FINITE also where a vertical has no direction;
+        NO_CONSENSUS also where a pose that is more than 0.03 radians off the verticals fits the rays clearly better),
+        degeneracy (ROTATION: a rotation relates all inliers but so few as chance explains, and t means nothing; COLLINEAR: so
+        many are on a line in an image, and several poses fit), covariance (12 x 12, of rank 3). The pose carries its
+        derivatives with respect to the inliers and the verticals (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
@@ -194,4 +203,14 @@ def estimate_upright(
     estimator = UprightPoseEstimator(up1, up2, pose_slack(threshold, d1).expand(batch))
     # Without verticals there are no data either.
     rays1 = torch.where(known[..., None], unit_rays(d1), torch.nan)
-    return estimate_robustly(estimator, rays1, unit_rays(d2), threshold=threshold, dtype=d1.dtype, **options)
+    rays2 = unit_rays(d2)
+    found = estimate_robustly(estimator, rays1, rays2, threshold=threshold, dtype=d1.dtype, **options)
+    counted = torch.isfinite(rays1).all(-1) & torch.isfinite(rays2).all(-1)
+    mask = options.get("mask")
+    with torch.no_grad():
+        wrong = contradicts_verticals(
+            found.model.double(), rays1.detach().nan_to_num(0, 0, 0), rays2.detach().nan_to_num(0, 0, 0), up1, up2,
+            counted if mask is None else counted & mask, found.threshold.double(), estimator.slack,
+        )  # fmt: skip
+    status = torch.where(wrong & (found.status == Status.OK), int(Status.NO_CONSENSUS), found.status).to(found.status.dtype)
+    return replace(found, status=status)
