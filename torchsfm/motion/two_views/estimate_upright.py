@@ -133,17 +133,27 @@ class UprightPoseEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
-        """ROTATION: R alone relates the inliers but so few as chance explains, so that t is open.
+        """ROTATION: a turn about the vertical relates the inliers but so few as chance explains, so that t is open.
 
         COLLINEAR: all but so few are on a line in an image; several poses then fit, if not more.
         """
         h1, h2 = sphere_rows(d1), sphere_rows(d2)
-        turned = inliers & (squared_transfer(model[..., :3], h1, h2, sphere=True) < (4 * threshold * threshold)[..., None])
+        near = squared_transfer(self._best_turn(model[..., :3], d1, d2, inliers), h1, h2, sphere=True)
+        turned = inliers & (near < (4 * threshold * threshold)[..., None])
         rotation = turned.any(-1) & ~more_than_chance((inliers & ~turned).sum(-1), chance, 2)
         aside = torch.stack([off_great_circle(d, inliers, threshold) for d in (d1, d2)])
         lined = (~more_than_chance(aside, chance, 2) & (2 * aside <= inliers.sum(-1))).any(0)
         code = torch.where(lined, int(Degeneracy.COLLINEAR), int(Degeneracy.NONE))
         return torch.where(rotation, int(Degeneracy.ROTATION), code).to(torch.int8)
+
+    def _best_turn(self, R: Tensor, d1: Tensor, d2: Tensor, inliers: Tensor) -> Float[Tensor, "*batch 3 3"]:
+        """The turn that relates the inliers best: that of a pose may be off, where a sideways t makes up for it."""
+        up = self.gravity2[..., None, :].to(d1.dtype)
+        y, z = (unit_rays(d) for d in (d1 @ R.mT, d2))
+        across = (y * z).sum(-1) - (y * up).sum(-1) * (z * up).sum(-1)
+        around = (torch.linalg.cross(y, z, dim=-1) * up).sum(-1)
+        angle = torch.atan2(*(torch.where(inliers, part, 0).sum(-1) for part in (around, across)))
+        return rotation_from_rotvec(angle[..., None] * up[..., 0, :]) @ R
 
 
 def estimate_upright(
@@ -206,11 +216,20 @@ def estimate_upright(
     rays2 = unit_rays(d2)
     found = estimate_robustly(estimator, rays1, rays2, threshold=threshold, dtype=d1.dtype, **options)
     counted = torch.isfinite(rays1).all(-1) & torch.isfinite(rays2).all(-1)
-    mask = options.get("mask")
+    for given in (options.get("mask"), options.get("weights")):
+        counted = counted if given is None else counted & (given > 0)
+    (rows,) = (found.status.flatten() == Status.OK).nonzero(as_tuple=True)
+
+    def of_good(t: Tensor, dims: int) -> Tensor:
+        """Those of the problems that have a pose."""
+        t = t.detach().expand((*batch, *t.shape[t.ndim - dims :]))
+        return t.reshape(batch.numel(), *t.shape[len(batch) :])[rows]
+
     with torch.no_grad():
         wrong = contradicts_verticals(
-            found.model.double(), rays1.detach().nan_to_num(0, 0, 0), rays2.detach().nan_to_num(0, 0, 0), up1, up2,
-            counted if mask is None else counted & mask, found.threshold.double(), estimator.slack,
+            of_good(found.model.double(), 2), of_good(rays1.nan_to_num(0, 0, 0), 2), of_good(rays2.nan_to_num(0, 0, 0), 2),
+            of_good(up1, 1), of_good(up2, 1), of_good(counted, 1), of_good(found.threshold.double(), 0),
+            of_good(estimator.slack, 0),
         )  # fmt: skip
-    status = torch.where(wrong & (found.status == Status.OK), int(Status.NO_CONSENSUS), found.status).to(found.status.dtype)
-    return replace(found, status=status)
+    status = found.status.flatten().index_copy(0, rows, wrong.to(found.status.dtype) * int(Status.NO_CONSENSUS))
+    return replace(found, status=status.view(found.status.shape))

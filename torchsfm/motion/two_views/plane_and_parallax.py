@@ -174,7 +174,7 @@ def most_by_chance(chance: Float[Tensor, "*batch"], free: int) -> Float[Tensor, 
     return chance + 3 * chance.sqrt() + (free + 2)
 
 
-def more_than_chance(number: Int[Tensor, "*batch"], chance: Float[Tensor, "*batch"], free: int) -> Bool[Tensor, "*batch"]:
+def more_than_chance(number: Int[Tensor, "*#batch"], chance: Float[Tensor, "*#batch"], free: int) -> Bool[Tensor, "*batch"]:
     """Whether so many points agree with such a model, rather than by chance."""
     return number > most_by_chance(chance, free)
 

@@ -23,15 +23,15 @@ _TILT = 0.03
 
 
 def contradicts_verticals(
-    model: Float[Tensor, "*batch 3 4"],
-    d1: Float[Tensor, "*#batch n 3"],
-    d2: Float[Tensor, "*#batch n 3"],
-    gravity1: Float[Tensor, "*#batch 3"],
-    gravity2: Float[Tensor, "*#batch 3"],
-    counted: Bool[Tensor, "*#batch n"],
-    threshold: Float[Tensor, "*batch"],
-    slack: Float[Tensor, "*#batch"],
-) -> Bool[Tensor, "*batch"]:
+    model: Float[Tensor, "p 3 4"],
+    d1: Float[Tensor, "p n 3"],
+    d2: Float[Tensor, "p n 3"],
+    gravity1: Float[Tensor, "p 3"],
+    gravity2: Float[Tensor, "p 3"],
+    counted: Bool[Tensor, "p n"],
+    threshold: Float[Tensor, "p"],
+    slack: Float[Tensor, "p"],
+) -> Bool[Tensor, "p"]:
     """Whether a pose that does not turn one vertical to the other fits the rays clearly better.
 
     Args:
@@ -44,11 +44,7 @@ def contradicts_verticals(
         threshold: Largest distance of an inlier.
         slack: See `RelativePoseEstimator`.
     """
-    batch, n = model.shape[:-2], d1.shape[-2]
-    model = model.reshape(-1, 3, 4)
-    first, second = (d.expand(*batch, n, 3).reshape(-1, n, 3) for d in (d1, d2))
-    limit, slack = (t.expand(batch).reshape(-1) for t in (threshold.square(), slack))
-    problem = _Problem(first, second, counted.expand(*batch, n).reshape(-1, n), limit, slack)
+    problem = _Problem(d1, d2, counted, threshold.square(), slack)
     free = problem.freed(model)
     own, other = problem.loss(model), problem.loss(free)
     # A free pose is at least as good, if it is found.
@@ -60,11 +56,10 @@ def contradicts_verticals(
     gain = (own - other).sum(-1)
     variance = torch.where(inside, other, 0.0).sum(-1) / (inside.sum(-1) - 5).clamp(min=1)
     support = (1 - own).sum(-1)
-    down1, down2 = (g.expand(*batch, 3).reshape(-1, 3) for g in (gravity1, gravity2))
-    tilt = 1 - ((free[..., :3] @ down1[..., None])[..., 0] * down2).sum(-1)
+    tilt = 1 - ((free[..., :3] @ gravity1[..., None])[..., 0] * gravity2).sum(-1)
     better = (gain > _CLEAR * variance) & (gain > _FEW + _GAIN * support)
     wrong: Tensor = better & (tilt > 0.5 * _TILT**2) & torch.isfinite(free).all(-1).all(-1)
-    return wrong.reshape(batch)
+    return wrong
 
 
 @dataclass(frozen=True)
