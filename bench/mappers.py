@@ -28,7 +28,8 @@ from torchsfm.reconstruction.models import build_models
 from torchsfm.reconstruction.photographs import NEIGHBOURS, match_photographs
 from torchsfm.reconstruction.report import SfmResult
 from torchsfm.reconstruction.stages import Stages
-from torchsfm.reconstruction.view_graph import ViewGraph, graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.view_graph import ViewGraph
 
 MAPPERS = ("incremental", "global")
 SIZE, FOCAL, GUESS = (1000, 750), 1100.0, 1.03

@@ -18,7 +18,7 @@ from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.segments import detect_all_segments
-from torchsfm.reconstruction.view_graph import graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.simulation import RenderedSequence
 
 VIEWS, WIDTH, HEIGHT, NOISE = 12, 960, 720, 0.2

@@ -16,7 +16,7 @@ from torchsfm.plot import write_page
 from torchsfm.reconstruction import SfmResult, incremental, reconstruct_tracks
 from torchsfm.reconstruction.calibration import CameraPrior, folded_cameras, lone_cameras_plausible
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.view_graph import graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 from torchsfm.simulation import look_at, random_bundle_problem, random_points, simulate_images
 

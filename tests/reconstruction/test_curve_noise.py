@@ -13,7 +13,7 @@ from torchsfm.geometry import Camera, Pose, Radial, intrinsics, random_rotation,
 from torchsfm.reconstruction import Curves
 from torchsfm.reconstruction.curve_noise import alike, measured_weights
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.view_graph import graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 
 F64 = torch.float64
 VIEWS, POINTS, CURVES, SAMPLES = 6, 30, 15, 40

@@ -26,7 +26,7 @@ from torchsfm.reconstruction.adjust import adjust
 from torchsfm.reconstruction.find_lines import FoundSegments, adjust_with_lines, find_lines
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.view_graph import graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 
 F64 = torch.float64
 VIEWS, POINTS, LINES = 6, 40, 25

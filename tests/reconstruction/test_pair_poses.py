@@ -17,7 +17,7 @@ from torchsfm.reconstruction import adjust, global_start, pair_poses
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.pair_poses import FORESTS, relative_poses, strongest_pairs
-from torchsfm.reconstruction.view_graph import graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.simulation import orbit_poses
 
 

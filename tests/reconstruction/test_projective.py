@@ -12,7 +12,7 @@ from torchsfm.reconstruction import ReconstructionError
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.projective import projective_start
-from torchsfm.reconstruction.view_graph import graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.simulation import orbit_poses
 
 

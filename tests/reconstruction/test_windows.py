@@ -13,7 +13,8 @@ from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.similarities import robust_similarity
-from torchsfm.reconstruction.view_graph import ViewGraph, graph_from_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.reconstruction.windows import Window, join_windows, map_windows
 from torchsfm.simulation import orbit_poses
 

@@ -28,9 +28,10 @@ from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.stages import Stages, one_thread
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import Unfolded, hanging_on_copies, unfold
-from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph, graph_from_tracks
+from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph
 from torchsfm.reconstruction.windows import window_start
 
 METHODS = ("incremental", "projective", "global", "windows", "auto")

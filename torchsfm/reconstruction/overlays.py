@@ -35,23 +35,21 @@ Matches = Mapping[int, Int[Tensor, "_ 2"]]
 class Overlays:
     """Places of images at which something stands still, for each size of image; where there are none, all is admitted."""
 
-    cells: Int[Tensor, "c 5"]
-    """Width and height of the images, which of four grids, and the column and row of the cell."""
+    cells: Int[Tensor, "c 3"]
+    """Width and height of the images, and the number of a cell, see `_cells`."""
 
     def admit(self, size: Int[Tensor, "2 2"], x1: Float[Tensor, "k 2"], x2: Float[Tensor, "k 2"]) -> Bool[Tensor, "k"]:
         """Which matches of two images of these sizes do not stand still at such a place."""
         kept = torch.ones(len(x1), dtype=torch.bool)
         if not len(self.cells) or not bool((size[0] == size[1]).all()):
             return kept
-        own = self.cells[(self.cells[:, :2] == size[0]).all(-1), 2:]
+        own = self.cells[(self.cells[:, :2] == size[0]).all(-1), 2]
         still = (_moved(x1, x2) <= _STILL * scale_of_images(size[0])).nonzero()[:, 0]
-        if not len(own) or not len(still):
-            return kept
-        found = (_cells(x1[still], size[0])[:, :, None] == own).all(-1).any(-1).any(-1)
+        found = torch.isin(_cells(x1[still], size[0]), own).any(-1)
         return kept.index_copy(0, still, ~found)
 
 
-NONE = Overlays(torch.zeros(0, 5, dtype=torch.long))
+NONE = Overlays(torch.zeros(0, 3, dtype=torch.long))
 
 
 def find_overlays(
@@ -102,29 +100,32 @@ def find_overlays(
         off = sampson_distance(verified.F[k], x1, x2) > _OFF * _THRESHOLD * scale[i]
         if int(off.sum()) >= MIN_INLIERS:
             cells = _cells(torch.cat((x1[off], x2[off])), image_size[i])
-            number = torch.tensor([i, j]).repeat_interleave(int(off.sum()))
-            rows.append(torch.cat((image_size[i].expand(*cells.shape[:2], 2), cells), -1).flatten(0, 1))
-            images.append(number.repeat_interleave(cells.shape[1]))
+            rows.append(torch.cat((image_size[i].expand(*cells.shape, 2), cells[..., None]), -1).flatten(0, 1))
+            images.append(pairs[q].repeat_interleave(int(off.sum())).repeat_interleave(cells.shape[1]))
     if not rows:
         return NONE
     return Overlays(_common(torch.cat(rows), torch.cat(images), image_size[moves]))
 
 
-def _common(rows: Int[Tensor, "r 5"], images: Int[Tensor, "r"], sizes: Int[Tensor, "a 2"]) -> Int[Tensor, "c 5"]:
+def _common(rows: Int[Tensor, "r 3"], images: Int[Tensor, "r"], sizes: Int[Tensor, "a 2"]) -> Int[Tensor, "c 3"]:
     """The cells that enough of the images show."""
     once = torch.unique(torch.cat((rows, images[:, None]), 1), dim=0)
-    cells, count = torch.unique(once[:, :5], dim=0, return_counts=True)
+    cells, count = torch.unique(once[:, :3], dim=0, return_counts=True)
     kinds, number = torch.unique(sizes, dim=0, return_counts=True)
     of_size = ((cells[:, None, :2] == kinds).all(-1) * number).sum(-1)
     common: Tensor = cells[count >= torch.minimum((_SHARE * of_size).clamp(min=_IMAGES), of_size)]
     return common
 
 
-def _cells(x: Float[Tensor, "k 2"], size: Int[Tensor, "2"]) -> Int[Tensor, "k 4 3"]:
-    """The cells of places in four grids, each half a cell off the others: what is near is in one cell of some grid."""
+def _cells(x: Float[Tensor, "k 2"], size: Int[Tensor, "2"]) -> Int[Tensor, "k 4"]:
+    """The numbers of the cells of places in four grids, each half a cell off the others: what is near shares one of them."""
     shift = torch.tensor([[0.0, 0.0], [0.0, 0.5], [0.5, 0.0], [0.5, 0.5]], dtype=x.dtype)
-    cell = (x[:, None] / (_CELL * _STILL * scale_of_images(size)) + shift).floor().long()
-    return torch.cat((torch.arange(4)[:, None].expand(len(x), 4, 1), cell), -1)
+    width = _CELL * _STILL * scale_of_images(size)
+    # Corners may be found a little beside the image.
+    column, row = ((x[:, None] / width + shift).floor().long() + 1).clamp(min=0).unbind(-1)
+    columns, rows = ((size / width).long() + 3).tolist()
+    cells: Tensor = (torch.arange(4) * columns + column.clamp(max=columns - 1)) * rows + row.clamp(max=rows - 1)
+    return cells
 
 
 def _moved(x1: Tensor, x2: Tensor) -> Float[Tensor, "k"]:
