@@ -174,6 +174,12 @@ def _image_curve(s: Scene) -> Curve:
     return tensor_map(lambda t: t[(*(slice(None),) * len(s.batch), 0)], _image_curves(s))
 
 
+def _from_afar(s: Scene) -> Tensor:
+    """Images of the points by cameras so far away that these are affine."""
+    _, R, _ = s.parameters(4)
+    return 120 * s.points(12)[..., None, :, :] @ R[..., :2, :].mT + 0.3 * s.randn(4, 12, 2)
+
+
 def _rings(s: Scene) -> Tensor:
     """Three bent rings, always the same ones."""
     t = torch.arange(48, dtype=torch.float64) * (6.28318 / 48)
@@ -428,7 +434,7 @@ FUNCTIONS: dict[str, Function] = {
         {"n": 30},
     ),
     "motion.estimate_upright": Function(RAYS, {"n": 30}),
-    "motion.factorize_affine": Function({"max_iterations": 20}),
+    "motion.factorize_affine": Function({"x": _from_afar, "max_iterations": 20}),
     "motion.factorize_curves": Function(
         {"curves": _images_of_curves, "samples": 16, "oriented": True, "aligned": True}, slow=True
     ),
