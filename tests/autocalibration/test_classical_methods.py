@@ -133,13 +133,14 @@ def test_two_views_in_general(generator):
 
 @pytest.mark.parametrize("assume", [FOCAL, ALL])
 def test_kruppa_with_exact_pairs(generator, assume):
-    scenes = [projective_scene(generator, 6, offset=0.0) for _ in range(6)]
+    # From some starts the first step leads to focal lengths whose squares overflow, where everything would seem to fit.
+    scenes = [projective_scene(generator, 6, offset=0.0) for _ in range(20)]
     F = torch.stack([fundamentals(s) for s in scenes])
     found = intrinsics_from_kruppa(F, image_size=SIZE, assume=assume)
     truth = torch.stack([s.K[0] for s in scenes])
-    assert (found.status == Status.OK).sum() >= 5
+    assert (found.status == Status.OK).all()
     error = (found.K - truth).abs().amax((-2, -1)) / truth[:, 0, 0]
-    assert error[found.status == Status.OK].max() < 1e-3
+    assert error.max() < 1e-3
 
 
 @pytest.mark.parametrize(("assume", "K"), [(FOCAL, intrinsic()), (ALL, intrinsic(aspect=1.03, skew=8.0, offset=40.0))])

@@ -100,8 +100,12 @@ def fit_intrinsics(
     q = spread.shape[-1]
     precision = assume.precision(1, starts) * _PRIOR
 
+    def camera(x: Tensor) -> Tensor:
+        # Beyond this range squares overflow, and what is divided by infinity would seem to fit.
+        return intrinsics_from_relative((x[..., :q] @ spread.mT).clamp(-20, 20))
+
     def residual(x: Tensor, *tensors: Tensor) -> Tensor:
-        K = intrinsics_from_relative(x[..., :q] @ spread.mT)
+        K = camera(x)
         return torch.cat((constraints(K, x[..., q:], *tensors), x[..., :q] * precision), -1)[..., None]
 
     many = tuple(t[:, None].expand(b, k, *t.shape[1:]) for t in data)
@@ -136,7 +140,7 @@ def fit_intrinsics(
     seeming = torch.nan_to_num((unit * noise).sqrt(), 1.0)
     deviation = torch.nan_to_num((unit * (likely_variance(total, count - u) + 1e-20)).sqrt(), 1.0).clamp_max(1.0)
     T = image_scaling(image_size)
-    K = torch.linalg.inv_ex(T).inverse @ intrinsics_from_relative((x[:, :q] @ spread.mT).clamp(-20, 20))
+    K = torch.linalg.inv_ex(T).inverse @ camera(x)
     K = K / K[:, 2:, 2:]
     status = torch.full((b,), int(Status.OK), dtype=torch.int8, device=x.device)
     # Other focal lengths that fit as well, found or asked for, leave the question open, as linear as that may look here.
