@@ -14,7 +14,8 @@ from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_from_ro
 from torchsfm.optim import Cauchy
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import SfmResult, incremental, reconstruct_tracks
-from torchsfm.reconstruction.calibration import CameraPrior, folded_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.calibration import folded_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.reconstruction.written_report import report_markdown, report_record

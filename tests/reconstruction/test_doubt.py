@@ -12,7 +12,8 @@ from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction.adjust import LOSS, adjust
-from torchsfm.reconstruction.calibration import CameraPrior, calibration_of
+from torchsfm.reconstruction.calibration import calibration_of
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.evaluation import pose_errors

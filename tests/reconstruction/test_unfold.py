@@ -10,7 +10,7 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.motion.many_views.components import components
-from torchsfm.reconstruction.calibration import CameraPrior
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.distinctive import Backbone, Distinctiveness
 from torchsfm.reconstruction.doubt import examine
 from torchsfm.reconstruction.evaluation import pose_errors

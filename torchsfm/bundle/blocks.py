@@ -145,7 +145,7 @@ class Bundle:
             raise ValueError(f"structure: wanted one of a kind, got {[some.block for some in self.structure]}")
         for some in self.structure:
             some.check(views)
-        limits = {"pose": poses, "point": len(start.X)}
+        limits = {"pose": poses, "point": len(start.X), "camera": groups}
         check_index(**{f"priors[{k}].index": (prior.index, limits[prior.block]) for k, prior in enumerate(self.priors)})
 
     def problem(self) -> tuple[dict[str, Block], list[Term]]:
@@ -206,7 +206,7 @@ class Bundle:
     def world_is_free(self, blocks: Mapping[str, Block]) -> bool:
         """Whether nothing says where the world is: no pose or structure held, no pose known but to others."""
         held = [blocks[name].fixed for name in ("pose", *structure_blocks(self))]
-        relative = all(isinstance(prior, RelativePosePrior) for prior in self.priors)
+        relative = all(isinstance(prior, RelativePosePrior) or prior.block == "camera" for prior in self.priors)
         return relative and not any(fixed is not None and bool(fixed.any()) for fixed in held)
 
     @property

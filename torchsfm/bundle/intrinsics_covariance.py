@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.bundle.blocks import Bundle
+from torchsfm.bundle.priors import Prior
 from torchsfm.geometry import BundleProblem, Camera
 from torchsfm.optim import Loss, marginal_covariance
 
@@ -19,6 +20,7 @@ def intrinsics_covariance(
     loss: Loss | None = None,
     intrinsics_sigma: Mapping[str, float | Tensor] | None = None,
     intrinsics_mean: Camera | None = None,
+    priors: Sequence[Prior] = (),
 ) -> Float[Tensor, "g k k"]:
     """Compute the covariance of each camera's free intrinsics, by the arguments of `bundle_adjust` at its result.
 
@@ -32,6 +34,7 @@ def intrinsics_covariance(
         loss: The robust loss, squares if not given.
         intrinsics_sigma: Standard deviations of the priors on intrinsics, by names as in `free`.
         intrinsics_mean: Where these were centred; the cameras of the problem if not given.
+        priors: What else is known of poses, points and cameras.
 
     Returns:
         Covariances in the order focal (pixels along x), aspect, skew, principal point, distortion, for noise of one pixel in
@@ -48,7 +51,7 @@ def intrinsics_covariance(
     """
     bundle = Bundle(
         problem, free=free, fixed_intrinsics=fixed_intrinsics, loss=loss, intrinsics_sigma=intrinsics_sigma,
-        intrinsics_mean=intrinsics_mean,
+        intrinsics_mean=intrinsics_mean, priors=priors,
     )  # fmt: skip
     with torch.no_grad():
         blocks, terms = bundle.problem()

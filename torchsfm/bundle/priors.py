@@ -44,11 +44,11 @@ class Prior(Protocol):
 
     @property
     def index(self) -> Tensor:
-        """Which poses or points it speaks of."""
+        """Which poses, points or cameras it speaks of."""
 
     @property
     def block(self) -> str:
-        """Which block: "pose" or "point"."""
+        """Which block: "pose", "point" or "camera", whose rows are focal length, aspect, skew, principal point, distortion."""
 
     def term(self) -> Term:
         """The prior as a term of the optimiser."""

@@ -12,7 +12,6 @@ from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.calibration import (
-    CameraPrior,
     Free,
     as_expected,
     cameras_free,
@@ -21,6 +20,7 @@ from torchsfm.reconstruction.calibration import (
     images_of_cameras,
     measure_noise,
 )
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
 
 NEIGHBOURS = 8
@@ -73,8 +73,12 @@ def adjust(
     if result.status == Status.INTERRUPTED:
         # There is more to do than this: let the interrupt through.
         raise KeyboardInterrupt
-    adjustment = mapping.adjustment if moving is not None else Adjustment(result.status, result.iterations, free or {})
-    return replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X, adjustment=adjustment)
+    cameras = result.cameras
+    if free and prior is not None:
+        cameras = prior.made_alike(cameras, images_of_cameras(mapping) > 0)
+    whole = Adjustment(result.status, result.iterations, free or {}, result.cost)
+    adjustment = mapping.adjustment if moving is not None else whole
+    return replace(mapping, poses=result.poses, cameras=cameras, X=result.X, adjustment=adjustment)
 
 
 def adjust_all(
@@ -82,7 +86,7 @@ def adjust_all(
     names: Sequence[str],
     prior: CameraPrior,
     *,
-    lone: bool = False,
+    faultless: int = 0,
     settled: bool = False,
     **limits: Any,
 ) -> Mapping:
@@ -94,7 +98,7 @@ def adjust_all(
         mapping: The model so far.
         names: Numbers of the cameras that may be estimated.
         prior: What is expected of the cameras.
-        lone: Whether cameras that took a single photograph count as those of many; see `choose_free`.
+        faultless: Cameras that took up to so many photographs count as those of many; see `choose_free`.
         settled: Whether the model has been adjusted so before, and has hardly changed since. Where the images determined all
             numbers then, that is not found out again.
         **limits: When to stop; see `adjust`.
@@ -102,11 +106,12 @@ def adjust_all(
     free = dict(mapping.adjustment.free) if settled and mapping.adjustment is not None else {}
     used = images_of_cameras(mapping) > 0
     if set(free) != set(names) or not all(bool(mask[used].all()) for mask in free.values()):
-        free = choose_free(mapping, names, prior, loss=LOSS, lone=lone)
+        free = choose_free(mapping, names, prior, loss=LOSS, faultless=faultless)
     adjusted = adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
     folded = folded_cameras(adjusted)
     if not bool(folded.any()):
         return adjusted
+    folded = folded | prior.alike
     free |= {name: free[name] & ~folded for name in mapping.cameras.distortion.parameter_names if name in free}
     return adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
 
@@ -116,7 +121,7 @@ def about_cameras(mapping: Mapping, free: Free | None, prior: CameraPrior | None
     if not free or prior is None:
         return {"free": ()}
     noise = measure_noise(mapping, LOSS)
-    return cameras_free(free) | {"intrinsics_sigma": prior.in_units_of(noise, free), "intrinsics_mean": prior.mean}
+    return cameras_free(free) | prior.terms(noise, free, images_of_cameras(mapping) > 0)
 
 
 def neighbourhood(mapping: Mapping, new: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]:

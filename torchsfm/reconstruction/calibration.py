@@ -1,11 +1,11 @@
 """What the images of a model say of its cameras: which numbers they determine, how well, and in plain words.
 
 A camera is a row of numbers: focal length, principal point, distortion. Each has a Gaussian prior, which stands for all cameras
-ever made; the images add what they know, with the poses and points eliminated.
+ever made (`CameraPrior`); the images add what they know, with the poses and points eliminated.
 """
 
-from collections.abc import Iterable, Sequence
 from collections.abc import Mapping as Dict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,16 +16,12 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.bundle import intrinsics_covariance
 from torchsfm.bundle.intrinsics import free_columns
-from torchsfm.geometry import Camera, Distortion
+from torchsfm.geometry import Distortion
 from torchsfm.geometry.intrinsic_parameters import camera_from_row, intrinsic_labels, row_from_camera
 from torchsfm.optim import Cauchy, loss_slope
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
 
-PRINCIPAL_POINT_SIGMA = 0.01
-"""How far principal points lie from the middle of the image, as a fraction of its longer side."""
-RADIAL_SIGMA = 0.3
-TANGENTIAL_SIGMA = 0.01
-"""How large the distortion parameters of lenses are."""
 LEAST_NOISE = 0.05
 """Image points are never better than this, in pixels."""
 MIN_IMAGES = 3
@@ -39,35 +35,6 @@ RESTS = 0.7
 
 Free = Dict[str, Bool[Tensor, "g"]]
 """By the names that `bundle_adjust` knows, the cameras in which a number is estimated."""
-
-
-@dataclass(frozen=True)
-class CameraPrior:
-    """What is expected of the cameras before any image point was seen.
-
-    Attributes:
-        mean: The cameras expected.
-        sigma: Standard deviations by the names `bundle_adjust` knows: of "focal" as a fraction, of others in their own unit.
-    """
-
-    mean: Camera
-    sigma: Dict[str, Float[Tensor, "g"]]
-
-    @classmethod
-    def of(cls, mapping: Mapping, mean: Camera, focal_sigma: Float[Tensor, "g"]) -> "CameraPrior":
-        """The prior of the cameras of a mapping: principal points in the middle, no distortion."""
-        g = len(mean.K)
-        size = mapping.graph.image_size.max(-1).values.to(mean.K.dtype)
-        side = torch.ones_like(focal_sigma).scatter_reduce(0, mapping.camera_index, size, "amax")
-        sigma = {"focal": focal_sigma, "principal_point": PRINCIPAL_POINT_SIGMA * side}
-        for name in mean.distortion.parameter_names:
-            width = TANGENTIAL_SIGMA if name in ("p1", "p2") else RADIAL_SIGMA
-            sigma[name] = torch.full((g,), width, dtype=mean.K.dtype)
-        return cls(mean, sigma)
-
-    def in_units_of(self, noise: float, names: Iterable[str]) -> dict[str, Tensor]:
-        """Standard deviations for a cost that takes the image points' noise to be one pixel."""
-        return {name: self.sigma[name] / noise for name in names}
 
 
 @dataclass(frozen=True)
@@ -220,8 +187,7 @@ def _information(
             mapping.problem(),
             free=names,
             loss=loss,
-            intrinsics_sigma=prior.in_units_of(noise, names),
-            intrinsics_mean=prior.mean,
+            **prior.terms(noise, names, used),
         )
     before = torch.zeros(len(used), len(columns), dtype=covariance.dtype)
     for name in names:
@@ -233,7 +199,7 @@ def _information(
 
 
 def choose_free(
-    mapping: Mapping, names: Sequence[str], prior: CameraPrior, *, loss: Cauchy, lone: bool = False
+    mapping: Mapping, names: Sequence[str], prior: CameraPrior, *, loss: Cauchy, faultless: int = 0
 ) -> dict[str, Bool[Tensor, "g"]]:
     """Decide which numbers of which cameras to estimate, by the error to be expected of each.
 
@@ -248,7 +214,7 @@ def choose_free(
         names: Numbers that may be estimated.
         prior: What is expected of the cameras.
         loss: The loss of the adjustment.
-        lone: Whether cameras that took a single photograph are taken to be without such faults.
+        faultless: Cameras that took up to so many photographs are taken to be without such faults.
     """
     images = images_of_cameras(mapping)
     candidates = [name for name in ("focal", *mapping.cameras.distortion.parameter_names, "principal_point") if name in names]
@@ -268,8 +234,7 @@ def choose_free(
         # The prior is counted in the variance; without it, the noise alone is left.
         noise = 1 / (1 / variance - 1 / before).clamp_min(1e-12 / before)
         faults = FAULTS * before / images.clamp(min=1) if name == "principal_point" else torch.zeros_like(before)
-        if lone:
-            faults[images == 1] = 0
+        faults = torch.where(images <= faultless, 0.0, faults)
         free[name] = (images > 0) & ((noise + faults < before) | (name == "focal"))
         chosen[:, own] |= free[name][:, None]
     return free

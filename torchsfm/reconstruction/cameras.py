@@ -102,7 +102,7 @@ def _focal_of_pairs(
     graph: ViewGraph, member: Bool[Tensor, "v"], c: Float[Tensor, "2"], size: Float[Tensor, "2"]
 ) -> float | None:
     """One focal length that makes the fundamental matrices of a camera's pairs essential; None where they do not tell."""
-    good = member[graph.pairs].all(-1) & _telling(graph)
+    good = member[graph.pairs].all(-1) & telling_pairs(graph)
     if not bool(good.any()):
         return None
     weights = graph.fundamental_inliers[good].to(c.dtype)
@@ -124,7 +124,7 @@ def _focals_of_graph(
     if "default" not in source:
         return focal
     pairs = camera_index[graph.pairs]
-    telling = _telling(graph) & (pairs[:, 0] != pairs[:, 1])
+    telling = telling_pairs(graph) & (pairs[:, 0] != pairs[:, 1])
     found = calibrate_view_graph(graph.F[telling], pairs[telling], c, focal, focal_uncertainty(source).to(focal.dtype))
     told = (found.status == Status.OK) & torch.tensor([word == "default" for word in source])
     for k in told.nonzero()[:, 0].tolist():
@@ -132,7 +132,7 @@ def _focals_of_graph(
     return torch.where(told, found.model, focal)
 
 
-def _telling(graph: ViewGraph) -> Bool[Tensor, "q"]:
+def telling_pairs(graph: ViewGraph) -> Bool[Tensor, "q"]:
     """Pairs that determine F: neither a plane nor a rotation explains most of what they have in common."""
     several = graph.fundamental_inliers >= 2 * MIN_INLIERS
     return several & (graph.homography_inliers < 0.7 * graph.fundamental_inliers.double())

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
-from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
+from torchsfm.reconstruction.calibration import measure_noise
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import PairAgreement, excess_scatter, pair_agreement
 from torchsfm.reconstruction.groups import outvoted_groups
 from torchsfm.reconstruction.mapping import Mapping

@@ -12,7 +12,8 @@ from torchsfm.bundle import BundleLines, bundle_adjust
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
-from torchsfm.reconstruction.calibration import CameraPrior, measure_noise
+from torchsfm.reconstruction.calibration import images_of_cameras, measure_noise
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
 from torchsfm.reconstruction.line_tracks import Cameras, ViewSegments, link_lines, propose_lines
 from torchsfm.reconstruction.lines import Lines
@@ -104,8 +105,11 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
         raise KeyboardInterrupt
     (moved,) = result.structure
     assert isinstance(moved, BundleLines), "given"
-    adjustment = Adjustment(result.status, result.iterations, free or {})
-    model = replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X, adjustment=adjustment)
+    adjustment = Adjustment(result.status, result.iterations, free or {}, result.cost)
+    cameras = result.cameras
+    if free and prior is not None:
+        cameras = prior.made_alike(cameras, images_of_cameras(mapping) > 0)
+    model = replace(mapping, poses=result.poses, cameras=cameras, X=result.X, adjustment=adjustment)
     return model, lines.moved_to(moved.L)
 
 

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera
 from torchsfm.reconstruction.adjust import adjust, adjust_all, neighbourhood
-from torchsfm.reconstruction.calibration import CameraPrior, images_of_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.calibration import images_of_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.register import MIN_VISIBLE, register_images, visibility_scores
@@ -47,6 +48,8 @@ class MappingOptions:
         registration: Largest reprojection error of an inlier when an image is registered.
         min_angle: Smallest angle between the rays of a point.
         generator: Source of randomness.
+        cropped: Whether images may have been cut out of larger ones, so that their principal points lie anywhere.
+        alike: Whether one camera took them all; see `CameraPrior`.
     """
 
     free: tuple[str, ...]
@@ -56,18 +59,22 @@ class MappingOptions:
     registration: float = 8.0
     min_angle: float = 0.026
     generator: torch.Generator | None = None
+    cropped: bool = False
+    alike: bool = False
 
     def prior(self, model: Mapping) -> CameraPrior:
         """What to expect of the cameras, as `adjust` takes it."""
-        return CameraPrior.of(model, self.expected, self.focal_sigma)
+        return CameraPrior.of(model, self.expected, self.focal_sigma, cropped=self.cropped, alike=self.alike)
 
     def adjust(self, model: Mapping, *, last: bool = False, lone: bool = False, **limits: Any) -> Mapping:
         """Adjust all of a model, with those numbers of its cameras free that its images determine.
 
         The principal point, which other errors pass for most easily, waits for the `last` adjustments, when all images are in.
+        Where it may lie anywhere it passes for other errors, and does not wait.
         """
-        names = [name for name in self.free if last or name != "principal_point"]
-        return adjust_all(model, names, self.prior(model), lone=lone, **limits)
+        names = [name for name in self.free if last or self.cropped or name != "principal_point"]
+        faultless = len(model.registered) if self.cropped else int(lone)
+        return adjust_all(model, names, self.prior(model), faultless=faultless, **limits)
 
 
 def grow_model(
@@ -200,7 +207,8 @@ def _refine(model: Mapping, options: MappingOptions) -> Mapping:
         if settled:
             break
     model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
-    if "principal_point" in options.free and bool((images_of_cameras(model) == 1).any()):
+    lone = not options.cropped and bool((images_of_cameras(model) == 1).any())
+    if lone and "principal_point" in options.free:
         freed = options.adjust(model, last=True, lone=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
         model = freed if lone_cameras_plausible(freed, options.prior(freed)) else model
     return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)

@@ -21,11 +21,13 @@ class Adjustment:
         status: `OK` where it reached a minimum, `NOT_CONVERGED` where its limit of steps came first.
         iterations: Steps tried.
         free: By the names that `bundle_adjust` knows, the cameras in which a number was estimated.
+        cost: Half the sum of losses, and of what was expected of the cameras, square pixels.
     """
 
     status: Status
     iterations: int
     free: Dict[str, Bool[Tensor, "g"]]
+    cost: float = 0.0
 
 
 @dataclass(frozen=True)

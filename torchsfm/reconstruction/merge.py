@@ -12,7 +12,7 @@ from torchsfm.geometry import Similarity, rotation_angle, similarity_from_points
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS, adjust, adjust_all
 from torchsfm.reconstruction.alignment import align_models
-from torchsfm.reconstruction.calibration import CameraPrior
+from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
 from torchsfm.reconstruction.joined_points import common_kind, joined_points, joined_views
 from torchsfm.reconstruction.joined_structure import with_structure

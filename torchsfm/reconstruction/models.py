@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -17,6 +18,7 @@ from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.consistency import PairAgreement
+from torchsfm.reconstruction.cropped import map_cropped, may_be_off_centre
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
@@ -92,6 +94,8 @@ def build_models(
     with stages.timed("map"), one_thread() if few else nullcontext():
         camera_index = group_cameras(graph.image_size, labels, shared_camera)
         cameras, source = guess_cameras(graph, camera_index, model=camera, K=K, exif_focal=exif_focal)
+        # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
+        family = group_cameras(torch.zeros_like(graph.image_size), labels, shared_camera)
         matched = track is None
         if track is None:
             # Matches of strongly linked pairs come first: they are wrong less often.
@@ -123,16 +127,15 @@ def build_models(
                 source = tuple("autocalibration" for _ in start.focal_sigma)
                 metric = replace(options, expected=start.expected(), focal_sigma=start.focal_sigma)
                 mapped, known = extend_model(start.mapping, taken, metric, report), metric
-            elif method in ("global", "windows"):
-                placed = (global_start if method == "global" else window_start)(empty, ~taken, options)
-                if placed is None:
-                    break
-                mapped, known = extend_model(placed, taken, options, report), options
             else:
-                grown = grow_model(replace(empty, registered=taken), options, report)
+                grow = partial(_grow, method, taken, report)
+                grown = grow(empty, options)
                 if grown is None:
                     break
                 mapped, known = grown, options
+                if may_be_off_centre(mapped[0], options):
+                    cropped = map_cropped(empty, mapped[0], taken, options, family, grow, report)
+                    mapped, known = cropped or (mapped, known)
             model, failed = mapped
             model, parted, agreement = settle(model, taken, known, report)
             settled = model
@@ -185,6 +188,20 @@ def build_models(
         still=graph.still,
     )  # fmt: skip
     return SfmResult(tuple(model for model, _, _ in found), course)
+
+
+def _grow(
+    method: str,
+    taken: Bool[Tensor, "v"],
+    progress: Callable[[int, int], None],
+    empty: Mapping,
+    options: MappingOptions,
+) -> tuple[Mapping, dict[int, str]] | None:
+    """A model of images that are not taken, and why others do not fit; None where there is no start."""
+    if method == "incremental":
+        return grow_model(replace(empty, registered=taken), options, progress)
+    placed = (global_start if method == "global" else window_start)(empty, ~taken, options)
+    return None if placed is None else extend_model(placed, taken, options, progress)
 
 
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:

@@ -1,0 +1,71 @@
+"""Photographs that were cropped: principal points are found where the images say that they are not in the middle."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsfm.geometry import Camera, Pose, Radial, intrinsics
+from torchsfm.reconstruction import SfmResult, models, reconstruct_tracks
+from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.simulation import look_at, random_points, simulate_images
+
+SIZE = (1000, 750)
+MIDDLE = torch.tensor([499.5, 374.5], dtype=torch.float64)
+
+
+def photographs(generator: torch.Generator, focal: Tensor, *, share: float) -> tuple[SfmResult, Pose, Tensor]:
+    """Simulated photographs of one facade with relief, of which up to a share of each side was cut off: result and truth.
+
+    Of one camera that has focal length `focal`, or of several.
+    """
+    v, options = 8, {"generator": generator, "dtype": torch.float64}
+    X = random_points(250, kind="cube", **options) * torch.tensor([4.0, 3.0, 1.5])
+    angle, distance = 1.6 * torch.rand(v, **options) - 0.8, 7 + 4 * torch.rand(v, **options)
+    centre = torch.stack((distance * angle.sin(), torch.randn(v, **options), -distance * angle.cos()), -1)
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    poses = look_at(centre, torch.randn(v, 3, **options) * torch.tensor([0.7, 0.4, 0.1]), up)
+    zero = torch.zeros(v, dtype=torch.float64)
+    cameras = Camera(intrinsics(focal.expand(v), MIDDLE.expand(v, 2)), Radial(zero - 0.05, zero))
+    seen = simulate_images(
+        X, poses, cameras, image_size=SIZE, noise=0.3, dropout=0.2, depth_range=(2.0, 25.0), generator=generator
+    )
+    whole = torch.tensor(SIZE)
+    first = (torch.rand(v, 2, **options) * share * whole).long()
+    # No two are of one size, also where nothing much is cut.
+    last = whole - (torch.rand(v, 2, **options) * share * whole).long() - torch.arange(v)[:, None]
+    inside = ((seen.x >= first[:, None]) & (seen.x < last[:, None])).all(-1)
+    view, track = (seen.visible & inside).nonzero(as_tuple=True)
+    result = reconstruct_tracks(seen.x[view, track] - first[view], view, track, last - first)
+    return result, poses, MIDDLE - first
+
+
+def angles(result: SfmResult, poses: Pose) -> Tensor:
+    """Errors of relative rotations, in degrees."""
+    return pose_errors(result.model.poses, poses, result.model.registered).rotation
+
+
+def test_crops_of_one_camera(generator: torch.Generator) -> None:
+    result, poses, c = photographs(generator, torch.tensor([1200.0]).double(), share=0.2)
+    assert bool(result.model.registered.all())
+    assert float(angles(result, poses).max()) < 0.5
+    (found,) = result.report.calibrations
+    assert bool((found.values[:, 0] == found.values[0, 0]).all())
+    assert float(((found.values[:, 0] - 1200) / found.deviation[:, 0]).abs().max()) < 5
+    assert float(((found.values[:, 1:3] - c) / found.deviation[:, 1:3]).abs().max()) < 5
+    assert not any(image.doubt for image in result.report.images)
+
+
+def test_crops_of_several_cameras(generator: torch.Generator) -> None:
+    focal = 900 + 500 * torch.rand(8, generator=generator, dtype=torch.float64)
+    result, poses, c = photographs(generator, focal, share=0.2)
+    (found,) = result.report.calibrations
+    assert float(angles(result, poses).max()) < 1
+    assert float(((found.values[:, 0] - focal) / found.deviation[:, 0]).abs().max()) < 5
+    assert float(((found.values[:, 1:3] - c) / found.deviation[:, 1:3]).abs().max()) < 5
+
+
+def test_whole_photographs_are_not_made_anew(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(models, "map_cropped", lambda *given: pytest.fail("nothing is cropped"))
+    focal = 900 + 500 * torch.rand(8, generator=generator, dtype=torch.float64)
+    result, poses, _ = photographs(generator, focal, share=0.0)
+    assert float(angles(result, poses).max()) < 0.5
