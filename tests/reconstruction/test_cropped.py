@@ -7,6 +7,7 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
 from torchsfm.reconstruction import SfmResult, models, reconstruct_tracks
 from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.written_report import report_markdown, report_record
 from torchsfm.simulation import look_at, random_points, simulate_images
 
 SIZE = (1000, 750)
@@ -53,12 +54,15 @@ def test_crops_of_one_camera(generator: torch.Generator) -> None:
     assert float(((found.values[:, 0] - 1200) / found.deviation[:, 0]).abs().max()) < 5
     assert float(((found.values[:, 1:3] - c) / found.deviation[:, 1:3]).abs().max()) < 5
     assert not any(image.doubt for image in result.report.images)
+    for text in (result.report.summary(), report_markdown(report_record(result))):
+        assert "the images seem to be cropped, all of one camera" in text
 
 
 def test_crops_of_several_cameras(generator: torch.Generator) -> None:
     focal = 900 + 500 * torch.rand(8, generator=generator, dtype=torch.float64)
     result, poses, c = photographs(generator, focal, share=0.2)
     (found,) = result.report.calibrations
+    assert "of several cameras" in found.remark
     assert float(angles(result, poses).max()) < 1
     assert float(((found.values[:, 0] - focal) / found.deviation[:, 0]).abs().max()) < 5
     assert float(((found.values[:, 1:3] - c) / found.deviation[:, 1:3]).abs().max()) < 5

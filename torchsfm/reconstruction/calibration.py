@@ -50,6 +50,8 @@ class Calibration:
         estimated: Which of them were estimated; the others were held where they were expected or given.
         deviation: Their standard deviations; zero where they were given.
         prior: Their standard deviations before any image point was seen; zero where they were given.
+        cropped: Whether the images were found to be cut out of larger ones, so that principal points lie anywhere.
+        alike: Whether they were found to be of one camera then, and have its focal length and distortion in common.
     """
 
     status: Status
@@ -60,6 +62,16 @@ class Calibration:
     estimated: Bool[Tensor, "g k"]
     deviation: Float[Tensor, "g k"]
     prior: Float[Tensor, "g k"]
+    cropped: bool = False
+    alike: bool = False
+
+    @property
+    def remark(self) -> str:
+        """What is unusual about the cameras, in plain words; empty where nothing is."""
+        if not self.cropped:
+            return ""
+        whose = "all of one camera, whose focal length they share" if self.alike else "of several cameras"
+        return f"the images seem to be cropped, {whose}: their principal points were looked for far from the middle, too"
 
     def camera_doubts(self, camera: int) -> list[str]:
         """What should not be trusted in a camera, in plain words."""
@@ -109,7 +121,8 @@ def calibration_of(
         places = [names.index(labels[column]) for column in known.columns]
         before[:, places], estimated[:, places] = known.prior.sqrt(), chosen
         deviation[:, places] = torch.where(chosen, variance, known.prior).sqrt().nan_to_num(torch.inf, torch.inf)
-    return Calibration(adjusted.status, adjusted.iterations, noise, names, values, estimated, deviation, before)
+    found = Calibration(adjusted.status, adjusted.iterations, noise, names, values, estimated, deviation, before)
+    return replace(found, cropped=prior.cropped, alike=prior.alike)
 
 
 def measure_noise(mapping: Mapping, loss: Cauchy) -> float:

@@ -33,11 +33,13 @@ class CameraPrior:
     Attributes:
         mean: The cameras expected.
         sigma: Standard deviations by the names `bundle_adjust` knows: of "focal" as a fraction, of others in their own unit.
-        alike: Whether all are one camera, whose images were cut out of larger ones: principal points alone differ.
+        cropped: Whether images may have been cut out of larger ones.
+        alike: Whether all are one camera then: principal points alone differ.
     """
 
     mean: Camera
     sigma: Dict[str, Float[Tensor, "g"]]
+    cropped: bool = False
     alike: bool = False
 
     @classmethod
@@ -53,7 +55,7 @@ class CameraPrior:
         for name in mean.distortion.parameter_names:
             width = TANGENTIAL_SIGMA if name in ("p1", "p2") else RADIAL_SIGMA
             sigma[name] = torch.full((g,), width, dtype=mean.K.dtype)
-        return cls(mean, sigma, alike)
+        return cls(mean, sigma, cropped, alike)
 
     def terms(self, noise: float, names: Iterable[str], used: Bool[Tensor, "g"]) -> dict[str, Any]:
         """The prior in the words of `bundle_adjust`, for a cost that takes the image points' noise to be one pixel.

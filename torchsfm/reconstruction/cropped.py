@@ -20,7 +20,6 @@ from torchsfm.autocalibration import focal_from_fundamentals
 from torchsfm.geometry import Camera
 from torchsfm.reconstruction.adjust import LOSS, adjust
 from torchsfm.reconstruction.calibration import calibration_of, choose_free, images_of_cameras, measure_noise
-from torchsfm.reconstruction.camera_prior import CROPPED_SIGMA, PRINCIPAL_POINT_SIGMA
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA, telling_pairs
 from torchsfm.reconstruction.consistency import excess_scatter
 from torchsfm.reconstruction.incremental import MappingOptions, extend_model
@@ -28,11 +27,13 @@ from torchsfm.reconstruction.mapping import Mapping
 
 MIN_IMAGES = 3
 """Fewer leave cameras as they were expected."""
+ODDS = math.log(100)
+"""Principal points are not in the middle where that is so much more probable."""
 FOCAL_FAULTS = 0.02
 """By how much a photograph's own faults make its focal length look another."""
 MOST, CHANGED = 4, 0.05
 """Models made with one camera, at most, from focal lengths that differ by more than this part."""
-ENOUGH: dict[str, Any] = {"max_iterations": 50}
+ENOUGH: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
 """Where adjustments that are compared end."""
 
 Grown = tuple[Mapping, dict[int, str]]
@@ -50,16 +51,25 @@ def may_be_off_centre(model: Mapping, options: MappingOptions) -> bool:
     believed = adjusted.get("principal_point", torch.zeros_like(images, dtype=torch.bool))
     if "principal_point" not in options.free or int(images.sum()) < MIN_IMAGES or bool(((images != 1) | believed).all()):
         return False
-    gain, cost, excess = _gain_off_centre(model, options)
+    gain, excess = _gain_off_centre(model, options)
     # A wrong model has errors of all kinds: where they alone leave it open, a better one will tell.
-    return gain * excess > cost
+    return _are_off(excess * gain, model)
 
 
-def _gain_off_centre(model: Mapping, options: MappingOptions) -> tuple[float, float, float]:
-    """How much more probable the images are if principal points lie anywhere, what that costs, and the excess scatter.
+def _are_off(gain: float, model: Mapping) -> bool:
+    """Whether principal points scatter so much wider than expected, rather than so by chance.
 
-    The wide prior must win by more than all that it costs: for each coordinate the logarithm of how much wider it is. Errors
-    that matches have in common count: images say less by as much as these move pairs of images more than noise does.
+    `gain` is half the sum of their squares, in units of what was expected: the wider Gaussian is the one of their own width.
+    """
+    n = 2 * int((images_of_cameras(model) == 1).sum())
+    square = 2 * gain / max(n, 1)
+    return square > 1 and n / 2 * (square - 1 - math.log(square)) > ODDS
+
+
+def _gain_off_centre(model: Mapping, options: MappingOptions) -> tuple[float, float]:
+    """How much more probable the images are if principal points lie anywhere, as a logarithm; and their excess scatter.
+
+    Errors that matches have in common count: images say less by as much as these move pairs of images more than noise does.
     """
     lone = images_of_cameras(model) == 1
     prior, wide = (replace(options, cropped=cropped).prior(model) for cropped in (False, True))
@@ -67,12 +77,11 @@ def _gain_off_centre(model: Mapping, options: MappingOptions) -> tuple[float, fl
     free["principal_point"] = free["principal_point"] | lone
     far = adjust(model, free=free, prior=wide, **ENOUGH)
     excess = excess_scatter(far, threshold=options.reprojection)
-    far = adjust(far, free=free, prior=wide.against(excess), **ENOUGH)
     near = adjust(far, free=free, prior=prior.against(excess), **ENOUGH)
+    far = adjust(near, free=free, prior=wide.against(excess), **ENOUGH)
     if near.adjustment is None or far.adjustment is None:
-        return 0.0, 0.0, 1.0
-    gain = (near.adjustment.cost - far.adjustment.cost) / (measure_noise(far, LOSS) ** 2 * excess)
-    return gain, 2 * int(lone.sum()) * math.log(CROPPED_SIGMA / PRINCIPAL_POINT_SIGMA), excess
+        return 0.0, 1.0
+    return (near.adjustment.cost - far.adjustment.cost) / (measure_noise(far, LOSS) ** 2 * excess), excess
 
 
 def map_cropped(
@@ -105,9 +114,8 @@ def map_cropped(
     if found is None or not _one_camera(found[0][0], found[1]):
         found = extend_model(grown, elsewhere, cropped, progress), cropped
     (model, _), made = found
-    gain, cost, _ = _gain_off_centre(model, made)
     better = _score(model, options.reprojection) > _score(grown, options.reprojection)
-    return found if better and gain > cost else None
+    return found if better and _are_off(_gain_off_centre(model, made)[0], model) else None
 
 
 def _of_one_camera(

@@ -16,14 +16,13 @@ from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
-from torchsfm.reconstruction.choose_mapper import choose_mapper
+from torchsfm.reconstruction.choose_mapper import choose_mapper, grow_by
 from torchsfm.reconstruction.consistency import PairAgreement
 from torchsfm.reconstruction.cropped import map_cropped, may_be_off_centre
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
-from torchsfm.reconstruction.global_start import global_start
-from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
+from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.projective import projective_start
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -34,7 +33,6 @@ from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import Unfolded, hanging_on_copies, unfold
 from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph
-from torchsfm.reconstruction.windows import window_start
 
 METHODS = ("incremental", "projective", "global", "windows", "auto")
 MIN_IMAGES = 2
@@ -107,11 +105,12 @@ def build_models(
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, options.focal_sigma[camera_index])
         empty = Mapping.start(graph, track, cameras, camera_index)
-        made: list[tuple[Reconstruction, Mapping, MappingOptions, Unfolded | None, PairAgreement | None]] = []
+        made: list[tuple[Reconstruction, Mapping, MappingOptions, bool, Unfolded | None, PairAgreement | None]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
         taken = given_up = empty.registered
         while int((~taken).sum()) >= MIN_IMAGES:
+            left_open = False
             report = lambda n, v: progress("map", n, v)  # noqa: E731
             if method == "projective":
                 start = projective_start(empty, ~taken, threshold=options.reprojection, min_angle=options.min_angle)
@@ -128,14 +127,14 @@ def build_models(
                 metric = replace(options, expected=start.expected(), focal_sigma=start.focal_sigma)
                 mapped, known = extend_model(start.mapping, taken, metric, report), metric
             else:
-                grow = partial(_grow, method, taken, report)
+                grow = partial(grow_by, method, taken, report)
                 grown = grow(empty, options)
                 if grown is None:
                     break
                 mapped, known = grown, options
-                if may_be_off_centre(mapped[0], options):
-                    cropped = map_cropped(empty, mapped[0], taken, options, family, grow, report)
-                    mapped, known = cropped or (mapped, known)
+                left_open = may_be_off_centre(mapped[0], options)
+                if left_open and (cropped := map_cropped(empty, mapped[0], taken, options, family, grow, report)):
+                    (mapped, known), left_open = cropped, False
             model, failed = mapped
             model, parted, agreement = settle(model, taken, known, report)
             settled = model
@@ -159,22 +158,24 @@ def build_models(
                 reasons |= failed
             taken = taken | model.registered
             finished = replace(model.reconstruction(), lines=lines, curves=curves)
-            made.append((finished, model, known, unfolded, agreement if model is settled else None))
+            made.append((finished, model, known, left_open, unfolded, agreement if model is settled else None))
             if stages.folder is not None:
                 _save_model(made[-1][0], stages.folder, len(made) - 1)
         found: list[tuple[Reconstruction, Standing, Calibration]] = []
-        for finished, model, known, unfolded, agreement in made:
+        for finished, model, known, left_open, unfolded, agreement in made:
             prior, threshold = known.prior(model), options.reprojection
             uncertain = None if unfolded is None else unfolded.uncertain
             # Lines move the cameras.
             conflicts = None if unfolded is None or model is not unfolded.model else unfolded.conflicts
             if uncertain is not None and bool(given_up.any()):
                 uncertain = uncertain | hanging_on_copies(graph, model, taken & ~model.registered, threshold=threshold)
+            # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
+            widest = replace(known, cropped=known.cropped or left_open).prior(model)
             standing = examine(
-                model, open_numbers=free, prior=prior, threshold=threshold, uncertain=uncertain, conflicts=conflicts,
+                model, open_numbers=free, prior=widest, threshold=threshold, uncertain=uncertain, conflicts=conflicts,
                 agreement=agreement, elsewhere=matches_across(graph, model.registered, taken & ~model.registered),
             )  # fmt: skip
-            covariance = None if standing.intrinsics is None else (free, standing.intrinsics)
+            covariance = None if standing.intrinsics is None or left_open else (free, standing.intrinsics)
             found.append((finished, standing, calibration_of(model, prior, loss=LOSS, covariance=covariance)))
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", len(graph.names), len(graph.names))
@@ -188,20 +189,6 @@ def build_models(
         still=graph.still,
     )  # fmt: skip
     return SfmResult(tuple(model for model, _, _ in found), course)
-
-
-def _grow(
-    method: str,
-    taken: Bool[Tensor, "v"],
-    progress: Callable[[int, int], None],
-    empty: Mapping,
-    options: MappingOptions,
-) -> tuple[Mapping, dict[int, str]] | None:
-    """A model of images that are not taken, and why others do not fit; None where there is no start."""
-    if method == "incremental":
-        return grow_model(replace(empty, registered=taken), options, progress)
-    placed = (global_start if method == "global" else window_start)(empty, ~taken, options)
-    return None if placed is None else extend_model(placed, taken, options, progress)
 
 
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:

@@ -179,7 +179,8 @@ class Report:
         lines += [f"autocalibration: {text}" for text in self.autocalibration]
         for number, calibration in enumerate(self.calibrations):
             prefix = f"model {number}: " if len(self.calibrations) > 1 else ""
-            lines += [prefix + text for text in calibration.doubts()]
+            remarks = [calibration.remark] if calibration.remark else []
+            lines += [prefix + text for text in (*remarks, *calibration.doubts())]
         for image in self.images:
             if image.model is None:
                 lines.append(printable(f"not registered: {image.name} ({image.reason})"))

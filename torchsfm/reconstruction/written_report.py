@@ -164,6 +164,7 @@ def _model_record(model: Reconstruction, found: Calibration | None) -> Record:
             "converged": found.status == Status.OK,
             "adjustment_steps": found.iterations,
             "noise_px": found.noise,
+            "remark": found.remark,
         }
     return {
         "images": model.num_registered,
@@ -231,6 +232,8 @@ def _models_text(record: Record) -> list[str]:
         if "converged" in model:
             ending = "converged" if model["converged"] else "did not converge"
             rows.append(["last adjustment", f"{ending} in {model['adjustment_steps']} steps"])
+        if model.get("remark"):
+            rows.append(["cameras", model["remark"]])
         for camera in model["cameras"]:
             rows.append([f"camera of {camera['images']} images ({camera['model']})", _camera_text(camera)])
         lines += [*_table(["", ""], rows), ""]
