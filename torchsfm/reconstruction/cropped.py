@@ -112,7 +112,10 @@ def map_cropped(
     if len(torch.unique(family[grown.registered])) == 1:
         found = _of_one_camera(empty, grown, cropped, grow)
     if found is None or not _one_camera(found[0][0], found[1]):
-        found = extend_model(grown, elsewhere, cropped, progress), cropped
+        several = extend_model(grown, elsewhere, cropped, progress), cropped
+        # Several cameras explain more than one in the right place can: if they do not, the model is wrong, not the tie.
+        if found is None or _score(several[0][0], options.reprojection) > _score(found[0][0], options.reprojection):
+            found = several
     (model, _), made = found
     better = _score(model, options.reprojection) > _score(grown, options.reprojection)
     return found if better and _are_off(_gain_off_centre(model, made)[0], model) else None
