@@ -217,7 +217,7 @@ class _Occupied:
         own, alike = torch.arange(len(pixel)), torch.zeros_like(pixel, dtype=torch.bool)
         while len(own):
             # Of the points at a pixel one after the other, until one looks like it.
-            held = self.pixel[there.clamp(max=last)] == pixel[own]
+            held = (there <= last) & (self.pixel[there.clamp(max=last)] == pixel[own])
             own, there = own[held], there[held]
             fits = self.looks.alike(like[own], self.point[there]) if self.looks is not None else torch.ones_like(there) > 0
             alike[own[fits]] = True
