@@ -69,6 +69,25 @@ def crops_more(image: Image, number: int, random: np.random.Generator) -> Image:
     return crops(image, number, random, 4)
 
 
+def zoom(image: Image, number: int, random: np.random.Generator) -> Image:
+    """A zoom lens: the middle, up to 1.7 times as large, at the size of the image."""
+    h, w = image.shape[:2]
+    scale = float(random.uniform(1.0, 1.7))
+    centre = np.array([w - 1, h - 1]) / 2
+    map_ = np.array([[scale, 0, centre[0] * (1 - scale)], [0, scale, centre[1] * (1 - scale)]])
+    return _image(cv2.warpAffine(image, map_, (w, h), flags=cv2.INTER_CUBIC))
+
+
+def barrel(image: Image, number: int, random: np.random.Generator) -> Image:
+    """As a wide lens of an action camera bends it: by 15 % in the corners."""
+    h, w = image.shape[:2]
+    f, bend = 0.9 * w, np.array([-0.3, 0.0, 0.0, 0.0])
+    K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+    grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 1, 2).astype(np.float64)
+    source = cv2.undistortPoints(grid, K, bend, P=K).reshape(h, w, 2).astype(np.float32)
+    return _image(cv2.remap(image, source, None, cv2.INTER_CUBIC))
+
+
 def turned(image: Image, number: int, random: np.random.Generator) -> Image:
     """One in three by a quarter."""
     return _image(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)) if number % 3 == 1 else image
@@ -99,7 +118,9 @@ def plain(image: Image, number: int, random: np.random.Generator) -> Image:
     return image
 
 
-SPOILS: tuple[Spoil, ...] = (plain, watermark, strip, sizes, crops, crops_less, crops_more, turned, exposure, blur, vignette)
+SPOILS: tuple[Spoil, ...] = (
+    plain, watermark, strip, sizes, crops, crops_less, crops_more, zoom, barrel, turned, exposure, blur, vignette,
+)  # fmt: skip
 FOLDERS = (*(spoil.__name__ for spoil in SPOILS), "gray", "jpeg", "duplicates", "again", "mirrored", "strangers")
 
 

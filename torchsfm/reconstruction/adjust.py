@@ -136,3 +136,15 @@ def neighbourhood(mapping: Mapping, new: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]
     moving = new.clone()
     moving[closest[shared[closest] > 0]] = True
     return moving
+
+
+def support(mapping: Mapping, threshold: float) -> float:
+    """By how much the observations of a model are better than such that just do not fit, all together.
+
+    Args:
+        mapping: The model.
+        threshold: Largest reprojection error of an inlier in pixels.
+    """
+    node = mapping.observations()
+    square = mapping.errors(mapping.point[node], node).clamp(max=threshold).square()
+    return float((LOSS(square.new_tensor(threshold**2)) - LOSS(square)).sum())

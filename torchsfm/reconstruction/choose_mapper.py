@@ -1,18 +1,12 @@
-"""Which mapper suits a view graph: from two images on, or all images at once; and to do as one of them does."""
-
-from collections.abc import Callable
-from dataclasses import replace
+"""Which mapper suits a view graph: from two images on, or all images at once."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.motion.many_views.components import components
-from torchsfm.reconstruction.global_start import global_start
-from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model, grow_model
-from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL
 from torchsfm.reconstruction.view_graph import MIN_INLIERS
-from torchsfm.reconstruction.windows import window_start
 
 MANY = 500
 """Images that hang together, from which on they are mapped at once: up to 200 at least, one by one is as exact and as fast."""
@@ -45,24 +39,3 @@ def choose_mapper(pairs: Int[Tensor, "q 2"], inliers: Int[Tensor, "q"], focal_si
         return float(good[largest].double().mean()) >= MOST
 
     return "global" if int(largest.sum()) >= MANY and most(held) and most(known) else "incremental"
-
-
-def grow_by(
-    method: str, taken: Bool[Tensor, "v"], progress: Callable[[int, int], None], empty: Mapping, options: MappingOptions
-) -> tuple[Mapping, dict[int, str]] | None:
-    """A model as one of the mappers makes it that start from known or guessed cameras.
-
-    Args:
-        method: "incremental", "global" or "windows".
-        taken: Images that belong to other models and are left alone.
-        progress: Called with the number of registered images and of all.
-        empty: A mapping without images, with the cameras to start from.
-        options: How models are made.
-
-    Returns:
-        The model, and for each image that was tried and did not fit the reason; None where there is no start.
-    """
-    if method == "incremental":
-        return grow_model(replace(empty, registered=taken), options, progress)
-    placed = (global_start if method == "global" else window_start)(empty, ~taken, options)
-    return None if placed is None else extend_model(placed, taken, options, progress)

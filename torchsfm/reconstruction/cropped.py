@@ -18,7 +18,8 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.autocalibration import focal_from_fundamentals
 from torchsfm.geometry import Camera
-from torchsfm.reconstruction.adjust import LOSS, adjust
+from torchsfm.reconstruction.adjust import LOSS, adjust, support
+from torchsfm.reconstruction.beginning import Grown
 from torchsfm.reconstruction.calibration import calibration_of, choose_free, images_of_cameras, measure_noise
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA, telling_pairs
 from torchsfm.reconstruction.consistency import excess_scatter
@@ -35,8 +36,6 @@ MOST, CHANGED = 4, 0.05
 """Models made with one camera, at most, from focal lengths that differ by more than this part."""
 ENOUGH: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
 """Where adjustments that are compared end."""
-
-Grown = tuple[Mapping, dict[int, str]]
 
 
 def may_be_off_centre(model: Mapping, options: MappingOptions) -> bool:
@@ -114,10 +113,10 @@ def map_cropped(
     if found is None or not _one_camera(found[0][0], found[1]):
         several = extend_model(grown, elsewhere, cropped, progress), cropped
         # Several cameras explain more than one in the right place can: if they do not, the model is wrong, not the tie.
-        if found is None or _score(several[0][0], options.reprojection) > _score(found[0][0], options.reprojection):
+        if found is None or support(several[0][0], options.reprojection) > support(found[0][0], options.reprojection):
             found = several
     (model, _), made = found
-    better = _score(model, options.reprojection) > _score(grown, options.reprojection)
+    better = support(model, options.reprojection) > support(grown, options.reprojection)
     return found if better and _are_off(_gain_off_centre(model, made)[0], model) else None
 
 
@@ -127,7 +126,7 @@ def _of_one_camera(
     """The best model of images of one camera that were cropped, from several focal lengths, and how it was made."""
     best: tuple[Grown, MappingOptions, float] | None = None
     images = empty.camera_index[grown.registered]
-    bar = _score(grown, options.reprojection)
+    bar = support(grown, options.reprojection)
     focals = [_focal_of_pairs(empty), *(float(c.K[images, 0, 0].median()) for c in (options.expected, grown.cameras))]
     tried: list[float] = []
     sigma = torch.full_like(options.focal_sigma, FOCAL_SIGMA["fundamental matrices"])
@@ -140,7 +139,7 @@ def _of_one_camera(
         trial = grow(replace(empty, cameras=one.expected), one)
         if trial is None:
             continue
-        score = _score(trial[0], options.reprojection)
+        score = support(trial[0], options.reprojection)
         if score < bar:
             # Not of one camera, or else the first focal lengths would be more wrong than those of a wrong model.
             break
@@ -168,13 +167,6 @@ def _one_camera(model: Mapping, options: MappingOptions) -> bool:
     square = (focal - focal.median()).square()
     same, other = (noise + width**2 for width in (FOCAL_FAULTS, FOCAL_SIGMA["fundamental matrices"]))
     return bool((square / same + same.log() < square / other + other.log()).all())
-
-
-def _score(model: Mapping, threshold: float) -> float:
-    """By how much the observations of a model are better than such that just do not fit, all together."""
-    node = model.observations()
-    square = model.errors(model.point[node], node).clamp(max=threshold).square()
-    return float((LOSS(square.new_tensor(threshold**2)) - LOSS(square)).sum())
 
 
 def _focal_of_pairs(empty: Mapping) -> float | None:

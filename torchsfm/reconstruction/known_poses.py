@@ -17,9 +17,9 @@ from torchsfm.reconstruction.adjust import LOSS, about_cameras, adjust
 from torchsfm.reconstruction.calibration import choose_free
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.doubt import examine
+from torchsfm.reconstruction.image_reports import image_reports
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE, UNKNOWN_FOCAL, MappingOptions, next_images
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.models import image_reports
 from torchsfm.reconstruction.photographs import NEIGHBOURS, MatchedPhotographs, match_photographs
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.register import register_images

@@ -14,33 +14,34 @@ from torchsfm._types import check_one_problem, check_options
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS
+from torchsfm.reconstruction.beginning import Beginning, grow_by
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
-from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
-from torchsfm.reconstruction.choose_mapper import choose_mapper, grow_by
+from torchsfm.reconstruction.cameras import group_cameras
+from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.consistency import PairAgreement
 from torchsfm.reconstruction.cropped import map_cropped, may_be_off_centre
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
+from torchsfm.reconstruction.image_reports import image_reports
 from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL, MappingOptions, extend_model
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.projective import projective_start
 from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
+from torchsfm.reconstruction.report import Progress, ReconstructionError, Report, SfmResult, pair_report
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.stages import Stages, one_thread
 from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import Unfolded, hanging_on_copies, unfold
-from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph
+from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.zoomed import better_beginning, part_zoomed
 
 METHODS = ("incremental", "projective", "global", "windows", "auto")
 MIN_IMAGES = 2
 """Smallest number of images of a model."""
 FEW_IMAGES = 60
 """Models of so few images have matrices too small to share between threads."""
-MIN_FEATURES = 30
-"""An image with fewer features shows nothing to match."""
 
 
 def build_models(
@@ -90,10 +91,6 @@ def build_models(
         raise ReconstructionError("the projective method finds the camera itself; known intrinsics are for the incremental one")
     few = len(graph.names) <= FEW_IMAGES
     with stages.timed("map"), one_thread() if few else nullcontext():
-        camera_index = group_cameras(graph.image_size, labels, shared_camera)
-        cameras, source = guess_cameras(graph, camera_index, model=camera, K=K, exif_focal=exif_focal)
-        # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
-        family = group_cameras(torch.zeros_like(graph.image_size), labels, shared_camera)
         matched = track is None
         if track is None:
             # Matches of strongly linked pairs come first: they are wrong less often.
@@ -101,17 +98,28 @@ def build_models(
         free: tuple[str, ...] = () if K is not None else ("focal",)
         free += DISTORTION_MODELS[camera].parameter_names
         free += ("principal_point",) if free_principal_point and K is None else ()
-        options = MappingOptions(free=free, expected=cameras, focal_sigma=focal_uncertainty(source), generator=generator)
+        begin = partial(
+            Beginning.of, graph, track, model=camera, K=K, exif_focal=exif_focal, free=free, generator=generator
+        )  # fmt: skip
+        together = group_cameras(graph.image_size, labels, shared_camera)
+        begun = begin(together)
         if method == "auto":
-            method = choose_mapper(graph.pairs, graph.fundamental_inliers, options.focal_sigma[camera_index])
-        empty = Mapping.start(graph, track, cameras, camera_index)
+            method = choose_mapper(graph.pairs, graph.fundamental_inliers, begun.options.focal_sigma[together])
+        report = lambda n, v: progress("map", n, v)  # noqa: E731
+        if shared_camera is None and K is None:
+            apart = part_zoomed(graph, together, torch.tensor([focal is not None for focal in exif_focal]))
+            if apart is not None:
+                begun = better_beginning(begun, begin(apart), partial(_settled, method, report))
+        empty, options, source = begun.empty, begun.options, begun.source
+        cameras, camera_index = empty.cameras, empty.camera_index
+        # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
+        family = group_cameras(torch.zeros_like(graph.image_size), labels, shared_camera)
         made: list[tuple[Reconstruction, Mapping, MappingOptions, bool, Unfolded | None, PairAgreement | None]] = []
         reasons: dict[int, str] = {}
         autocalibration: list[str] = []
         taken = given_up = empty.registered
         while int((~taken).sum()) >= MIN_IMAGES:
             left_open = False
-            report = lambda n, v: progress("map", n, v)  # noqa: E731
             if method == "projective":
                 start = projective_start(empty, ~taken, threshold=options.reprojection, min_angle=options.min_angle)
                 if start is None:
@@ -191,6 +199,12 @@ def build_models(
     return SfmResult(tuple(model for model, _, _ in found), course)
 
 
+def _settled(method: str, progress: Callable[[int, int], None], empty: Mapping, options: MappingOptions) -> Mapping | None:
+    """The first model, without images that contradict it."""
+    grown = grow_by(method, empty.registered, progress, empty, options)
+    return None if grown is None else settle(grown[0], empty.registered, options, progress)[0]
+
+
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
     (folder / "stages").mkdir(parents=True, exist_ok=True)
     model.save(folder / "stages" / f"model-{number}.npz")
@@ -203,48 +217,6 @@ def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool
         across = registered[own] & others[other]
         total.index_add_(0, own[across], graph.fundamental_inliers[across])
     return total
-
-
-def image_reports(
-    graph: ViewGraph,
-    found: Sequence[tuple[Reconstruction, Standing]],
-    reasons: dict[int, str],
-    failures: dict[str, str],
-    order: Sequence[str],
-) -> tuple[ImageReport, ...]:
-    """What became of each file, in the order of the input.
-
-    Args:
-        graph: Image points and verified matches of the images that could be read.
-        found: The models, and what is thought of their cameras.
-        reasons: Why images are in none of them, by index.
-        failures: Files that could not be read, with the reason.
-        order: All files.
-    """
-    features = torch.bincount(graph.view, minlength=len(graph.names)).tolist()
-    related = graph.pairs[torch.maximum(graph.fundamental_inliers, graph.homography_inliers) >= MIN_INLIERS].flatten()
-    linked = torch.bincount(related, minlength=len(graph.names)).tolist()
-    reports: list[ImageReport] = []
-    position = 0
-    for name in order:
-        if name in failures:
-            reports.append(ImageReport(name, None, failures[name]))
-            continue
-        i, position = position, position + 1
-        model = next((k for k, (m, _) in enumerate(found) if bool(m.registered[i])), None)
-        if model is not None:
-            standing = found[model][1]
-            sigma = {"rotation_sigma": float(standing.rotation_sigma[i]), "position_sigma": float(standing.position_sigma[i])}
-            reports.append(ImageReport(name, model, "", features[i], doubt=standing.doubt[i], **sigma))
-            continue
-        if features[i] < MIN_FEATURES:
-            reason = f"only {features[i]} features: nothing to match"
-        elif not linked[i]:
-            reason = "has too little in common with every other image"
-        else:
-            reason = reasons.get(i, "sees too few of the reconstructed points")
-        reports.append(ImageReport(name, model, reason, features[i]))
-    return tuple(reports)
 
 
 @on_the_cpu

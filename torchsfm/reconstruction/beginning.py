@@ -1,0 +1,67 @@
+"""What models grow from: an empty mapping with first cameras, and how it is to be made."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.reconstruction.cameras import focal_uncertainty, guess_cameras
+from torchsfm.reconstruction.global_start import global_start
+from torchsfm.reconstruction.incremental import MappingOptions, extend_model, grow_model
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.windows import window_start
+
+Grown = tuple[Mapping, dict[int, str]]
+"""A model, and why images that were tried do not fit."""
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """A mapping before anything is registered."""
+
+    empty: Mapping
+    options: MappingOptions
+    source: tuple[str, ...]
+    """Where each camera's first focal length comes from."""
+
+    @classmethod
+    def of(
+        cls,
+        graph: ViewGraph,
+        track: Int[Tensor, "n"],
+        camera_index: Int[Tensor, "v"],
+        *,
+        model: str,
+        K: Float[Tensor, "3 3"] | None,
+        exif_focal: Sequence[float | None],
+        free: tuple[str, ...],
+        generator: torch.Generator,
+    ) -> "Beginning":
+        """With the best guess of the cameras; see `guess_cameras` and `MappingOptions`."""
+        cameras, source = guess_cameras(graph, camera_index, model=model, K=K, exif_focal=exif_focal)
+        options = MappingOptions(free=free, expected=cameras, focal_sigma=focal_uncertainty(source), generator=generator)
+        return cls(Mapping.start(graph, track, cameras, camera_index), options, source)
+
+
+def grow_by(
+    method: str, taken: Bool[Tensor, "v"], progress: Callable[[int, int], None], empty: Mapping, options: MappingOptions
+) -> Grown | None:
+    """A model as one of the mappers makes it that start from known or guessed cameras.
+
+    Args:
+        method: "global", "windows", or else one by one.
+        taken: Images that belong to other models and are left alone.
+        progress: Called with the number of registered images and of all.
+        empty: A mapping without images, with the cameras to start from.
+        options: How models are made.
+
+    Returns:
+        The model, and for each image that was tried and did not fit the reason; None where there is no start.
+    """
+    if method not in ("global", "windows"):
+        return grow_model(replace(empty, registered=taken), options, progress)
+    placed = (global_start if method == "global" else window_start)(empty, ~taken, options)
+    return None if placed is None else extend_model(placed, taken, options, progress)
