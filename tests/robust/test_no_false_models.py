@@ -11,8 +11,9 @@ from scenes import make_scene
 from torchsfm import motion, resection
 from torchsfm._types import Status, tensor_map
 from torchsfm.geometry import transform_points
-from torchsfm.linalg import damped_solve
+from torchsfm.linalg import damped_solve, determinant_3x3
 from torchsfm.motion import (
+    FundamentalEstimator,
     HomographyEstimator,
     estimate_essential,
     estimate_fundamental,
@@ -20,7 +21,7 @@ from torchsfm.motion import (
     estimate_upright,
 )
 from torchsfm.resection import estimate_camera
-from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac, NeverZero
+from torchsfm.robust import InlierCount, LeastMedian, Magsac, Msac, NeverZero, constant_weights
 from torchsfm.robust.hypotheses import losses, squared_residual
 from torchsfm.robust.local_optimisation import optimise_fully, step_within
 from torchsfm.triangulation import ESTIMATORS as OF_POINTS
@@ -78,9 +79,21 @@ def test_steps_are_bounded_where_all_curvatures_vanish(kind: type, generator: to
     one, _ = step_within(estimator, start, data, reach, counts)
     assert torch.isfinite(one).all()
     assert ((one - start).flatten(1).norm(dim=-1) < 10 * (1 + start.flatten(1).norm(dim=-1))).all()
-    final, settled = optimise_fully(estimator, start, data, reach, counts)
+    final, settled = optimise_fully(estimator, start, one, data, reach, counts)
     assert torch.isfinite(final).all()
     assert (loss(final)[settled] <= loss(one)[settled] * (1 + 1e-4) + 1e-9).all()
+
+
+def test_steps_of_any_length_end_at_a_determinant_of_zero(generator: torch.Generator) -> None:
+    """Beside the manifold the loss may be less than anywhere on it: every step from there would be taken back."""
+    scene = make_scene(FundamentalEstimator, (20,), 40, generator, 1e-3)
+    off = 0.1 * torch.randn(20, 7, generator=generator, dtype=F64)
+    start = scene.estimator.retract(scene.model, off)
+    moved = scene.estimator.step(start, *scene.data, weigh=constant_weights(torch.ones(20, 40, dtype=F64)))
+    F, e = moved[..., :3], moved[..., 3]
+    assert ((moved - start).flatten(1).norm(dim=-1) > 1e-2).all()
+    assert (determinant_3x3(F).abs() < 1e-14).all()
+    assert ((e[:, None] @ F).abs() < 1e-14).all()
 
 
 def test_systems_without_equations_have_no_solution(generator: torch.Generator) -> None:

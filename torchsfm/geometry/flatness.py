@@ -80,7 +80,9 @@ def least_number_off(
     number = n // (d + 1)
     place = present.to(torch.int8).argsort(dim=-1, descending=True, stable=True)[..., : number * (d + 1)]
     corners = X.gather(-2, place[..., None].expand(*place.shape, d)).reshape(*place.shape[:-1], number, d + 1, d)
-    wide = tolerance.expand(present.shape).gather(-1, place).reshape(corners.shape[:-1]).amax(-1)
+    wide = tolerance
+    if tolerance.shape[-1] > 1:
+        wide = tolerance.expand(present.shape).gather(-1, place).reshape(corners.shape[:-1]).amax(-1)
     inverse, info = torch.linalg.inv_ex(corners[..., 1:, :] - corners[..., :1, :])
     thick = (inverse * inverse).sum((-2, -1)) * (wide * wide) * (4 * d) < 1
     full = torch.arange(1, number + 1, device=X.device) * (d + 1) <= present.sum(-1, keepdim=True)

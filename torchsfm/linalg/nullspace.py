@@ -70,9 +70,10 @@ def nullspace_columns(a: Float[Tensor, "n m batch"]) -> tuple[Float[Tensor, "n k
     rows, v, beta = reflections.pop()
     torch.mul(v, v[1:].mul(-beta).transpose(0, 1), out=basis[m - 1 :])
     basis[m:].diagonal(dim1=0, dim2=1).add_(1)
+    entries = basis.unbind(0)
     for i in range(m - 2, -1, -1):
         rows, v, beta = reflections[i]
-        basis[i:].addcmul_(v, combine_rows(basis[i + 1 :].unbind(0), rows[1:]).mul_(beta), value=-1)
+        basis[i:].addcmul_(v, combine_rows(entries[i + 1 :], rows[1:]).mul_(beta), value=-1)
     return basis, torch.cat(pivots).amin(0)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm.linalg.decompositions import eigvals
 from torchsfm.linalg.derivative import followed
+from torchsfm.linalg.vectors import fma, fms
 
 Roots = tuple[Float[Tensor, "*batch slots"], Bool[Tensor, "*batch slots"]]
 
@@ -52,7 +53,7 @@ def _cube_root(x: Tensor) -> Tensor:
     """
     integer, offset = (torch.int64, 715094163 << 32) if x.dtype == torch.float64 else (torch.int32, 709958130)
     root = (torch.div(x.view(integer), 3, rounding_mode="floor") + offset).view(x.dtype)
-    return (2 * root + x / (root * root)) * (1 / 3)
+    return torch.add(x / (root * root), root, alpha=2) * (1 / 3)
 
 
 def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,41 +63,47 @@ def cubic_rows(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> tuple[Tensor, 
     closed-form start; deflation leaves a quadratic (after Kahan, 1986). No trigonometric function is needed.
     """
     a, b, c = c2 / c3, c1 / c3, c0 / c3
+    twice = 2 * a
+
+    def value(x: Tensor) -> Tensor:
+        return fma(fma(x + a, x, b), x, c)
+
+    def newton(x: Tensor, value: Tensor) -> Tensor:
+        return value / fma(torch.add(twice, x, alpha=3), x, b)
+
     shift = a / -3
-    Q = shift * shift - b / 3
-    R = 0.5 * (((shift + a) * shift + b) * shift + c)
+    Q = fma(shift, shift, b / -3)
+    R = 0.5 * value(shift)
     # Depressed: y^3 - 3 Q y + 2 R = 0 with x = y + shift; |y| is looked for.
     size = R.abs()
     root = Q.clamp_min(0).sqrt()
-    inner = size * size - Q * Q * Q
+    inner = fms(Q * Q, Q, size * size)
     outer = _cube_root(size + inner.clamp_min(0).sqrt())
     ratio = (size / (root * root * root)).clamp_max(1)
     # 2 cos(acos(ratio) / 3) to three digits.
     y = torch.where(inner > 0, outer + Q / outer, root * (1.7320508 + ratio * (0.3208 - 0.0529 * ratio)))
-    linear, constant = 3 * Q, 2 * size
     for _ in range(3):
+        # Newton's method, without differences of what is nearly equal: y^2 is 4 Q at least where Q is positive.
         square = y * y
-        y = y - (y * (square - linear) - constant) / (3 * (square - Q))
-    x = shift + torch.copysign(y.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0), -R)
-    new = x - (((x + a) * x + b) * x + c) / ((3 * x + 2 * a) * x + b)
-    x = torch.where(torch.isfinite(new), new, x)
+        y = fma(square, y, size) / (square - Q) * (2 / 3)
+    x = shift - torch.copysign(y.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0), R)
+    x = x - newton(x, value(x)).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     # Division by x - x0 from the end that is stable for a root of this size.
-    q0 = b + (a + x) * x
+    q1 = a + x
+    q0 = fma(q1, x, b)
     large = x * x > q0.abs()
     q0 = torch.where(large, -c / x, q0)
-    q1 = torch.where(large, (q0 - b) / x, a + x)
-    rest = q1 * q1 - 4 * q0
-    other = rest >= 0
-    q = -0.5 * (q1 + torch.copysign(rest.clamp_min(0).sqrt(), q1))
-    x = torch.stack((x, q, torch.where(q != 0, q0 / q, 0)))
+    q1 = torch.where(large, (q0 - b) / x, q1)
+    # Not a number where the other two are complex.
+    q = -0.5 * (q1 + torch.copysign(torch.sub(q1 * q1, q0, alpha=4).sqrt(), q1))
+    x = torch.stack((x, q, (q0 / q).masked_fill(q == 0, 0)))
     # One step on the cubic itself, where it helps.
-    value = ((x + a) * x + b) * x + c
-    new = x - value / ((3 * x + 2 * a) * x + b)
-    better = (((new + a) * new + b) * new + c).abs() < value.abs()
-    x = torch.where(better, new, x)
-    # A sum is finite only if all numbers are.
-    fine = torch.isfinite(x + (Q + R + c3)) & (c3 != 0)
-    return torch.where(fine, x, 0), fine & torch.stack((torch.ones_like(other), other, other))
+    error = value(x)
+    new = x - newton(x, error)
+    x = torch.where(value(new).abs() < error.abs(), new, x)
+    # A sum is finite only if all numbers are; where c3 is zero, Q is none.
+    real = (x + (Q + R + c3)).abs() < torch.inf
+    return torch.where(real, x, 0), real
 
 
 def attach_roots(c: Float[Tensor, "*batch m"], roots: Float[Tensor, "*batch k"], real: Bool[Tensor, "*batch k"]) -> Tensor:

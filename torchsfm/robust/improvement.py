@@ -16,9 +16,16 @@ from torchsfm.linalg.portions import portion
 from torchsfm.robust.degeneracy import glance
 from torchsfm.robust.estimator import WithAlternatives
 from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, squared_residual, stages
-from torchsfm.robust.local_optimisation import LOCAL_DATA, LOCAL_STEPS, RIVAL_STEPS, optimise_fully, optimise_locally
+from torchsfm.robust.local_optimisation import (
+    LOCAL_DATA,
+    LOCAL_STEPS,
+    RIVAL_STEPS,
+    optimise_fully,
+    optimise_locally,
+    step_within,
+)
 from torchsfm.robust.models import cast, join, put, select, take, take_slots, zip_map
-from torchsfm.robust.noise import scale_of_noise
+from torchsfm.robust.noise import scale_of_noise, step_by_noise
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.samplers import Among, Sampler, draws
 from torchsfm.robust.scoring import Msac, Scoring, limits
@@ -250,21 +257,25 @@ def refine_finally(fine: Problems, coarse: Problems, best: Best) -> tuple[Best, 
     parts = []
     for part in _portions(_all(fine), fine.width, _NUMBERS):
         some, rough, old = fine.take(part), coarse.take(part), best.take(part)
-        model, reach = scale_of_noise(rough.estimator, old.model, rough.data, old.limit, rough.counts)
-        old = cast(old, torch.float64)
-        found, squared, won = _refined(some, old, cast(model, torch.float64), reach.double() * old.limit)
+        noisy = scale_of_noise(rough.estimator, old.model, rough.data, old.limit, rough.counts)
+        old, (start, noise) = cast((old, noisy), torch.float64)
+        model, reach = step_by_noise(some.estimator, start, some.data, old.limit, some.counts, noise)
+        found, squared, won = _refined(some, old, start, model, reach * old.limit)
         lost = (~won & old.solved).nonzero()[:, 0]
         if len(lost):
-            start = old.take(lost)
-            again = _refined(some.take(lost), start, start.model, start.limit)
+            few, start = some.take(lost), old.take(lost)
+            model, _ = step_within(few.estimator, start.model, few.data, start.limit, few.counts)
+            again = _refined(few, start, start.model, model, start.limit)
             found, squared = put(found, lost, again[0]), squared.index_copy(0, lost, again[1])
         parts.append((found, squared))
     return join([one[0] for one in parts]), torch.cat([one[1] for one in parts])
 
 
-def _refined(some: Problems, old: Best, model: Any, reach: Float[Tensor, "g"]) -> tuple[Best, Tensor, Bool[Tensor, "g"]]:
+def _refined(
+    some: Problems, old: Best, start: Any, model: Any, reach: Float[Tensor, "g"]
+) -> tuple[Best, Tensor, Bool[Tensor, "g"]]:
     """The optima of losses near some models where they are better than the old ones, the distances, and where that is."""
-    model, settled = optimise_fully(some.estimator, model, some.data, reach, some.counts)
+    model, settled = optimise_fully(some.estimator, start, model, some.data, reach, some.counts)
     # In double precision too: in single precision what is far may look near by a threshold below rounding.
     wide, models = some.spread(), zip_map(lambda *pair: torch.stack(pair, 1), model, old.model)
     both = squared_residual(wide.estimator, models, *wide.data)

@@ -68,38 +68,49 @@ def _local_step(
 
 def optimise_fully(
     estimator: Estimator[M],
+    start: M,
     model: M,
     data: Sequence[Tensor],
     reach: Float[Tensor, "g"],
     counts: Tensor,
 ) -> tuple[M, Bool[Tensor, "g"]]:
-    """Steps from one model of each problem to a minimum of the loss of `step_within`, and where it was reached.
+    """Steps from one model of each problem, the first already taken, to a minimum of the loss of `step_within`.
 
     Only a minimum has a derivative. A step that raises the loss is taken back and the next one damped (Levenberg 1944): in the
     limit it is a short one of reweighted least squares, which cannot raise it. Steps that shrink slowly are drawn out (Anderson
     1965, of depth 1).
+
+    Args:
+        estimator: The problem.
+        start: Where the first step started, `(g, ...)`.
+        model: Where it led.
+        data: The data, each `(g, n, d)`.
+        reach: Squared distance beyond which a datum does not matter.
+        counts: What the data count, `(g, n)`: a boolean or a weight.
+
+    Returns:
+        The minima, and where they were reached.
     """
     settled = torch.zeros_like(reach, dtype=torch.bool)
-    # What comes in lower precision is beside the manifold, where the loss may be less than anywhere on it.
-    coarse, (model, _) = model, step_within(estimator, model, data, reach, counts)
     found, row = model, torch.arange(len(reach), device=reach.device)
     problem: tuple[Any, ...] = (estimator, tuple(data), reach, counts)
-    start, last, step = model, model, _entries(model) - _entries(coarse)
+    # What started in lower precision was beside the manifold, where the loss may be less than anywhere on it.
+    entries = _entries(model)
+    step, start, last = entries - _entries(start), model, model
     length = _length(step)
-    still, least, damping = _STILL * length, torch.full_like(reach, torch.inf), torch.zeros_like(reach)
+    still = torch.maximum(_STILL * length, _SMALL * _length(entries))
+    least, damping = torch.full_like(reach, torch.inf), torch.zeros_like(reach)
     for count in range(2, _MOST_STEPS + 1):
         own, values, edge, counted = problem
         moved, loss = step_within(own, model, values, edge, counted, damping)
         # A loss that is no number is none.
         good = loss <= least * (1 + _ROUNDING)
-        damping = torch.where(good, torch.where(loss < least, damping / 4, damping), (4 * damping).clamp(min=1))
+        damping = torch.where(good, damping / 4, (4 * damping).clamp(min=1))
         start, least = select(good, model, start), torch.where(good, loss, least)
-        entries = _entries(moved)
-        before, step = step, entries - _entries(model)
+        before, step = step, _entries(moved) - _entries(model)
         shrunk, length = length, _length(step)
         # As a geometric series, steps that shrink have length^2 / (shrunk - length) before them.
-        most = torch.maximum(still, _SMALL * _length(entries))
-        done = good & (length * length <= most * torch.maximum(length, shrunk - length))
+        done = good & (length * length <= still * torch.maximum(length, shrunk - length))
         drawn = _drawn_out(moved, last, step, before) if count > 2 else moved
         last, model = moved, select(good, drawn, start)
         if not (bool(done.any()) or count == _MOST_STEPS):

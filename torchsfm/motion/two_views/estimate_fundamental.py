@@ -10,7 +10,15 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.linalg import damped_solve, svd
 from torchsfm.motion.two_views.collinear import collinear, collinear_suspected
-from torchsfm.motion.two_views.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, product, with_left_epipole
+from torchsfm.motion.two_views.epipolar_fit import (
+    cofactors,
+    cross_rows,
+    left_epipole,
+    matrices,
+    plane_rows,
+    product,
+    with_left_epipole,
+)
 from torchsfm.motion.two_views.estimate_homography import HomographyEstimator
 from torchsfm.motion.two_views.normalization import common_scale, largest_positive
 from torchsfm.motion.two_views.oriented_7pt import oriented_7pt
@@ -77,9 +85,11 @@ class FundamentalEstimator:
         *,
         weigh: Weigh,
     ) -> Float[Tensor, "*batch 3 4"]:
-        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and, to second order, of determinant 0.
+        """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and determinant 0.
 
-        The step minimises the quadratic model under the linearised constraint (sequential quadratic programming).
+        The step minimises the quadratic model under the linearised constraint (sequential quadratic programming). What that
+        leaves of the determinant goes with what F has along the new epipole: beside the manifold the loss may be less than
+        anywhere on it, and every step from there would be one up.
         """
         A, b = step_equations(model, x1, x2, weigh)
         model = model.double()
@@ -90,11 +100,13 @@ class FundamentalEstimator:
         A = torch.addcmul(A, (size * f)[..., None], f[..., None, :])
         free, bound = damped_solve(A, torch.stack((b, normal), -1)).unbind(-1)
         # The determinant is a third of the product with its gradient.
-        gap = (normal * torch.sub(f, free, alpha=3)).sum(-1, keepdim=True) / 3
+        gap = (normal * torch.sub(f, free, alpha=3)).sum(-1, keepdim=True)
         share = (normal * bound).sum(-1, keepdim=True)
-        f = torch.addcmul(f - free, gap / share.masked_fill(share <= 0, torch.inf), bound, value=-1)
+        f = torch.addcmul(f - free, gap / share.masked_fill(share <= 0, torch.inf), bound, value=-1 / 3)
         F = matrices(f / torch.linalg.vector_norm(f, dim=-1, keepdim=True), 3)
-        return with_left_epipole(F, e).to(x1.dtype)
+        e = left_epipole(F, e)[..., None]
+        F = torch.addcmul(F, e, (e * F).sum(-2, keepdim=True), value=-1)
+        return torch.cat((F, e), -1).to(x1.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
         """F moved along a basis of the tangent space, then to determinant 0 up to fourth order, and to norm 1."""
@@ -166,14 +178,9 @@ def _determinant_step(f: Tensor) -> Tensor:
     """Move matrices of small determinant towards determinant 0 by a Newton step along its gradient, and to norm 1."""
     c = _cofactors(f)
     square = (c * c).sum(-1, keepdim=True)
-    f = f - (c * f).sum(-1, keepdim=True) / 3 / torch.where(square > 0, square, 1) * c
+    f = torch.addcmul(f, (c * f).sum(-1, keepdim=True) / square.masked_fill(square == 0, 1), c, value=-1 / 3)
     square = (f * f).sum(-1, keepdim=True)
-    return f * torch.where(square > 0, square, 1).rsqrt()
-
-
-def _singular(F: Tensor) -> Tensor:
-    """The matrix of determinant 0 and norm 1 near one whose determinant is nearly 0, as that of every model is."""
-    return matrices(_determinant_step(F.flatten(-2)), 3)
+    return f * square.masked_fill(square == 0, 1).rsqrt()
 
 
 def estimate_fundamental(
@@ -221,7 +228,8 @@ def estimate_fundamental(
     y = common_scale(x1.double(), x2.double(), options.get("mask"))
 
     def back(model: Tensor) -> Tensor:
-        return largest_positive(_singular(product(product(y.T2.mT, _singular(model[..., :3])), y.T1)))
+        F = product(product(y.T2.mT, model[..., :3]), y.T1)
+        return largest_positive(matrices(_determinant_step(F.flatten(-2)), 3))
 
     return estimate_robustly(
         FundamentalEstimator(), y.x1, y.x2, threshold=threshold, dtype=x1.dtype, scale=y.scale, back=back, **options

@@ -83,39 +83,39 @@ def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tup
     x = torch.stack((x1, x2))
     c1, c2 = centre = x[:, :, 0]
     moved = x[:, :, 1:] - centre[:, :, None]
-    size = moved.abs().amax((1, 2))
-    (u, v), (a, b) = moved * size.reciprocal()[:, None, None]
-    size1, size2 = size
+    s1, s2 = extent = moved.abs().amax((1, 2))
+    (u, v), (a, b) = moved * extent.reciprocal()[:, None, None]
     # The first point says that F33 = 0: six equations in eight entries are left.
     N, pivot = nullspace_columns(torch.stack((a * u, a * v, a, b * u, b * v, b, u, v)))
     # Each row for G and for H.
-    n, crossed = N.unbind(0), N.flip(1).unbind(0)
+    swapped = N.flip(1)
+    n, crossed = N.unbind(0), swapped.unbind(0)
     C = _cofactors(n)
-    # det(s G + t H): the coefficients of s^3 and t^3, and of s^2 t and s t^2.
+    # det(G + t H): the coefficients of 1 and t^3, and of t and t^2.
     outer, inner = combine_rows(C[6:], n[6:]), combine_rows(C, crossed)
-    some = torch.maximum(outer.abs(), inner.abs()).amax(0)
-    # The larger of the outer coefficients leads.
-    turn = outer[1].abs() > outer[0].abs()
     cubic = torch.cat((outer[:1], inner, outer[1:]))
-    roots, real = cubic_rows(*torch.where(turn, cubic, cubic.flip(0)).unbind(0))
-    s, t = torch.where(turn, 1.0, roots), torch.where(turn, roots, 1.0)
-    F = N.new_zeros(9, *s.shape)
-    torch.addcmul(N[:, :1] * s, N[:, 1:], t, out=F[:8])
+    size = cubic.abs()
+    # The larger of the outer coefficients leads: where that is the first one, G and H change places.
+    turn = size[0] > size[3]
+    roots, real = cubic_rows(*torch.where(turn, cubic.flip(0), cubic).unbind(0))
+    G, H = torch.split(torch.where(turn, swapped, N), 1, 1)
+    F = N.new_zeros(9, *roots.shape)
+    torch.addcmul(G, H, roots, out=F[:8])
     # Back to the coordinates that came: T2' F T1 with T = [I, -c] / size, up to scale; by columns, then by rows.
-    rows = F.view(3, 3, *s.shape)
+    rows = F.view(3, 3, *roots.shape)
     first, second, third = rows.unbind(1)
-    third.mul_(size1)
-    rows[2].mul_(size2)
+    third.mul_(s1)
+    rows[2].mul_(s2)
     third.addcmul_(c1[0], first, value=-1).addcmul_(c1[1], second, value=-1)
     first, second, third = rows
     third.addcmul_(c2[0], first, value=-1).addcmul_(c2[1], second, value=-1)
     entries = F.unbind(0)
     square = combine_rows(entries, entries)
     # False for NaN; an empty slot holds diag(1, 1, 0).
-    valid = real & (torch.minimum(pivot, some) > _INDEPENDENT) & (square > 0) & (square < torch.inf)
-    scale = torch.where(valid, square.rsqrt(), 0.0)
-    F.mul_(scale).nan_to_num_(0.0, 0.0, 0.0)
-    F[0:5:4].add_(~valid, alpha=0.5**0.5)
+    valid = real & (torch.minimum(pivot, size.amax(0)) > _INDEPENDENT) & (square > 0) & (square < torch.inf)
+    empty = ~valid
+    F.mul_(square.rsqrt().masked_fill(empty, 0.0)).nan_to_num_(0.0, 0.0, 0.0)
+    F[0:5:4].add_(empty, alpha=0.5**0.5)
     return F, valid
 
 

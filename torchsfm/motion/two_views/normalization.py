@@ -52,11 +52,9 @@ def common_scale_of_views(
     centre, sizes = middle_and_size(fixed, present(mask, *fixed))
     size = sizes.amax(0)
     scale = size.reciprocal()
-    s = scale[..., None, None]
-    similarities = s.new_zeros(*centre.shape[:-1], 3, 3)
-    similarities.diagonal(dim1=-2, dim2=-1)[..., :2] = s[..., 0]
-    similarities[..., :2, 2] = -s[..., 0] * centre
-    similarities[..., 2, 2] = 1
+    similarities = torch.nn.functional.pad(-centre[..., None], (2, 0, 0, 1))
+    similarities.diagonal(dim1=-2, dim2=-1).add_(1)
+    similarities[..., :2, :].mul_(scale[..., None, None])
     points = list(moved_and_scaled(views, centre, size))
     return points, list(similarities), scale
 

@@ -59,7 +59,7 @@ def _orient(
     (u, v), (a, b) = x1[:, :, None].unbind(0), x2[:, :, None].unbind(0)
     # e2 x h2 and F h1 are parallel: two of their coordinates tell whether they point the same way.
     same = fms(e2, b, e1) * fma(f0, u, fma(f1, v, f2))
-    same = torch.addcmul(same, fms(-e2, a, -e0), fma(f3, u, fma(f4, v, f5)))
+    same = fms(fms(e2, a, e0), fma(f3, u, fma(f4, v, f5)), same)
     plus, minus = same.amin(0) >= 0, same.amax(0) <= 0
-    sign = 2 * plus.to(F.dtype) - 1
-    return torch.cat((rows, (e * sign)[:, None]), 1).flatten(0, 1), valid & (plus | minus)
+    e = torch.where(plus, e, -e)
+    return torch.cat((rows, e[:, None]), 1).flatten(0, 1), valid & (plus | minus)

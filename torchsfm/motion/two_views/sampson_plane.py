@@ -24,7 +24,11 @@ _SQUARES = ((0, 0), (0, 1), (1, 1))
 
 def homogeneous_rows(x: Float[Tensor, "*batch n 2"]) -> Float[Tensor, "*batch 3 n"]:
     """The coordinates x, y, 1 of points."""
-    return torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0)
+    return _with_ones(x.mT)
+
+
+def _with_ones(rows: Float[Tensor, "*batch 2 n"]) -> Float[Tensor, "*batch 3 n"]:
+    return torch.nn.functional.pad(rows, (0, 0, 0, 1), value=1.0)
 
 
 def infinite_where_positive(squared: Float[Tensor, "*batch n"], behind: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
@@ -103,8 +107,7 @@ def step_equations(
     weights, curvature = weigh(infinite_where_positive(share * e, side))
     # |g| times the derivative of e / |g|: that of e, less e / |g|^2 times that of |g|^2 / 2.
     row = share[..., None, :]
-    left = h2.expand(*share.shape[:-1], *h2.shape[-2:]).clone()
-    left[..., :2, :].addcmul_(row, second, value=-1)
+    left = _with_ones(torch.addcmul(x2.mT, row, second, value=-1))
     J = left[..., :, None, :] * h1[..., None, :, :]
     J[..., :2, :].addcmul_(h2[..., :, None, :], (row * first)[..., None, :, :], value=-1)
     J = J.flatten(-3, -2)
