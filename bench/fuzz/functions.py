@@ -376,6 +376,7 @@ FUNCTIONS: dict[str, Function] = {
     "images.detect_ellipses": Function({"image": _round_picture, "max_ellipses": 3}, {"h": 32, "w": 40}),
     "images.detect_features": Function({"image": lambda s: s.rand(1, 32, 40)}, batched=False),
     "images.fit_ellipse": Function({"x": _edge_points}, {"n": 24}),
+    "images.detect_motion": Function({"images": lambda s: [_picture(s) for _ in range(2)]}, batched=False, slow=True),
     "images.detect_segments": Function({"image": lambda s: _picture(s), "max_segments": 20}, {"h": 32, "w": 40}),
     "images.describe_segments": Function({"image": lambda s: _picture(s)}, batched=False),
     "images.hough_lines": Function({"image": lambda s: _picture(s), "max_lines": 8, "min_count": 12}, {"h": 32, "w": 40}),

@@ -140,7 +140,7 @@ def test_a_frame_is_placed_near_a_guess_that_its_edges_confirm(generator: torch.
     mapping = model(X, seen(X, frames()), torch.arange(FRAMES - 1))
     last = FRAMES - 1
     nearly = frames()[last:].retract(1e-3 * torch.randn(1, 6, dtype=F64, generator=generator))
-    found = register(mapping, last, nearly)
+    found = register(mapping, last, (nearly,))
     assert found is not None
     assert degrees_off(found, last) < NEAR
     # A guess that the edges do not confirm is no harm: the curves are looked for as without one.
@@ -148,7 +148,7 @@ def test_a_frame_is_placed_near_a_guess_that_its_edges_confirm(generator: torch.
         Pose(rotation_from_rotvec(torch.tensor([[0.0, 0.3, 0.0]], dtype=F64)), torch.zeros(1, 3, dtype=F64)) @ frames()[last:]
     )
     for guess in (turned, None):
-        found = register(mapping, last, guess)
+        found = register(mapping, last, (guess,))
         assert found is not None
         assert degrees_off(found, last) < NEAR
 
@@ -162,7 +162,7 @@ def test_what_repeats_itself_does_not_draw_a_frame_from_its_guess(generator: tor
     last = FRAMES - 1
     # Posts are twelve pixels apart; only around the guess is looked, not where the most of them fit.
     moved = Pose(frames().R[last:], frames().t[last:] + frames().R[last:] @ torch.tensor([0.12, 0.0, 0.0], dtype=F64))
-    found = register(mapping, last, moved)
+    found = register(mapping, last, (moved,))
     assert found is not None
     assert torch.linalg.vector_norm(found.poses.t[last] - moved.t[0]) < 0.02
     anywhere = register(mapping, last)

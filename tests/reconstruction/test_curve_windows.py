@@ -11,6 +11,7 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, Similarity, intrinsics, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.images import read_image
+from torchsfm.reconstruction.curve_frames import Frames
 from torchsfm.reconstruction.curve_mapping import CurveMapping
 from torchsfm.reconstruction.curve_sequence import Expected, Settled
 from torchsfm.reconstruction.curve_start import FirstCameras
@@ -161,7 +162,7 @@ def test_a_window_of_a_real_turntable_by_a_long_lens(data: Path) -> None:
     edges = [ImageEdges.of(read_image(folder / name).pixels) for name in names]
     guess = intrinsics(torch.tensor(768.0, dtype=F64), torch.tensor([319.5, 239.5], dtype=F64))
     # The focal length is twice the expected one; in a short window all that is far is almost seen in parallel.
-    found = window_at(edges, 0, guess, 0.5).found
+    found = window_at(Frames(edges), 0, guess, 0.5).found
     assert found.refusal == ""
     assert rotation_angle(found.poses.R @ (R @ R[2].mT).mT).rad2deg().max() < 1.0
     assert abs(math.log(float(found.focal / numbers[0, 0]))) < 0.1

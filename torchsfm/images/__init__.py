@@ -3,6 +3,7 @@
 from torchsfm.images.boards import BoardPoints, detect_chessboard, detect_circles_grid
 from torchsfm.images.corners import Corners, detect_corners
 from torchsfm.images.curve_tracking import TrackedCurves, track_curves
+from torchsfm.images.dense_motion import DenseMotion, detect_motion
 from torchsfm.images.edges import Edges, detect_edges
 from torchsfm.images.ellipses import Ellipses, detect_ellipses
 from torchsfm.images.exif import Exif, parse_exif
@@ -27,6 +28,7 @@ __all__ = [
     "SUFFIXES",
     "BoardPoints",
     "Corners",
+    "DenseMotion",
     "Edges",
     "EllipseFit",
     "Ellipses",
@@ -50,6 +52,7 @@ __all__ = [
     "detect_edges",
     "detect_ellipses",
     "detect_features",
+    "detect_motion",
     "detect_segments",
     "extract_frames",
     "fit_ellipse",

@@ -6,6 +6,7 @@ an affine map; the chain on which most of them come to lie is the one it continu
 images show about the same piece.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -17,6 +18,8 @@ from torch import Tensor
 from torchsfm._types import check_options
 from torchsfm.geometry.curves import Curve
 from torchsfm.geometry.splines import fit_spline
+from torchsfm.images.curve_prediction import predicted
+from torchsfm.images.dense_motion import DenseMotion
 from torchsfm.images.edge_field import EdgeField, edge_field
 from torchsfm.images.edges import Edges
 from torchsfm.linalg import solve
@@ -103,8 +106,9 @@ def track_curves(
     min_images: int = 3,
     spacing: float = 4.0,
     max_curves: int = 200,
+    motion: Sequence[DenseMotion] | None = None,
 ) -> TrackedCurves:
-    """Follow the curves of edges through a sequence of images between which little moves.
+    """Follow the curves of edges through a sequence of images between which little moves, or as `motion` says.
 
     Edges that no surface carries, as the outline of a ball, are followed like any others: what they are is told by geometry.
     Of straight edges, the place along them is not known.
@@ -118,6 +122,8 @@ def track_curves(
         min_images: Fewest images of a curve.
         spacing: Between control points of the smoothed curves, in pixels.
         max_curves: The longest chains are followed, so many of them.
+        motion: Where what each image shows is in the next one, as from `detect_motion`: curves are sought where most of them is
+            said to be, however far, and others as without it.
 
     Returns:
         The curves, those that most images show first, and of these the longest.
@@ -142,6 +148,8 @@ def track_curves(
         start=(start, "?int >= 0"), reach=(reach, "0 <= float <= 200"), min_length=(min_length, "float > 0"),
         min_images=(min_images, "int >= 1"), spacing=(spacing, "float > 0"), max_curves=(max_curves, "int >= 1"),
     )  # fmt: skip
+    if motion is not None and len(motion) != max(v - 1, 0):
+        raise ValueError(f"motion: wanted one for each of {v} images and the next, got {len(motion)}")
     if start is not None and start >= v:
         raise ValueError(f"start: wanted one of {v} images, got {start}")
     with torch.no_grad():
@@ -152,7 +160,7 @@ def track_curves(
             empty = edges.x.new_zeros(v, 0, 2, 2)
             none = edges.chain.new_zeros(v, 0)
             return TrackedCurves(Curve(empty, empty[..., 0] > 0, none > 0), none)
-        shown = _there_and_back(fields, pieces, middle, reach, min_length)
+        shown = _there_and_back(fields, pieces, middle, reach, min_length, motion)
         curves = _smoothed(fields, shown, spacing)
         chain = torch.stack(
             [
@@ -192,7 +200,14 @@ def _whole_chains(field: EdgeField, min_length: float, most: int) -> _Pieces:
     return _Pieces(*(t[chosen] for t in pieces))
 
 
-def _there_and_back(fields: list[EdgeField], pieces: _Pieces, middle: int, reach: float, least: float) -> list[_Pieces]:
+def _there_and_back(
+    fields: list[EdgeField],
+    pieces: _Pieces,
+    middle: int,
+    reach: float,
+    least: float,
+    motion: Sequence[DenseMotion] | None,
+) -> list[_Pieces]:
     """The pieces in all images: followed to their first image, from there to their last, and back."""
     v = len(fields)
     shown: list[_Pieces] = [_alive(*pieces[:3], torch.zeros_like(pieces.alive)) for _ in fields]
@@ -201,7 +216,8 @@ def _there_and_back(fields: list[EdgeField], pieces: _Pieces, middle: int, reach
         moved = fields[0].x.new_zeros(len(pieces.chain), 2)
         lost = torch.zeros_like(pieces.alive)
         for here, there in pairwise(way):
-            found, moved = _followed(shown[here], fields[here], fields[there], moved, reach, least)
+            step = None if motion is None else (motion[min(here, there)], there < here)
+            found, moved = _followed(shown[here], fields[here], fields[there], moved, reach, least, step)
             # Where it was found before on the same chain; a curve that is lost stays lost.
             began = shown[here].alive & ~lost
             known = shown[there].alive
@@ -216,7 +232,13 @@ def _there_and_back(fields: list[EdgeField], pieces: _Pieces, middle: int, reach
 
 
 def _followed(
-    pieces: _Pieces, here: EdgeField, there: EdgeField, guess: Float[Tensor, "k 2"], reach: float, least: float
+    pieces: _Pieces,
+    here: EdgeField,
+    there: EdgeField,
+    guess: Float[Tensor, "k 2"],
+    reach: float,
+    least: float,
+    motion: tuple[DenseMotion, bool] | None,
 ) -> tuple[_Pieces, Float[Tensor, "k 2"]]:
     """Pieces of one image in the next, and how far they moved; not alive where they were not found."""
     if not len(there.length) or not pieces.alive.any():
@@ -224,7 +246,12 @@ def _followed(
     curve = pieces.curve(here).resample(_SAMPLES)
     tangent = curve.tangents()
     x, normal = curve.x, torch.stack((tangent[..., 1], -tangent[..., 0]), -1)
-    y = _fitted(x, normal, there, _moved(x, normal, there, guess, reach))
+    y = _fitted(x, normal, there, x + _moved(x, normal, there, guess, reach)[:, None])
+    if motion is not None:
+        other, facing, sure = predicted(x, *motion)
+        other = other + _moved(other, facing, there, torch.zeros_like(guess), _FAR)[:, None]
+        use = sure[:, None, None]
+        y, normal = torch.where(use, _fitted(other, facing, there, other), y), torch.where(use, facing, normal)
     index, far = there.look_up(y, normal)
     hit = far < _RADII[-1]
     votes = far.new_zeros(len(x), len(there.length)).scatter_add_(1, there.chain[index], hit.to(far.dtype))
@@ -267,13 +294,12 @@ def _moved(
     return move
 
 
-def _fitted(x: Tensor, normal: Tensor, there: EdgeField, move: Float[Tensor, "k 2"]) -> Float[Tensor, "k m 2"]:
+def _fitted(x: Tensor, normal: Tensor, there: EdgeField, start: Float[Tensor, "k m 2"]) -> Float[Tensor, "k m 2"]:
     """Curves moved on by the affine maps that bring them nearest to edges, across these."""
     centre = x.mean(1, keepdim=True)
     size = (x - centre).square().sum(-1).mean(-1).sqrt().clamp_min(1e-9)
     z = (x - centre) / size[:, None, None]
     z = torch.cat((z, torch.ones_like(z[..., :1])), -1)
-    start = x + move[:, None]
     y = start
     # Nothing is far from a translation.
     stiff = torch.tensor([0.02, 0.02, 0.005] * 2, dtype=x.dtype, device=x.device) * x.shape[1]

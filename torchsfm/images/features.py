@@ -100,7 +100,7 @@ def detect_features(
         max_features=(max_features, "int >= 1"), contrast=(contrast, "float >= 0"), edge=(edge, "float > 0"),
         max_size=(max_size, "int >= 1"),
     )  # fmt: skip
-    gray = _gray_bytes(pixels_of(image))
+    gray = gray_bytes(pixels_of(image))
     height, width = gray.shape
     shrink = min(1.0, max_size / max(height, width))
     if shrink < 1:
@@ -133,7 +133,8 @@ def _spread(table: NDArray[np.float64], cell: float) -> NDArray[np.int64]:
     return order[np.argsort(-table[order, 4] / rank, kind="stable")]
 
 
-def _gray_bytes(pixels: Tensor) -> NDArray[np.uint8]:
+def gray_bytes(pixels: Tensor) -> NDArray[np.uint8]:
+    """An image as OpenCV takes it, grey."""
     check_options(image=(pixels, Tensor))
     if pixels.ndim != 3 or pixels.shape[0] not in (1, 3) or 0 in pixels.shape:
         raise ValueError(f"image: wanted shape (1, h, w) or (3, h, w), got {tuple(pixels.shape)}")

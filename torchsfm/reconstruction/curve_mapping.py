@@ -276,14 +276,14 @@ def _confirmed(mapping: CurveMapping, near: float) -> Bool[Tensor, "n"]:
     return torch.bincount(pairs[0], minlength=len(X)) >= _CONFIRM
 
 
-def register(mapping: CurveMapping, view: int, guess: Pose | None = None) -> CurveMapping | None:
+def register(mapping: CurveMapping, view: int, guesses: Sequence[Pose | None] = ()) -> CurveMapping | None:
     """The model with one more frame; None where it does not show the curves that frames around it do.
 
     Args:
         mapping: The model.
         view: The frame.
-        guess: Where it may be, batch (1). Only its surroundings are looked at first: where things repeat themselves, other
-            places fit as well.
+        guesses: Where it may be, batch (1) each. Only their surroundings are looked at first: where things repeat
+            themselves, other places fit as well.
     """
     known = mapping.known
     near = known[(known - view).abs().argsort(stable=True)]
@@ -293,8 +293,9 @@ def register(mapping: CurveMapping, view: int, guess: Pose | None = None) -> Cur
         return None
     X, tangent = mapping.curves.X[use], mapping.curves.tangents()[use]
     seen = (X, tangent, mapping.sights[view].field(mapping.size), mapping.size, mapping.camera.K)
-    if guess is not None and (pose := _shown(pose_from_edges(*seen, guess, reach=_CLOSE))) is not None:
-        return mapping.placed(torch.tensor([view]), pose)
+    for guess in guesses:
+        if guess is not None and (pose := _shown(pose_from_edges(*seen, guess, reach=_CLOSE))) is not None:
+            return mapping.placed(torch.tensor([view]), pose)
     pose = _shown(pose_from_edges(*seen, _starts(mapping, X, a, b, (view - a) / (a - b))))
     return None if pose is None else mapping.placed(torch.tensor([view]), pose)
 

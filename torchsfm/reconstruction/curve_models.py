@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
 from torchsfm.reconstruction.cameras import DEFAULT_FOCAL, FOCAL_SIGMA
+from torchsfm.reconstruction.curve_frames import Frames, as_motion, detect_all_motion
 from torchsfm.reconstruction.curve_mapping import CurveMapping, covariance
 from torchsfm.reconstruction.curve_sequence import Expected, Settled, all_curves, map_sequence
 from torchsfm.reconstruction.doubt import DEVIATIONS, GUESSED_FOCAL, WRONG_ANGLE, Standing
@@ -69,8 +70,11 @@ def reconstruct_from_curves(
     focal = [f for f in found.focal[readable].tolist() if f > 0]
     expected, source = _expected(camera, K, focal, size[0], zoom)
     width, height = found.size[readable[0]].tolist()
+    files = [sources.files[i] for i in readable.tolist()]
+    moved = stages.run("motion", lambda: detect_all_motion(files, max_pixels, progress, longest=FRAME_SIZE))
+    frames = Frames([found.edges[i] for i in readable.tolist()], as_motion(moved))
     with stages.timed("map"), one_thread():
-        settled, reason = map_sequence([found.edges[i] for i in readable.tolist()], (height, width), expected, progress)
+        settled, reason = map_sequence(frames, (height, width), expected, progress)
     names = [sources.names[i] for i in readable.tolist()]
     models: tuple[Reconstruction, ...] = ()
     standing = None

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from torchsfm.bundle import RelativePosePrior
 from torchsfm.geometry import Camera, rotation_angle
+from torchsfm.reconstruction.curve_frames import Frames
+from torchsfm.reconstruction.curve_guess import guess_by_motion
 from torchsfm.reconstruction.curve_mapping import (
     NEAR,
     CurveMapping,
@@ -122,13 +124,11 @@ class Expected:
         return {"free": self.free, "intrinsics_sigma": sigma, "intrinsics_mean": self.camera[(None,)], "priors": priors}
 
 
-def map_sequence(
-    edges: Sequence[ImageEdges], size: tuple[int, int], expected: Expected, progress: Progress
-) -> tuple[Settled | None, str]:
+def map_sequence(frames: Frames, size: tuple[int, int], expected: Expected, progress: Progress) -> tuple[Settled | None, str]:
     """Cameras and curves of consecutive frames.
 
     Args:
-        edges: Of each frame.
+        frames: Their edges, and the motion from each to the next.
         size: Height and width of the frames.
         expected: What is known of their camera.
         progress: Called as the work goes on.
@@ -136,10 +136,10 @@ def map_sequence(
     Returns:
         The model; or None, and why there is none.
     """
-    v = len(edges)
+    v = len(frames.edges)
     if v < FEWEST:
         return None, f"{v} frames: curves alone need {FEWEST}"
-    found = all_windows(edges, expected.camera.K, expected.sigma["focal"], progress)
+    found = all_windows(frames, expected.camera.K, expected.sigma["focal"], progress)
     windows = [window for window in found if not window.found.refusal]
     if not windows:
         reasons = [window.found.refusal for window in found]
@@ -147,17 +147,17 @@ def map_sequence(
     told = replace(expected.told(*focal_of(windows)), turns=turns_of(windows))
     best: CurveMapping | None = None
     for chain in chains(windows)[:_TRIES]:
-        begun = _begin(edges, size, told.steady(), chain, progress)
+        begun = _begin(frames.edges, size, told.steady(), chain, progress)
         if not len(begun.curves):
             continue
-        grown = _grow(begun, chain, told.steady(), progress)
+        grown = _grow(begun, frames, chain, told.steady(), progress)
         if best is None or len(grown.known) > len(best.known):
             best = grown
         if len(best.known) >= _MOST * v:
             break
     if best is None:
         return None, "no curves stay in one place"
-    return _together(best, told, progress), ""
+    return _together(best, frames, told, progress), ""
 
 
 def _begin(
@@ -180,7 +180,7 @@ def _anew(mapping: CurveMapping, known: Expected, progress: Progress, near: floa
     return adjust(mapping, known.terms(mapping.registered), near, rounds=rounds)
 
 
-def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progress) -> CurveMapping:
+def _grow(mapping: CurveMapping, frames: Frames, chain: Chain, told: Expected, progress: Progress) -> CurveMapping:
     """Frame after frame, the nearest to those that are placed first."""
     v = len(mapping.edges)
     adjusted, failed = len(mapping.known), set[int]()
@@ -189,7 +189,8 @@ def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progres
         away = (torch.arange(v)[:, None] - mapping.known).abs().amin(-1)
         waiting = [i for i in away.argsort(stable=True).tolist() if 0 < away[i] <= _GAP and i not in failed]
         if waiting:
-            more = register(mapping, waiting[0], chain.carried(waiting[0], mapping.known, mapping.poses))
+            carried = chain.carried(waiting[0], mapping.known, mapping.poses)
+            more = register(mapping, waiting[0], (carried, guess_by_motion(mapping, waiting[0], frames.motion)))
             if more is None:
                 failed.add(waiting[0])
             else:
@@ -202,7 +203,7 @@ def _grow(mapping: CurveMapping, chain: Chain, told: Expected, progress: Progres
             return mapping
 
 
-def _together(mapping: CurveMapping, told: Expected, progress: Progress) -> Settled:
+def _together(mapping: CurveMapping, frames: Frames, told: Expected, progress: Progress) -> Settled:
     """All cameras, from samples that are found anew."""
     views, known = mapping.known, told.beside_edges()
     mapping = _anew(mapping, known, progress, rounds=_ROUGH)
@@ -212,7 +213,8 @@ def _together(mapping: CurveMapping, told: Expected, progress: Progress) -> Sett
         moved = float(rotation_angle(turned @ turned[len(views) // 2].mT).rad2deg().amax())
         if moved < _STILL:
             break
-    alone = windows_by_themselves([sight.edges for sight in mapping.sights], told.camera.K)
+    seen = frames._replace(edges=[sight.edges for sight in mapping.sights])
+    alone = windows_by_themselves(seen, told.camera.K)
     return Settled(prune(mapping), moved, contradictions(alone, mapping.poses, mapping.registered), told)
 
 

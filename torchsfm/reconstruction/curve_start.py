@@ -207,7 +207,12 @@ class FirstCameras:
 
 
 def first_cameras(
-    curves: Curve, reference: int, focal: Float[Tensor, ""], centre: Float[Tensor, "2"], sigma: float
+    curves: Curve,
+    reference: int,
+    focal: Float[Tensor, ""],
+    centre: Float[Tensor, "2"],
+    sigma: float,
+    starts: Float[Tensor, "s v 3 3"] | None = None,
 ) -> FirstCameras:
     """Cameras from curves that were followed through a few frames.
 
@@ -217,6 +222,7 @@ def first_cameras(
         focal: The focal length to expect, in pixels,
         centre: and the principal point.
         sigma: Standard deviation of the logarithm of the focal length.
+        starts: Rotations of all frames that are tried besides, those of each trial in a world of their own.
     """
     v = len(curves.x)
     curves = Curve(*(t[:, curve_places(curves).number[reference] >= 3] for t in (curves.x, curves.valid, curves.closed)))
@@ -229,9 +235,10 @@ def first_cameras(
     samples = places.at(spread)[0].flatten(1, 2) - centre
     images = curve_places(Curve(curves.x[others], curves.valid[others], curves.closed[others]))
     shown = (places.number[others] >= 3).repeat_interleave(_SAMPLES, 1).to(samples)
-    turns = _turns(samples)
-    h = len(turns)
-    R = rotation_from_rotvec(turns[:, None] * (others - reference)[:, None])
+    R = rotation_from_rotvec(_turns(samples)[:, None] * (others - reference)[:, None])
+    if starts is not None:
+        R = torch.cat((R, starts[:, others] @ starts[:, reference, None].mT))
+    h = len(R)
     f = focal.expand(h)
     t = _translations(R, samples[reference], samples[others], shown, f)
     motion = Motion(R, t, t.new_ones(h, c * _SAMPLES), torch.zeros_like(f), spread[others].expand(h, -1, -1, -1))

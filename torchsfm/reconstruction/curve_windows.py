@@ -14,6 +14,7 @@ from torchsfm.geometry import Curve, Pose, Similarity, rotation_angle
 from torchsfm.images import Edges, track_curves
 from torchsfm.linalg import nearest_rotation
 from torchsfm.optim import GemanMcClure
+from torchsfm.reconstruction.curve_frames import Frames
 from torchsfm.reconstruction.curve_start import FirstCameras, first_cameras
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.report import Progress
@@ -35,6 +36,10 @@ _SURE_TURN = 0.3
 """Degrees, the least, to which windows tell how cameras are turned: what misleads one misleads those that overlap it."""
 _WRONG = 4.0
 """Standard deviations by which what a window says may be off and still count."""
+_TELLING = 6
+"""Curves that a frame must show: a camera is six numbers, and one may be wrong with a curve as a whole,"""
+_LEAST = 3
+"""and frames that show so many, of a window."""
 _SHARED = WIDTH // 2 + 1
 """Frames that two windows of a chain share, at least: the middle one of each is among them."""
 _ONE_TURN = 1.0
@@ -51,11 +56,13 @@ class Window:
 
     views: Int[Tensor, "w"]
     found: FirstCameras
+    reference: int | None = None
+    """Rank of the frame whose camera is the world; that of the middle one if not given."""
 
     @property
     def middle(self) -> int:
         """The frame whose camera is the world."""
-        return int(self.views[len(self.views) // 2])
+        return int(self.views[len(self.views) // 2 if self.reference is None else self.reference])
 
 
 @dataclass(frozen=True)
@@ -82,26 +89,42 @@ class Chain:
         return self.poses[own] @ self.poses[a].inverse() @ poses[int(self.views[a])]
 
 
-def window_at(edges: Sequence[ImageEdges], first: int, K: Float[Tensor, "3 3"], sigma: float = _SURE) -> Window:
+def window_at(frames: Frames, first: int, K: Float[Tensor, "3 3"], sigma: float = _SURE) -> Window:
     """Cameras of a few frames by what is followed through them.
 
     Args:
-        edges: Of each frame of the sequence.
+        frames: Those of the sequence.
         first: The window's first frame.
         K: Calibration to expect; the focal length is found,
         sigma: known to such a part of it.
     """
-    views = torch.arange(first, min(first + WIDTH, len(edges)))
-    tracked = track_curves(as_edges([edges[i] for i in views.tolist()]), min_length=_LENGTH, max_curves=_CURVES).curves
+    views = torch.arange(first, min(first + WIDTH, len(frames.edges)))
+    motion = frames.motion[first : first + len(views) - 1] if frames.motion else None
+    edges = as_edges([frames.edges[i] for i in views.tolist()])
+    tracked = track_curves(edges, min_length=_LENGTH, max_curves=_CURVES, motion=motion).curves
     curves = Curve(tracked.x.double(), tracked.valid, tracked.closed)
-    return Window(views, first_cameras(curves, len(views) // 2, K[0, 0], K[:2, 2], sigma))
+    low, high = _telling(curves.valid.any(-1).sum(1).tolist())
+    views, own, reference = views[low:high], slice(low, high), len(views) // 2 - low
+    curves = Curve(curves.x[own], curves.valid[own], curves.closed[own])
+    found = first_cameras(curves, reference, K[0, 0], K[:2, 2], sigma, frames.starts(views))
+    return Window(views, found, reference)
 
 
-def all_windows(edges: Sequence[ImageEdges], K: Float[Tensor, "3 3"], sigma: float, progress: Progress) -> list[Window]:
-    """Windows that overlap from end to end; next to those that tell nothing there are two more.
+def _telling(shown: Sequence[int]) -> tuple[int, int]:
+    """The first of the frames, and the one after the last, that show curves enough to tell where their cameras are."""
+    low = high = len(shown) // 2
+    while low > 0 and shown[low - 1] >= _TELLING:
+        low -= 1
+    while high + 1 < len(shown) and shown[high + 1] >= _TELLING:
+        high += 1
+    return (low, high + 1) if high - low + 1 >= _LEAST else (0, len(shown))
+
+
+def all_windows(frames: Frames, K: Float[Tensor, "3 3"], sigma: float, progress: Progress) -> list[Window]:
+    """Windows that overlap from end to end; next to those that tell nothing, or of fewer frames, there are two more.
 
     Args:
-        edges: Of each frame.
+        frames: Those of the sequence.
         K: Calibration to expect.
         sigma: Standard deviation of its focal length, as a part of it.
         progress: Called as the work goes on.
@@ -112,24 +135,26 @@ def all_windows(edges: Sequence[ImageEdges], K: Float[Tensor, "3 3"], sigma: flo
         waiting = sorted({*firsts} - found.keys())
         for k, first in enumerate(waiting):
             progress("follow", k, len(waiting))
-            found[first] = window_at(edges, first, K, sigma)
+            found[first] = window_at(frames, first, K, sigma)
         progress("follow", len(waiting), len(waiting))
 
-    add(_firsts(edges, _NEXT))
-    last = _firsts(edges, 1)[-1]
-    refused = [first for first, window in found.items() if window.found.refusal]
-    add(first + step for first in refused for step in (-1, 1) if 0 <= first + step <= last)
+    frames = frames.seen_with(K)
+    add(_firsts(frames, _NEXT))
+    last = _firsts(frames, 1)[-1]
+    short = [k for k, one in found.items() if one.found.refusal or len(one.views) < min(WIDTH, len(frames.edges))]
+    add(first + step for first in short for step in (-1, 1) if 0 <= first + step <= last)
     return [found[first] for first in sorted(found)]
 
 
-def windows_by_themselves(edges: Sequence[ImageEdges], K: Float[Tensor, "3 3"]) -> list[Window]:
+def windows_by_themselves(frames: Frames, K: Float[Tensor, "3 3"]) -> list[Window]:
     """Windows from end to end, each sharing its last frame with the next, with a focal length that is known."""
-    return [window_at(edges, first, K) for first in _firsts(edges, WIDTH - 1)]
+    frames = frames.seen_with(K)
+    return [window_at(frames, first, K) for first in _firsts(frames, WIDTH - 1)]
 
 
-def _firsts(edges: Sequence[ImageEdges], step: int) -> list[int]:
+def _firsts(frames: Frames, step: int) -> list[int]:
     """First frames of windows, so many frames apart, up to the end."""
-    last = max(len(edges) - WIDTH, 0)
+    last = max(len(frames.edges) - WIDTH, 0)
     return sorted({*range(0, last + 1, step), last})
 
 
