@@ -12,7 +12,7 @@ from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation
 from torchsfm.geometry.distortion import Radial
 from torchsfm.images import detect_motion
 from torchsfm.reconstruction.curve_frames import Frames, as_motion, turns_between
-from torchsfm.reconstruction.curve_guess import guess_by_motion
+from torchsfm.reconstruction.curve_guess import agrees_with_motion, guess_by_motion
 from torchsfm.reconstruction.curve_mapping import CurveMapping
 from torchsfm.reconstruction.curve_windows import window_at
 from torchsfm.reconstruction.image_edges import ImageEdges
@@ -75,7 +75,7 @@ def test_a_window_between_whose_frames_much_moves(scene: Scene) -> None:
 def test_rotations_from_one_frame_to_the_next(scene: Scene) -> None:
     turns = turns_between(*scene.frames[:2], K)
     assert len(turns) == V - 1
-    assert scene.turned(torch.stack([turn for turn in turns if turn is not None])).max() < 3.0
+    assert scene.turned(torch.stack([turn.R for turn in turns if turn is not None])).max() < 3.0
     # Where nothing is sure, nothing is told, and nothing is begun from it.
     one = scene.frames.motion[1]
     blind = [*scene.frames.motion[:1], replace(one, sure=one.sure & False), *scene.frames.motion[2:]]
@@ -97,13 +97,25 @@ def test_a_guess_where_the_next_camera_is(scene: Scene) -> None:
     mapping = CurveMapping.start(scene.frames.edges, (HEIGHT, WIDTH), camera).placed(torch.tensor([1, 2]), scene.poses[1:3])
     curves = Curves(X, curve, closed, X, X[:, 0], X[:0, :2], X[:0, :2], X[:0, 0], X[:0, 0], none, none)
     mapping = mapping.with_curves(curves, torch.full_like(curve, 2))
-    guess = guess_by_motion(mapping, 3, scene.frames.motion)
+    guess = guess_by_motion(mapping, 3, scene.frames)
     assert guess is not None
     assert rotation_angle(guess.R[0] @ scene.poses.R[3].mT).rad2deg() < 1.0
-    back = guess_by_motion(mapping.with_curves(curves, torch.full_like(curve, 1)), 0, scene.frames.motion)
+    back = guess_by_motion(mapping.with_curves(curves, torch.full_like(curve, 1)), 0, scene.frames)
     assert back is not None
     assert rotation_angle(back.R[0] @ scene.poses.R[0].mT).rad2deg() < 1.0
     # No neighbour is placed; nothing of it is in the model; no motion is known.
-    assert guess_by_motion(mapping, 4, scene.frames.motion) is None
-    assert guess_by_motion(mapping, 0, scene.frames.motion) is None
-    assert guess_by_motion(mapping, 3, ()) is None
+    assert guess_by_motion(mapping, 4, scene.frames) is None
+    assert guess_by_motion(mapping, 0, scene.frames) is None
+    assert guess_by_motion(mapping, 3, Frames(scene.frames.edges)) is None
+
+
+def test_poses_that_the_motion_contradicts(scene: Scene) -> None:
+    camera = Camera(K, Radial(K.new_zeros(()), K.new_zeros(())))
+    frames = scene.frames.seen_with(K)
+    mapping = CurveMapping.start(frames.edges, (HEIGHT, WIDTH), camera).placed(torch.arange(3), scene.poses[:3])
+    assert agrees_with_motion(mapping, 2, frames)
+    assert agrees_with_motion(mapping.placed(torch.tensor([3]), scene.poses[3:4]), 3, frames)
+    turn = Pose(rotation_from_rotvec(torch.tensor([[0.1, 0.0, 0.0]], dtype=F64)), torch.zeros(1, 3, dtype=F64))
+    assert agrees_with_motion(mapping.placed(torch.tensor([3]), turn @ scene.poses[3:4]), 3, frames) is False
+    assert agrees_with_motion(mapping.placed(torch.tensor([4]), scene.poses[4:]), 4, frames) is None
+    assert agrees_with_motion(mapping, 2, Frames(frames.edges)) is None

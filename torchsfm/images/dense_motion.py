@@ -116,6 +116,18 @@ def detect_motion(images: Iterable[Photograph | Float[Tensor, "c h w"]]) -> list
         >>> [float(motion.sure.float().mean()) > 0.7 for motion in motions]  # not what enters on the left
         [True, True]
     """
+    import cv2
+
+    # What the flow's search hands on from patch to patch depends on the number of threads.
+    count = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        return _detect(images)
+    finally:
+        cv2.setNumThreads(count)
+
+
+def _detect(images: Iterable[Photograph | Tensor]) -> list[DenseMotion]:
     found: list[DenseMotion] = []
     before: tuple[NDArray[np.uint8], Features] | None = None
     for gray, features in _looks(images):

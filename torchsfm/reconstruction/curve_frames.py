@@ -41,14 +41,22 @@ def as_motion(arrays: Arrays) -> list[DenseMotion]:
     return [DenseMotion(shift, sure) for shift, sure in zip(arrays["shift"], arrays["sure"], strict=True)]
 
 
+class Turn(NamedTuple):
+    """How a camera turns to the next."""
+
+    R: Float[Tensor, "3 3"]
+    E: Float[Tensor, "3 3"]
+    """The essential matrix that this is from."""
+
+
 class Frames(NamedTuple):
     """The frames of a sequence."""
 
     edges: Sequence[ImageEdges]
     motion: Sequence[DenseMotion] = ()
     """Where what each shows is in the next one; empty if that was not looked for."""
-    turns: Sequence[Tensor | None] = ()
-    """Rotations from one camera to the next by that, None where it does not tell."""
+    turns: Sequence[Turn | None] = ()
+    """From one camera to the next by that, None where it does not tell."""
 
     def seen_with(self, K: Float[Tensor, "3 3"]) -> "Frames":
         """With the rotations that a calibration gives."""
@@ -61,14 +69,12 @@ class Frames(NamedTuple):
         for turn in turns:
             if turn is None:
                 return None
-            R.append(turn @ R[-1])
+            R.append(turn.R @ R[-1])
         return torch.stack(R)[None]
 
 
-def turns_between(
-    edges: Sequence[ImageEdges], motion: Sequence[DenseMotion], K: Float[Tensor, "3 3"]
-) -> list[Float[Tensor, "3 3"] | None]:
-    """Rotations from each camera to the next; None where too little tells of it.
+def turns_between(edges: Sequence[ImageEdges], motion: Sequence[DenseMotion], K: Float[Tensor, "3 3"]) -> list[Turn | None]:
+    """What tells how each camera turns to the next; None where too little does.
 
     They are where to begin, no more: one plane has two, and the focal length is not known yet.
 
@@ -77,19 +83,30 @@ def turns_between(
         motion: From each frame to the next.
         K: Calibration to expect.
     """
-    turns: list[Tensor | None] = []
+    turns: list[Turn | None] = []
     for own, step in zip(edges, motion, strict=False):
-        x = own.x.double()
-        y, sure = step.moved(x)
-        some = sure.nonzero()[:, 0]
-        some = some[:: max(1, len(some) // _PLACES)]
-        if len(some) < _FEWEST:
+        x, y = moved_places(own, step)
+        if len(x) < _FEWEST:
             turns.append(None)
             continue
-        d1, d2 = ((t - K[:2, 2]) / K[0, 0] for t in (x[some], y[some]))
-        d1, d2 = (torch.cat((d, torch.ones_like(d[:, :1])), -1) for d in (d1, d2))
+        d1, d2 = rays_of(x, K), rays_of(y, K)
         found = estimate_essential(d1, d2, threshold=_NEAR / float(K[0, 0]), generator=torch.Generator().manual_seed(0))
-        pose = pose_from_essential(found.model, d1, d2, found.inliers).pose
-        enough = int(found.inliers.sum()) >= _FEWEST and bool(pose.R.isfinite().all())
-        turns.append(pose.R if enough else None)
+        R = pose_from_essential(found.model, d1, d2, found.inliers).pose.R
+        enough = int(found.inliers.sum()) >= _FEWEST and bool(R.isfinite().all())
+        turns.append(Turn(R, found.model) if enough else None)
     return turns
+
+
+def moved_places(edges: ImageEdges, motion: DenseMotion) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]:
+    """Some places at edges of a frame, and where they are in the next one, as far as that is sure."""
+    x = edges.x.double()
+    y, sure = motion.moved(x)
+    some = sure.nonzero()[:, 0]
+    some = some[:: max(1, len(some) // _PLACES)]
+    return x[some], y[some]
+
+
+def rays_of(x: Float[Tensor, "n 2"], K: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3"]:
+    """Rays of pixels, the lens taken for one without distortion."""
+    d = (x - K[:2, 2]) / K[0, 0]
+    return torch.cat((d, torch.ones_like(d[:, :1])), -1)

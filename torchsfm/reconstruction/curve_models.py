@@ -76,13 +76,9 @@ def reconstruct_from_curves(
     with stages.timed("map"), one_thread():
         settled, reason = map_sequence(frames, (height, width), expected, progress)
     names = [sources.names[i] for i in readable.tolist()]
-    models: tuple[Reconstruction, ...] = ()
-    standing = None
-    if settled is not None:
-        with stages.timed("curves"):
-            model = _model(settled.mapping, names, size, zoom, progress)
-        models, standing = (model,), _standing(settled, expected)
-    images = _reports(sources.names, readable, found, settled, standing, reason)
+    with stages.timed("curves"):
+        models = tuple(_model(one.mapping, names, size, zoom, progress) for one in settled)
+    images = _reports(sources.names, readable, found, [(one, _standing(one, expected)) for one in settled], reason)
     none = torch.zeros(0, dtype=torch.long)
     pairs = pair_report(none.reshape(0, 2), none, none, none, none)
     return SfmResult(models, Report(images, pairs, dict(stages.seconds), (source,), method="curves", refusal=reason))
@@ -159,20 +155,22 @@ def _standing(settled: Settled, expected: Expected) -> Standing:
 
 
 def _reports(
-    names: Sequence[str], readable: Tensor, found: FoundEdges, settled: Settled | None, standing: Standing | None, reason: str
+    names: Sequence[str], readable: Tensor, found: FoundEdges, models: Sequence[tuple[Settled, Standing]], reason: str
 ) -> tuple[ImageReport, ...]:
     """What became of each file."""
     place = {file: i for i, file in enumerate(readable.tolist())}
     reports = []
     for k, name in enumerate(names):
         i, features = place.get(k), len(found.edges[k])
+        own = [] if i is None else [m for m, (one, _) in enumerate(models) if bool(one.mapping.registered[i])]
         if i is None:
             reports.append(ImageReport(name, None, "cannot be read as an image"))
-        elif settled is None or standing is None:
+        elif not models:
             reports.append(ImageReport(name, None, reason, features))
-        elif not settled.mapping.registered[i]:
+        elif not own:
             reports.append(ImageReport(name, None, "its edges do not fit the curves of the frames around", features))
         else:
+            standing = models[own[0]][1]
             sigma = {"rotation_sigma": float(standing.rotation_sigma[i]), "position_sigma": float(standing.position_sigma[i])}
-            reports.append(ImageReport(name, 0, "", features, doubt=standing.doubt[i], **sigma))
+            reports.append(ImageReport(name, own[0], "", features, doubt=standing.doubt[i], **sigma))
     return tuple(reports)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchsfm.bundle import RelativePosePrior
 from torchsfm.geometry import Camera, rotation_angle
 from torchsfm.reconstruction.curve_frames import Frames
-from torchsfm.reconstruction.curve_guess import guess_by_motion
+from torchsfm.reconstruction.curve_guess import agrees_with_motion, guess_by_motion
 from torchsfm.reconstruction.curve_mapping import (
     NEAR,
     CurveMapping,
@@ -124,7 +124,7 @@ class Expected:
         return {"free": self.free, "intrinsics_sigma": sigma, "intrinsics_mean": self.camera[(None,)], "priors": priors}
 
 
-def map_sequence(frames: Frames, size: tuple[int, int], expected: Expected, progress: Progress) -> tuple[Settled | None, str]:
+def map_sequence(frames: Frames, size: tuple[int, int], expected: Expected, progress: Progress) -> tuple[list[Settled], str]:
     """Cameras and curves of consecutive frames.
 
     Args:
@@ -134,30 +134,36 @@ def map_sequence(frames: Frames, size: tuple[int, int], expected: Expected, prog
         progress: Called as the work goes on.
 
     Returns:
-        The model; or None, and why there is none.
+        Models of frames that no two have in common, that of most frames first; or none, and why.
     """
     v = len(frames.edges)
     if v < FEWEST:
-        return None, f"{v} frames: curves alone need {FEWEST}"
+        return [], f"{v} frames: curves alone need {FEWEST}"
+    frames = frames.seen_with(expected.camera.K)
     found = all_windows(frames, expected.camera.K, expected.sigma["focal"], progress)
     windows = [window for window in found if not window.found.refusal]
     if not windows:
         reasons = [window.found.refusal for window in found]
-        return None, max(set(reasons), key=reasons.count)
+        return [], max(set(reasons), key=reasons.count)
     told = replace(expected.told(*focal_of(windows)), turns=turns_of(windows))
-    best: CurveMapping | None = None
+    frames = frames.seen_with(told.camera.K)
+    grown: list[CurveMapping] = []
     for chain in chains(windows)[:_TRIES]:
         begun = _begin(frames.edges, size, told.steady(), chain, progress)
         if not len(begun.curves):
             continue
-        grown = _grow(begun, frames, chain, told.steady(), progress)
-        if best is None or len(grown.known) > len(best.known):
-            best = grown
-        if len(best.known) >= _MOST * v:
+        grown.append(_grow(begun, frames, chain, told.steady(), progress))
+        if len(grown[-1].known) >= _MOST * v:
             break
-    if best is None:
-        return None, "no curves stay in one place"
-    return _together(best, frames, told, progress), ""
+    if not grown:
+        return [], "no curves stay in one place"
+    best: list[CurveMapping] = []
+    for one in sorted(grown, key=lambda mapping: -len(mapping.known)):
+        if not best or (
+            len(one.known) >= FEWEST and not any(bool((one.registered & other.registered).any()) for other in best)
+        ):
+            best.append(one)
+    return [_together(one, frames, told, progress) for one in best], ""
 
 
 def _begin(
@@ -189,8 +195,7 @@ def _grow(mapping: CurveMapping, frames: Frames, chain: Chain, told: Expected, p
         away = (torch.arange(v)[:, None] - mapping.known).abs().amin(-1)
         waiting = [i for i in away.argsort(stable=True).tolist() if 0 < away[i] <= _GAP and i not in failed]
         if waiting:
-            carried = chain.carried(waiting[0], mapping.known, mapping.poses)
-            more = register(mapping, waiting[0], (carried, guess_by_motion(mapping, waiting[0], frames.motion)))
+            more = _next(mapping, waiting[0], frames, chain)
             if more is None:
                 failed.add(waiting[0])
             else:
@@ -201,6 +206,17 @@ def _grow(mapping: CurveMapping, frames: Frames, chain: Chain, told: Expected, p
             mapping, adjusted, failed = settle(mapping, told.terms(mapping.registered), rounds=_ROUGH), count, set()
         elif not waiting:
             return mapping
+
+
+def _next(mapping: CurveMapping, view: int, frames: Frames, chain: Chain) -> CurveMapping | None:
+    """The model with one more frame, if that is found and what moves does not contradict it."""
+    carried = chain.carried(view, mapping.known, mapping.poses)
+    more = register(mapping, view, (carried, guess_by_motion(mapping, view, frames)))
+    if more is None or not len(frames.motion):
+        return more
+    right = agrees_with_motion(more, view, frames)
+    # What neither a window nor the motion tells is found next to edges anywhere.
+    return more if right or (right is None and carried is not None) else None
 
 
 def _together(mapping: CurveMapping, frames: Frames, told: Expected, progress: Progress) -> Settled:
@@ -214,7 +230,7 @@ def _together(mapping: CurveMapping, frames: Frames, told: Expected, progress: P
         if moved < _STILL:
             break
     seen = frames._replace(edges=[sight.edges for sight in mapping.sights])
-    alone = windows_by_themselves(seen, told.camera.K)
+    alone = windows_by_themselves(seen.seen_with(told.camera.K), told.camera.K)
     return Settled(prune(mapping), moved, contradictions(alone, mapping.poses, mapping.registered), told)
 
 

@@ -138,7 +138,6 @@ def all_windows(frames: Frames, K: Float[Tensor, "3 3"], sigma: float, progress:
             found[first] = window_at(frames, first, K, sigma)
         progress("follow", len(waiting), len(waiting))
 
-    frames = frames.seen_with(K)
     add(_firsts(frames, _NEXT))
     last = _firsts(frames, 1)[-1]
     short = [k for k, one in found.items() if one.found.refusal or len(one.views) < min(WIDTH, len(frames.edges))]
@@ -148,7 +147,6 @@ def all_windows(frames: Frames, K: Float[Tensor, "3 3"], sigma: float, progress:
 
 def windows_by_themselves(frames: Frames, K: Float[Tensor, "3 3"]) -> list[Window]:
     """Windows from end to end, each sharing its last frame with the next, with a focal length that is known."""
-    frames = frames.seen_with(K)
     return [window_at(frames, first, K) for first in _firsts(frames, WIDTH - 1)]
 
 
