@@ -13,9 +13,9 @@ from torchsfm.geometry.distortion import Radial
 from torchsfm.images import read_image
 from torchsfm.reconstruction.curve_frames import Frames
 from torchsfm.reconstruction.curve_mapping import CurveMapping
-from torchsfm.reconstruction.curve_sequence import Expected, Settled
+from torchsfm.reconstruction.curve_sequence import Expected, Settled, apart
 from torchsfm.reconstruction.curve_start import FirstCameras
-from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of, turns_of, window_at
+from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of, telling, turns_of, window_at
 from torchsfm.reconstruction.image_edges import ImageEdges
 
 F64 = torch.float64
@@ -166,3 +166,26 @@ def test_a_window_of_a_real_turntable_by_a_long_lens(data: Path) -> None:
     assert found.refusal == ""
     assert rotation_angle(found.poses.R @ (R @ R[2].mT).mT).rad2deg().max() < 1.0
     assert abs(math.log(float(found.focal / numbers[0, 0]))) < 0.1
+
+
+def test_models_share_no_frame() -> None:
+    camera = Camera(K, Radial(K.new_zeros(()), K.new_zeros(())))
+    nothing = CurveMapping.start([ImageEdges.none()] * 20, (300, 400), camera)
+    poses = Pose.identity(20, dtype=F64)
+    models = [
+        nothing.placed(torch.tensor(views), poses[: len(views)])
+        for views in ([12, 13, 14, 15], [*range(9)], [8, 9, 10, 11, 16], [17, 18, 19])
+    ]
+    assert [one.known.tolist() for one in apart(models)] == [[*range(9)], [12, 13, 14, 15]]
+    assert [len(one.known) for one in apart(models[3:])] == [3]
+    assert apart([]) == []
+
+
+def test_frames_at_the_ends_that_show_too_little_are_left_out() -> None:
+    assert telling([9, 9, 9, 9, 9]) == (0, 5)
+    assert telling([2, 9, 9, 9, 1]) == (1, 4)
+    assert telling([2, 9, 9, 7, 8]) == (1, 5)
+    # What is beyond a frame that shows too little is not linked to the middle; of two frames nothing is told.
+    assert telling([9, 1, 9, 9, 9]) == (2, 5)
+    assert telling([9, 1, 9, 9, 1]) == (0, 5)
+    assert telling([1, 1, 3, 1, 1]) == (0, 5)

@@ -157,13 +157,17 @@ def map_sequence(frames: Frames, size: tuple[int, int], expected: Expected, prog
             break
     if not grown:
         return [], "no curves stay in one place"
-    best: list[CurveMapping] = []
-    for one in sorted(grown, key=lambda mapping: -len(mapping.known)):
-        if not best or (
-            len(one.known) >= FEWEST and not any(bool((one.registered & other.registered).any()) for other in best)
-        ):
-            best.append(one)
-    return [_together(one, frames, told, progress) for one in best], ""
+    return [_together(one, frames, told, progress) for one in apart(grown)], ""
+
+
+def apart(models: Sequence[CurveMapping]) -> list[CurveMapping]:
+    """Models that share no frame: the one of most frames, of the others the one of most, and so on."""
+    kept: list[CurveMapping] = []
+    for one in sorted(models, key=lambda mapping: -len(mapping.known)):
+        free = not any(bool((one.registered & other.registered).any()) for other in kept)
+        if not kept or (free and len(one.known) >= FEWEST):
+            kept.append(one)
+    return kept
 
 
 def _begin(

@@ -103,14 +103,14 @@ def window_at(frames: Frames, first: int, K: Float[Tensor, "3 3"], sigma: float 
     edges = as_edges([frames.edges[i] for i in views.tolist()])
     tracked = track_curves(edges, min_length=_LENGTH, max_curves=_CURVES, motion=motion).curves
     curves = Curve(tracked.x.double(), tracked.valid, tracked.closed)
-    low, high = _telling(curves.valid.any(-1).sum(1).tolist())
+    low, high = telling(curves.valid.any(-1).sum(1).tolist())
     views, own, reference = views[low:high], slice(low, high), len(views) // 2 - low
     curves = Curve(curves.x[own], curves.valid[own], curves.closed[own])
     found = first_cameras(curves, reference, K[0, 0], K[:2, 2], sigma, frames.starts(views))
     return Window(views, found, reference)
 
 
-def _telling(shown: Sequence[int]) -> tuple[int, int]:
+def telling(shown: Sequence[int]) -> tuple[int, int]:
     """The first of the frames, and the one after the last, that show curves enough to tell where their cameras are."""
     low = high = len(shown) // 2
     while low > 0 and shown[low - 1] >= _TELLING:
