@@ -44,6 +44,7 @@ LABELS = {
     "bundle": "adjusting",
     "merge": "joining the models",
     "edges": "finding edges",
+    "motion": "finding what moves where",
     "follow": "following edges through images",
     "curves": "finding curves in space",
     "write": "writing results",

@@ -83,10 +83,11 @@ def reconstruct(
             camera comes back, so that what each adds to the drift is spread over the loop; "auto" is "global" for 500 images or
             more that many pairs hold together and whose focal lengths are roughly known, else "incremental"; "curves" goes by
             edges alone, where points do not suffice: smooth things with painted curves. The images are consecutive frames of
-            one camera that is a little elsewhere each time; its principal point is held centred. Curves are followed through a
-            few frames at a time, which tells their cameras; these are joined, other frames are placed by the curves in space,
-            and all are adjusted together. There are no points then: the curves are in `Reconstruction.curves`. `report.refusal`
-            says why where there is no model.
+            one camera that is a little elsewhere each time, or farther where dense motion tells where what they show is in the
+            next one; its principal point is held centred. Curves are followed through a few frames at a time, which tells their
+            cameras; these are joined, other frames are placed by the curves in space, and all are adjusted together; where
+            nothing joins them there are several models. There are no points then: the curves are in `Reconstruction.curves`.
+            `report.refusal` says why where there is no model.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
         curves: Find curves in space, too, with the cameras that have been found: edges of the photographs, scaled down to a
