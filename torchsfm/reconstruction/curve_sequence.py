@@ -149,6 +149,8 @@ def map_sequence(frames: Frames, size: tuple[int, int], expected: Expected, prog
     frames = frames.seen_with(told.camera.K)
     grown: list[CurveMapping] = []
     for chain in chains(windows)[:_TRIES]:
+        if any(bool(other.registered[chain.begun()[0]].all()) for other in grown):
+            continue
         begun = _begin(frames.edges, size, told.steady(), chain, progress)
         if not len(begun.curves):
             continue
