@@ -88,18 +88,13 @@ def cofactors(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     return C
 
 
-def left_epipole(F: Float[Tensor, "*#batch 3 3"], e: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
-    """The left null vector of F, of norm 1 and on the side of a given one.
+def with_left_epipole(F: Float[Tensor, "*#batch 3 3"], e: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 4"]:
+    """F and its left null vector, of norm 1 and on the side of a given one.
 
     It is across all columns: across two mixtures of them, so that no choice between pairs of columns is needed.
     """
     first, second, third = F.unbind(-1)
     across = torch.linalg.cross(torch.add(first, third, alpha=MIXTURE[0]), torch.add(second, third, alpha=MIXTURE[1]))
     length = torch.linalg.vector_norm(across, dim=-1, keepdim=True).clamp(min=1e-100)
-    turned: Tensor = across / torch.copysign(length, (across * e).sum(-1, keepdim=True))
-    return turned
-
-
-def with_left_epipole(F: Float[Tensor, "*#batch 3 3"], e: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 4"]:
-    """F and its left null vector, of norm 1 and on the side of a given one."""
-    return torch.cat((F, left_epipole(F, e)[..., None]), -1)
+    turned = across / torch.copysign(length, (across * e).sum(-1, keepdim=True))
+    return torch.stack((first, second, third, turned), -1)

@@ -10,15 +10,7 @@ from torch import Tensor
 from torchsfm._types import Solutions
 from torchsfm.linalg import damped_solve, svd
 from torchsfm.motion.two_views.collinear import collinear, collinear_suspected
-from torchsfm.motion.two_views.epipolar_fit import (
-    cofactors,
-    cross_rows,
-    left_epipole,
-    matrices,
-    plane_rows,
-    product,
-    with_left_epipole,
-)
+from torchsfm.motion.two_views.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, product, with_left_epipole
 from torchsfm.motion.two_views.estimate_homography import HomographyEstimator
 from torchsfm.motion.two_views.normalization import common_scale, largest_positive
 from torchsfm.motion.two_views.oriented_7pt import oriented_7pt
@@ -88,7 +80,7 @@ class FundamentalEstimator:
         """A Gauss-Newton step on Sampson's distance along the matrices of norm 1 and determinant 0.
 
         The step minimises the quadratic model under the linearised constraint (sequential quadratic programming). What that
-        leaves of the determinant goes with what F has along the new epipole: beside the manifold the loss may be less than
+        leaves of the determinant goes with one more step along its gradient: beside the manifold the loss may be less than
         anywhere on it, and every step from there would be one up.
         """
         A, b = step_equations(model, x1, x2, weigh)
@@ -103,10 +95,7 @@ class FundamentalEstimator:
         gap = (normal * torch.sub(f, free, alpha=3)).sum(-1, keepdim=True)
         share = (normal * bound).sum(-1, keepdim=True)
         f = torch.addcmul(f - free, gap / share.masked_fill(share <= 0, torch.inf), bound, value=-1 / 3)
-        F = matrices(f / torch.linalg.vector_norm(f, dim=-1, keepdim=True), 3)
-        e = left_epipole(F, e)[..., None]
-        F = torch.addcmul(F, e, (e * F).sum(-2, keepdim=True), value=-1)
-        return torch.cat((F, e), -1).to(x1.dtype)
+        return with_left_epipole(matrices(_determinant_step(f), 3), e).to(x1.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
         """F moved along a basis of the tangent space, then to determinant 0 up to fourth order, and to norm 1."""
