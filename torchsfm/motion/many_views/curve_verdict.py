@@ -30,6 +30,14 @@ _FLAT_STEPS = 30
 """Most steps of the homographies that are fitted for comparison: where they do not fit, their minimum does not matter."""
 
 
+def enough_shown(shown: Float[Tensor, "p c m"], view: Bool[Tensor, "p v"]) -> Bool[Tensor, "p"]:
+    """Whether cameras may follow from samples shown in so many views; more views never make it worse."""
+    v = view.sum(-1)
+    enough = (v >= 3) & ((shown - 2).clamp(min=0).sum((-2, -1)) >= 11 * v - 15)
+    beyond = (shown.amax(-1) - 2).clamp(min=0)
+    return enough & ((beyond > 0).sum(-1) >= 2) & (beyond.sum(-1) >= _BEYOND_TWO)
+
+
 def judge(images: CurvePlaces, found: Found, view: Bool[Tensor, "p v"], threshold: Float[Tensor, "p"]) -> Tensor:
     """What became of each problem (p); `threshold` in the frame in which it was solved."""
     v = view.sum(-1)
@@ -38,9 +46,6 @@ def judge(images: CurvePlaces, found: Found, view: Bool[Tensor, "p v"], threshol
     observed, points = counts.sum((1, 2, 3)), found.measured.sum((-2, -1))
     shown = found.weight.sum(1)
     unknowns = 11 * v - 15
-    enough = (v >= 3) & ((shown - 2).clamp(min=0).sum((-2, -1)) >= unknowns)
-    beyond = (shown.amax(-1) - 2).clamp(min=0)
-    enough &= ((beyond > 0).sum(-1) >= 2) & (beyond.sum(-1) >= _BEYOND_TWO)
     redundancy = observed - 2 * points - unknowns
     total = (found.misfit.nan_to_num(0.0, 0.0, 0.0).square() * views).sum((-2, -1))
     rms = (total / observed.clamp(min=1)).sqrt()
@@ -57,7 +62,7 @@ def judge(images: CurvePlaces, found: Found, view: Bool[Tensor, "p v"], threshol
     status = torch.where(found.end.status == Status.OK, int(Status.OK), int(Status.NOT_CONVERGED))
     status = torch.where(wrong, int(Status.NO_CONSENSUS), status)
     status = torch.where(loose, int(Status.DEGENERATE), status)
-    return torch.where(enough, status, int(Status.TOO_FEW))
+    return torch.where(enough_shown(shown, view), status, int(Status.TOO_FEW))
 
 
 def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor) -> Bool[Tensor, "p"]:

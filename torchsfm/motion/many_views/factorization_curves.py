@@ -20,7 +20,7 @@ from torchsfm.motion.many_views.curve_anew import put_together
 from torchsfm.motion.many_views.curve_fit import Scene
 from torchsfm.motion.many_views.curve_search import Found, agreement, approach, finish, typical_misfit
 from torchsfm.motion.many_views.curve_starts import Runs, guess_runs
-from torchsfm.motion.many_views.curve_verdict import judge
+from torchsfm.motion.many_views.curve_verdict import enough_shown, judge
 from torchsfm.motion.many_views.factorization_points import factorize_points, signs_of_depths
 from torchsfm.optim.pytree import cut, join, pick
 
@@ -68,7 +68,7 @@ class CurveFactorization:
     P: Float[Tensor, "*batch v 3 4"]
     """Camera matrices, |P| = 1; zero where `used_view` is False."""
     X: Float[Tensor, "*batch c m 4"]
-    """Samples of the space curves in order, homogeneous, of norm 1."""
+    """Samples of the space curves in order, homogeneous, of norm 1; zero where the curves shown are too few for any search."""
     x: Float[Tensor, "*batch v c m 2"]
     """The nearest points of the image curves: points in correspondence; zero where an image does not show the curve."""
     error: Float[Tensor, "*batch v c m"]
@@ -170,6 +170,9 @@ def _factorize(
     there = (places.number >= 3) & torch.isfinite(curves.x).all(-1).all(-1)
     there = there & (there.sum(1, keepdim=True) >= 3)
     view = there.any(-1)
+    # No search shows more than the curves do.
+    if not bool(enough_shown(there.sum(1).to(curves.x.dtype)[..., None].expand(-1, -1, m), view)):
+        return _too_few(there, m, curves.x)
     centre, scale = _frames(places, there)
     x = torch.where(curves.valid[..., None], (curves.x - centre[:, :, None, None]) / scale[:, None, None, None, None], 0)
     moved = Curve(torch.where(there[..., None, None], x, 0), curves.valid & there[..., None], curves.closed)
@@ -198,6 +201,20 @@ def _factorize(
         found.measured,
         used,
         status.to(torch.int8),
+    )
+
+
+def _too_few(there: Bool[Tensor, "p v c"], m: int, like: Tensor) -> CurveFactorization:
+    """What is said where the counts alone leave cameras open."""
+    p, v, c = there.shape
+    return CurveFactorization(
+        like.new_zeros(p, v, 3, 4),
+        like.new_zeros(p, c, m, 4),
+        like.new_zeros(p, v, c, m, 2),
+        like.new_full((p, v, c, m), torch.inf),
+        there.new_zeros(p, c, m),
+        there.new_zeros(p, v),
+        torch.full((p,), int(Status.TOO_FEW), dtype=torch.int8, device=like.device),
     )
 
 
