@@ -20,9 +20,9 @@ class Runner:
     patch: pytest.MonkeyPatch
     capsys: pytest.CaptureFixture[str]
 
-    def run(self, script: Path) -> tuple[str, dict[str, Any]]:
+    def run(self, script: Path, *words: str) -> tuple[str, dict[str, Any]]:
         """What a script prints, and the names that it leaves behind."""
-        self.patch.setattr(sys, "argv", [str(script)])
+        self.patch.setattr(sys, "argv", [str(script), *words])
         space = runpy.run_path(str(script), run_name="__main__")
         return self.capsys.readouterr().out, space
 

@@ -235,7 +235,9 @@ def test_gradients_of_minimal_solutions(kind: type, generator: torch.Generator) 
         slot = error.argmin(-1)
 
         def solve(*data: torch.Tensor) -> torch.Tensor:
-            return scene.estimator.minimal(*data).model[torch.arange(3), slot]
+            more = data[0].shape[: data[0].ndim - scene.data[0].ndim]
+            wide = tensor_map(lambda t: t.expand(more + t.shape), scene.estimator)
+            return wide.minimal(*data).model[(slice(None),) * len(more) + (torch.arange(3), slot)]
 
         inputs = [d.clone().requires_grad_() for d in scene.data]
         slopes = torch.autograd.grad(solve(*inputs).square().sum(), inputs, allow_unused=True)
@@ -247,14 +249,15 @@ def test_gradients_of_minimal_solutions(kind: type, generator: torch.Generator) 
     solve, inputs, steepest = min(tried, key=lambda one: one[2])
     assert steepest < math.inf
     derivatives = torch.autograd.functional.jacobian(solve, tuple(inputs))
-    # `gradcheck` would prepare for derivatives at each of its differences.
+    # `gradcheck` would prepare for derivatives at each of its differences, and take them one by one.
     with torch.no_grad():
         for k, (x, derivative) in enumerate(zip(inputs, derivatives, strict=True)):
-            for i in range(x.numel()):
-                step = torch.zeros(x.numel(), dtype=x.dtype).index_fill(0, torch.tensor(i), 1e-8).view(x.shape)
-                ahead, behind = (solve(*inputs[:k], x + d, *inputs[k + 1 :]) for d in (step, -step))
-                difference = (ahead - behind) / 2e-8
-                torch.testing.assert_close(derivative.flatten(ahead.ndim)[..., i], difference, rtol=1e-3, atol=1e-3)
+            n = x.numel()
+            step = 1e-8 * torch.eye(n, dtype=x.dtype).view(n, *x.shape)
+            before, after = ([y.expand(n, *y.shape) for y in part] for part in (inputs[:k], inputs[k + 1 :]))
+            ahead, behind = (solve(*before, x + d, *after) for d in (step, -step))
+            difference = ((ahead - behind) / 2e-8).movedim(0, -1)
+            torch.testing.assert_close(derivative.flatten(ahead.ndim - 1), difference, rtol=1e-3, atol=1e-3)
 
 
 # ---- estimation in the presence of outliers --------------------------------------------------------------------------------
@@ -290,14 +293,12 @@ def test_ransac_is_deterministic_alone_and_in_a_batch(kind: type, generator: tor
     together = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seeded(3))
     again = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seeded(3))
     assert torch.equal(together.model, again.model)
-    for i in range(2):
-        for j in range(3):
-            estimator = tensor_map(lambda t: t[i, j], scene.estimator)  # noqa: B023
-            own = [d[i, j] for d in data]
-            alone = ransac(estimator, *own, threshold=3 * scene.noise, mask=mask[i, j], generator=seeded(3))
-            assert torch.equal(alone.inliers, together.inliers[i, j])
-            assert torch.equal(alone.iterations, together.iterations[i, j])
-            torch.testing.assert_close(alone.model, together.model[i, j], rtol=1e-9, atol=1e-9)
+    for i, j in ((0, 0), (0, 1), (1, 2)):
+        estimator, own = row(scene, (i, j))[0], [d[i, j] for d in data]
+        alone = ransac(estimator, *own, threshold=3 * scene.noise, mask=mask[i, j], generator=seeded(3))
+        assert torch.equal(alone.inliers, together.inliers[i, j])
+        assert torch.equal(alone.iterations, together.iterations[i, j])
+        torch.testing.assert_close(alone.model, together.model[i, j], rtol=1e-9, atol=1e-9)
 
 
 def test_ransac_follows_the_dtype(kind: type, generator: torch.Generator) -> None:

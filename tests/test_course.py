@@ -1,8 +1,6 @@
 """The notebooks of the course run as scripts, write nothing, and what they print is true."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -134,14 +132,11 @@ def test_cells_read_the_same_in_editors_and_in_galleries(name: str) -> None:
     assert "plt.show(" not in text
 
 
-def test_figures_are_saved_where_told(tmp_path: Path) -> None:
-    script = str(COURSE / "save_figures.py")
-    done = subprocess.run(
-        [sys.executable, script, str(tmp_path / "figures"), "6"], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert done.returncode == 0, done.stderr
-    assert {p.name for p in tmp_path.iterdir()} == {"figures"}
-    assert {p.suffix for p in (tmp_path / "figures").iterdir()} == {".png"}
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_figures_are_saved_where_told(runner: Runner) -> None:
+    runner.run(COURSE / "save_figures.py", str(runner.folder / "figures"), "6")
+    assert {p.name for p in runner.folder.iterdir()} == {"figures"}
+    assert {p.suffix for p in (runner.folder / "figures").iterdir()} == {".png"}
 
 
 def test_table_of_contents() -> None:

@@ -32,7 +32,7 @@ def said_by(code: str) -> str:
 def test_all_names_are_listed_and_loaded_together() -> None:
     """And leave slow packages out, which only those load who need them."""
     code = (
-        "from torchsfm import *; import sys, torchsfm;"
+        "from torchsfm import *; import sys, torchsfm, torchsfm.plot;"
         "slow = {'kornia', 'cv2', 'matplotlib', 'plotly', 'pycolmap', 'typer', 'rich', 'scipy'};"
         "print(set(torchsfm.__all__) <= set(globals()) & set(dir(torchsfm)), sorted(slow & set(sys.modules)))"
     )

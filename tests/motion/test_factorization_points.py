@@ -310,7 +310,8 @@ def test_noise_does_not_make_up_what_points_leave_open(layout: str, v: int, gene
         return x + 0.5 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
 
     assert (factorize_points(images(X)).status == Status.OK).double().mean() < 0.15
-    assert (factorize_points(images(general)).status == Status.OK).double().mean() > 0.9
+    if layout == "plane and a point":  # once: points in general position are of no layout
+        assert (factorize_points(images(general)).status == Status.OK).double().mean() > 0.9
 
 
 @pytest.mark.parametrize("views", [2, 3])

@@ -1,8 +1,6 @@
 """Figures hold what they were given; warnings are errors, also when drawing."""
 
 import builtins
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -269,12 +267,6 @@ def test_without_matplotlib_the_error_names_the_extra(monkeypatch: pytest.Monkey
     monkeypatch.setattr(builtins, "__import__", absent)
     with pytest.raises(ImportError, match=r"pip install 'torchsfm\[plot\]'"):
         show_image(torch.rand(4, 4))
-
-
-def test_importing_the_room_does_not_import_matplotlib() -> None:
-    code = "import sys, torchsfm.plot; print([m for m in ('matplotlib', 'plotly', 'cv2', 'kornia') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def test_lines_in_space_are_drawn_where_they_are(generator: torch.Generator) -> None:

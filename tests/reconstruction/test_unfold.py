@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from chance import seeded
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -112,6 +113,15 @@ def wrong_cameras(model: Mapping, truth: Pose) -> int:
     return int((errors.image_position > 0.05 * (truth.centre[-1] - truth.centre[0]).norm())[model.registered].sum())
 
 
+@pytest.fixture(scope="module")
+def folded() -> tuple[Mapping, Pose, Mapping]:
+    """A street, its true poses, and the model in which both copies are at one place."""
+    empty, truth, _ = street(seeded(), apart=8.0)
+    model = mapped(empty)
+    assert wrong_cameras(model, truth) > 0
+    return empty, truth, model
+
+
 def test_the_backbone_passes_by_copies(generator: torch.Generator) -> None:
     fooled = 0
     for _ in range(10):
@@ -124,19 +134,16 @@ def test_the_backbone_passes_by_copies(generator: torch.Generator) -> None:
     assert fooled > 0
 
 
-def test_a_folded_model_is_put_right(generator: torch.Generator) -> None:
-    for _ in range(2):
-        empty, truth, _ = street(generator, apart=8.0)
-        folded = mapped(empty)
-        assert wrong_cameras(folded, truth) > 0
-        unfolded = unfold(empty, folded, empty.registered, options(empty), quiet)
-        assert unfolded.model.registered.all()
-        assert wrong_cameras(unfolded.model, truth) == 0
-        assert not unfolded.uncertain.any()
-        assert not len(missing_correspondences(unfolded.model).refuted)
-        # The pairs that took one copy for the other have no say in it any more.
-        left = torch.unique(unfolded.model.graph.match_pair)
-        assert set(left.tolist()) < set(empty.graph.match_pair.tolist())
+def test_a_folded_model_is_put_right(folded: tuple[Mapping, Pose, Mapping]) -> None:
+    empty, truth, model = folded
+    unfolded = unfold(empty, model, empty.registered, options(empty), quiet)
+    assert unfolded.model.registered.all()
+    assert wrong_cameras(unfolded.model, truth) == 0
+    assert not unfolded.uncertain.any()
+    assert not len(missing_correspondences(unfolded.model).refuted)
+    # The pairs that took one copy for the other have no say in it any more.
+    left = torch.unique(unfolded.model.graph.match_pair)
+    assert set(left.tolist()) < set(empty.graph.match_pair.tolist())
 
 
 def test_what_nothing_refutes_is_left_alone(generator: torch.Generator) -> None:
@@ -151,15 +158,13 @@ def test_what_nothing_refutes_is_left_alone(generator: torch.Generator) -> None:
 
 
 def test_what_contradicts_the_most_distinctive_relations_is_doubted(
-    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+    folded: tuple[Mapping, Pose, Mapping], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    empty, truth, _ = street(generator, apart=8.0)
-    folded = mapped(empty)
-    assert wrong_cameras(folded, truth) > 0
+    empty, _, model = folded
     # Nothing better is found.
     monkeypatch.setattr("torchsfm.reconstruction.unfold.ROUNDS", 0)
-    unfolded = unfold(empty, folded, empty.registered, options(empty), quiet)
-    assert unfolded.model is folded
+    unfolded = unfold(empty, model, empty.registered, options(empty), quiet)
+    assert unfolded.model is model
     assert unfolded.uncertain.any()
 
 
