@@ -18,7 +18,7 @@ from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.reconstruction.windows import Window, join_windows, map_windows
 from torchsfm.simulation import orbit_poses
 
-FRAMES, NEXT = 20, 12
+FRAMES, NEXT = 16, 10
 """Of windows smaller than those of films, which show the same in less time."""
 VIEWS = 2 * NEXT + FRAMES - 4
 """Three windows."""
