@@ -82,7 +82,7 @@ def reconstruct(
         bool | None,
         typer.Option(
             "--shared-camera/--own-cameras",
-            help="Whether one camera took all images of a size; by default as folders and the files' Exif data suggest.",
+            help="Whether one camera took all images of a size; by default as folders, Exif data and the images suggest.",
             show_default=False,
         ),
     ] = None,

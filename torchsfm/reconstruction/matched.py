@@ -95,7 +95,8 @@ def reconstruct_matches(
         color: Colours of the keypoints in [0, 1].
         camera: Distortion model, see `reconstruct`.
         camera_index: Which camera took each image, numbered from 0; images of different size never share one.
-        shared_camera: Whether all images of one size share a camera, as they do by default where `camera_index` is not given.
+        shared_camera: Whether all images of one size share a camera, as they do by default where `camera_index` is not given,
+            unless pairs and models say that their focal lengths differ.
         K: Known intrinsics of all images.
         focal: First guess of the focal length in pixels, of all images or of each, which is then adjusted.
         free_principal_point: Estimate the principal point too.
@@ -174,6 +175,7 @@ def reconstruct_matches(
         generator=generator,
         stages=stages,
         progress=report,
+        known_cameras=camera_index is not None,
     )
 
 

@@ -62,6 +62,7 @@ def build_models(
     progress: Progress,
     segments: Callable[[], FoundSegments] | None = None,
     edges: Callable[[], FoundEdges] | None = None,
+    known_cameras: bool = False,
 ) -> SfmResult:
     """Reconstruct every component of a view graph.
 
@@ -82,6 +83,7 @@ def build_models(
         progress: Called as images are registered.
         segments: Finds the segments of all images where lines are wanted.
         edges: Finds the edges of all images where curves are wanted.
+        known_cameras: Whether labels tell for certain which images one camera took.
     """
     if camera not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
@@ -106,7 +108,7 @@ def build_models(
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, begun.options.focal_sigma[together])
         report = lambda n, v: progress("map", n, v)  # noqa: E731
-        if shared_camera is None and K is None:
+        if shared_camera is None and K is None and not known_cameras:
             apart = part_zoomed(graph, together, torch.tensor([focal is not None for focal in exif_focal]))
             if apart is not None:
                 begun = better_beginning(begun, begin(apart), partial(_settled, method, report))
@@ -247,7 +249,8 @@ def reconstruct_tracks(
         names: Names of the images.
         color: Colours of the image points in [0, 1].
         camera: Distortion model, see `reconstruct`.
-        shared_camera: Whether all images of one size share a camera, as they do by default.
+        shared_camera: Whether all images of one size share a camera, as they do by default unless pairs and models say that
+            their focal lengths differ.
         K: Known intrinsics of all images.
         focal: First guess of the focal length in pixels, which is then adjusted; one that the images refute is not used.
         free_principal_point: Estimate the principal point too.

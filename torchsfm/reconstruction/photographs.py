@@ -69,7 +69,8 @@ def reconstruct(
         camera: Name of the distortion model, one of `torchsfm.DISTORTION_MODELS`. By default "radial", or "pinhole"
             when `K` is given.
         shared_camera: Whether one camera took all images of the same size. By default it did where they lie in one folder and
-            the files name the same camera and focal length, or name none.
+            the files name the same camera and focal length, or name none, unless without a focal length pairs and models say
+            that there are several.
         K: Known intrinsics of all images, in pixels; they are not adjusted.
         free_principal_point: Estimate the principal point too, of models of four images or more, expected within 1 % of the
             image's size from its centre, instead of holding it there. Where images of different sizes say that they were
