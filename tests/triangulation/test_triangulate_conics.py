@@ -194,10 +194,10 @@ def test_a_plane_seen_from_nearly_one_place_is_told(generator):
 
 
 def arcs(scene: SimulatedConics, degrees: float, sigma: float, generator: torch.Generator) -> Tensor:
-    """Edge points (*batch, v, n, 60, 2) of arcs that begin anywhere."""
+    """Edge points (*batch, v, n, 30, 2) of arcs that begin anywhere."""
     ellipse, _ = ellipse_from_conic(scene.C)
     begin = torch.rand(*ellipse.angle.shape, 1, generator=generator, dtype=F64) * (2 * math.pi)
-    t = begin + torch.linspace(0, math.radians(degrees), 60, dtype=F64)
+    t = begin + torch.linspace(0, math.radians(degrees), 30, dtype=F64)
     cos, sin = ellipse.angle.cos()[..., None], ellipse.angle.sin()[..., None]
     u, v = ellipse.semi_axes[..., :1] * t.cos(), ellipse.semi_axes[..., 1:] * t.sin()
     x = ellipse.centre[..., None, :] + torch.stack((u * cos - v * sin, u * sin + v * cos), -1)
