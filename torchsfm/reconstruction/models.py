@@ -14,7 +14,7 @@ from torchsfm._types import check_one_problem, check_options
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS
-from torchsfm.reconstruction.beginning import Beginning, grow_by
+from torchsfm.reconstruction.beginning import Beginning, Grown, grow_by
 from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import group_cameras
 from torchsfm.reconstruction.choose_mapper import choose_mapper
@@ -108,10 +108,11 @@ def build_models(
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, begun.options.focal_sigma[together])
         report = lambda n, v: progress("map", n, v)  # noqa: E731
-        if shared_camera is None and K is None and not known_cameras:
+        first: Grown | None = None
+        if shared_camera is None and K is None and not known_cameras and method != "projective":
             apart = part_zoomed(graph, together, torch.tensor([focal is not None for focal in exif_focal]))
             if apart is not None:
-                begun = better_beginning(begun, begin(apart), partial(_settled, method, report))
+                begun, first = better_beginning(begun, begin(apart), partial(_settled, method, report))
         empty, options, source = begun.empty, begun.options, begun.source
         cameras, camera_index = empty.cameras, empty.camera_index
         # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
@@ -138,7 +139,7 @@ def build_models(
                 mapped, known = extend_model(start.mapping, taken, metric, report), metric
             else:
                 grow = partial(grow_by, method, taken, report)
-                grown = grow(empty, options)
+                grown, first = first or grow(empty, options), None
                 if grown is None:
                     break
                 mapped, known = grown, options
@@ -201,10 +202,12 @@ def build_models(
     return SfmResult(tuple(model for model, _, _ in found), course)
 
 
-def _settled(method: str, progress: Callable[[int, int], None], empty: Mapping, options: MappingOptions) -> Mapping | None:
-    """The first model, without images that contradict it."""
+def _settled(
+    method: str, progress: Callable[[int, int], None], empty: Mapping, options: MappingOptions
+) -> tuple[Grown, Mapping] | None:
+    """The first model, and what is left of it without images that contradict it."""
     grown = grow_by(method, empty.registered, progress, empty, options)
-    return None if grown is None else settle(grown[0], empty.registered, options, progress)[0]
+    return None if grown is None else (grown, settle(grown[0], empty.registered, options, progress)[0])
 
 
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:

@@ -17,7 +17,7 @@ from torchsfm.autocalibration import calibrate_view_graph
 from torchsfm.autocalibration.focal_from_fundamentals import SCALE, WIDE
 from torchsfm.linalg import svdvals
 from torchsfm.reconstruction.adjust import support
-from torchsfm.reconstruction.beginning import Beginning
+from torchsfm.reconstruction.beginning import Beginning, Grown
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA, telling_pairs
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
@@ -57,21 +57,24 @@ def part_zoomed(graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Ten
 
 
 def better_beginning(
-    together: Beginning, apart: Beginning, make: Callable[[Mapping, MappingOptions], Mapping | None]
-) -> Beginning:
+    together: Beginning, apart: Beginning, make: Callable[[Mapping, MappingOptions], tuple[Grown, Mapping] | None]
+) -> tuple[Beginning, Grown | None]:
     """Cameras of their own for some images, if these explain clearly more of what is seen, else those that images share.
 
     Args:
         together: With cameras that images share.
         apart: With cameras of their own.
-        make: Makes a model, as far as one can be made.
+        make: Makes a model, and what is left of it without images that contradict it.
+
+    Returns:
+        The better one, and the model that came of it.
     """
     one, several = (make(begun.empty, begun.options) for begun in (together, apart))
-    if several is None:
-        return together
     threshold = together.options.reprojection
-    known = 0.0 if one is None else support(one, threshold)
-    return apart if support(several, threshold) > MORE * known else together
+    known = 0.0 if one is None else support(one[1], threshold)
+    if several is not None and support(several[1], threshold) > MORE * known:
+        return apart, several[0]
+    return together, None if one is None else one[0]
 
 
 def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"]) -> bool:
