@@ -27,7 +27,7 @@ TRIED = 64
 """Common focal lengths that are tried."""
 MORE = 1.05
 """By how much more of what is seen must be explained: numbers of their own make up for a little of all errors."""
-MOST = 200
+MOST = 60
 """Images of one size that are asked: those of the most pairs."""
 
 
