@@ -38,7 +38,15 @@ OPENCV = "OpenCV takes images and gives points on the CPU"
 ON_THE_CPU = EXCEPTIONS | {
     **{
         f"images.{name}": OPENCV
-        for name in ("detect_chessboard", "detect_corners", "detect_features", "track_curves", "track_points", "track_sequence")
+        for name in (
+            "detect_chessboard",
+            "detect_corners",
+            "detect_features",
+            "detect_motion",
+            "track_curves",
+            "track_points",
+            "track_sequence",
+        )
     },
     "images.list_skipped": "reads a folder",
     "images.retrieve_pairs": "pairs are numbers for the program, not data",

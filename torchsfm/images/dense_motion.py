@@ -152,6 +152,7 @@ def _between(first: NDArray[np.uint8], second: NDArray[np.uint8], x1: Tensor, x2
     """The motion between two images, some places of which were matched."""
     h, w = first.shape
     places = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1).float()
+    x1, x2 = x1.float(), x2.float()
     if min(h, w) < _SMALLEST:
         none = torch.zeros(2, *places[::_STEP, ::_STEP].shape)
         return DenseMotion(none, none[..., 0] > 0)
