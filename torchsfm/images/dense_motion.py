@@ -159,7 +159,7 @@ def _between(first: NDArray[np.uint8], second: NDArray[np.uint8], x1: Tensor, x2
     agreeing = _supported(x1, x2)
     matches = x1[agreeing], x2[agreeing]
     seeds: tuple[Tensor, Tensor] | None = None
-    shifts, gaps = torch.zeros(2, h, w, 2), torch.full((2, h, w), torch.inf)
+    shifts, gaps = places.new_zeros(2, h, w, 2), places.new_full((2, h, w), torch.inf)
     for _ in range(_ROUNDS):
         there = _flow(first, second, None if seeds is None else _around(*seeds, (h, w)))
         back = _flow(second, first, None if seeds is None else _around(*seeds[::-1], (h, w)))
