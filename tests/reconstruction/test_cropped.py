@@ -14,13 +14,15 @@ SIZE = (1000, 750)
 MIDDLE = torch.tensor([499.5, 374.5], dtype=torch.float64)
 
 
-def photographs(generator: torch.Generator, focal: Tensor, *, share: float) -> tuple[SfmResult, Pose, Tensor]:
+def photographs(
+    generator: torch.Generator, focal: Tensor, *, share: float, relief: float = 1.5
+) -> tuple[SfmResult, Pose, Tensor]:
     """Simulated photographs of one facade with relief, of which up to a share of each side was cut off: result and truth.
 
     Of one camera that has focal length `focal`, or of several.
     """
     v, options = 8, {"generator": generator, "dtype": torch.float64}
-    X = random_points(250, kind="cube", **options) * torch.tensor([4.0, 3.0, 1.5])
+    X = random_points(250, kind="cube", **options) * torch.tensor([4.0, 3.0, relief])
     angle, distance = 1.6 * torch.rand(v, **options) - 0.8, 7 + 4 * torch.rand(v, **options)
     centre = torch.stack((distance * angle.sin(), torch.randn(v, **options), -distance * angle.cos()), -1)
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
@@ -66,6 +68,13 @@ def test_crops_of_several_cameras(generator: torch.Generator) -> None:
     assert float(angles(result, poses).max()) < 1
     assert float(((found.values[:, 0] - focal) / found.deviation[:, 0]).abs().max()) < 5
     assert float(((found.values[:, 1:3] - c) / found.deviation[:, 1:3]).abs().max()) < 5
+
+
+def test_crops_of_a_plane_are_doubtful(generator: torch.Generator) -> None:
+    """Other focal lengths explain them as well, and errors that matches have in common, small as they are, choose one."""
+    result, _, _ = photographs(generator, torch.tensor([1200.0]).double(), share=0.2, relief=0.05)
+    assert result.report.calibrations[0].cropped
+    assert all("one plane" in image.doubt for image in result.report.images)
 
 
 def test_whole_photographs_are_not_made_anew(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

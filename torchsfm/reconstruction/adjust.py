@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.bundle import bundle_adjust
+from torchsfm.bundle.bundle_adjust import BundleResult
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.calibration import (
     Free,
@@ -73,12 +74,8 @@ def adjust(
     if result.status == Status.INTERRUPTED:
         # There is more to do than this: let the interrupt through.
         raise KeyboardInterrupt
-    cameras = result.cameras
-    if free and prior is not None:
-        cameras = prior.made_alike(cameras, images_of_cameras(mapping) > 0)
-    whole = Adjustment(result.status, result.iterations, free or {}, result.cost)
-    adjustment = mapping.adjustment if moving is not None else whole
-    return replace(mapping, poses=result.poses, cameras=cameras, X=result.X, adjustment=adjustment)
+    adjusted = as_adjusted(mapping, result, free, prior)
+    return adjusted if moving is None else replace(adjusted, adjustment=mapping.adjustment)
 
 
 def adjust_all(
@@ -114,6 +111,15 @@ def adjust_all(
     folded = folded | prior.alike
     free |= {name: free[name] & ~folded for name in mapping.cameras.distortion.parameter_names if name in free}
     return adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
+
+
+def as_adjusted(mapping: Mapping, result: BundleResult, free: Free | None, prior: CameraPrior | None) -> Mapping:
+    """The model as `bundle_adjust` has left it, with one lens where all cameras are one."""
+    cameras = result.cameras
+    if free and prior is not None:
+        cameras = prior.made_alike(cameras, images_of_cameras(mapping) > 0)
+    adjustment = Adjustment(result.status, result.iterations, free or {}, result.cost)
+    return replace(mapping, poses=result.poses, cameras=cameras, X=result.X, adjustment=adjustment)
 
 
 def about_cameras(mapping: Mapping, free: Free | None, prior: CameraPrior | None) -> dict[str, Any]:

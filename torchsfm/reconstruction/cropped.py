@@ -25,6 +25,7 @@ from torchsfm.reconstruction.cameras import FOCAL_SIGMA, telling_pairs
 from torchsfm.reconstruction.consistency import excess_scatter
 from torchsfm.reconstruction.incremental import MappingOptions, extend_model
 from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.view_graph import MIN_INLIERS
 
 MIN_IMAGES = 3
 """Fewer leave cameras as they were expected."""
@@ -118,6 +119,21 @@ def map_cropped(
     (model, _), made = found
     better = support(model, options.reprojection) > support(grown, options.reprojection)
     return found if better and _are_off(_gain_off_centre(model, made)[0], model) else None
+
+
+def crops_of_one_plane(model: Mapping, options: MappingOptions) -> bool:
+    """Whether most pairs of images that seem to be cropped show little besides one plane.
+
+    Several focal lengths with principal points of their own explain images of a plane about as well, and standard deviations
+    hold near one of them only.
+
+    Args:
+        model: A finished model.
+        options: How it was made.
+    """
+    graph = model.graph
+    pairs = (graph.fundamental_inliers >= MIN_INLIERS) & model.registered[graph.pairs].all(1)
+    return options.cropped and 2 * int((telling_pairs(graph) & pairs).sum()) < int(pairs.sum())
 
 
 def _of_one_camera(

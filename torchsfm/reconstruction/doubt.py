@@ -57,6 +57,7 @@ def examine(
     conflicts: Conflicts | None = None,
     agreement: PairAgreement | None = None,
     elsewhere: Int[Tensor, "v"] | None = None,
+    flat: bool = False,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
@@ -69,6 +70,7 @@ def examine(
         conflicts: What missing correspondences say of this model where that is known; else it is found.
         agreement: How all pairs agree with this model where that is known; else it is found.
         elsewhere: How many verified matches each image has with images of other models.
+        flat: Whether most pairs of images that seem to be cropped show little besides one plane, see `crops_of_one_plane`.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -112,6 +114,8 @@ def examine(
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
         if count < 3 and bool(guessed[i]):
             return "two images alone, with a guessed focal length"
+        if flat:
+            return "the images seem to be cropped, and most pairs of them show little besides one plane"
         if not DEVIATIONS * rotation[i] < WRONG_ANGLE:
             return f"its rotation is known to {rotation[i]:.1f} degrees only"
         if not DEVIATIONS * degrees[i] < WRONG_ANGLE:

@@ -1,6 +1,6 @@
 """Lines after points: segments are linked over the placed views, then cameras, points and lines are adjusted together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,13 +11,13 @@ from torchsfm._types import Status
 from torchsfm.bundle import BundleLines, bundle_adjust
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.optim import Cauchy
-from torchsfm.reconstruction.adjust import LOSS, about_cameras
-from torchsfm.reconstruction.calibration import images_of_cameras, measure_noise
+from torchsfm.reconstruction.adjust import LOSS, about_cameras, as_adjusted
+from torchsfm.reconstruction.calibration import measure_noise
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
 from torchsfm.reconstruction.line_tracks import Cameras, ViewSegments, link_lines, propose_lines
 from torchsfm.reconstruction.lines import Lines
-from torchsfm.reconstruction.mapping import Adjustment, Mapping
+from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.stages import Arrays
 
 PAIRS, NEIGHBOURS = 5, 16
@@ -105,12 +105,7 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
         raise KeyboardInterrupt
     (moved,) = result.structure
     assert isinstance(moved, BundleLines), "given"
-    adjustment = Adjustment(result.status, result.iterations, free or {}, result.cost)
-    cameras = result.cameras
-    if free and prior is not None:
-        cameras = prior.made_alike(cameras, images_of_cameras(mapping) > 0)
-    model = replace(mapping, poses=result.poses, cameras=cameras, X=result.X, adjustment=adjustment)
-    return model, lines.moved_to(moved.L)
+    return as_adjusted(mapping, result, free, prior), lines.moved_to(moved.L)
 
 
 def _without_lenses(mapping: Mapping, found: FoundSegments) -> tuple[ViewSegments, Tensor]:

@@ -19,7 +19,7 @@ from torchsfm.reconstruction.calibration import Calibration, calibration_of
 from torchsfm.reconstruction.cameras import group_cameras
 from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.consistency import PairAgreement
-from torchsfm.reconstruction.cropped import map_cropped, may_be_off_centre
+from torchsfm.reconstruction.cropped import crops_of_one_plane, map_cropped, may_be_off_centre
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
@@ -185,6 +185,7 @@ def build_models(
             standing = examine(
                 model, open_numbers=free, prior=widest, threshold=threshold, uncertain=uncertain, conflicts=conflicts,
                 agreement=agreement, elsewhere=matches_across(graph, model.registered, taken & ~model.registered),
+                flat=crops_of_one_plane(model, known),
             )  # fmt: skip
             covariance = None if standing.intrinsics is None or left_open else (free, standing.intrinsics)
             found.append((finished, standing, calibration_of(model, prior, loss=LOSS, covariance=covariance)))
