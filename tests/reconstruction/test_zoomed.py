@@ -1,17 +1,20 @@
 """Images of one size that were taken with several focal lengths, and such that only look so."""
 
+import pytest
 import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, reconstruct_tracks
+from torchsfm.reconstruction import SfmResult, models, reconstruct_tracks
+from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.zoomed import part_zoomed
 from torchsfm.simulation import look_at, random_points, simulate_images
 
 SIZE = (1000, 750)
 
 
-def photographs(f: Tensor, c: tuple[float, float], k1: float, generator: torch.Generator) -> SfmResult:
-    """A facade with relief, of which no file tells by what lens it was taken."""
+def see(f: Tensor, c: tuple[float, float], k1: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Image points of a facade with relief, the image of each and its track."""
     v, options = len(f), {"generator": generator, "dtype": torch.float64}
     X = random_points(150, kind="cube", **options) * torch.tensor([4.0, 3.0, 1.5])
     angle, distance = 1.6 * torch.rand(v, **options) - 0.8, 7 + 4 * torch.rand(v, **options)
@@ -23,7 +26,12 @@ def photographs(f: Tensor, c: tuple[float, float], k1: float, generator: torch.G
         X, poses, cameras, image_size=SIZE, noise=0.5, dropout=0.4, depth_range=(2.0, 25.0), generator=generator
     )
     view, track = seen.visible.nonzero(as_tuple=True)
-    return reconstruct_tracks(seen.x[view, track], view, track, torch.tensor([SIZE] * v))
+    return seen.x[view, track], view, track
+
+
+def photographs(f: Tensor, c: tuple[float, float], k1: float, generator: torch.Generator) -> SfmResult:
+    """Photographs of which no file tells by what lens they were taken."""
+    return reconstruct_tracks(*see(f, c, k1, generator), torch.tensor([SIZE] * len(f)))
 
 
 def test_a_zoom_lens(generator: torch.Generator) -> None:
@@ -34,9 +42,24 @@ def test_a_zoom_lens(generator: torch.Generator) -> None:
     assert (found.log() - f.log()).abs().max() < 0.03
 
 
-def test_a_lens_that_distorts_and_is_off_the_middle(generator: torch.Generator) -> None:
-    """The pairs look as if focal lengths differed."""
+def test_models_decide_where_pairs_mislead(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lens that distorts and is off the middle makes pairs look as if focal lengths differed."""
+    monkeypatch.setattr(models, "part_zoomed", lambda graph, camera_index, told: torch.arange(len(camera_index)))
     model = photographs(torch.full((7,), 900.0, dtype=torch.float64), (559.5, 344.5), -0.2, generator).model
     assert model.registered.all()
     assert len(model.cameras.K) == 1
     assert abs(float(model.cameras.K[0, 0, 0]) / 900 - 1) < 0.03
+
+
+def test_what_files_tell_is_not_asked(generator: torch.Generator) -> None:
+    f = 800 * torch.logspace(0, 0.25, 7, dtype=torch.float64)
+    x, view, track = see(f, (499.5, 374.5), -0.05, generator)
+    names, size = [str(i) for i in range(7)], torch.tensor([SIZE] * 7)
+    graph, _ = graph_from_tracks(names, size, x, view, track, torch.zeros(len(x), 3), generator=generator)
+    one, none = torch.zeros(7, dtype=torch.long), torch.zeros(7, dtype=torch.bool)
+    assert part_zoomed(graph, one, none).tolist() == list(range(7))
+    assert part_zoomed(graph, one, ~none) is None
+    # Two cameras, of which one is known: its images keep it, whatever their places.
+    index = torch.tensor([0, 1, 0, 0, 1, 0, 0])
+    parted = part_zoomed(graph, index, index == 1)
+    assert parted is None or parted[1] == parted[4]
