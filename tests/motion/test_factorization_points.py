@@ -315,7 +315,7 @@ def test_noise_does_not_make_up_what_points_leave_open(layout: str, v: int, gene
 
 
 @pytest.mark.parametrize("views", [2, 3])
-@pytest.mark.parametrize("noise", [0.0, 3.0])
+@pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
 def test_six_points_often_are_six(views: int, noise: float) -> None:
     x, _ = scene(40, views, 6)
     x = x.repeat(1, 1, 5, 1)

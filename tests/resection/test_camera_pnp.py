@@ -333,7 +333,7 @@ def test_a_plane_wants_two_points_off_every_line(generator):
 
 
 @ALL
-@pytest.mark.parametrize("noise", [1e-5, 2.5e-3])
+@pytest.mark.parametrize("noise", [1e-5, 3e-4, 2.5e-3])
 def test_points_apart_are_enough(generator, solve, noise):
     for n in (10, 100, 1000):
         X = torch.randn(100, n, 3, generator=generator, dtype=F64)

@@ -204,7 +204,7 @@ def arcs(scene: SimulatedConics, degrees: float, sigma: float, generator: torch.
     return x + sigma * torch.randn(x.shape, generator=generator, dtype=F64)
 
 
-@pytest.mark.parametrize("views", [2, 5])
+@pytest.mark.parametrize("views", [2, 3, 5])
 @pytest.mark.parametrize("degrees", [46.0, 140.0])
 @pytest.mark.parametrize("given", ["x", "covariance"])
 def test_arcs_of_noisy_points_give_no_wrong_ellipse(views, degrees, given, generator):
