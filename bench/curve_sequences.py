@@ -1,22 +1,28 @@
 """Cameras of a sequence by curves alone: smooth glazed objects with painted curves before a camera that goes around them.
 
     python -m bench.curve_sequences [--scenes 0,1,2] [--frames 20] [--points]
+    TORCHSFM_DATA=/path/to/data python -m bench.curve_sequences --scenes "" --real temple pavilion
 
 Rotations are compared with the truth up to a rotation of the world. `--points` adds what points give for the same frames.
+Real are 18 photographs of the temple ring, 7.7 degrees apart (templeR0013-0030), and 25 frames of the Barcelona pavilion, 7 to 31
+degrees apart. A line each model.
 """
 
 import argparse
 import math
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bench.doubt_scenes import TEXEL, Draw, _smooth_parts, _vector
-from torchsfm.geometry import Camera, Pose, intrinsics, rotation_angle
+from bench.real_data import SETS, data_folder
+from torchsfm.geometry import Camera, Pose, intrinsics, krt_from_camera, rotation_angle
 from torchsfm.geometry.distortion import Radial
 from torchsfm.images import save_image
 from torchsfm.linalg import nearest_rotation
@@ -75,26 +81,41 @@ def rotation_errors(found: Pose, truth: Pose) -> Tensor:
     return rotation_angle(found.R @ (truth.R @ turn).mT).rad2deg()
 
 
-def row(number: int, frames: int, method: str) -> str:
-    """One line of the table."""
-    scene = smooth_sequence(number, frames)
-    with tempfile.TemporaryDirectory() as scratch:
-        for i, image in enumerate(scene.images):
-            save_image(Path(scratch) / f"{i:03d}.png", image)
-        start = time.perf_counter()
-        found = reconstruct(scratch, method=method, sequence=method != "curves")
-        seconds = time.perf_counter() - start
+def temple(data: Path) -> tuple[list[Path], Pose, float]:
+    """Photographs, their poses, and the focal length."""
+    ring = SETS["temple"](data)
+    paths = [path for path in ring.paths if 13 <= int(path.stem[-4:]) <= 30]
+    poses = Pose.from_matrix(torch.from_numpy(np.stack([ring.poses[path.name] for path in paths])))
+    return paths, poses, float(ring.focal or math.nan)
+
+
+def pavilion(data: Path) -> tuple[list[Path], Pose, float]:
+    """Rendered frames of the Barcelona pavilion, their poses, and the focal length."""
+    folder = data / "curves/pavilion"
+    paths = sorted((folder / "images").iterdir())
+    P = torch.stack([torch.from_numpy(np.loadtxt(folder / "cameras" / f"{path.stem}.projmatrix")) for path in paths])
+    K, R, t = krt_from_camera(P)
+    return paths, Pose(R, t), float(K[0, 0, 0])
+
+
+REAL = {"temple": temple, "pavilion": pavilion}
+
+
+def rows(name: str, folder: Path, poses: Pose, focal: float, method: str) -> Iterator[str]:
+    """Lines of the table, for each model one."""
+    start = time.process_time()
+    found = reconstruct(folder, method=method, sequence=method != "curves")
+    seconds, frames = time.process_time() - start, len(poses.R)
     if not found.models:
-        return f"| {number} | {method} | 0 of {frames} |  |  |  |  | {seconds:.0f} | {found.failure()} |"
-    model = found.model
-    known = model.registered
-    error = rotation_errors(model.poses[known], scene.poses[known])
-    focal = float(model.cameras.K[0, 0, 0] / scene.camera.K[0, 0])
-    doubtful = sum(bool(image.doubt) for image in found.report.images)
-    return (
-        f"| {number} | {method} | {int(known.sum())} of {frames} | {doubtful} | {error.median():.2f} | {error.max():.2f} "
-        f"| {focal:.3f} | {seconds:.0f} |  |"
-    )
+        yield f"| {name} | {method} | 0 of {frames} |  |  |  |  | {seconds:.0f} | {found.failure()} |"
+    for number, model in enumerate(found.models):
+        known = model.registered
+        error = rotation_errors(model.poses[known], poses[known])
+        doubtful = sum(bool(image.doubt) for image in found.report.images if image.model == number)
+        yield (
+            f"| {name} | {method} | {int(known.sum())} of {frames} | {doubtful} | {error.median():.2f} | {error.max():.2f} "
+            f"| {float(model.cameras.K[0, 0, 0]) / focal:.3f} | {seconds:.0f} |  |"
+        )
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -103,12 +124,30 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--scenes", default="0,1,2,3,4,5", help="numbers separated by commas")
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--points", action="store_true", help="also what points give")
+    parser.add_argument("--real", nargs="+", choices=tuple(REAL), default=[])
+    parser.add_argument("--data", type=Path, default=data_folder(), help="folder of the data sets (default: $TORCHSFM_DATA)")
     options = parser.parse_args(arguments)
-    print("| scene | by | placed | doubtful | rotation off, deg, median | largest | f / true f | s | refused |")
+    if options.real and options.data is None:
+        parser.error("TORCHSFM_DATA does not name the folder of the data sets")
+    methods = ("curves", "incremental") if options.points else ("curves",)
+    print("| scene | by | placed | doubtful | rotation off, deg, median | largest | f / true f | CPU s | refused |")
     print("|---" * 9 + "|", flush=True)
-    for number in map(int, options.scenes.split(",")):
-        for method in ("curves", "incremental") if options.points else ("curves",):
-            print(row(number, options.frames, method), flush=True)
+    for number in (word for word in options.scenes.split(",") if word):
+        scene = smooth_sequence(int(number), options.frames)
+        with tempfile.TemporaryDirectory() as scratch:
+            for i, image in enumerate(scene.images):
+                save_image(Path(scratch) / f"{i:03d}.png", image)
+            for method in methods:
+                for line in rows(number, Path(scratch), scene.poses, float(scene.camera.K[0, 0]), method):
+                    print(line, flush=True)
+    for name in options.real:
+        paths, poses, focal = REAL[name](options.data)
+        with tempfile.TemporaryDirectory() as scratch:
+            for path in paths:
+                (Path(scratch) / path.name).symlink_to(path.resolve())
+            for method in methods:
+                for line in rows(name, Path(scratch), poses, focal, method):
+                    print(line, flush=True)
 
 
 if __name__ == "__main__":
