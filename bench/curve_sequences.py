@@ -4,8 +4,8 @@
     TORCHSFM_DATA=/path/to/data python -m bench.curve_sequences --scenes "" --real temple pavilion
 
 Rotations are compared with the truth up to a rotation of the world. `--points` adds what points give for the same frames.
-Real are 18 photographs of the temple ring, 7.7 degrees apart (templeR0013-0030), and 25 frames of the Barcelona pavilion, 7 to 31
-degrees apart. A line each model.
+Real are 18 photographs of the temple ring (templeR0013-0030), 7.7 degrees apart, and 25 frames of the Barcelona pavilion, 7 to
+31 degrees apart. A line each model.
 """
 
 import argparse
