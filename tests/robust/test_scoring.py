@@ -129,8 +129,9 @@ def test_a_threshold_that_is_wanted_must_be_given(generator: torch.Generator) ->
 
 
 def test_trusted_data_end_the_search_early(generator: torch.Generator) -> None:
-    x1, x2, wrong, R, t = scene(6, 400, 0.4, generator)
-    order = torch.rand(6, 400, generator=generator, dtype=torch.float64) + 0.8 * (~wrong)
+    # Of a few pairs the median of errors is chance: each search ends at its own one of several sets of inliers.
+    x1, x2, wrong, R, t = scene(48, 400, 0.4, generator)
+    order = torch.rand(48, 400, generator=generator, dtype=torch.float64) + 0.8 * (~wrong)
     plain = estimate_fundamental(x1, x2, threshold=1.5, generator=seeded(), max_iterations=30_000)
     guided = estimate_fundamental(x1, x2, threshold=1.5, quality=order, generator=seeded(), max_iterations=30_000)
     assert (guided.status == Status.OK).all()
