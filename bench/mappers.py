@@ -24,6 +24,7 @@ from bench.real_data import SETS, PhotographSet, data_folder
 from bench.view_graphs import FAMILIES, look_around
 from torchsfm.geometry import Pose
 from torchsfm.reconstruction.evaluation import pose_auc, pose_errors
+from torchsfm.reconstruction.growth import Given, Wanted
 from torchsfm.reconstruction.models import build_models
 from torchsfm.reconstruction.photographs import NEIGHBOURS, match_photographs
 from torchsfm.reconstruction.report import SfmResult
@@ -89,9 +90,9 @@ def mapped(given: Input, mapper: str, seed: int) -> tuple[SfmResult, float]:
     """What a mapper makes of verified pairs, and the seconds of a processor core that it takes."""
     start = time.process_time()
     result = build_models(
-        given.graph, None, labels=given.labels, exif_focal=given.focal, failures={}, order=given.graph.names,
-        camera="radial" if given.K is None else "pinhole", shared_camera=True, K=given.K, free_principal_point=True,
-        method=mapper, generator=torch.Generator().manual_seed(seed), stages=Stages(None, False, ""), progress=nothing,
+        Given(given.graph, given.labels, given.focal), Wanted(shared_camera=True, K=given.K, method=mapper),
+        order=given.graph.names, generator=torch.Generator().manual_seed(seed), stages=Stages(None, False, ""),
+        progress=nothing,
     )  # fmt: skip
     return result, time.process_time() - start
 

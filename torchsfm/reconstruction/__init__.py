@@ -12,12 +12,12 @@ from torchsfm.reconstruction.localise import register_photographs
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
 from torchsfm.reconstruction.merge import MergedModel, merge_models
 from torchsfm.reconstruction.model_curves import Curves
-from torchsfm.reconstruction.models import reconstruct_tracks
 from torchsfm.reconstruction.parts import part_of_model
 from torchsfm.reconstruction.photographs import reconstruct
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, ReconstructionError, Report, SfmResult
 from torchsfm.reconstruction.similarities import Certainty
+from torchsfm.reconstruction.tracked import reconstruct_tracks
 from torchsfm.reconstruction.upright import Levelling, align_to_ground, align_upright, up_direction
 from torchsfm.reconstruction.view_graph import Verdict
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
 from torchsfm.linalg.devices import on_the_cpu
+from torchsfm.reconstruction.growth import Given, Wanted
 from torchsfm.reconstruction.models import build_models
 from torchsfm.reconstruction.report import Progress, SfmResult
 from torchsfm.reconstruction.stages import Stages, one_thread
@@ -160,22 +161,15 @@ def reconstruct_matches(
         verified = verify_pairs(image_size, points, kept, rows, quality=trust, threshold=threshold, generator=generator)
         graph = verified.graph(named, image_size, points, [values.double() for values in colors], kept)
         report("verify", len(kept), len(kept))
+    labels = [""] * v if camera_index is None else [str(k) for k in camera_index.tolist()]
+    focals = list(focal) if isinstance(focal, Sequence) else [focal] * v
     return build_models(
-        graph,
-        None,
-        labels=[""] * v if camera_index is None else [str(k) for k in camera_index.tolist()],
-        exif_focal=list(focal) if isinstance(focal, Sequence) else [focal] * v,
-        failures={},
+        Given(graph, labels, focals, known_cameras=camera_index is not None),
+        Wanted(camera, shared_camera, K, free_principal_point, method),
         order=named,
-        camera=camera or ("pinhole" if K is not None else "radial"),
-        shared_camera=shared_camera,
-        K=K,
-        free_principal_point=free_principal_point,
-        method=method,
         generator=generator,
         stages=stages,
         progress=report,
-        known_cameras=camera_index is not None,
     )
 
 

@@ -9,16 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.images import MAX_PIXELS
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.curve_models import reconstruct_from_curves
 from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges
 from torchsfm.reconstruction.find_lines import FoundSegments
+from torchsfm.reconstruction.growth import METHODS, Given, Wanted
 from torchsfm.reconstruction.image_points import ImagePoints, detect_all
 from torchsfm.reconstruction.masks import Masks
 from torchsfm.reconstruction.match_all import match_all
-from torchsfm.reconstruction.models import METHODS, build_models
+from torchsfm.reconstruction.models import build_models
 from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
 from torchsfm.reconstruction.segments import detect_all_segments
 from torchsfm.reconstruction.sources import Source, Sources
@@ -121,22 +121,20 @@ def reconstruct(
         5
         >>> result.model.save("model.npz")
     """
-    if camera is not None and camera not in DISTORTION_MODELS:
-        raise ReconstructionError(f"no camera model '{camera}'; there are {', '.join(DISTORTION_MODELS)}")
     if method not in (*METHODS, FROM_CURVES):
         raise ReconstructionError(f"no method '{method}'; there are {', '.join((*METHODS, FROM_CURVES))}")
-    if method == FROM_CURVES and lines:
-        raise ReconstructionError("the method from curves finds no lines")
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
+    wanted = Wanted(camera, shared_camera, K, free_principal_point, METHODS[0] if method == FROM_CURVES else method)
+    if method == FROM_CURVES and lines:
+        raise ReconstructionError("the method from curves finds no lines")
     report = progress or (lambda stage, done, total: None)
-    model = camera or ("pinhole" if K is not None else "radial")
     if method == FROM_CURVES:
         sources = Sources.of(images, without=[folder for folder in (out, masks) if folder is not None])
         admitted = None if masks is None else Masks.of(masks, sources)
         stages = _stages(sources, admitted, {"method": method, "pixels": max_pixels}, out, resume)
         found = reconstruct_from_curves(
-            sources, stages, camera=model, K=K, max_pixels=max_pixels, masks=admitted, progress=report
+            sources, stages, camera=wanted.lens, K=K, max_pixels=max_pixels, masks=admitted, progress=report
         )
         return replace(found, report=replace(found.report, skipped=sources.skipped))
     seen = match_photographs(
@@ -154,17 +152,10 @@ def reconstruct(
         )
 
     result = build_models(
-        seen.graph,
-        None,
-        labels=seen.points.labels,
-        exif_focal=seen.points.focal,
-        failures=seen.points.failures,
+        Given(seen.graph, seen.points.labels, seen.points.focal),
+        wanted,
         order=seen.names,
-        camera=model,
-        shared_camera=shared_camera,
-        K=K,
-        free_principal_point=free_principal_point,
-        method=method,
+        failures=seen.points.failures,
         generator=torch.Generator().manual_seed(seed),
         stages=seen.stages,
         progress=report,
