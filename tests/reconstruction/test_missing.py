@@ -1,5 +1,7 @@
 """Two places that pass for one, by what each of their photographs misses of the other's."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from chance import assert_share
@@ -9,7 +11,7 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.missing import SIGNIFICANCE, _Looks, _Occupied, missing_correspondences
+from torchsfm.reconstruction.missing import SIGNIFICANCE, Conflicts, _Looks, _Occupied, missing_correspondences
 from torchsfm.reconstruction.view_graph import ViewGraph
 
 SIZE = (640, 480)
@@ -120,3 +122,38 @@ def test_a_point_at_the_last_pixel_that_looks_unlike_is_none() -> None:
     place, view = torch.tensor([[2], [0]]), torch.tensor([0])
     assert occupied.at(view, place, torch.tensor([0])).tolist() == [False]
     assert occupied.at(view, place, torch.tensor([1])).tolist() == [True]
+
+
+def with_a_copy(mapping: Mapping, image: int) -> Mapping:
+    """The same photograph once more, all its observations again."""
+    graph, again = mapping.graph, mapping.graph.view == image
+    v = len(graph.names)
+
+    def twice(t: Tensor) -> Tensor:
+        return torch.cat([t, t[again]])
+
+    copied = replace(
+        graph, names=(*graph.names, "copy.png"), image_size=torch.cat([graph.image_size, graph.image_size[image, None]]),
+        x=twice(graph.x), view=torch.cat([graph.view, graph.view.new_full((int(again.sum()),), v)]), color=twice(graph.color),
+    )  # fmt: skip
+    rows = torch.cat([torch.arange(v), torch.tensor([image])])
+    return Mapping(
+        copied, twice(mapping.track), mapping.cameras, mapping.camera_index[rows], mapping.poses[rows],
+        mapping.registered[rows], mapping.X, twice(mapping.point),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_copies_of_a_photograph_are_one_witness(folded: bool, generator: torch.Generator) -> None:
+    """What two cameras miss of each other does not depend on whether one of them, or a third, is there twice."""
+    alone = model(generator, folded=folded)
+    once, twice = missing_correspondences(alone), missing_correspondences(with_a_copy(alone, 0))
+    own = (twice.pairs < 2 * GROUP).all(1)
+    torch.testing.assert_close(twice.pairs[own], once.pairs)
+    torch.testing.assert_close(twice.score[own], once.score)
+    assert twice.place[-1] == twice.place[0]
+    assert once.folded == twice.folded == folded
+    # Two places that are refuted twice by one photograph and its copy are refuted once.
+    pairs = torch.tensor([[0, 1], [1, 2 * GROUP]])
+    assert not Conflicts(pairs, torch.full((2,), 99.0), 1.0, twice.place).folded
+    assert Conflicts(pairs, torch.full((2,), 99.0), 1.0, torch.arange(2 * GROUP + 1)).folded

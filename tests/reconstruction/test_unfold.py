@@ -11,16 +11,17 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.motion.many_views.components import components
+from torchsfm.reconstruction import unfold as unfolding
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.distinctive import Backbone, Distinctiveness
 from torchsfm.reconstruction.doubt import examine
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions, grow_model
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.tracks import build_tracks
-from torchsfm.reconstruction.unfold import hanging_on_copies, imitated, unfold
+from torchsfm.reconstruction.unfold import Unfolded, hanging_on_copies, imitated, unfold
 from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at
 
@@ -299,3 +300,24 @@ def test_matches_that_return_to_an_image_do_not_count() -> None:
     )
     assert Distinctiveness.of(graph).weight.tolist() == [1.0]
     assert Distinctiveness.of(graph.only(torch.tensor([False]))).weight.tolist() == [0.0]
+
+
+def test_no_image_is_given_up_for_less_than_a_fold(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once a model of all images is not folded, one of fewer images with a little less against it is no better."""
+    empty, poses, _ = street(generator, 0.5)
+    everything = torch.ones(VIEWS, dtype=torch.bool)
+    whole = replace(empty, poses=poses, registered=everything)
+    part = replace(whole, registered=torch.arange(VIEWS) > 2)
+    options = MappingOptions(free=(), expected=empty.cameras, focal_sigma=torch.zeros(1, dtype=torch.float64))
+    pairs, place = torch.tensor([[0, 1], [1, 2]]), torch.arange(VIEWS)
+
+    def found(model: Mapping, *score: float) -> Unfolded:
+        conflicts = Conflicts(pairs, torch.tensor(score, dtype=torch.float64), 10.0, place)
+        return Unfolded(model, ~everything, conflicts, 1.0)
+
+    better = found(whole, 10.1, 0.0)
+    monkeypatch.setattr(unfolding, "missing_correspondences", lambda _: found(whole, 12.0, 12.0).conflicts)
+    monkeypatch.setattr(unfolding, "_trials", lambda *_: [better, found(part, 0.0, 0.0)])
+    assert unfold(empty, whole, ~everything, options, lambda *_: None) is better
+    monkeypatch.setattr(unfolding, "_trials", lambda *_: [found(whole, 11.0, 11.0), found(part, 0.0, 0.0)])
+    assert not unfold(empty, whole, ~everything, options, lambda *_: None).model.registered.all()

@@ -32,6 +32,8 @@ FINE = (24, 20)
 """Columns and rows in which the depth of what an image sees is known."""
 BEHIND = 0.95
 """A point is taken to be hidden by what lies at less than this fraction of its depth."""
+SAME_PLACE = 0.005
+"""Cameras whose distance is less than this part of that of what they see are at one place: copies of one photograph are."""
 FINER = (48, 36)
 """Columns and rows in which it is known how far an image sees."""
 FARTHER = 0.97
@@ -60,11 +62,13 @@ class Conflicts:
         pairs: Images that look at the same points from like viewpoints, according to the model, `i < j`.
         score: Log-likelihood ratio, summed over the parts of the image where each misses what the other sees.
         limit: What chance exceeds once in a hundred models.
+        place: Where each image was taken; copies of one photograph have one number.
     """
 
     pairs: Int[Tensor, "q 2"]
     score: Float[Tensor, "q"]
     limit: float
+    place: Int[Tensor, "v"]
 
     @property
     def refuted(self) -> Int[Tensor, "r 2"]:
@@ -75,10 +79,11 @@ class Conflicts:
     def folded(self) -> bool:
         """Whether two places pass for one.
 
-        One pair may miss what something without features hides. A place taken for another is refuted by more than one camera,
+        One pair may miss what something without features hides. A place taken for another is refuted from more than one other,
         and folds the whole model.
         """
-        return bool((torch.bincount(self.refuted.flatten(), minlength=1) >= 2).any())
+        places = torch.unique(self.place[self.refuted].sort(dim=1).values, dim=0)
+        return bool((torch.bincount(places.flatten(), minlength=1) >= 2).any())
 
     @property
     def strength(self) -> float:
@@ -89,11 +94,12 @@ class Conflicts:
 def missing_correspondences(mapping: Mapping) -> Conflicts:
     """Compare every two cameras with like viewpoints, point by point, in each part of the image.
 
-    A point counts between two cameras if the one sees it, at least one camera besides these two does, and the model says that
-    it lies in the other's view, from nearly the same direction and distance. The share that the other sees is the pair's own;
-    a part of the image where it is zero speaks against the pair with the likelihood of so many misses at that share, if it is
-    zero both for the points of the one camera and for those of the other, or if both miss points, each anywhere, at places that
-    they see. A point is found again where its track says so, or where the other image has a point that looks like it.
+    A point counts between two cameras if the one sees it, at least one camera at another place than these two does, and the
+    model says that it lies in the other's view, from nearly the same direction and distance. The share that the other sees is
+    the pair's own; a part of the image where it is zero speaks against the pair with the likelihood of so many misses at that
+    share, if it is zero both for the points of the one camera and for those of the other, or if both miss points, each
+    anywhere, at places that they see. A point is found again where its track says so, or where the other image has a point that
+    looks like it.
     """
     v = len(mapping.registered)
     pairs = _like_viewpoints(mapping)
@@ -106,6 +112,8 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     point, view = mapping.point[node], mapping.graph.view[node]
     sightings = torch.bincount(point, minlength=len(mapping.X))
     first_sighting = sightings.cumsum(0) - sightings
+    site = _places(mapping)
+    sites = torch.bincount(torch.unique(point * v + site[view]) // v, minlength=len(mapping.X))
     occupied = _Occupied.of(mapping)
     nearest, farthest = _DepthMap.of(mapping, FINE, "amin"), _DepthMap.of(mapping, FINER, "amax")
     beside = _DepthMap.of(mapping, FINER, "amin")
@@ -120,12 +128,12 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
         # Observations are sorted by point.
         column = torch.arange(len(p)).repeat_interleave(sightings[p])
         step = torch.arange(len(column)) - (sightings[p].cumsum(0) - sightings[p])[column]
-        row = torch.full((v,), -1).index_copy_(0, b, torch.arange(len(b)))[view[first_sighting[p][column] + step]]
-        row, column = row[row >= 0], column[row >= 0]
-        seen = torch.zeros(len(b), len(p), dtype=torch.bool)
-        seen[row, column] = True
-        near &= sightings[p] >= 2
-        near[row, column] &= sightings[p[column]] >= 3
+        seer = view[first_sighting[p][column] + step]
+        seen = _seen_from(b, seer, column, len(p), v)
+        there, which = torch.unique(site[b], return_inverse=True)
+        from_there = _seen_from(there, site[seer], column, len(p), v)[which]
+        # Seen from a third place.
+        near &= sites[p] > 1 + (from_there & (site[b] != site[a])[:, None]).long()
         # Of the points that count, one row each: where the other camera should see them, and does if nothing hides them.
         k, n = near.nonzero(as_tuple=True)
         image, ray = b[k], ray.flatten(1).index_select(1, k * len(p) + n)
@@ -153,7 +161,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     each = _Shares.of(open_).against(open_).sum(-1)
     score = torch.maximum(both, torch.minimum(each, each[swapped])).reshape(2, -1).amax(0)
     limit = math.log(2 * max(len(pairs), 1) * cells / SIGNIFICANCE)
-    return Conflicts(pairs, score, limit)
+    return Conflicts(pairs, score, limit, site)
 
 
 @dataclass(frozen=True)
@@ -269,6 +277,34 @@ class _DepthMap:
     def at(self, view: Int[Tensor, "n"], cell: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
         """The depth in or beside a part of an image; infinite with the other sign where nothing is seen."""
         return self.table.flatten().index_select(0, view * self.table[0].numel() + cell)
+
+
+def _places(mapping: Mapping) -> Int[Tensor, "v"]:
+    """For each image the first one that was taken within `SAME_PLACE` of it, so that no chain of images is one place."""
+    node = mapping.observations()
+    point, view = mapping.point[node], mapping.graph.view[node]
+    centre = mapping.poses.centre
+    away = (mapping.X[point] - centre[view]).norm(dim=-1).log()
+    reach = SAME_PLACE * away.new_zeros(len(centre)).scatter_reduce(0, view, away, "mean", include_self=False).exp()
+    place = torch.arange(len(centre))
+    open_ = mapping.registered.clone()
+    for i in mapping.registered.nonzero()[:, 0].tolist():
+        if bool(open_[i]):
+            beside = open_ & ((centre - centre[i]).norm(dim=-1) < reach[i])
+            beside[i] = True
+            place[beside] = i
+            open_ &= ~beside
+    return place
+
+
+def _seen_from(
+    place: Int[Tensor, "k"], seer: Int[Tensor, "m"], column: Int[Tensor, "m"], points: int, views: int
+) -> Bool[Tensor, "k n"]:
+    """Which of some points are seen from some places, given for each sighting from where."""
+    row = torch.full((views,), -1).index_copy_(0, place, torch.arange(len(place)))[seer]
+    seen = torch.zeros(len(place), points, dtype=torch.bool)
+    seen[row[row >= 0], column[row >= 0]] = True
+    return seen
 
 
 def _like_viewpoints(mapping: Mapping) -> Int[Tensor, "q 2"]:

@@ -70,9 +70,9 @@ def unfold(
         return first
     for trial in _trials(empty, distinct, elsewhere, options, progress):
         # Less than a fold is no reason to give images up.
-        complete = int(trial.model.registered.sum()) >= int(model.registered.sum())
+        complete = int(trial.model.registered.sum()) >= int(best.model.registered.sum())
         better = (trial.conflicts.strength, -trial.support) < (best.conflicts.strength, -best.support)
-        if better and (complete or first.conflicts.folded):
+        if better and (complete or best.conflicts.folded):
             best = trial
     return best
 
