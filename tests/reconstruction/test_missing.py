@@ -157,3 +157,23 @@ def test_copies_of_a_photograph_are_one_witness(folded: bool, generator: torch.G
     pairs = torch.tensor([[0, 1], [1, 2 * GROUP]])
     assert not Conflicts(pairs, torch.full((2,), 99.0), 1.0, twice.place).folded
     assert Conflicts(pairs, torch.full((2,), 99.0), 1.0, torch.arange(2 * GROUP + 1)).folded
+
+
+@pytest.mark.parametrize(("larger", "compared"), [(1.3, True), (2.0, False)])
+def test_images_of_other_sizes_need_not_show_the_same(larger: float, compared: bool, generator: torch.Generator) -> None:
+    """Where a thing is twice as large in the one image as in the other, neither has to find the points of the other."""
+    folded = model(generator, folded=True)
+    second = torch.arange(2 * GROUP) >= GROUP
+    scale = torch.where(second, larger, 1.0)
+    c = (torch.tensor(SIZE, dtype=F64) - 1) / 2
+    K = intrinsics(torch.tensor([500.0, 500.0 * larger], dtype=F64), torch.stack([c, larger * c]))
+    zero = torch.zeros(2, dtype=F64)
+    graph = replace(
+        folded.graph,
+        x=folded.graph.x * scale[folded.graph.view, None],
+        image_size=(folded.graph.image_size * scale[:, None]).long(),
+    )
+    found = missing_correspondences(
+        replace(folded, graph=graph, cameras=Camera(K, Radial(zero, zero)), camera_index=second.long())
+    )
+    assert bool((found.score[across(found.pairs)] > 0).any()) == compared

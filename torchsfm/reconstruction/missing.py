@@ -25,7 +25,7 @@ from torchsfm.reconstruction.mapping import Mapping
 MAX_ANGLE = 0.35
 """Rays farther apart than this (20 degrees) need not see the same, whatever the scene."""
 MAX_ZOOM = 1.5
-"""Nor do cameras whose distances from a point differ by more than this factor."""
+"""Nor do cameras in whose images it differs by more than this factor how many pixels a thing at the point is wide."""
 CELLS = (6, 5)
 """Columns and rows into which the image is cut."""
 FINE = (24, 20)
@@ -330,7 +330,9 @@ def _looked_at(
     # Several times as fast as norms along the first dimension, and as quotients.
     near, far = (torch.addcmul(torch.addcmul(x * x, y, y), z, z).sqrt_() for x, y, z in (from_a, ray))
     along = (from_a * X).sum(0) - poses.centre @ from_a
-    alike = (along > math.cos(MAX_ANGLE) * near * far) & (MAX_ZOOM * far > near) & (far < MAX_ZOOM * near)
+    f = mapping.cameras.K[mapping.camera_index, 0, 0]
+    large, small = near * f[b, None], far * f[a]
+    alike = (along > math.cos(MAX_ANGLE) * near * far) & (MAX_ZOOM * small > large) & (small < MAX_ZOOM * large)
     return alike & (ray[2] > 0), ray
 
 
