@@ -100,3 +100,27 @@ def test_photographs_with_a_large_logo(courtyard, tmp_path):
     relative = (R @ R[:1].mT) @ (other @ other[:1].mT).mT
     angle = ((relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).arccos().rad2deg()
     assert (angle < 0.3).all()
+
+
+def hidden(generator: torch.Generator, fixed: Tensor, images: Tensor) -> float:
+    """Which share is left out of points that stand still in so many of twelve images, the rest of which moves."""
+    seen = scene(generator, 240).reshape(6, 2, 120, 2).transpose(0, 1).reshape(12, 120, 2)
+    x = torch.cat((seen, fixed + 0.1 * torch.randn(12, *fixed.shape, generator=generator, dtype=fixed.dtype)), 1)
+    shown = torch.rand(12, len(fixed), generator=generator).argsort(0).argsort(0) < images
+    shown = torch.cat((torch.ones(12, 120, dtype=torch.bool), shown), 1)
+    # The images of either half see the same points of the scene.
+    pairs = torch.cat((PAIRS, PAIRS + 6))
+    matches = {q: (shown[i] & shown[j]).nonzero().expand(-1, 2) for q, (i, j) in enumerate(pairs.tolist())}
+    overlays = find_overlays(SIZE.repeat(12, 1), list(x), pairs, [matches], generator=torch.Generator().manual_seed(0))
+    out = left_out(overlays, x)
+    assert not out[:120].any()
+    return float(out[120:][images < 6].double().mean())
+
+
+def test_parts_of_an_overlay_that_most_images_hide(generator):
+    """Beside what eight of twelve images show, five are enough; elsewhere they may be those of a camera that rested."""
+    text = 20 + 20 * torch.cartesian_prod(torch.arange(16.0), torch.arange(5.0)).double()
+    images = torch.where(torch.arange(80) % 2 == 0, 9, 5)
+    assert hidden(generator, text, images) > 0.5
+    apart = torch.where(images[:, None] == 5, text + torch.tensor([600.0, 500.0]), text)
+    assert hidden(generator, apart, images) < 0.1

@@ -27,6 +27,8 @@ _CELL = 4.0
 """The width of the cells of places, in distances of what stands still."""
 _IMAGES, _SHARE = 3, 0.5
 """The fewest images, of three and more, and which part of those of one size that move, that show an overlay at a place."""
+_REACH = 8.0
+"""Within so many cells of a place of an overlay the fewest images are enough: what is behind it hides parts of a watermark."""
 
 Matches = Mapping[int, Int[Tensor, "_ 2"]]
 
@@ -113,8 +115,31 @@ def _common(rows: Int[Tensor, "r 3"], images: Int[Tensor, "r"], sizes: Int[Tenso
     cells, count = torch.unique(once[:, :3], dim=0, return_counts=True)
     kinds, number = torch.unique(sizes, dim=0, return_counts=True)
     of_size = ((cells[:, None, :2] == kinds).all(-1) * number).sum(-1)
-    common: Tensor = cells[count >= torch.minimum((_SHARE * of_size).clamp(min=_IMAGES), of_size)]
-    return common
+    fewest = of_size.clamp(max=_IMAGES)
+    common = count >= torch.minimum((_SHARE * of_size).clamp(min=_IMAGES), of_size)
+    place, likely = _centres(cells), count >= fewest
+    while True:
+        near = (
+            torch.cdist(place[likely], place[common]) <= _REACH * _CELL * _STILL * scale_of_images(cells[likely, :2])[:, None]
+        )
+        beside = near & (cells[likely, None, :2] == cells[common, :2]).all(-1)
+        grown = common.index_put((likely.nonzero()[:, 0],), common[likely] | beside.any(1))
+        if bool((grown == common).all()):
+            break
+        common = grown
+    found: Tensor = cells[common]
+    return found
+
+
+def _centres(cells: Int[Tensor, "c 3"]) -> Float[Tensor, "c 2"]:
+    """The middle of cells, see `_cells`, in pixels."""
+    size, number = cells[:, :2], cells[:, 2]
+    width = (_CELL * _STILL * scale_of_images(size))[:, None]
+    columns, rows = ((size / width).long() + 3).unbind(-1)
+    column, row, grid = number // rows % columns, number % rows, number // rows // columns
+    shift = torch.stack([grid // 2, grid % 2], -1) / 2
+    centre: Tensor = (torch.stack([column, row], -1) - 0.5 - shift) * width
+    return centre
 
 
 def _cells(x: Float[Tensor, "k 2"], size: Int[Tensor, "2"]) -> Int[Tensor, "k 4"]:
