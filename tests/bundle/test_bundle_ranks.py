@@ -47,6 +47,7 @@ def cases(generator: torch.Generator) -> dict[str, Case]:
     index = torch.arange(0, 8, 2)
     centre = CentrePrior(index, own.poses.centre[index] + 0.01 * torch.randn(4, 3, generator=generator, dtype=F64), 0.02)
     place = PointPrior(torch.arange(5), own.X[:5], 0.05)
+    stands = CentrePrior(torch.arange(6), few.poses.centre, 0.02)
     some = (torch.rand(len(own.x), generator=generator, dtype=F64) * 2).floor()
     missing = own.x.clone()
     missing[::13] = torch.nan
@@ -55,6 +56,7 @@ def cases(generator: torch.Generator) -> dict[str, Case]:
     start = Rig(disturb(rig.cam_from_rig, generator), rig.sensor, rig.frame)
     moved = X + 0.02 * torch.randn(X.shape, generator=generator, dtype=F64)
     bodies = BundleProblem(start.view_poses(disturb(body, generator)), cameras, rig.sensor, moved, x, view, point)
+    near = PointPrior(torch.arange(5), moved[:5], 0.05)
     return {
         "own intrinsics": (own, {"free": free}),
         "iterative": (own, {"free": free, "linear_solver": "pcg"}),
@@ -68,9 +70,14 @@ def cases(generator: torch.Generator) -> dict[str, Case]:
         "no free camera": (own, {"fixed_poses": torch.ones(8, dtype=torch.bool), "free": ()}),
         "holes": (holes, {"free": free}),
         "two points": (few, {"free": (), "fixed_poses": torch.ones(6, dtype=torch.bool)}),
+        "two points, iterative": (few, {"free": (), "priors": [stands], "linear_solver": "pcg"}),
         "poses eliminated": (scene(generator, points=12, views=60), {"free": ()}),
         "rig": (bodies, {"rig": start, "free": ()}),
         "rig, iterative": (bodies, {"rig": start, "linear_solver": "pcg", "free": ()}),
+        "rig, all at once": (
+            spoiled(bodies, generator),
+            {"rig": start, "loss": Cauchy(1.0), "free": ("focal",), "priors": [near]},
+        ),
     }
 
 
@@ -86,7 +93,7 @@ def adjust(found: dict[str, Case]) -> dict[str, Any]:
     return answers
 
 
-@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 3, pytest.param(4, marks=pytest.mark.slow)])
 def test_costs_and_answers_are_those_of_one_process(count: int, generator: torch.Generator, tmp_path: Path) -> None:
     found = cases(generator)
     alone = adjust(found)

@@ -36,16 +36,22 @@ class Runs:
     def combine(self, steps: Tensor, W: Tensor) -> Tensor:
         """Rows of W (q, c, m) combined by the coefficients (runs, c) of their run: (q, m)."""
         if self.number is None:
-            return torch.cat([steps[k] @ W[:, :, a:b] for k, (a, b) in enumerate(self.ends)], -1)
+            rows = steps[:, None, None].expand(-1, len(W), 1, -1)
+            return torch.cat([torch.bmm(row, part) for row, part in zip(rows, self._parts(W), strict=True)], -1)[:, 0]
         return (W * steps.mT[:, self.number]).sum(1)
 
     def lift(self, W: Tensor, at: Tensor) -> Tensor:
         """Columns of W (q, c, m) summed with the factors (q, m), over q too: (runs, c)."""
         if self.number is None:
-            column = at[:, :, None]
-            return torch.stack([torch.bmm(W[:, :, a:b], column[:, a:b]) for a, b in self.ends]).sum(1)[:, :, 0]
+            # A row from the left: with a column from the right the same product takes several times as long.
+            rows = self._parts(at[:, None])
+            return torch.stack([torch.bmm(row, part.mT) for row, part in zip(rows, self._parts(W), strict=True)]).sum(1)[:, 0]
         columns = (W * at[:, None]).sum(0).mT
         return columns.new_zeros((len(self.ends), W.shape[1])).index_add_(0, self.number, columns)
+
+    def _parts(self, W: Tensor) -> tuple[Tensor, ...]:
+        """The columns of each run."""
+        return torch.split(W, [b - a for a, b in self.ends], -1)
 
 
 def find_runs(slots: Tensor) -> Runs:
