@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -161,15 +162,18 @@ def recall(views: int) -> Row:
     return row
 
 
-def bundle(ranks: int) -> list[Row]:
-    """A bundle of 200 cameras over processes: what each of them takes."""
+def bundle(ranks: int, mixed: bool = False) -> list[dict[str, Any]]:
+    """A bundle of 200 cameras over processes: what each of them takes; `mixed` has the points in another order."""
     from torchsfm._types import tensor_map
     from torchsfm.simulation import random_bundle_problem
 
     with tempfile.TemporaryDirectory() as folder:
-        simulated = random_bundle_problem(200, 120_000, 600_000, generator=torch.Generator().manual_seed(0))
+        problem = random_bundle_problem(200, 120_000, 600_000, generator=torch.Generator().manual_seed(0)).problem
+        if mixed:
+            order = torch.randperm(len(problem.X), generator=torch.Generator().manual_seed(0))
+            problem = replace(problem, X=problem.X[order], point=torch.argsort(order)[problem.point])
         # Views of larger tensors would be saved with all of these.
-        torch.save(tensor_map(torch.clone, simulated.problem), Path(folder) / "problem")
+        torch.save(tensor_map(torch.clone, problem), Path(folder) / "problem")
         words = [sys.executable, "-m", "bench.scale", "bundle", "--worker", folder]
         group = [
             subprocess.Popen(words, env=os.environ | {"RANK": str(rank), "WORLD_SIZE": str(ranks)}, stdout=subprocess.PIPE)
@@ -178,7 +182,7 @@ def bundle(ranks: int) -> list[Row]:
         return [json.loads(process.communicate()[0].splitlines()[-1]) for process in group]
 
 
-def bundle_worker(folder: str) -> Row:
+def bundle_worker(folder: str) -> dict[str, Any]:
     """One rank of `bundle`."""
     import torch.distributed as dist
 
@@ -195,13 +199,16 @@ def bundle_worker(folder: str) -> Row:
 
     dist.all_reduce = counted
     problem = torch.load(Path(folder) / "problem", weights_only=False)
+    costs: dict[int, float] = {}
     before, start = memory(), time.process_time()
     result = bundle_adjust(
-        problem, free=("focal", "k1", "k2"), linear_solver="pcg", max_iterations=5, tolerance=0.0, group=dist.group.WORLD
-    )
+        problem, free=("focal", "k1", "k2"), linear_solver="pcg", max_iterations=5, tolerance=0.0, group=dist.group.WORLD,
+        progress=costs.__setitem__,
+    )  # fmt: skip
     spent = time.process_time() - start
     own = 72 * len(problem.poses.t)
     row = {
+        "costs": list(costs.values()),
         "final cost": result.cost,
         "cpu s": spent,
         "MB before": before,
@@ -212,6 +219,18 @@ def bundle_worker(folder: str) -> Row:
     }
     dist.destroy_process_group()
     return row
+
+
+def compare_ranks(numbers: list[int]) -> None:
+    """Print what a bundle over processes takes, and how far its costs are from those of the first number of them."""
+    found = {f"{ranks}": bundle(ranks) for ranks in numbers} | {f"{numbers[0]}, points mixed": bundle(numbers[0], mixed=True)}
+    costs = {name: rows[0].pop("costs") for name, rows in found.items()}
+    most = {ranks: {name: max(row[name] for row in found[f"{ranks}"]) for name in found[f"{ranks}"][0]} for ranks in numbers}
+    print(table(most, "ranks"))
+    first = costs[f"{numbers[0]}"]
+    for name, rows in found.items():
+        apart = ", ".join(f"{abs(a / b - 1):.0e}" for a, b in zip(costs[name], first, strict=True))
+        print(f"{name}: {sum(row['cpu s'] for row in rows):.1f} core-seconds in all; costs after each step differ by {apart}")
 
 
 def apart(job: str, size: int, method: str) -> Row:
@@ -265,17 +284,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    jobs = {"photographs": partial(photographs, method=options.methods[0]), "features": simulated, "recall": recall}
+    jobs: dict[str, Callable[[int], Row]] = {
+        "photographs": partial(photographs, method=options.methods[0]),
+        "features": simulated,
+        "recall": recall,
+    }
     if options.worker:
         row = bundle_worker(options.worker) if options.job == "bundle" else jobs[options.job](options.images[0])
         print(json.dumps(row))
     elif options.job == "bundle":
-        found = {ranks: bundle(ranks) for ranks in options.ranks}
-        print(
-            table({ranks: {name: max(row[name] for row in rows) for name in rows[0]} for ranks, rows in found.items()}, "ranks")
-        )
-        for ranks, rows in found.items():
-            print(f"{ranks} ranks: {sum(row['cpu s'] for row in rows):.1f} core-seconds in all")
+        compare_ranks(options.ranks)
     else:
         for method in options.methods if options.job == "photographs" else options.methods[:1]:
             rows = {size: apart(options.job, size, method) for size in options.images}

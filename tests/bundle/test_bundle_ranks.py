@@ -1,6 +1,6 @@
 """Bundles over several processes: each step and each answer is that of one process."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from torchsfm._types import Status
 from torchsfm.bundle import CentrePrior, PointPrior, Rig, bundle_adjust
 from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Block, Cauchy, Huber, Term, sparse_levenberg_marquardt
+from torchsfm.optim.ranks import Ranks, share
 
 F64 = torch.float64
 Case = tuple[BundleProblem, dict[str, Any]]
@@ -183,6 +184,39 @@ def test_problems_of_ones_own(eliminate: str | None, generator: torch.Generator,
             assert torch.equal(own_tensors[0][0], blocks["station"].x[0])
             for a, b in zip(own_tensors, tensors, strict=True):
                 torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+
+
+@dataclass(frozen=True)
+class Member:
+    """One of several processes that have nothing to say to each other."""
+
+    number: int
+    count: int
+
+    def rank(self) -> int:
+        return self.number
+
+    def size(self) -> int:
+        return self.count
+
+
+def test_neighbours_are_on_one_rank(generator: torch.Generator) -> None:
+    """Points that four stations in a row see, in any order: each rank has few stations, all points once, and even shares."""
+    first = torch.randint(37, (400,), generator=generator)
+    i, j = (first[:, None] + torch.arange(4)).flatten(), torch.arange(400).repeat_interleave(4)
+    blocks = {"station": Block(torch.zeros(40, 2)), "mark": Block(torch.randn(400, 2, generator=generator))}
+    terms = [Term(difference, ("station", "mark"), (i, j), (torch.randn(1600, 2, generator=generator),))]
+    seen = torch.zeros(400)
+    for rank in range(4):
+        mine = share(blocks, terms, "mark", Ranks(Member(rank, 4)))
+        station, mark = mine.terms[0].index
+        assert len(torch.unique(station)) <= 40 // 4 + 8
+        assert abs(len(mark) - 400) <= 4
+        assert torch.equal(mine.blocks["mark"].x, blocks["mark"].x[mine.places["mark"]][int(seen.sum()) :][: len(mark) // 4])
+        own = mine.places["mark"][int(seen.sum()) :][: len(mine.blocks["mark"].x)]
+        assert torch.equal(terms[0].data[0][torch.isin(j, own)], mine.terms[0].data[0])
+        seen[own] += 1
+    assert bool((seen == 1).all())
 
 
 def stopped(problem: BundleProblem) -> tuple[int, int]:

@@ -5,7 +5,7 @@ What belongs to eliminated variables never leaves their rank before the end.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
@@ -87,7 +87,7 @@ class Ranks:
 
 @dataclass(frozen=True)
 class Share:
-    """What one rank has of a problem: a run of the variables of each eliminated block, and the residuals that meet them."""
+    """What one rank has of a problem: some of the variables of each eliminated block, and the residuals that meet them."""
 
     blocks: Mapping[str, Block]
     """All retained variables and its own eliminated ones."""
@@ -96,10 +96,15 @@ class Share:
     ranks: Ranks
     order: Sequence[Tensor] = ()
     """The rows of each term, those of the first rank first."""
+    places: Mapping[str, Tensor] = field(default_factory=dict)
+    """The variables of each eliminated block, those of the first rank first."""
 
     def whole(self, x: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The variables of all ranks, given those of this one."""
-        return {name: self.ranks.gather(values) if name in self.eliminated else values for name, values in x.items()}
+        if self.ranks.size == 1:
+            return dict(x)
+        whole = {name: self.ranks.gather(x[name]) for name in self.eliminated}
+        return {**x, **{name: torch.empty_like(v).index_copy_(0, self.places[name], v) for name, v in whole.items()}}
 
     def rows(self, values: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """One tensor for each term with a row for each of its residuals, given those of this rank."""
@@ -110,7 +115,7 @@ class Share:
 
 
 def share(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None, ranks: Ranks) -> Share:
-    """Divide a problem that all ranks know, so that each has about as many residuals of each eliminated block.
+    """Divide a problem that all ranks know, so that each has about as many residuals of each eliminated block, of few retained.
 
     Residuals of retained variables alone are divided evenly.
 
@@ -121,12 +126,15 @@ def share(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | S
     if ranks.size == 1:
         return Share(blocks, terms, names, ranks)
     met = [eliminated_block(term, names) for term in terms]
-    owner = {name: _owners(blocks[name], name, terms, ranks.size) for name in names}
-    first = {name: int((found < ranks.rank).sum()) for name, found in owner.items()}
-    own_blocks = dict(blocks)
-    for name, found in owner.items():
-        mine, block = slice(first[name], first[name] + int((found == ranks.rank).sum())), blocks[name]
+    owner, places, number, own_blocks = dict[str, Tensor](), dict[str, Tensor](), dict[str, Tensor](), dict(blocks)
+    for name in names:
+        block = blocks[name]
+        places[name] = torch.argsort(_neighbourhood(name, blocks, terms), stable=True)
+        at = torch.argsort(places[name])
+        found = _owners(block, name, terms, places[name], ranks.size)
+        mine = places[name][found == ranks.rank]
         own_blocks[name] = replace(block, x=block.x[mine], fixed=None if block.fixed is None else block.fixed[mine])
+        owner[name], number[name] = found[at], at - int((found < ranks.rank).sum())
     own_terms, orders = [], []
     for term, eliminated in zip(terms, met, strict=True):
         count = len(term.index[0])
@@ -135,18 +143,40 @@ def share(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | S
         else:
             where = owner[eliminated][term.index[term.blocks.index(eliminated)]]
         own = term.select((where == ranks.rank).nonzero()[:, 0])
-        index = tuple(i - first[n] if n == eliminated else i for n, i in zip(term.blocks, own.index, strict=True))
+        index = tuple(number[n][i] if n == eliminated else i for n, i in zip(term.blocks, own.index, strict=True))
         own_terms.append(replace(own, index=index))
         orders.append(torch.argsort(where, stable=True))
-    return Share(own_blocks, own_terms, names, ranks, orders)
+    return Share(own_blocks, own_terms, names, ranks, orders, places)
 
 
-def _owners(block: Block, name: str, terms: Sequence[Term], ranks: int) -> Tensor:
-    """The rank of each variable, which never falls from one to the next."""
+def _neighbourhood(name: str, blocks: Mapping[str, Block], terms: Sequence[Term]) -> Tensor:
+    """Where each variable stands among the retained ones that it meets: the mean of their numbers, in the block of most.
+
+    Neighbours meet the same ones, so where they are on one rank it has to do with fewer of them.
+    """
+    block = blocks[name]
+    with_it = [term for term in terms if name in term.blocks]
+    total = torch.zeros(len(block.x), dtype=torch.float64, device=block.x.device)
+    others = sorted({other for term in with_it for other in term.blocks} - {name})
+    if not others:
+        return total
+    guide, count = max(others, key=lambda other: len(blocks[other].x)), torch.zeros_like(total)
+    for term in with_it:
+        index = term.index[term.blocks.index(name)]
+        for other, met in zip(term.blocks, term.index, strict=True):
+            if other == guide:
+                total.index_add_(0, index, met.double())
+                count.index_add_(0, index, torch.ones_like(met, dtype=torch.float64))
+    return total / count.clamp_min(1)
+
+
+def _owners(block: Block, name: str, terms: Sequence[Term], order: Tensor, ranks: int) -> Tensor:
+    """The rank of each variable in an order of them, which never falls from one to the next."""
     count = torch.zeros(len(block.x), dtype=torch.int64, device=block.x.device)
     for term in terms:
         for other, index in zip(term.blocks, term.index, strict=True):
             if other == name:
                 count += torch.bincount(index, minlength=len(count))
+    count = count[order]
     end = count.cumsum(0)
     return ((2 * end - count) * ranks // (2 * count.sum().clamp_min(1))).clamp_max(ranks - 1)
