@@ -261,15 +261,23 @@ def table(rows: dict[int, Row], first: str) -> str:
 
 
 def predict(rows: dict[int, Row]) -> str:
-    """Core-hours at large sizes from the largest run: linear parts by image and by pair, retrieval by its square, on top."""
-    size, row = max(rows.items())
+    """Core-hours at large sizes: linear parts by image and by pair of the largest run, retrieval by its square, on top.
+
+    Mapping grows as from the second largest run to it.
+    """
+    *others, size = sorted(rows)
+    row = rows[size]
     per_image, per_pair = row["features s"] / size, (row["match s"] + row["verify s"]) / row["pairs compared"]
-    lines = ["| images | features h | retrieval h | pairs | match and verify h | in days on 16 cores |", "|---" * 6 + "|"]
+    grows = math.log(row["map s"] / rows[others[-1]]["map s"]) / math.log(size / others[-1]) if others else math.nan
+    names = ["images", "features h", "retrieval h", "pairs", "match and verify h", f"mapping h (exponent {grows:.2f})"]
+    lines = [f"| {' | '.join([*names, 'in days on 16 cores, mapping on one'])} |", "|---" * 7 + "|"]
     for n in LARGE:
         pairs = 0.75 * n * NEIGHBOURS
         # A product of 64 x 128 numbers for each pair of images at 30 GFLOP/s.
         hours = [n * per_image / 3600, 2 * 8192 * n**2 / 30e9 / 3600, pairs * per_pair / 3600]
-        cells = [f"{hours[0]:.3g}", f"{hours[1]:.3g}", f"{pairs:.2g}", f"{hours[2]:.3g}", f"{sum(hours) / 16 / 24:.3g}"]
+        mapping = row["map s"] * (n / size) ** grows / 3600
+        cells = [f"{hours[0]:.3g}", f"{hours[1]:.3g}", f"{pairs:.2g}", f"{hours[2]:.3g}", f"{mapping:.3g}"]
+        cells.append(f"{sum(hours) / 16 / 24 + mapping / 24:.3g}")
         lines.append(f"| 10^{round(math.log10(n))} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
