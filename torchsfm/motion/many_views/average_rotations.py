@@ -137,13 +137,9 @@ def average_rotations(
     with torch.no_grad():
         counts = _countable(R, edges, deviation, weights)
     kept = counts.nonzero()[:, 0]
-    graph = _Graph(
-        R[kept].double(),
-        edges[kept],
-        None if deviation is None else deviation[kept].double(),
-        None if weights is None else weights[kept].double(),
-        views,
-    )
+    sigma = None if deviation is None else deviation[kept].double()
+    weight = None if weights is None else weights[kept].double()
+    graph = _Graph(R[kept].double(), edges[kept], sigma, _whitening(sigma, R[kept].double()), weight, views)
     with torch.no_grad():
         tree, _ = graph.start()
         start = tree
@@ -190,6 +186,8 @@ class _Graph:
     R: Float[Tensor, "e 3 3"]
     edges: Int[Tensor, "e 2"]
     deviation: Float[Tensor, "e 3 3"] | None
+    W: Float[Tensor, "e 3 3"]
+    """`W' W` is the inverse of the covariance of each."""
     weights: Float[Tensor, "e"] | None
     views: int
 
@@ -212,14 +210,14 @@ class _Graph:
     def square(self, model: Float[Tensor, "v 3 3"]) -> Float[Tensor, "e"]:
         """The squared residual of each edge."""
         e = rotvec_from_rotation(self.disagreement(model))[..., None]
-        return (self._whitening() @ e)[..., 0].square().sum(-1)
+        return (self.W @ e)[..., 0].square().sum(-1)
 
     def reseat(self, model: Float[Tensor, "v 3 3"], reach: float) -> Float[Tensor, "v 3 3"]:
         """Put cameras with which most of their edges disagree where one of these wants them, if more then agree.
 
         A sum of lengths has minima in which a few edges hold a camera far from where more of them would put it.
         """
-        W = self._whitening()
+        W = self.W
         camera = self.edges.mT.flatten()
         agree = (self.square(model) <= reach**2).repeat(2)
         total, support = (torch.bincount(c, minlength=self.views) for c in (camera, camera[agree]))
@@ -259,12 +257,12 @@ class _Graph:
 
     def least(self) -> float:
         """The standard deviation that there is at least."""
-        return EXACT * float(torch.linalg.matrix_norm(self._whitening()).median()) / 3**0.5
+        return EXACT * float(torch.linalg.matrix_norm(self.W).median()) / 3**0.5
 
     def terms(self, loss: Loss) -> list[Term]:
         """All edges."""
         i, j = self.edges.unbind(-1)
-        return [Term(_residual, ("R", "R"), (i, j), (self.R, self._whitening()), loss, self.weights, _linearize)]
+        return [Term(_residual, ("R", "R"), (i, j), (self.R, self.W), loss, self.weights, _linearize)]
 
     def minimise(self, start: Float[Tensor, "v 3 3"], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
         """The minimum nearest to a start."""
@@ -283,14 +281,15 @@ class _Graph:
         spread = scale**2 * marginal_covariance({"R": block}, terms, "R")
         return torch.where(known[:, None, None], model @ spread @ model.mT, unknown)
 
-    def _whitening(self) -> Float[Tensor, "e 3 3"]:
-        """W with `W' W` the inverse of the covariance of each edge."""
-        eye = torch.eye(3, dtype=self.R.dtype, device=self.R.device).expand(len(self.R), 3, 3)
-        if self.deviation is None:
-            return eye
-        lower, _ = torch.linalg.cholesky_ex(self.deviation)
-        whitening: Tensor = torch.linalg.solve_triangular(lower, eye, upper=False)
-        return whitening
+
+def _whitening(covariance: Float[Tensor, "e 3 3"] | None, R: Float[Tensor, "e 3 3"]) -> Float[Tensor, "e 3 3"]:
+    """W with `W' W` the inverse of the covariance of each edge."""
+    eye = torch.eye(3, dtype=R.dtype, device=R.device).expand(len(R), 3, 3)
+    if covariance is None:
+        return eye
+    lower, _ = torch.linalg.cholesky_ex(covariance)
+    whitening: Tensor = torch.linalg.solve_triangular(lower, eye, upper=False)
+    return whitening
 
 
 def _rotations(found: SparseResult) -> Float[Tensor, "v 3 3"]:
