@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.autocalibration.focal_from_fundamentals import SCALE
-from torchsfm.linalg import cross, inverse, usable
+from torchsfm.linalg import cross, inverse, nearest_psd, usable
 from torchsfm.optim import Cauchy, levenberg_marquardt
 
 STARTS, SPREAD = 9, 1.6
@@ -24,6 +24,8 @@ COMMON = 0.5
 """Share of the variance of what was expected that is one and the same for all cameras: a guess is off for all of them."""
 TINY, ROUNDING = 1e-300, 1e-14
 """The least denominator; the square of an asymmetry that rounding makes."""
+CHANCE = 3.0
+"""Slopes that are so many standard deviations of what noise makes of them tell something."""
 DETERMINED = 0.6
 """A focal length at most so uncertain, compared to what was expected, is determined by the pairs."""
 
@@ -129,7 +131,9 @@ def calibrate_view_graph(
         residual, J = graph.linearize(x, *data)
         residual, J = residual[..., 0, :, 0], J[..., 0, :, 0, :]
         weight = 1 / (1 + residual.square())
-        covariance, regular = inverse(J.mT @ (weight[..., None] * J))
+        told = _beyond_noise(residual[..., :p], J[..., :p, :], weight[..., :p], good, i, j)
+        prior = J[..., p:, :]
+        covariance, regular = inverse(told + prior.mT @ (weight[..., p:, None] * prior))
         variance = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0)
         deviation = torch.where(regular[..., None], torch.minimum(variance.sqrt(), width), width)
         x = x[..., 0, :]
@@ -181,6 +185,21 @@ class _Graph:
         root = COMMON**-0.5
         whitening: Tensor = root * eye - (root - (COMMON * (1 + self.number)) ** -0.5) / max(self.number, 1)
         return whitening
+
+
+def _beyond_noise(residual: Tensor, J: Tensor, weight: Tensor, good: Tensor, i: Tensor, j: Tensor) -> Tensor:
+    """The information `(*batch, v, v)` of the pairs on the logarithms of focal lengths, without what their noise alone makes.
+
+    Noise gives slopes too: the asymmetry of a pair whose cameras only translate is its noise, which a focal length scales. An
+    asymmetry is the length of two numbers, so that each pair has one redundant number less than it has unknowns, two; the
+    scale that losses have counts as one more.
+    """
+    weight = torch.where(good, weight, 0.0)
+    # Each focal length scales half of the noise.
+    share = torch.zeros_like(J[..., :1, :].sum(-2)).index_add(-1, i, weight / 2).index_add(-1, j, weight / 2)
+    redundancy = (2 * weight.sum(-1) - (share > 0).sum(-1)).clamp(min=0)
+    noise = (1 + (weight * residual.square()).sum(-1)) / (1 + redundancy)
+    return nearest_psd(J.mT @ (weight[..., None] * J) - torch.diag_embed(CHANCE**2 * noise[..., None] * share))
 
 
 def _asymmetry(a: Tensor, b: Tensor, invariants: Tensor, good: Tensor) -> Tensor:

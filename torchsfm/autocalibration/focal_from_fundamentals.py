@@ -16,6 +16,7 @@ from torch import Tensor
 from torchsfm._types import Status, check_options, check_tensors
 from torchsfm.linalg import cross, usable
 from torchsfm.optim import attach_optimum
+from torchsfm.optim.likely_noise import QUARTER, likely_variance
 
 WIDE = (0.15, 12.0)
 """Focal lengths searched, over the longer side of the image: views of 147 to 5 degrees."""
@@ -150,10 +151,13 @@ def focal_from_fundamentals(
         # The pairs that agree decide whether another focal length would do as well.
         agreeing = w * (SCALE**2 / (SCALE**2 + k2)) ** 2
         share = agreeing.sum(-1, keepdim=True).clamp_min(1e-300)
-        level = (agreeing * k2).sum(-1, keepdim=True) / share + NOISE**2
-        along = (agreeing[..., None, :] * curves(grid)).sum(-1) / share
-        told = ((along > 4 * level) | ((grid - log_f).abs() < APART)).all(-1)
         number = share[..., 0] ** 2 / (agreeing**2).sum(-1).clamp_min(1e-300)
+        mean = (agreeing * k2).sum(-1) / share[..., 0]
+        level = (mean + NOISE**2)[..., None]
+        # An asymmetry is the length of two numbers; of few pairs the best focal length leaves little by chance.
+        likely = 2 * likely_variance(number * mean, 2 * number - 1, QUARTER)[..., None] + NOISE**2
+        along = (agreeing[..., None, :] * curves(grid)).sum(-1) / share
+        told = ((along > 4 * likely) | ((grid - log_f).abs() < APART)).all(-1)
         # One pair always agrees with itself; of the others some must agree too.
         support = (w * SCALE**2 / (SCALE**2 + k2)).sum(-1)
         largest = w.amax(-1) if p else torch.zeros(batch, dtype=torch.float64, device=F.device)
