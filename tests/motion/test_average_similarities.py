@@ -179,3 +179,26 @@ def test_one_loop_that_does_not_close_is_told(wrong: int, noise: float) -> None:
         told.append((found.status == (Status.NO_CONSENSUS if wrong else Status.OK)).all())
     # Nobody knows how large the noise is, but unrelated models would close a loop as well; few do so by chance.
     assert_share(torch.stack(told), 0.95)
+
+
+def test_loops_that_close_say_nothing_of_others() -> None:
+    """Two loops share a model, the first of all: what one says does not follow from the other."""
+    g, right, wrong = seeded(5), [], []
+    edges = torch.tensor([(k, (k + 1) % 8) for k in range(8)] + [(0, 8), *((k, k + 1) for k in range(8, 14)), (14, 0)])
+    i, j = edges.unbind(1)
+    for _ in range(10):
+        world = Similarity(
+            torch.ones(15, dtype=torch.float64),
+            random_rotation(15, generator=g, dtype=torch.float64),
+            torch.randn(15, 3, generator=g, dtype=torch.float64),
+        )
+        X = torch.randn(16, 10, 3, generator=g, dtype=torch.float64)
+        seen = [_part(world, k).inverse().transform(X) for k in (i, j)]
+        seen = [x + 0.01 * torch.randn(x.shape, generator=g, dtype=torch.float64) for x in seen]
+        seen[1][8:] = torch.randn(8, 10, 3, generator=g, dtype=torch.float64)
+        between, deviation = similarity_from_points(*seen), torch.full((16,), 0.01, dtype=torch.float64)
+        found = average_similarities(between, edges, models=15, places=seen[0], deviation=deviation)
+        right.append((found.status[:8] == Status.OK).all())
+        wrong.append((found.status[8:] == Status.OK).any())
+    assert_share(torch.stack(right), 0.9)
+    assert_share(~torch.stack(wrong), 0.95)

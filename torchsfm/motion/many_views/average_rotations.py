@@ -18,7 +18,7 @@ from torchsfm._types import Status, check_index, check_one_problem, check_option
 from torchsfm.geometry import cross_matrix, rotvec_from_rotation
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.components import components
-from torchsfm.motion.many_views.rotation_loops import close_by_chance, count_loops
+from torchsfm.motion.many_views.rotation_loops import count_loops, vouched_parts
 from torchsfm.motion.many_views.spanning_rotations import spanning_rotations
 from torchsfm.motion.many_views.triplets import find_triplets, pairs_within, turn_angle
 from torchsfm.optim import Block, GemanMcClure, Huber, Loss, Rotation, SparseResult, Term, marginal_covariance
@@ -47,10 +47,10 @@ class AveragedRotations:
     Attributes:
         model: Rotations from the world to the cameras. The world is the smallest camera of each component.
         status: OK; TOO_FEW: no edge of this camera counts; NO_CONSENSUS: of several edges at most one
-            agrees with the rest, or loops close no better than those of unrelated rotations might; NOT_CONVERGED: the
+            agrees with the rest, or its loops close no better than those of unrelated rotations might; NOT_CONVERGED: the
             iteration limit came first, the rotations are the best seen.
-        component: The smallest camera that each is connected with through edges that agree. Rotations of different components
-            have nothing to do with each other.
+        component: The smallest camera that each is connected with through edges that agree, and that loops of theirs confirm or
+            nothing contradicts. Rotations of different components have nothing to do with each other.
         angle: By how much each edge disagrees with the model, in radians; pi for edges that do not count.
         inliers: Edges that agree to within four standard deviations.
         scale: Standard deviation of the right edges in each of three directions, as the loops that they close tell: in radians,
@@ -161,9 +161,12 @@ def average_rotations(
         angle[kept] = off.to(R.dtype)
         inliers[kept] = graph.square(plain).sqrt() <= AGREES * scale
         status = _status(edges, counts, inliers, views, found.status)
-        unlikely = close_by_chance(off, graph.edges, views) & (status != int(Status.TOO_FEW))
+        part = vouched_parts(off, graph.edges, views)
+        vouched = part[edges[:, 0]] == part[edges[:, 1]]
+        supported = torch.bincount(edges[counts & vouched].flatten(), minlength=views) > 0
+        unlikely = ~supported & (status != int(Status.TOO_FEW))
         status = torch.where(unlikely, int(Status.NO_CONSENSUS), status).to(torch.int8)
-        sure = inliers & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
+        sure = inliers & vouched & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
         component = components(edges[sure], views)
         told = count_loops(edges[sure], component)
         if told:

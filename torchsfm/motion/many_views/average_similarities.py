@@ -20,7 +20,7 @@ from torchsfm.geometry import Similarity, rotvec_from_rotation
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.average_rotations import average_rotations
 from torchsfm.motion.many_views.components import components
-from torchsfm.motion.many_views.rotation_loops import close_by_chance
+from torchsfm.motion.many_views.rotation_loops import vouched_parts
 from torchsfm.optim import Block, GemanMcClure, Huber, Loss, Term, rotation_exponential
 from torchsfm.optim import sparse_levenberg_marquardt as minimise
 
@@ -47,10 +47,10 @@ class AveragedSimilarities:
     Attributes:
         model: From the models to the world, which is the smallest model of each component.
         status: OK; TOO_FEW: no edge of this model counts; NO_CONSENSUS: none of its edges agrees, or one of several, or
-            the loops are closed so badly, and so few, that unrelated models close theirs as well; NOT_CONVERGED: the iteration
+            its loops are closed so badly, and so few, that unrelated models close theirs as well; NOT_CONVERGED: the iteration
             limit came first.
-        component: The smallest model that each is connected with through edges that agree. Worlds of different components have
-            nothing to do with each other.
+        component: The smallest model that each is connected with through edges that agree, and that loops of theirs confirm or
+            nothing contradicts. Worlds of different components have nothing to do with each other.
         distance: By how much each edge disagrees: the root mean square distance of its places, in standard deviations of the
             edge; infinite for edges that do not count.
         inliers: Edges that agree to within four times the scatter of the right ones.
@@ -154,11 +154,13 @@ def average_similarities(
         distance = torch.full_like(between.scale, torch.inf)
         distance[kept] = graph.distance(x.detach()).to(dtype)
         inliers = counts & (distance <= AGREES * scatter)
-        component = components(edges[inliers], models)
+        part = vouched_parts(graph.angle(x), graph.edges, models)
+        vouched = part[edges[:, 0]] == part[edges[:, 1]]
+        component = components(edges[inliers & vouched], models)
         counted, agreeing = (torch.bincount(edges[e].flatten(), minlength=models) for e in (counts, inliers))
         # One edge of several supports nothing but itself, and unrelated models may be as near to closing as few loops.
         alone = (agreeing < 2) & (agreeing < counted)
-        unrelated = close_by_chance(graph.angle(x), graph.edges, models)
+        unrelated = torch.bincount(edges[counts & vouched].flatten(), minlength=models) == 0
         code = torch.where(alone | unrelated, int(Status.NO_CONSENSUS), int(course))
         status = torch.where(counted == 0, int(Status.TOO_FEW), code).to(torch.int8)
     scale, R, t = _parts(x)
