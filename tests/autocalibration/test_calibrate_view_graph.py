@@ -102,6 +102,22 @@ def test_bad_data_have_a_status_and_touch_nobody(generator: torch.Generator) -> 
         calibrate_view_graph(F, cameras + 1, C.expand(7, 2), 1800 * ones, 0.5 * ones)
 
 
+@pytest.mark.parametrize("kind", ["walk", "object", "turntable", "parallel"])
+def test_order_of_cameras_and_pairs_means_nothing(kind: str, generator: torch.Generator) -> None:
+    F, cameras, _ = simulate(kind, 6, 2.0, generator, 30)
+    focal = 1500 + 150 * torch.randn(6, generator=generator, dtype=torch.float64)
+    sigma = torch.full_like(focal, 0.5)
+    first = calibrate_view_graph(F, cameras, C.expand(6, 2), focal, sigma)
+    views, pairs = torch.randperm(6, generator=generator), torch.randperm(len(F), generator=generator)
+    turned = torch.rand(len(F), generator=generator) < 0.5
+    F, cameras = F[pairs], views.argsort()[cameras[pairs]]
+    F, cameras = torch.where(turned[:, None, None], F.mT, F), torch.where(turned[:, None], cameras.flip(1), cameras)
+    second = calibrate_view_graph(F, cameras, C.expand(6, 2), focal[views], sigma)
+    assert torch.equal(second.status, first.status[views])
+    torch.testing.assert_close(second.model, first.model[views], rtol=1e-6, atol=0)
+    torch.testing.assert_close(second.asymmetry, first.asymmetry[pairs], rtol=1e-4, atol=1e-9)
+
+
 def test_a_batch_is_a_loop(generator: torch.Generator) -> None:
     scenes = [simulate("object", 6, 0.5, generator) for _ in range(3)]
     F, cameras = torch.stack([scene[0] for scene in scenes]), scenes[0][1]

@@ -240,3 +240,14 @@ def test_wrong_rays_do_not_place_cameras_that_only_turned(generator: torch.Gener
     for _ in range(5):
         rays = see(torch.zeros(12, 3, dtype=torch.float64), X, 7, 1e-3, 0.2, generator)
         assert (rays.solve().status == Status.OK).sum() <= 1
+
+
+def test_order_of_cameras_points_and_rays_means_nothing(generator: torch.Generator) -> None:
+    rays = orbit(8, 60, 0.002, 0.2, generator)
+    first = rays.solve()
+    order, places, views = (torch.randperm(n, generator=generator) for n in (len(rays.d), 60, 8))
+    view, point = views.argsort()[rays.view[order]], places.argsort()[rays.point[order]]
+    second = position_globally(rays.d[order], view, point, rays.R[views], points=60)
+    assert torch.equal(second.status, first.status[views])
+    assert torch.equal(second.inliers, first.inliers[order])
+    torch.testing.assert_close(second.angle, first.angle[order], rtol=1e-3, atol=1e-6)
