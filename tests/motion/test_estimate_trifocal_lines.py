@@ -242,3 +242,22 @@ def test_wrong_arguments(unchecked: None) -> None:
         estimate_trifocal(x, l[..., 0], threshold=1.0)
     with pytest.raises(ValueError, match="mask"):
         estimate_trifocal(x, l, threshold=1.0, mask=torch.ones(9, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("layout", ["one point", "one direction", "two directions", "a plane"])
+def test_lines_that_leave_the_cameras_open_are_told(layout: str, generator: torch.Generator) -> None:
+    p, k = 8, 60
+    P, a, b = cameras(p, v=3, generator=generator), *points(p, n=2 * k, generator=generator).split(k, 1)
+    if layout == "one point":
+        a = a[:, :1].expand_as(b)
+    elif layout == "a plane":
+        a, b = (torch.cat((X[..., :2], 0.4 * X[..., :1]), -1) for X in (a, b))
+    else:
+        number = 1 if layout == "one direction" else 2
+        along = torch.nn.functional.normalize(torch.randn(p, number, 3, generator=generator, dtype=F64), dim=-1)
+        b = a + 0.7 * along.repeat(1, k // number, 1)
+    l = torch.stack((images(P, a), images(P, b)), -2)  # noqa: E741
+    l = l + 0.7 * torch.randn(l.shape, generator=generator, dtype=F64)  # noqa: E741
+    scene = Scene(l[..., :0, 0, :], l, torch.zeros(p, k, dtype=torch.bool), P)
+    found = scene.estimate(max_iterations=200)
+    assert_share((found.status != Status.OK) | (found.degeneracy == Degeneracy.UNDETERMINED), 0.95)
