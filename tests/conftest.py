@@ -1,6 +1,7 @@
 """What all tests share: one thread, seeds by option, real data by environment variable, tolerances by dtype."""
 
 import functools
+import gc
 import importlib
 import os
 import pkgutil
@@ -15,6 +16,8 @@ from chance import seeded, set_seed, stream_seed
 from hypothesis import settings
 
 pytest_plugins = ["scripts"]
+# Nearly all that is made until the tests begin stays: to look for what is no longer used there takes long and finds little.
+gc.disable()
 torch.set_num_threads(1)
 type_checks.install()
 # No run remembers another.
@@ -53,6 +56,12 @@ def pytest_collection(session: pytest.Session) -> None:
         torch.set_default_device(device)
         # Other programs, with which answers are compared, take them on the CPU.
         torch.Tensor.numpy = functools.partialmethod(torch.Tensor.numpy, force=True)  # type: ignore[method-assign]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_report_header(config: pytest.Config) -> str:
