@@ -17,6 +17,9 @@ Linearize = Callable[..., tuple[Tensor, Tensor]]
 WIDE = 1 << 20
 """Numbers, of variables and data, for which rows of exact Hessians are found at once."""
 
+FEW = 1 << 15
+"""And for which all columns of Jacobians are."""
+
 
 @dataclass(frozen=True)
 class DenseSystem:
@@ -133,16 +136,24 @@ class DenseProblem:
         The pullback is linear in what it pulls back, so its own pullbacks are the columns of the Jacobian. Forward mode would
         do the same, but loading it takes PyTorch seconds.
         """
-        first = leaves(x)[0]
+        some, t = self, self.tangent
+        if few := t * sum(v.numel() for v in leaves((x, self.data))) <= FEW:
+            # Each problem stands there once for each column, so that one derivative gives them all.
+            first = leaves(x)[0]
+            copies = (torch.arange(len(first), device=first.device).repeat_interleave(t),)
+            some, x = self.pick(copies), pick(copies, x)
         with torch.enable_grad():
-            delta = first.new_zeros((first.shape[0], self.tangent)).requires_grad_()
-            value = self.residual(self.retract(x, delta), *self.data)
+            delta = leaves(x)[0].new_zeros((len(leaves(x)[0]), t)).requires_grad_()
+            value = some.residual(some.retract(x, delta), *some.data)
             seed = torch.zeros_like(value).requires_grad_()
             (pulled,) = torch.autograd.grad(value, delta, seed, create_graph=True, materialize_grads=True)
+            if few:
+                own = pulled.view(len(first), t, t).diagonal(dim1=1, dim2=2).sum()
+                (column,) = torch.autograd.grad(own, seed, materialize_grads=True)
+                return value.detach()[::t], column.view(len(first), t, *column.shape[1:]).movedim(1, -1)
             ones = torch.ones_like(pulled[:, 0])
             columns = [
-                torch.autograd.grad(pulled[:, i], seed, ones, retain_graph=True, materialize_grads=True)[0]
-                for i in range(self.tangent)
+                torch.autograd.grad(pulled[:, i], seed, ones, retain_graph=True, materialize_grads=True)[0] for i in range(t)
             ]
         return value.detach(), torch.stack(columns, -1)
 

@@ -15,6 +15,9 @@ from torchsfm._types import check_options
 from torchsfm.optim.loss import Loss, loss_slope
 from torchsfm.optim.manifold import Manifold
 
+FEW = 4096
+"""Rows that are differentiated together at most."""
+
 
 @dataclass(frozen=True)
 class Block:
@@ -238,41 +241,54 @@ def linearize(
 
 
 def _differentiate(term: Term, arguments: list[Tensor], lifts: dict[str, Tensor | None], out: list[Tensor | None]) -> Tensor:
-    """Each residual sees one row of each argument, so one reverse sweep gives one row of every Jacobian."""
-    leaves = [a.mT.detach().requires_grad_(o is not None) for a, o in zip(arguments, out, strict=True)]
+    """Each residual sees one row of each argument, so one reverse sweep gives one row of every Jacobian.
+
+    Few residuals stand there once for each of these rows, so that one sweep gives them all: calls cost more than arithmetic.
+    """
+    wanted = [target for target in out if target is not None]
+    m, d = len(term.index[0]), wanted[0].shape[1] if wanted else 1
+    together = d if d * m <= FEW else 1
+    columns = [a.mT.repeat(1, together) if together > 1 else a.mT.detach() for a in arguments]
+    leaves = [column.requires_grad_(o is not None) for column, o in zip(columns, out, strict=True)]
+    data = [_columns(t).repeat(*[1] * (t.ndim - 1), together).movedim(-1, 0) if together > 1 else t for t in term.data]
     follow = [leaf for leaf in leaves if leaf.requires_grad]
     with torch.enable_grad():
-        value = term.residual(*(leaf.mT for leaf in leaves), *term.data)
-        components = value.unbind(-1)
-        for k, component in enumerate(components):
-            if component.requires_grad:
-                last = k + 1 == len(components)
-                # Sums, since the first call with factors of its own imports for half a second.
-                slopes = torch.autograd.grad(component.sum(), follow, retain_graph=not last, materialize_grads=True)
+        value = term.residual(*(leaf.mT for leaf in leaves), *data)
+        rows = value.reshape(together, m, value.shape[-1])
+        for first in range(0, d if wanted else 0, together):
+            # Sums, since the first call with factors of its own imports for half a second.
+            row = rows[..., first : first + together].diagonal(dim1=0, dim2=2).sum()
+            if row.requires_grad:
+                slopes = torch.autograd.grad(row, follow, retain_graph=first + together < d, materialize_grads=True)
             else:
                 slopes = tuple(torch.zeros_like(leaf) for leaf in follow)
-            rows = iter(slopes)
+            own = iter(slopes)
             for name, index, target in zip(term.blocks, term.index, out, strict=True):
                 if target is None:
                     continue
-                ambient, lift = next(rows), lifts[name]
+                ambient, lift = next(own), lifts[name]
+                ambient = ambient.view(len(ambient), together, m)
                 if lift is not None:
-                    ambient = (ambient[:, None] * lift.index_select(-1, index)).sum(0)
-                target[:, k] = ambient.mT
-    return value.detach()
+                    ambient = (ambient[:, None] * lift.index_select(-1, index)[:, :, None]).sum(0)
+                target[:, first : first + together] = ambient.permute(2, 1, 0)
+    residual: Tensor = rows[0].detach()
+    return residual
 
 
 def lift_of(block: Block, x: Float[Tensor, "n k"]) -> Tensor | None:
     """The derivative `(k, tangent, n)` of the retraction at zero; None where it is the identity."""
     if block.manifold is None:
         return None
+    n, k = x.shape
+    together = k if k * n <= FEW else 1
     with torch.enable_grad():
-        delta = x.new_zeros((x.shape[0], block.tangent)).requires_grad_()
-        moved = block.retract(x.detach(), delta).unbind(-1)
-        rows = [
-            torch.autograd.grad(c.sum(), delta, retain_graph=True, materialize_grads=True)[0]
-            if c.requires_grad
-            else torch.zeros_like(delta)
-            for c in moved
-        ]
-    return torch.stack([row.mT for row in rows])
+        delta = x.new_zeros((together * n, block.tangent)).requires_grad_()
+        moved = block.retract(x.detach().repeat(together, 1), delta).view(together, n, k)
+        rows = []
+        for first in range(0, k, together):
+            row = moved[..., first : first + together].diagonal(dim1=0, dim2=2).sum()
+            if row.requires_grad:
+                rows.append(torch.autograd.grad(row, delta, retain_graph=True, materialize_grads=True)[0])
+            else:
+                rows.append(torch.zeros_like(delta))
+    return torch.cat([row.view(together, n, block.tangent).mT for row in rows])
