@@ -12,6 +12,7 @@ from torchsfm.geometry.distortion import NoDistortion
 from torchsfm.geometry.distortion_model import Distortion
 from torchsfm.geometry.homogeneous import divide_safely, finite_or_zero
 from torchsfm.geometry.poses import Index, Pose, check_alike, index_batch
+from torchsfm.linalg.magnitude import all_below
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Camera:
         fx, fy = torch.where(regular, fx, 1.0), torch.where(regular, fy, 1.0)
         skew = torch.where(regular, skew, 0.0)
         centre = torch.where(regular[..., None], K[..., :2, 2], 0.0)
-        known = torch.isfinite(x.detach().sum(-1))
+        known = all_below(x, torch.finfo(x.dtype).max / 4, 1)
         x = finite_or_zero(x)
         v = (x[..., 1] - centre[..., None, 1]) / fy[..., None]
         u = (x[..., 0] - centre[..., None, 0] - skew[..., None] * v) / fx[..., None]

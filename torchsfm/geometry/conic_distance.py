@@ -10,6 +10,7 @@ from torchsfm._types import check_tensors
 from torchsfm.geometry.conics import Ellipse, check_ellipse, ellipse_of_shape, shape_of_ellipse
 from torchsfm.geometry.homogeneous import finite_or_zero
 from torchsfm.linalg import unit_scale
+from torchsfm.linalg.rows import inner
 
 _STEPS = 16
 """Newton steps to the foot point: monotone, they come to rounding, but for points next to a cusp of the evolute of a long
@@ -85,8 +86,8 @@ def signed_distance(
     m = torch.stack((-n[..., 1], n[..., 0]), -1)
     nDn, mDn, mDm = _form(D, n, n), _form(D, m, n), _form(D, m, m)
     s = nDn.sqrt()
-    slope = (m * y).sum(-1) - mDn / s
-    bend = -(n * y).sum(-1) - (mDm - nDn) / s + mDn.square() / (nDn * s)
+    slope = inner(m, y) - mDn / s
+    bend = -inner(n, y) - (mDm - nDn) / s + mDn.square() / (nDn * s)
     bend = bend.detach()
     # At the centre of curvature every normal near by is as good: no step.
     flat = bend.abs() <= 1e-12 * s.detach()
@@ -94,7 +95,7 @@ def signed_distance(
     turn = turn - turn.detach()
     # To second order in a turn that is zero.
     n = n * (1 - 0.5 * turn.square())[..., None] + m * turn[..., None]
-    return (n * y).sum(-1) - _form(D, n, n).sqrt()
+    return inner(n, y) - _form(D, n, n).sqrt()
 
 
 def foot_normal(D: Float[Tensor, "*#batch 2 2"], y: Float[Tensor, "*#batch n 2"]) -> Float[Tensor, "*batch n 2"]:
@@ -144,4 +145,4 @@ def square_root(D: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
 
 def _form(D: Tensor, p: Tensor, q: Tensor) -> Tensor:
     """P'Dq for many vectors."""
-    return ((p @ D) * q).sum(-1)
+    return inner(p @ D, q)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry.curves import Cubics, Curve, Segments, segments_of
+from torchsfm.linalg.rows import inner
 
 _LONGEST = 1 / 40
 """Of a curve, by which a place moves at most in one step to a nearer one."""
@@ -52,9 +53,9 @@ class CurvePlaces:
         longest = _LONGEST * self.number[..., None].to(place.dtype)
         for _ in range(steps):
             x, first, second = self.at(place)
-            away, speed = x - y, first.square().sum(-1)
-            bent = torch.maximum(speed + (away * second).sum(-1), 0.3 * speed)
-            move = (away * first).sum(-1) / bent.clamp_min(1e-300)
+            away, speed = x - y, inner(first, first)
+            bent = torch.maximum(speed + inner(away, second), 0.3 * speed)
+            move = inner(away, first) / bent.clamp_min(1e-300)
             place = place - torch.minimum(torch.maximum(move, -longest), longest)
         return place
 

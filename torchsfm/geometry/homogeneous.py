@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import check_tensors
 from torchsfm.linalg import unit_scale
+from torchsfm.linalg.magnitude import all_below
 
 
 def to_homogeneous(x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d+1"]:
@@ -153,8 +154,8 @@ def transform_points(H: Float[Tensor, "*#batch h h"], x: Float[Tensor, "*#batch 
 
 def finite_or_zero(x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
     """Replace the rows that have NaN or inf by zero, so that they reach neither values nor gradients of others."""
-    # The sum is finite where all entries are (those that overflow it are past any use); it is cheaper than a mask over entries.
-    return torch.where(torch.isfinite(x.detach().sum(-1, keepdim=True)), x, 0.0)
+    # Sums of those that are larger overflow: they are past any use.
+    return torch.where(all_below(x, torch.finfo(x.dtype).max / 4, 1)[..., None], x, 0.0)
 
 
 def divide_safely(y: Float[Tensor, "*batch d"], w: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch d"]:

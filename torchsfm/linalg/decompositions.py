@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
+from torchsfm.linalg.magnitude import all_below
+
 _GaveUp: type[RuntimeError] = torch.linalg.LinAlgError  # type: ignore[attr-defined]
 _ROOM = 2.0**20
 """How far below the largest number entries have to stay: sums of products with unit vectors must not overflow."""
@@ -170,7 +172,7 @@ def solve(
         # One dimension less, and torch may take columns for a batch of vectors: a 4x4 matrix for four systems of four, say.
         b = b.expand(*A.shape[:-2], *b.shape[-2:])
     x, info = torch.linalg.solve_ex(A, b)
-    ok = _is_sound(A) & (info == 0) & torch.isfinite(x).all(-1).all(-1)
+    ok = _is_sound(A) & (info == 0) & all_below(x, torch.inf, 2)
     return torch.where(ok[..., None, None], x, 0.0), ok
 
 
@@ -188,7 +190,7 @@ def inverse(A: Float[Tensor, "*batch n n"]) -> tuple[Float[Tensor, "*batch n n"]
         (tensor([0.5000, 0.5000]), tensor([ True, False]))
     """
     B, info = torch.linalg.inv_ex(A)
-    ok = _is_sound(A) & (info == 0) & torch.isfinite(B).all(-1).all(-1)
+    ok = _is_sound(A) & (info == 0) & all_below(B, torch.inf, 2)
     return torch.where(ok[..., None, None], B, 0.0), ok
 
 
@@ -199,7 +201,7 @@ def _sound(A: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _is_sound(A: Tensor) -> Tensor:
-    return (A.detach().abs() < torch.finfo(A.dtype).max / _ROOM).all(-1).all(-1)
+    return all_below(A, torch.finfo(A.dtype).max / _ROOM, 2)
 
 
 def _or_axes(A: Tensor, ok: Tensor) -> Tensor:

@@ -22,6 +22,13 @@ def usable(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
     return x.detach().abs() < LARGEST
 
 
+def all_below(x: Float[Tensor, "*shape"], limit: float, dims: int) -> Bool[Tensor, "*batch"]:
+    """Whether all numbers of the last dimensions are, in size: by the largest, in a fifth of the time of `all` over few."""
+    if 0 in x.shape[x.ndim - dims :]:
+        return torch.ones(x.shape[: x.ndim - dims], dtype=torch.bool, device=x.device)
+    return x.detach().abs().amax(tuple(range(-dims, 0))) < limit
+
+
 def unit_scale(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch 1 1"]:
     """A power of two by which the largest number of a finite matrix, unless it is 0, comes to between 1/2 and 1.
 

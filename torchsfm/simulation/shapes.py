@@ -225,8 +225,10 @@ def photograph(maps: Float[Tensor, "h2 w2"], width: int, height: int, blur: floa
     offset = torch.arange(-reach, reach + 1, dtype=maps.dtype, device=maps.device)
     kernel = torch.exp(-0.5 * (offset / (blur * fine)).square())
     kernel = kernel / kernel.sum()
-    maps = conv2d(conv2d(maps[None, None], kernel[:, None][None, None]), kernel[None, None, None])
-    return maps.reshape(height, fine, width, fine).mean((1, 3))[None]
+    # Blur and average at once, one axis after the other.
+    kernel = torch.stack([torch.nn.functional.pad(kernel, (j, fine - 1 - j)) for j in range(fine)]).mean(0)
+    rows = conv2d(maps[None, None], kernel[:, None][None, None], stride=(fine, 1))
+    return conv2d(rows, kernel[None, None, None], stride=(1, fine))[0]
 
 
 def fine_samples(size: int, blur: float, fine: int, like: Tensor) -> Float[Tensor, " n"]:

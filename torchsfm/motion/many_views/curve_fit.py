@@ -19,6 +19,7 @@ from torch import Tensor
 from torchsfm.geometry.curve_places import CurvePlaces
 from torchsfm.geometry.homogeneous import divide_safely
 from torchsfm.linalg import solve
+from torchsfm.linalg.rows import inner
 from torchsfm.motion.many_views.bilinear_fit import unit_frame
 from torchsfm.motion.many_views.bilinear_steps import BilinearSystem, Linearisation
 from torchsfm.optim.problem import Problem, Step
@@ -82,7 +83,7 @@ def near_curves(images: CurvePlaces, place: Float[Tensor, "p v c m"], y: Float[T
     foot, first, _ = images.at(place)
     tangent = torch.nn.functional.normalize(first, dim=-1)
     normal = torch.stack((-tangent[..., 1], tangent[..., 0]), -1)
-    return Near(points, ((points - foot) * normal).sum(-1).flatten(2), _by_image(normal, points, y), place)
+    return Near(points, inner(points - foot, normal).flatten(2), _by_image(normal, points, y), place)
 
 
 def _points(y: Tensor, place: Tensor) -> Float[Tensor, "p v c m 2"]:
@@ -91,7 +92,7 @@ def _points(y: Tensor, place: Tensor) -> Float[Tensor, "p v c m 2"]:
 
 def _by_image(way: Tensor, points: Tensor, y: Tensor) -> Float[Tensor, "p v 3 n"]:
     """The derivative by y of how far points are along unit vectors."""
-    row = torch.cat((way, -(way * points).sum(-1, keepdim=True)), -1).flatten(2, 3)
+    row = torch.cat((way, -inner(way, points)[..., None]), -1).flatten(2, 3)
     return divide_safely(row, y[:, :, 2]).mT
 
 
@@ -125,7 +126,7 @@ class CurveDistances(Problem[BilinearSystem]):
         """Where samples are seen, and how far from the image curves."""
         y = x.P @ x.u[:, None]
         near, pins = near_curves(self.images, x.place, y), self.pins
-        along = ((near.points - pins.x) * pins.tangent).sum(-1) * pins.at
+        along = inner(near.points - pins.x, pins.tangent) * pins.at
         along_slope = _by_image(pins.tangent, near.points, y) * pins.at.flatten(2)[:, :, None]
         return Sights(y, near.r, near.slope, along.flatten(2), along_slope, near.place)
 

@@ -170,6 +170,8 @@ def _mended(plain: CurveDistances, x: Scene) -> tuple[CurveDistances, Scene]:
     e = misfit.sqrt().reshape(x.place[:, 0].shape)
     bad = (e > _WRONG * _median(misfit.sqrt(), plain)[..., None]) | _out_of_order(plain, seen.place)
     anew, possible = _between(plain, x, bad)
+    if not bool(possible.any()):
+        return pinned(plain.images, plain.weight, x), x
     other = pinned(plain.images, plain.weight, anew)
     anew, now = other.settled(anew, _OWN)
     taken = possible & (other.misfit(now) < misfit).reshape(e.shape)

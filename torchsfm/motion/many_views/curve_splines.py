@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.geometry.curves import Cubics
+from torchsfm.linalg.rows import inner
 
 _POWERS = [[1.0, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]
 """Six times the coefficients of a spline after a knot, by the four control points about it."""
@@ -72,9 +73,9 @@ def _seen(images: Cubics, t: Float[Tensor, "p v c n"], closed: Bool[Tensor, "p c
     points = y[..., :2] / depth
     move = (first[..., :2] - points * first[..., 2:]) / depth
     bend = (second[..., :2] - points * second[..., 2:] - 2 * move * first[..., 2:]) / depth
-    away, speed = points - measured, move.square().sum(-1)
-    bent = torch.maximum(speed + (away * bend).sum(-1), _BENT * speed).clamp_min(1e-300)
-    slope = (away * move).sum(-1)
+    away, speed = points - measured, inner(move, move)
+    bent = torch.maximum(speed + inner(away, bend), _BENT * speed).clamp_min(1e-300)
+    slope = inner(away, move)
     end = torch.where(slope < 0, t >= k - 3, t <= 0)
     return Images(y, first, points, away, speed, bent, slope, end & ~ring)
 
@@ -90,7 +91,7 @@ def nearest(x: Splines, closed: Bool[Tensor, "p c"], measured: Float[Tensor, "p 
         move = (-seen.slope / seen.bent).clamp(-longest, longest)
         moved = torch.where(ring, t + move, (t + move).clamp(0, last))
         other = _seen(images, moved, closed, measured)
-        nearer = other.away.square().sum(-1) <= seen.away.square().sum(-1)
+        nearer = inner(other.away, other.away) <= inner(seen.away, seen.away)
         longest = torch.where(nearer, most, move.abs() / 4)
         t = torch.where(nearer, moved, t)
         seen = Images(*(torch.where(nearer[(...,) + (None,) * (a.ndim - 4)], b, a) for a, b in zip(seen, other, strict=True)))
