@@ -12,6 +12,7 @@ from torchsfm.geometry.conic_distance import foot_normal, root_slopes, signed_di
 from torchsfm.geometry.conics import ellipse_of_shape
 from torchsfm.images.ellipse_moments import extreme, monomials, shape_of_conic
 from torchsfm.linalg import eigh, inverse
+from torchsfm.linalg.rows import inner
 from torchsfm.optim import levenberg_marquardt
 
 _UNSURE = 0.2
@@ -176,7 +177,7 @@ def _normals(p: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     q = n @ root
     support = torch.linalg.vector_norm(q, dim=-1)
     q = q / support.clamp_min(1e-300)[..., None]
-    return n, q, (n * offset).sum(-1) - support
+    return n, q, inner(n, offset) - support
 
 
 def _information(p: Tensor, y: Tensor, w: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsfm.geometry.homogeneous import divide_safely
 from torchsfm.linalg import inverse
+from torchsfm.linalg.rows import inner
 from torchsfm.reconstruction.edge_maps import EdgeMaps
 
 _NUMBERS = 1 << 22
@@ -153,7 +154,7 @@ def agreement(shown: Float[Tensor, "*batch 2"], edge: Float[Tensor, "*batch 2"],
 
     The darker side of an edge may be the brighter one in another image: what is behind an outline changes.
     """
-    along, enough = (shown * edge).sum(-1), least * torch.linalg.vector_norm(shown, dim=-1)
+    along, enough = inner(shown, edge), least * torch.linalg.vector_norm(shown, dim=-1)
     return torch.where(along > enough, 1.0, torch.where(along < -enough, _EXCHANGED, 0.0)).to(shown.dtype)
 
 
@@ -174,7 +175,7 @@ def _space_tangents(
     axes = torch.stack([a[:, None].expand(*y.shape[1:3], 3) for a in (rays.along, rays.direction)])
     image = torch.einsum("vij,ascj->avsci", M, axes)
     motion = (image[..., :2] - y * image[..., 2:]) / depth[..., None]
-    a, b = (motion * normal).sum(-1)
+    a, b = inner(motion, normal)
     size = torch.linalg.vector_norm(motion, dim=-1).sum(0).clamp_min(1e-300)
     a, b = a / size, b / size
     # The least of the sum of squares of a cos + b sin.

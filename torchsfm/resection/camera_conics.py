@@ -17,6 +17,7 @@ from torchsfm.geometry.conic_distance import square_root
 from torchsfm.geometry.conics import shape_of_dual_conic
 from torchsfm.geometry.poses import Pose
 from torchsfm.linalg import adjugate_3x3, eigh, unit_scale, usable
+from torchsfm.linalg.rows import inner
 from torchsfm.optim import levenberg_marquardt, rotation_exponential
 from torchsfm.optim.pytree import cut, flatten, join
 from torchsfm.resection.ellipse_poses import ellipse_poses
@@ -250,7 +251,7 @@ def _images(H: Tensor, data: _Data) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     front = (corner.detach() > 0) & (depth.detach() > 0)
     safe = torch.where(front, corner, 1.0)[..., None]
     u = (data.n @ (dual[..., :2, 2] / safe)[..., None])[..., 0]
-    g = ((data.n @ dual[..., :2, :2]) * data.n).sum(-1) / safe
+    g = inner(data.n @ dual[..., :2, :2], data.n) / safe
     square = u.square() - g
     some = front[..., None] & (square.detach() > 0)
     s = torch.where(some, torch.where(some, square, 1.0).sqrt(), torch.inf)

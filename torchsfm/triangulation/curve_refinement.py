@@ -7,6 +7,7 @@ from torch import Tensor
 from torchsfm.geometry import Curve, foot_points
 from torchsfm.geometry.homogeneous import divide_safely
 from torchsfm.linalg import inverse
+from torchsfm.linalg.rows import inner
 from torchsfm.triangulation.curve_views import CurveDistances, CurveViews, Sight, project_all
 
 _STEPS = 8
@@ -65,7 +66,7 @@ def _across(X: Tensor, found: Tensor, around: Tensor) -> Float[Tensor, "p m 3 2"
 def _slopes(P: Tensor, near: CurveDistances, basis: Tensor) -> Float[Tensor, "p v m 2"]:
     """The derivatives of distances by steps across the curve: n' (M - y m3') / depth."""
     M = P[..., :3]
-    rows = near.normal @ M[..., :2, :] - (near.normal * near.image).sum(-1, keepdim=True) * M[..., 2:, :]
+    rows = near.normal @ M[..., :2, :] - inner(near.normal, near.image)[..., None] * M[..., 2:, :]
     return divide_safely((rows[..., None, :] @ basis[:, None])[..., 0, :], near.depth)
 
 

@@ -15,6 +15,7 @@ from torchsfm.geometry.conic_distance import foot_normal, signed_distance
 from torchsfm.geometry.conics import shape_of_dual_conic
 from torchsfm.geometry.quadrics import principal_axes
 from torchsfm.linalg import cross
+from torchsfm.linalg.rows import inner
 from torchsfm.optim import rotation_exponential
 
 
@@ -80,7 +81,7 @@ class Sights:
         if self.white is None or self.support is None:
             distance = signed_distance(centre, D, self.y) * self.unit[..., None]
         else:
-            h = (self.y * centre[..., None, :]).sum(-1) + ((self.y @ D) * self.y).sum(-1).sqrt()
+            h = inner(self.y, centre[..., None, :]) + inner(self.y @ D, self.y).sqrt()
             distance = (self.white @ (self.support - h)[..., None])[..., 0]
         return torch.where(good[..., None], distance, torch.nan).flatten(-2)[..., None]
 
@@ -89,25 +90,25 @@ class Sights:
         beside = _beside_views(shape)
         centre, D, good = project(self.P, beside)
         n = self.y if self.white is not None else foot_normal(D, self.y - centre[..., None, :])
-        h = (n * centre[..., None, :]).sum(-1) + ((n @ D) * n).sum(-1).sqrt()
+        h = inner(n, centre[..., None, :]) + inner(n @ D, n).sqrt()
         touching = torch.cat((n, -h[..., None]), -1)
         U = self.P[..., :3] @ beside.axes()
         p = (self.P[..., :3] @ beside.centre[..., None])[..., 0] + self.P[..., 3]
-        w = -(touching @ U) / (touching * p[..., None, :]).sum(-1, keepdim=True)
-        depth = p[..., 2, None] + (w * U[..., 2:, :]).sum(-1)
+        w = -(touching @ U) / inner(touching, p[..., None, :])[..., None]
+        depth = p[..., 2, None] + inner(w, U[..., 2:, :])
         g = -(touching @ self.P[..., :3]) / depth[..., None]
         along = g @ beside.frame
         columns = [g]
         m = shape.root.shape[-1]
         if m == 2:
             s = w @ beside.root
-            across = (g * cross(beside.frame[..., 0], beside.frame[..., 1])[..., None, :]).sum(-1)
+            across = inner(g, cross(beside.frame[..., 0], beside.frame[..., 1])[..., None, :])
             columns.append(torch.stack((s[..., 1] * across, -s[..., 0] * across), -1))
         pairs = [(i, j) for i in range(m) for j in range(i, m)]
         entries = [along[..., i] * w[..., j] + (along[..., j] * w[..., i] if i != j else 0) for i, j in pairs]
         J = torch.cat((*columns, torch.stack(entries, -1)), -1)
         if self.white is None or self.support is None:
-            r = ((n * self.y).sum(-1) - h) * self.unit[..., None]
+            r = (inner(n, self.y) - h) * self.unit[..., None]
             J = J * self.unit[..., None, None]
         else:
             r, J = (self.white @ (self.support - h)[..., None])[..., 0], self.white @ J
