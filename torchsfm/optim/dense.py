@@ -14,11 +14,8 @@ from torchsfm.optim.problem import Step
 from torchsfm.optim.pytree import Places, leaves, norm, pick, places, put
 
 Linearize = Callable[..., tuple[Tensor, Tensor]]
-WIDE = 1 << 20
-"""Numbers, of variables and data, for which rows of exact Hessians are found at once."""
-
 FEW = 1 << 15
-"""And for which all columns of Jacobians are."""
+"""Numbers, of variables and data, for which all derivatives are found at once: calls cost more than arithmetic on so few."""
 
 
 @dataclass(frozen=True)
@@ -164,22 +161,22 @@ class DenseProblem:
     def curve(self, here: DenseSystem, where: Tensor) -> DenseSystem:
         """The exact second derivatives of the cost in some elements; not always positive."""
         (at,) = places(where)
-        each = sum(v[0].numel() for v in leaves((here.x, self.data)))
-        rows = []
-        # Each problem stands there once for each row of its Hessian, so that one derivative gives them all.
-        for directions in torch.split(torch.eye(self.tangent, device=at.device), max(1, WIDE // (each * len(at)))):
-            copies = (at.repeat_interleave(len(directions)),)
-            some, x = self.pick(copies), pick(copies, here.x)
-            first = leaves(x)[0]
-            with torch.enable_grad():
-                delta = first.new_zeros((len(first), self.tangent)).requires_grad_()
-                cost = some.cost(self.retract(x, delta)).sum()
-                (slope,) = torch.autograd.grad(cost, delta, create_graph=True, materialize_grads=True)
-                along = (slope * directions.to(slope).repeat(len(at), 1)).sum()
-                row = torch.zeros_like(delta)
+        t, each = self.tangent, sum(v[0].numel() for v in leaves((here.x, self.data)))
+        # Few problems stand there once for each row of their Hessians, so that one derivative gives them all.
+        together = t if t * len(at) * each <= FEW else 1
+        copies = (at.repeat_interleave(together),)
+        some, x = self.pick(copies), pick(copies, here.x)
+        first, rows = leaves(x)[0], []
+        with torch.enable_grad():
+            delta = first.new_zeros((len(first), t)).requires_grad_()
+            cost = some.cost(self.retract(x, delta)).sum()
+            (slope,) = torch.autograd.grad(cost, delta, create_graph=True, materialize_grads=True)
+            slope = slope.view(len(at), together, t)
+            for i in range(0, t, together):
+                along, row = slope[..., i : i + together].diagonal(dim1=1, dim2=2).sum(), torch.zeros_like(delta)
                 if along.requires_grad:
-                    (row,) = torch.autograd.grad(along, delta, materialize_grads=True)
-            rows.append(row.view(len(at), len(directions), self.tangent))
+                    (row,) = torch.autograd.grad(along, delta, retain_graph=i + together < t, materialize_grads=True)
+                rows.append(row.view(len(at), together, t))
         return replace(here, hessian=put((at,), here.hessian, torch.cat(rows, 1).double()))
 
     def rounding(self, here: DenseSystem) -> Tensor:
