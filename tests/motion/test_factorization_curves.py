@@ -1,6 +1,7 @@
 """Cameras and curves from images of curves alone: exact data, laws, noise, what the data do not determine, what is wrong."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -156,7 +157,15 @@ def test_more_samples_than_were_measured(generator: torch.Generator) -> None:
     assert (camera_error(found, x)[found.status == Status.OK] < 3 * noise).all()
 
 
-def test_what_curves_do_not_determine(generator: torch.Generator) -> None:
+def test_what_curves_do_not_determine(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor are they put together anew then: no way to do so would determine more."""
+    anew, search = [], factorization_curves._search_anew
+
+    def counted(*args: Any) -> Any:
+        anew.append(True)
+        return search(*args)
+
+    monkeypatch.setattr(factorization_curves, "_search_anew", counted)
     P, X = cameras(2, 5, generator), space_curves(2, 3, 300, generator)
     flat = X.clone()
     flat[..., 2] = 0.3 * X[..., 0] + 0.2
@@ -179,6 +188,7 @@ def test_what_curves_do_not_determine(generator: torch.Generator) -> None:
     told = torch.cat(statuses)
     assert (told != Status.OK).all()
     assert_share(told == Status.DEGENERATE, 0.8)
+    assert len(anew) <= int((told != Status.DEGENERATE).sum())
 
 
 def test_images_of_other_curves_have_no_consensus(generator: torch.Generator) -> None:
