@@ -177,3 +177,12 @@ def test_images_of_other_sizes_need_not_show_the_same(larger: float, compared: b
         replace(folded, graph=graph, cameras=Camera(K, Radial(zero, zero)), camera_index=second.long())
     )
     assert bool((found.score[across(found.pairs)] > 0).any()) == compared
+
+
+@pytest.mark.parametrize(("refuted", "folded"), [(1, False), (3, False), (4, True)])
+def test_where_many_are_compared_chance_refutes_some(refuted: int, folded: bool) -> None:
+    """A place taken for another is refuted from more of those around than points that are missed together explain."""
+    others = torch.arange(1, 48)
+    pairs = torch.stack([torch.zeros_like(others), others], 1)
+    score = torch.where(others <= refuted, 20.0, 3.0)
+    assert Conflicts(pairs, score, 17.0, torch.arange(48)).folded == folded

@@ -46,6 +46,9 @@ BESIDE = ((7, 7), (-7, 7), (7, -7), (-7, -7))
 """Pixels by which places beside a predicted one are off, where an image point is found by chance alone."""
 SIGNIFICANCE = 0.01
 """Chance that a right model has a conflict anywhere, were all its points equally easy to find again."""
+PART = 1 / 12
+"""Part of the places that a place is compared with by which one that is taken for another is refuted, at least: where there are
+many, chance refutes some, as points next to each other are missed together."""
 SPARSE = 8
 """Entries of a table of occupied pixels, at least, for each that is occupied."""
 ROWS = 2048
@@ -80,10 +83,13 @@ class Conflicts:
         """Whether two places pass for one.
 
         One pair may miss what something without features hides. A place taken for another is refuted from more than one other,
-        and folds the whole model.
+        and from a `PART` of those it is compared with, and folds the whole model.
         """
-        places = torch.unique(self.place[self.refuted].sort(dim=1).values, dim=0)
-        return bool((torch.bincount(places.flatten(), minlength=1) >= 2).any())
+        refuting, compared = (
+            torch.bincount(torch.unique(self.place[pairs].sort(dim=1).values, dim=0).flatten(), minlength=len(self.place))
+            for pairs in (self.refuted, self.pairs)
+        )
+        return bool(((refuting >= 2) & (refuting >= PART * compared)).any())
 
     @property
     def strength(self) -> float:
