@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, models, reconstruct_tracks
+from torchsfm.reconstruction import SfmResult, growth, reconstruct_tracks
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 from torchsfm.simulation import look_at, random_points, simulate_images
@@ -78,7 +78,7 @@ def test_crops_of_a_plane_are_doubtful(generator: torch.Generator) -> None:
 
 
 def test_whole_photographs_are_not_made_anew(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(models, "map_cropped", lambda *given: pytest.fail("nothing is cropped"))
+    monkeypatch.setattr(growth, "map_cropped", lambda *given: pytest.fail("nothing is cropped"))
     focal = 900 + 500 * torch.rand(8, generator=generator, dtype=torch.float64)
     result, poses, _ = photographs(generator, focal, share=0.0)
     assert float(angles(result, poses).max()) < 0.5

@@ -7,7 +7,7 @@ import torch
 from chance import seeded
 from test_reconstruct_tracks import Scene, make_scene
 
-from torchsfm.reconstruction import MatchedImages, SfmResult, adjust, doubt, incremental, models, reconstruct_matches, unfold
+from torchsfm.reconstruction import MatchedImages, SfmResult, adjust, doubt, growth, incremental, reconstruct_matches, unfold
 from torchsfm.reconstruction.evaluation import pose_errors
 
 
@@ -122,7 +122,7 @@ def test_keypoints_that_are_not_finite_match_nothing() -> None:
 
 
 def test_known_cameras_and_focal_lengths_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(models, "part_zoomed", lambda *given: pytest.fail("cameras are known"))
+    monkeypatch.setattr(growth, "part_zoomed", lambda *given: pytest.fail("cameras are known"))
     scene = make_scene(points=200, outliers=0.0)
     m = matched(scene)
     index = torch.tensor([0, 1] * 4)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, models, reconstruct_tracks
+from torchsfm.reconstruction import SfmResult, growth, reconstruct_tracks
 from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.reconstruction.zoomed import part_zoomed
 from torchsfm.simulation import look_at, random_points, simulate_images
@@ -44,7 +44,7 @@ def test_a_zoom_lens(generator: torch.Generator) -> None:
 
 def test_models_decide_where_pairs_mislead(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lens that distorts and is off the middle makes pairs look as if focal lengths differed."""
-    monkeypatch.setattr(models, "part_zoomed", lambda graph, camera_index, told: torch.arange(len(camera_index)))
+    monkeypatch.setattr(growth, "part_zoomed", lambda graph, camera_index, told: torch.arange(len(camera_index)))
     model = photographs(torch.full((7,), 900.0, dtype=torch.float64), (559.5, 344.5), -0.2, generator).model
     assert model.registered.all()
     assert len(model.cameras.K) == 1
