@@ -163,7 +163,7 @@ class DenseProblem:
         (at,) = places(where)
         t, each = self.tangent, sum(v[0].numel() for v in leaves((here.x, self.data)))
         # Few problems stand there once for each row of their Hessians, so that one derivative gives them all.
-        together = t if t * len(at) * each <= FEW else 1
+        together = t if len(at) * each <= FEW else 1
         copies = (at.repeat_interleave(together),)
         some, x = self.pick(copies), pick(copies, here.x)
         first, rows = leaves(x)[0], []
