@@ -118,7 +118,7 @@ def hidden(generator: torch.Generator, fixed: Tensor, images: Tensor) -> float:
 
 
 def test_parts_of_an_overlay_that_most_images_hide(generator):
-    """Beside what eight of twelve images show, five are enough; elsewhere they may be those of a camera that rested."""
+    """Beside what nine of twelve images show, five are enough; elsewhere they may be those of a camera that rested."""
     text = 20 + 20 * torch.cartesian_prod(torch.arange(16.0), torch.arange(5.0)).double()
     images = torch.where(torch.arange(80) % 2 == 0, 9, 5)
     assert hidden(generator, text, images) > 0.5

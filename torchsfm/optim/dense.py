@@ -15,7 +15,8 @@ from torchsfm.optim.pytree import Places, leaves, norm, pick, places, put
 
 Linearize = Callable[..., tuple[Tensor, Tensor]]
 FEW = 1 << 15
-"""Numbers, of variables and data, for which all derivatives are found at once: calls cost more than arithmetic on so few."""
+"""Numbers, of variables and data, for which all derivatives are found at once, as calls cost more than arithmetic on so few:
+without the copies that this takes for Hessians, where a call goes through two derivatives, with them for Jacobians."""
 
 
 @dataclass(frozen=True)

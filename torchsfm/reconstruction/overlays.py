@@ -27,8 +27,9 @@ _CELL = 4.0
 """The width of the cells of places, in distances of what stands still."""
 _IMAGES, _SHARE = 3, 0.5
 """The fewest images, of three and more, and which part of those of one size that move, that show an overlay at a place."""
-_REACH = 8.0
-"""Within so many cells of a place of an overlay the fewest images are enough: what is behind it hides parts of a watermark."""
+_BLOCK = 8
+"""In or next to a block of so many cells that has a place of an overlay the fewest images are enough: what is behind a
+watermark hides parts of it."""
 
 Matches = Mapping[int, Int[Tensor, "_ 2"]]
 
@@ -110,36 +111,33 @@ def find_overlays(
 
 
 def _common(rows: Int[Tensor, "r 3"], images: Int[Tensor, "r"], sizes: Int[Tensor, "a 2"]) -> Int[Tensor, "c 3"]:
-    """The cells that enough of the images show."""
+    """The cells that enough of the images show, or that are around those."""
     once = torch.unique(torch.cat((rows, images[:, None]), 1), dim=0)
     cells, count = torch.unique(once[:, :3], dim=0, return_counts=True)
     kinds, number = torch.unique(sizes, dim=0, return_counts=True)
     of_size = ((cells[:, None, :2] == kinds).all(-1) * number).sum(-1)
-    fewest = of_size.clamp(max=_IMAGES)
     common = count >= torch.minimum((_SHARE * of_size).clamp(min=_IMAGES), of_size)
-    place, likely = _centres(cells), count >= fewest
-    while True:
-        near = (
-            torch.cdist(place[likely], place[common]) <= _REACH * _CELL * _STILL * scale_of_images(cells[likely, :2])[:, None]
-        )
-        beside = near & (cells[likely, None, :2] == cells[common, :2]).all(-1)
-        grown = common.index_put((likely.nonzero()[:, 0],), common[likely] | beside.any(1))
-        if bool((grown == common).all()):
-            break
-        common = grown
+    likely = count >= of_size.clamp(max=_IMAGES)
+    block, around = _blocks(cells)
+    reached = torch.zeros_like(common)
+    while not bool((common == reached).all()):
+        reached = common
+        common = common | likely & torch.isin(around, block[common]).any(-1)
     found: Tensor = cells[common]
     return found
 
 
-def _centres(cells: Int[Tensor, "c 3"]) -> Float[Tensor, "c 2"]:
-    """The middle of cells, see `_cells`, in pixels."""
+def _blocks(cells: Int[Tensor, "c 3"]) -> tuple[Int[Tensor, "c"], Int[Tensor, "c 9"]]:
+    """The block of `_BLOCK` by `_BLOCK` cells of a grid that each cell is in, see `_cells`, and those around with it."""
     size, number = cells[:, :2], cells[:, 2]
-    width = (_CELL * _STILL * scale_of_images(size))[:, None]
-    columns, rows = ((size / width).long() + 3).unbind(-1)
-    column, row, grid = number // rows % columns, number % rows, number // rows // columns
-    shift = torch.stack([grid // 2, grid % 2], -1) / 2
-    centre: Tensor = (torch.stack([column, row], -1) - 0.5 - shift) * width
-    return centre
+    columns, rows = ((size / (_CELL * _STILL * scale_of_images(size))[:, None]).long() + 3).unbind(-1)
+    place = torch.stack([number // rows % columns, number % rows], -1) // _BLOCK + 1
+    _, kind = torch.unique(size, dim=0, return_inverse=True)
+    wide, high = (place.amax(0) + 2).tolist() if len(place) else (1, 1)
+    step = torch.cartesian_prod(torch.arange(-1, 2), torch.arange(-1, 2))
+    near = place[:, None] + step
+    around = (kind[:, None] * wide + near[..., 0]) * high + near[..., 1]
+    return around[:, 4], around
 
 
 def _cells(x: Float[Tensor, "k 2"], size: Int[Tensor, "2"]) -> Int[Tensor, "k 4"]:

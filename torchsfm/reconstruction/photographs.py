@@ -125,18 +125,19 @@ def reconstruct(
         raise ReconstructionError(f"no method '{method}'; there are {', '.join((*METHODS, FROM_CURVES))}")
     if K is not None and K.shape != (3, 3):
         raise ValueError(f"K: wanted shape (3, 3), got {tuple(K.shape)}")
-    wanted = Wanted(camera, shared_camera, K, free_principal_point, METHODS[0] if method == FROM_CURVES else method)
-    if method == FROM_CURVES and lines:
-        raise ReconstructionError("the method from curves finds no lines")
     report = progress or (lambda stage, done, total: None)
     if method == FROM_CURVES:
+        if lines:
+            raise ReconstructionError("the method from curves finds no lines")
+        lens = Wanted(camera, K=K).lens
         sources = Sources.of(images, without=[folder for folder in (out, masks) if folder is not None])
         admitted = None if masks is None else Masks.of(masks, sources)
         stages = _stages(sources, admitted, {"method": method, "pixels": max_pixels}, out, resume)
         found = reconstruct_from_curves(
-            sources, stages, camera=wanted.lens, K=K, max_pixels=max_pixels, masks=admitted, progress=report
+            sources, stages, camera=lens, K=K, max_pixels=max_pixels, masks=admitted, progress=report
         )
         return replace(found, report=replace(found.report, skipped=sources.skipped))
+    wanted = Wanted(camera, shared_camera, K, free_principal_point, method)
     seen = match_photographs(
         images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
         resume=resume, seed=seed, progress=report, masks=masks,

@@ -1,11 +1,10 @@
 """Rotations of all cameras of a view graph from relative rotations of which many may be wrong.
 
-The residual of an edge is the rotation vector of `R_j R_i' R_ij'`, in units of its standard deviation. The start is a spanning
-tree of the edges that close best around triangles; from there a minimum of the sum of lengths, which outliers bend little
-(Hartley, Aftab & Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011), whose scatter then sets the scale
-of a loss under which they have no pull at all (Chatterjee & Govindu, "Robust relative rotation averaging", PAMI 2018). Each is
-a sparse problem of three unknowns a camera, turns of the world seen by it: equal ones of all cameras change nothing, which is
-what `optim.multigrid` makes use of.
+Residuals are those of `rotation_graph`. The start is a spanning tree of edges that close best around triangles; from there a
+minimum of the sum of lengths, which outliers bend little (Hartley, Aftab & Trumpf, "L1 rotation averaging using the Weiszfeld
+algorithm", CVPR 2011), whose scatter then sets the scale of a loss under which they have no pull at all (Chatterjee & Govindu,
+"Robust relative rotation averaging", PAMI 2018). Each is a sparse problem of three unknowns a camera, turns of the world seen
+by it: equal ones of all cameras change nothing, which is what `optim.multigrid` makes use of.
 """
 
 from dataclasses import dataclass
@@ -15,17 +14,13 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_index, check_one_problem, check_options
-from torchsfm.geometry import cross_matrix, rotvec_from_rotation
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.components import components
+from torchsfm.motion.many_views.rotation_graph import RotationGraph, rotations_of
 from torchsfm.motion.many_views.rotation_loops import count_loops, vouched_parts
-from torchsfm.motion.many_views.spanning_rotations import spanning_rotations
-from torchsfm.motion.many_views.triplets import find_triplets, pairs_within, turn_angle
-from torchsfm.optim import Block, GemanMcClure, Huber, Loss, Rotation, SparseResult, Term, marginal_covariance
-from torchsfm.optim import sparse_levenberg_marquardt as minimise
+from torchsfm.motion.many_views.triplets import turn_angle
+from torchsfm.optim import GemanMcClure, Huber
 
-QUARTILE = 1.2125
-"""Of a squared residual of three normal components."""
 ROUNDS = 2
 """Sums of lengths minimised, each with the scale that the last has left."""
 ROUGH = 1e-3
@@ -34,8 +29,6 @@ REACH = 5.0
 """Scale of the last loss: where edges lose their pull, in standard deviations."""
 AGREES = 4.0
 """Standard deviations within which an edge agrees: 0.1 % of right ones do not."""
-EXACT = 1e-4
-"""Radians that all edges are taken to be off at least: sharper losses find no way, and gain nothing."""
 NOT_A_ROTATION = 1e-2
 """By how much entries of `R R'` may differ from those of the identity."""
 
@@ -139,21 +132,21 @@ def average_rotations(
     kept = counts.nonzero()[:, 0]
     sigma = None if deviation is None else deviation[kept].double()
     weight = None if weights is None else weights[kept].double()
-    graph = _Graph(R[kept].double(), edges[kept], sigma, _whitening(sigma, R[kept].double()), weight, views)
+    graph = RotationGraph.of(R[kept].double(), edges[kept], sigma, weight, views)
     with torch.no_grad():
         tree, _ = graph.start()
         start = tree
         for _ in range(ROUNDS):
             scale = graph.scale(start)
-            start = _rotations(graph.minimise(start, Huber(scale), max_iterations, ROUGH))
+            start = rotations_of(graph.minimise(start, Huber(scale), max_iterations, ROUGH))
             start = graph.reseat(start, AGREES * graph.scale(start))
         # A few wrong edges that claim to be very exact outweigh all right ones in a sum of lengths, but not in the tree.
         scale = min(graph.scale(start), graph.scale(tree))
         loss = GemanMcClure(REACH * scale)
-        start, tree = (_rotations(graph.minimise(x, loss, max_iterations, ROUGH)) for x in (start, tree))
+        start, tree = (rotations_of(graph.minimise(x, loss, max_iterations, ROUGH)) for x in (start, tree))
         start = graph.better(start, tree, loss)
     found = graph.minimise(start, loss, max_iterations, tolerance)
-    model = _rotations(found)
+    model = rotations_of(found)
     with torch.no_grad():
         plain = model.detach()
         angle, inliers = R.new_full((len(R),), torch.pi), torch.zeros_like(counts)
@@ -180,146 +173,6 @@ def average_rotations(
             spread = graph.covariance(plain, component, status, loss, known).to(R.dtype)
     model = (model @ model[component].mT).to(R.dtype)
     return AveragedRotations(model, status, component, angle, inliers, R.new_tensor(scale), spread)
-
-
-@dataclass(frozen=True)
-class _Graph:
-    """The edges that count, in double precision."""
-
-    R: Float[Tensor, "e 3 3"]
-    edges: Int[Tensor, "e 2"]
-    deviation: Float[Tensor, "e 3 3"] | None
-    W: Float[Tensor, "e 3 3"]
-    """`W' W` is the inverse of the covariance of each."""
-    weights: Float[Tensor, "e"] | None
-    views: int
-
-    def start(self) -> tuple[Tensor, Tensor]:
-        """Rotations along the tree of the edges that most triangles speak for; among equals the more precise ones."""
-        R = self.R.detach()
-        quality = find_triplets(R, self.edges, self.views).votes(len(R))
-        weight = R.new_ones(len(R)) if self.weights is None else self.weights.detach()
-        if self.deviation is not None:
-            weight = weight / self.deviation.detach().diagonal(dim1=-2, dim2=-1).sum(-1)
-        if len(R):
-            quality = quality + weight / weight.amax()
-        return spanning_rotations(R, self.edges, quality, self.views)
-
-    def disagreement(self, model: Float[Tensor, "v 3 3"]) -> Float[Tensor, "e 3 3"]:
-        """`R_j R_i' R_ij'` of each edge."""
-        i, j = self.edges.unbind(-1)
-        return model[j] @ model[i].mT @ self.R.mT
-
-    def square(self, model: Float[Tensor, "v 3 3"]) -> Float[Tensor, "e"]:
-        """The squared residual of each edge."""
-        e = rotvec_from_rotation(self.disagreement(model))[..., None]
-        return (self.W @ e)[..., 0].square().sum(-1)
-
-    def reseat(self, model: Float[Tensor, "v 3 3"], reach: float) -> Float[Tensor, "v 3 3"]:
-        """Put cameras with which most of their edges disagree where one of these wants them, if more then agree.
-
-        A sum of lengths has minima in which a few edges hold a camera far from where more of them would put it.
-        """
-        W = self.W
-        camera = self.edges.mT.flatten()
-        agree = (self.square(model) <= reach**2).repeat(2)
-        total, support = (torch.bincount(c, minlength=self.views) for c in (camera, camera[agree]))
-        i, j = self.edges.unbind(-1)
-        wish = torch.cat((self.R.mT @ model[j], self.R @ model[i]))
-        doubtful = (2 * support < total)[camera].nonzero()[:, 0]
-        doubtful = doubtful[torch.argsort(camera[doubtful], stable=True)]
-        backers = torch.zeros_like(camera)
-        for a, b in pairs_within(camera[doubtful]):
-            a, b = doubtful[a], doubtful[b]
-            e = rotvec_from_rotation(wish[a] @ wish[b].mT)[..., None]
-            near = [((W[k % len(W)] @ e)[..., 0].square().sum(-1) <= 2 * reach**2).long() for k in (a, b)]
-            backers.index_add_(0, a, near[0]).index_add_(0, b, near[1])
-        most = torch.zeros_like(support).scatter_reduce_(0, camera, backers + 1, "amax")
-        # The first of the edges that most agree with.
-        chosen = (backers + 1 == most[camera]).nonzero()[:, 0]
-        seat = torch.full_like(support, len(wish)).scatter_reduce_(0, camera[chosen], chosen, "amin")
-        move = (most > support) & (most > 1)
-        return model.index_copy(0, move.nonzero()[:, 0], wish[seat[move]])
-
-    def better(self, first: Float[Tensor, "v 3 3"], second: Float[Tensor, "v 3 3"], loss: Loss) -> Float[Tensor, "v 3 3"]:
-        """Of each connected part of the graph the rotations that cost less; of equals the first."""
-        part = components(self.edges, self.views)
-        weights = torch.ones_like(self.R[:, 0, 0]) if self.weights is None else self.weights
-        gain = weights * (loss(self.square(first)) - loss(self.square(second)))
-        gained = gain.new_zeros(self.views).index_add_(0, part[self.edges[:, 0]], gain)
-        return torch.where((gained > 0)[part, None, None], second, first)
-
-    def scale(self, model: Float[Tensor, "v 3 3"]) -> float:
-        """The standard deviation of the right edges, if a quarter of those that do not merely fix the model are right."""
-        if not len(self.R):
-            return EXACT
-        least = self.least()
-        fixing = min(self.views - 1, len(self.R) - 1)
-        rank = fixing + (len(self.R) - fixing - 1) // 4
-        return max(float((self.square(model).kthvalue(rank + 1).values / QUARTILE).sqrt()), least)
-
-    def least(self) -> float:
-        """The standard deviation that there is at least."""
-        return EXACT * float(torch.linalg.matrix_norm(self.W).median()) / 3**0.5
-
-    def terms(self, loss: Loss) -> list[Term]:
-        """All edges."""
-        i, j = self.edges.unbind(-1)
-        return [Term(_residual, ("R", "R"), (i, j), (self.R, self.W), loss, self.weights, _linearize)]
-
-    def minimise(self, start: Float[Tensor, "v 3 3"], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
-        """The minimum nearest to a start."""
-        blocks = {"R": Block(start.mT.flatten(1), Rotation())}
-        return minimise(blocks, self.terms(loss), max_iterations=max_iterations, function_tolerance=tolerance)
-
-    def covariance(self, model: Tensor, component: Tensor, status: Tensor, loss: Loss, scale: float) -> Float[Tensor, "v 3 3"]:
-        """That of each rotation, with the first cameras of all components held."""
-        first = component == torch.arange(self.views, device=component.device)
-        known, unknown = status == int(Status.OK), torch.diag(model.new_full((3,), torch.inf))
-        if scale == torch.inf:
-            return torch.where((first & known)[:, None, None], 0, unknown)
-        within = (component[self.edges[:, 0]] == component[self.edges[:, 1]]).nonzero()[:, 0]
-        terms = [term.select(within) for term in self.terms(loss)]
-        block = Block(model.mT.flatten(1), Rotation(), first | ~known)
-        spread = scale**2 * marginal_covariance({"R": block}, terms, "R")
-        return torch.where(known[:, None, None], model @ spread @ model.mT, unknown)
-
-
-def _whitening(covariance: Float[Tensor, "e 3 3"] | None, R: Float[Tensor, "e 3 3"]) -> Float[Tensor, "e 3 3"]:
-    """W with `W' W` the inverse of the covariance of each edge."""
-    eye = torch.eye(3, dtype=R.dtype, device=R.device).expand(len(R), 3, 3)
-    if covariance is None:
-        return eye
-    lower, _ = torch.linalg.cholesky_ex(covariance)
-    whitening: Tensor = torch.linalg.solve_triangular(lower, eye, upper=False)
-    return whitening
-
-
-def _rotations(found: SparseResult) -> Float[Tensor, "v 3 3"]:
-    return found.x["R"].view(-1, 3, 3).mT
-
-
-def _residual(a: Tensor, b: Tensor, R: Tensor, W: Tensor) -> Tensor:
-    """The whitened rotation vector of `b' a R'`, of rotations a and b from the cameras to the world."""
-    e = rotvec_from_rotation(b.reshape(-1, 3, 3).mT @ a.reshape(-1, 3, 3) @ R.mT)
-    return (W @ e[..., None])[..., 0]
-
-
-def _linearize(a: Tensor, b: Tensor, R: Tensor, W: Tensor, *, out: list[Tensor | None]) -> Tensor:
-    """The same, and its derivatives by turns of both cameras: `log(exp(w) exp(e)) = e + J w` for a turn w in b's frame."""
-    back = b.reshape(-1, 3, 3).mT
-    e = rotvec_from_rotation(back @ a.reshape(-1, 3, 3) @ R.mT)
-    square = (e * e).sum(-1)
-    half = 0.5 * square.clamp(min=1e-6).sqrt()
-    factor = torch.where(square < 1e-6, 1 / 12 + square / 720, (1 - half * half.cos() / half.sin()) / square.clamp(min=1e-6))
-    cross = cross_matrix(e)
-    J = torch.eye(3, dtype=e.dtype, device=e.device) - 0.5 * cross + factor[:, None, None] * (cross @ cross)
-    turned = W @ J @ back
-    if out[0] is not None:
-        out[0].copy_(turned)
-    if out[1] is not None:
-        out[1].copy_(-turned)
-    return (W @ e[..., None])[..., 0]
 
 
 def _countable(R: Tensor, edges: Tensor, deviation: Tensor | None, weights: Tensor | None) -> Bool[Tensor, "e"]:
