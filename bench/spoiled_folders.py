@@ -1,6 +1,6 @@
 """Folders of photographs as users have them: what is turned, cropped, marked, doubled or mixed up, and what comes of it.
 
-    TORCHSFM_DATA=/path/to/data python -m bench.spoiled_folders [--set fountain] [--only watermark crops]
+    TORCHSFM_DATA=/path/to/data python -m bench.spoiled_folders [--set fountain] [--images 0:3] [--only watermark crops]
 
 prints one markdown table. Photographs are at half size where they are larger than a thousand pixels; nothing is known of the
 cameras. Duplicates count as images of their own; pairs of images from one place have no direction between them, and are left
@@ -124,8 +124,10 @@ SPOILS: tuple[Spoil, ...] = (
 FOLDERS = (*(spoil.__name__ for spoil in SPOILS), "gray", "jpeg", "duplicates", "again", "mirrored", "strangers")
 
 
-def folder(name: str, which: str, data: Path, out: Path, seed: int = 3) -> dict[str, NDArray[np.float64]]:
-    """Write the photographs; the true poses by name."""
+def folder(
+    name: str, which: str, data: Path, out: Path, seed: int = 3, images: slice = slice(None)
+) -> dict[str, NDArray[np.float64]]:
+    """Write the photographs, or some of them; the true poses by name."""
     random, photographs = np.random.default_rng(seed), SETS[name](data)
     spoil = next((spoil for spoil in SPOILS if spoil.__name__ == which), plain)
     poses: dict[str, NDArray[np.float64]] = {}
@@ -136,7 +138,7 @@ def folder(name: str, which: str, data: Path, out: Path, seed: int = 3) -> dict[
         if pose is not None:
             poses[path.name] = pose
 
-    for number, path in enumerate(photographs.paths):
+    for number, path in enumerate(photographs.paths[images]):
         pose = photographs.poses.get(path.name)
         image = spoil(_read(path), number, random)
         if which == "turned" and number % 3 == 1 and pose is not None:
@@ -157,10 +159,10 @@ def folder(name: str, which: str, data: Path, out: Path, seed: int = 3) -> dict[
     return poses
 
 
-def row(name: str, which: str, data: Path, seed: int) -> str:
+def row(name: str, which: str, data: Path, seed: int, images: slice) -> str:
     """One line of the table."""
     with tempfile.TemporaryDirectory() as scratch:
-        poses = folder(name, which, data, Path(scratch), seed)
+        poses = folder(name, which, data, Path(scratch), seed, images)
         result = reconstruct(scratch)
         number = len(list(Path(scratch).iterdir()))
     model = result.model
@@ -186,12 +188,12 @@ def row(name: str, which: str, data: Path, seed: int) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def table(name: str, only: list[str], data: Path, seed: int) -> Iterator[str]:
+def table(name: str, only: list[str], data: Path, seed: int, images: slice) -> Iterator[str]:
     """The lines, each as soon as it is known."""
     yield "| folder | registered | strangers | models | doubtful | matches left out | AUC 1 / 2 / 5 deg | largest error, deg |"
     yield "|---|---|---|---|---|---|---|---|"
     for which in only:
-        yield row(name, which, data, seed)
+        yield row(name, which, data, seed, images)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -201,13 +203,17 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--set", choices=sorted(SETS), default="fountain")
     parser.add_argument("--only", nargs="+", choices=FOLDERS, default=list(FOLDERS))
     parser.add_argument("--seed", type=int, default=3, help="of where photographs are cropped")
+    parser.add_argument(
+        "--images", default=":", metavar="A:B", help="those photographs of the set alone, from 0, B not included"
+    )
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args(arguments)
     if options.data is None:
         parser.error("TORCHSFM_DATA does not name the folder of the data sets")
     torch.set_num_threads(options.threads)
     cv2.setNumThreads(options.threads)
-    for line in table(options.set, options.only, options.data, options.seed):
+    images = slice(*(int(end) if end else None for end in options.images.split(":")))
+    for line in table(options.set, options.only, options.data, options.seed, images):
         print(line, flush=True)
 
 

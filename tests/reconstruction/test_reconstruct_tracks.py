@@ -1,7 +1,8 @@
 """From image points with known correspondence to a metric model, nothing known of the camera."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, Verdict, reconstruct_tracks
+from torchsfm.reconstruction import SfmResult, Verdict, incremental, reconstruct_tracks
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses, random_points, simulate_images
 
@@ -148,3 +149,20 @@ def test_nan_observations_are_left_out() -> None:
     assert model.num_registered == 8
     assert bool(model.x.isfinite().all())
     assert bool(model.X.isfinite().all())
+
+
+def test_of_few_images_the_best_of_several_starts_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the first start got wrong two or three images do not put right, though all of them are registered."""
+    scene, extend, calls = make_scene(orbit_poses(3, radius=5.0, sweep=0.6)), incremental.extend_model, []
+
+    def spoiled_at_first(*args: Any) -> Any:
+        model, reasons = extend(*args)
+        calls.append(model)
+        if len(calls) == 1:
+            model = replace(model, poses=Pose(model.poses.R.roll(1, 0), model.poses.t))
+        return model, reasons
+
+    monkeypatch.setattr(incremental, "extend_model", spoiled_at_first)
+    model = run(scene).model
+    assert len(calls) > 1
+    assert bool((pose_errors(model.poses, scene.poses, model.registered).pose < 2).all())

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import Camera
-from torchsfm.reconstruction.adjust import adjust, adjust_all, neighbourhood
+from torchsfm.reconstruction.adjust import adjust, adjust_all, neighbourhood, support
 from torchsfm.reconstruction.calibration import images_of_cameras, lone_cameras_plausible
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
@@ -23,6 +23,9 @@ from torchsfm.reconstruction.structure import complete_tracks, filter_points, me
 
 MAX_STARTS = 5
 """Starting pairs tried before a set of images is given up."""
+FEW = 6
+"""Of so few images a model is made from each of these, as what a start got wrong the others do not put right: a plane seen from
+the wrong side, another focal length."""
 GLOBAL_GROWTH = 1.1
 """A model this much larger than at its last global adjustment gets another."""
 SMALL = 20
@@ -93,6 +96,7 @@ def grow_model(
     """
     empty = Mapping.start(mapping.graph, mapping.track, mapping.cameras, mapping.camera_index)
     best: tuple[Mapping, dict[int, str]] | None = None
+    most = -1.0  # Explained by it.
     available = int((~mapping.registered).sum())
     unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[mapping.camera_index]
     starts = starting_pairs(mapping, unknown_focal, threshold=options.reprojection, generator=options.generator)
@@ -103,9 +107,10 @@ def grow_model(
         if len(model.X) < MIN_POINTS:
             continue
         grown = extend_model(model, mapping.registered, options, progress)
-        if best is None or int(grown[0].registered.sum()) > int(best[0].registered.sum()):
-            best = grown
-        if int(grown[0].registered.sum()) > 0.5 * available:
+        explained = support(grown[0], options.reprojection)
+        if explained > most:
+            best, most = grown, explained
+        if available > FEW and int(grown[0].registered.sum()) > 0.5 * available:
             break
     return best
 
