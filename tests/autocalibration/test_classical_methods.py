@@ -10,6 +10,7 @@ from torchsfm._types import Status
 from torchsfm.autocalibration import (
     Assumption,
     constant_intrinsics,
+    dual_quadric,
     dual_quadric_linear,
     intrinsics_from_kruppa,
     intrinsics_from_modulus,
@@ -82,6 +83,23 @@ def test_dual_quadric_is_right_or_refused(generator, motion, noise, expected_foc
         elif motion == "general":
             assert (~accepted).sum() <= allowed
             assert found.deviation[accepted].max() < (1e-3 if noise == 0 else 0.15)
+
+
+@pytest.mark.parametrize("motion", ["translation", "orbital"])
+def test_dual_quadric_is_refused_whatever_the_rounding(generator, motion, monkeypatch):
+    # Errors far below rounding, the same in every decomposition, choose one of the many solutions each time.
+    error = torch.randn(10, 10, generator=generator, dtype=torch.float64)
+    error = 1e-13 * error @ error.mT
+
+    def chosen(N: Tensor) -> Tensor:
+        unit = N.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        return torch.linalg.eigh(N / unit + error)
+
+    monkeypatch.setattr(dual_quadric, "eigh", lambda N: (*(chosen(N) if N.shape[-1] == 10 else torch.linalg.eigh(N)), None))
+    monkeypatch.setattr(dual_quadric, "null_vector", lambda A: (chosen(A.mT @ A)[1][..., 0], None))
+    scene = stack([projective_scene(generator, 7, motion=motion, offset=0.0) for _ in range(20)])
+    found = dual_quadric_linear(scene.P, image_size=SIZE, expected_focal=None)
+    assert (found.status != Status.OK).all()
 
 
 def test_dual_quadric_without_a_view_is_that_of_the_others(generator):
