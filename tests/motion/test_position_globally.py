@@ -191,7 +191,7 @@ def test_wrong_arguments_are_named(unchecked: None, generator: torch.Generator) 
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
-@pytest.mark.parametrize("shared", ["one point", "one camera", "pairs"])
+@pytest.mark.parametrize("shared", ["one point", "one camera", "small part", "pairs"])
 def test_parts_of_free_size_are_open(shared: str, noise: float, generator: torch.Generator) -> None:
     """Whose points and cameras all together are known but for one number."""
     c, X = (torch.randn(n, 3, generator=generator, dtype=torch.float64) * size for n, size in ((12, 1.5), (120, 2.0)))
@@ -200,8 +200,12 @@ def test_parts_of_free_size_are_open(shared: str, noise: float, generator: torch
     visible[:6, 60:], visible[6:, :60] = False, False
     if shared == "one point":
         visible[:, 0] = True
-    elif shared == "one camera":
+    elif shared in ("one camera", "small part"):
         visible[5] = True
+        if shared == "small part":
+            # The nearest point of each part comes out about one unit away, which makes the other part smaller.
+            X[0] = c[0] + torch.tensor([0.0, 0.0, 0.4])
+            visible[0, 0] = True
     else:
         # Each point from two cameras, one after the other in a line.
         c = torch.arange(12, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.2, 0.0])

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_options
@@ -143,6 +143,46 @@ def marginal_covariance(
         >>> torchsfm.optim.marginal_covariance({"x": x}, [measured], "x")[0].diagonal()
         tensor([0.2500, 0.2500], dtype=torch.float64)
     """
+    joint, free = _of_free(blocks, terms, name, eliminate)
+    count, width = blocks[name].x.shape[0], joint.shape[1]
+    own = torch.arange(len(free), device=free.device)
+    return joint.new_zeros((count, width, width)).index_copy_(0, free, joint[own, :, own])
+
+
+def joint_covariance(
+    blocks: Mapping[str, Block], terms: Sequence[Term], name: str, *, eliminate: str | Sequence[str] | None = None
+) -> Float[Tensor, "n k n k"]:
+    """The covariance of all variables of one block together, those of the others as they follow.
+
+    As `marginal_covariance` in all else; the covariance of a difference of two variables is that of the one and the other less
+    twice what they have in common.
+
+    Args:
+        blocks: The variables by name, at the optimum.
+        terms: The residuals of which it is the optimum.
+        name: The block whose covariance is wanted.
+        eliminate: Blocks that are eliminated first, as points are.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> from torchsfm.optim import Block, Term
+        >>> pair = torch.arange(2)
+        >>> one, other = Term(lambda x: x, ("x",), (pair[:1],)), Term(lambda x, y: y - x, ("x", "x"), (pair[:1], pair[1:]))
+        >>> torchsfm.optim.joint_covariance({"x": Block(torch.zeros(2, 1))}, [one, other], "x")[:, 0, :, 0]
+        tensor([[1., 1.],
+                [1., 2.]], dtype=torch.float64)
+    """
+    joint, free = _of_free(blocks, terms, name, eliminate)
+    count, width = blocks[name].x.shape[0], joint.shape[1]
+    out = joint.new_zeros((count, width, count, width))
+    out[free[:, None], :, free[None]] = joint.movedim(1, 2)
+    return out
+
+
+def _of_free(
+    blocks: Mapping[str, Block], terms: Sequence[Term], name: str, eliminate: str | Sequence[str] | None
+) -> tuple[Float[Tensor, "m k m k"], Int[Tensor, "m"]]:
+    """The covariance of the variables of a block that are free, and which those are."""
     _check(blocks, terms, eliminate)
     check_options(name=(name, tuple(blocks)))
     with torch.no_grad():
@@ -150,9 +190,8 @@ def marginal_covariance(
         x = {key: b.x for key, b in double.items()}
         layout = lay_out(double, counted, eliminate)
         width, free = double[name].tangent, layout.free[name]
-        out = double[name].x.new_zeros((double[name].x.shape[0], width, width))
         if not free.numel() or not width:
-            return out
+            return double[name].x.new_zeros((free.numel(), width, free.numel(), width)), free
         columns = layout.first[name] + torch.arange(free.numel() * width, device=free.device)
         information = Elimination(double, layout, "dense").linearize(x).information(columns)
         held = information.diagonal() <= 0
@@ -162,9 +201,7 @@ def marginal_covariance(
         whole = torch.where(info == 0, factor, torch.eye(len(factor), dtype=factor.dtype, device=factor.device))
         joint = torch.where(info == 0, torch.cholesky_inverse(whole), torch.inf)
         joint.diagonal()[held] = 0.0
-        places = torch.arange(free.numel() * width, device=free.device).view(-1, width)
-        out[free] = joint[places[:, :, None], places[:, None]]
-    return out
+    return joint.view(free.numel(), width, free.numel(), width), free
 
 
 def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None) -> None:

@@ -22,7 +22,8 @@ from torch import Tensor
 from torchsfm._types import Status, check_index, check_one_problem, check_options
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.components import components
-from torchsfm.optim import Block, Huber, SparseResult, Term, marginal_covariance
+from torchsfm.motion.many_views.triplets import pairs_within
+from torchsfm.optim import Block, Huber, SparseResult, Term, joint_covariance
 from torchsfm.optim import sparse_levenberg_marquardt as minimise
 
 CORNER = 0.1
@@ -33,6 +34,9 @@ QUARTILE = 0.5754
 """Of a squared residual of two normal components."""
 EXACT = 1e-5
 """The least standard deviation of rays, in radians."""
+TOLD = 1e-4
+"""That of which deviations are told: eliminating points holds each by about 1e-10 of what its rays say, and were rays more exact
+that would be more than what is expected of a part of free size."""
 MOST_LOST = 0.9
 """Where fewer residuals than a tenth are free, scatter tells no more than that."""
 AGREES = 4.0
@@ -50,6 +54,8 @@ FAR = 1e4
 """Points so far away, in extents of the component, or so near, say nothing of centres."""
 OPEN = 0.3
 """Standard deviation of a centre over the extent of its component from which on nothing is known of it."""
+FREE = 0.5
+"""Standard deviation of the size of what a camera sees together with others, over that size, from which on it is free."""
 LARGEST = 3000
 """Cameras of the largest component whose deviations are computed, which takes the inverse of a dense matrix."""
 
@@ -69,8 +75,8 @@ class GlobalPositions:
             iteration limit came first, the centres are the best seen.
         component: The smallest camera that each is connected with through points. Components have nothing to do with each
             other.
-        deviation: Standard deviation of each centre in its component, by the scatter of the rays; infinite where it is not
-            known. Zero for the smallest camera, and in components of so many cameras that it is not computed (3,000).
+        deviation: Standard deviation of each centre in its component, by the scatter of the rays but of no less than 1e-4;
+            infinite where it is not known. Zero for the smallest camera, and in components of so many cameras that it is not computed (3,000).
         angle: Between each ray and the direction to its point, in radians; pi for rays that do not count.
         inliers: Rays that agree to within four standard deviations.
         scale: Standard deviation of the right rays in each of two directions, in radians.
@@ -260,6 +266,7 @@ class _Rays:
         """
         if not len(self.v) or int(torch.bincount(component).amax()) > LARGEST:
             return c.new_zeros(self.views)
+        scale = max(scale, TOLD)
         own = torch.arange(self.views, device=c.device)
         far = c.square().sum(-1)
         most = torch.zeros_like(far).scatter_reduce_(0, component, far, "amax")
@@ -286,8 +293,22 @@ class _Rays:
             Term(_length, ("c", "c"), (first, last), (direction, HELD * apart.norm(dim=-1))),
         ]
         blocks = {"c": Block(c, fixed=component == own), "X": Block(X)}
-        spread = marginal_covariance(blocks, terms, "c", eliminate="X")
-        return spread.diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        spread = joint_covariance(blocks, terms, "c", eliminate="X").diagonal(dim1=1, dim2=3).sum(-1)
+        own = spread.diagonal()
+        # A part of free size may have come out so small that its deviation is, too, but not beside its own size.
+        shared = self._shared()
+        off = (shared * (own[:, None] + own - 2 * spread)).sum(-1)
+        size = (shared * torch.cdist(c, c).square()).sum(-1)
+        return torch.where(off > FREE**2 * size, torch.inf, own.sqrt())
+
+    def _shared(self) -> Float[Tensor, "v v"]:
+        """How many points two cameras share beyond the first, which leaves it open how far apart they are."""
+        different = torch.unique(self.point * self.views + self.view)
+        view, shared = different % self.views, self.v.new_zeros(self.views * self.views)
+        for a, b in pairs_within(different // self.views):
+            shared += torch.bincount(view[a] * self.views + view[b], minlength=len(shared))
+        shared = shared.view(self.views, self.views)
+        return (shared + shared.mT - 1).clamp(min=0)
 
     def _sines(self, scale: float, unit: float = 1.0) -> Term:
         """Sines of angles, in a unit."""
