@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from chance import assert_share
+from chance import assert_share, assert_unit_variance
 from robust_doors import DOORS, F64, Door, Scene, extremes, pixels
 from torch import Tensor
 
@@ -114,27 +114,26 @@ def spread(door: Door, trials: int, generator: torch.Generator) -> tuple[Tensor,
     return door.difference(found.model, truth), unit * found.covariance
 
 
-def check_spread(door: Door, error: Tensor, covariance: Tensor, slack: float) -> None:
+def check_spread(door: Door, error: Tensor, covariance: Tensor) -> None:
     assert covariance.shape == (len(error), error.shape[-1], error.shape[-1])
     torch.testing.assert_close(covariance, covariance.mT, rtol=1e-6, atol=1e-9 * float(covariance.abs().amax()))
-    ratio = error.square().sum(-1).mean() / covariance.diagonal(dim1=-2, dim2=-1).sum(-1).mean()
-    assert 1 - slack < ratio < 1 + slack
-    values, vectors = torch.linalg.eigh(covariance)
+    values = torch.linalg.eigvalsh(covariance)
     assert (values[:, : error.shape[-1] - door.rank].abs() <= 1e-9 * values[:, -1:]).all()
-    # In the directions that vary enough to be seen next to the curvature of the manifold, it is as large as predicted, too.
-    whitened = ((error[:, None] @ vectors)[:, 0].square() / values.clamp(min=1e-300))[:, -min(door.rank, 4) :].mean(0)
-    assert ((whitened > 0.7) & (whitened < 1.6)).all(), whitened
+    # What few data tell, their scatter tells badly: each covariance may be too small, their mean is not.
+    values, vectors = torch.linalg.eigh(covariance.mean(0))
+    # Of directions that vary enough to be seen next to the curvature of the manifold.
+    assert_unit_variance(((error @ vectors) / values.clamp(min=1e-300).sqrt())[:, -min(door.rank, 4) :], dim=0)
 
 
 @every_door
 def test_the_covariance_is_that_of_many_trials(door: Door, generator: torch.Generator) -> None:
-    check_spread(door, *spread(door, 200, generator), slack=0.25)
+    check_spread(door, *spread(door, 200, generator))
 
 
 @pytest.mark.slow
 @every_door
 def test_the_covariance_is_that_of_a_thousand_trials(door: Door, generator: torch.Generator) -> None:
-    check_spread(door, *spread(door, 1000, generator), slack=0.2)
+    check_spread(door, *spread(door, 1000, generator))
 
 
 @every_door_but_triangulation
