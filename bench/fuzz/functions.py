@@ -612,8 +612,8 @@ INNER = {
     "geometry.line_and_plane_distances", "images.describe_images", "images.describe_segments", "images.list_skipped",
     "optim.for_slots",
     "images.parse_exif", "optim.joint_covariance", "optim.loss_slope", "optim.marginal_covariance",
-    "optim.rotation_exponential", "optim.wants_derivative", "robust.check_counts", "robust.check_door", "robust.constant_weights",
-    "robust.estimate_robustly",
+    "optim.rotation_exponential", "optim.wants_derivative", "robust.check_counts", "robust.check_door",
+    "robust.constant_weights", "robust.estimate_robustly",
 }  # fmt: skip
 """Functions that rooms export for each other, as all of `linalg`: they know what they pass."""
 

@@ -65,7 +65,7 @@ def test_the_derivative_is_that_of_the_whole_estimation(door: Door, generator: t
         slope = (g * step).flatten(1).sum(-1)
         (low, before), (high, after) = (value_and_data_used([*inputs[:i], x + s * step, *inputs[i + 1 :]]) for s in (-1, 1))
         difference = (high - low) / 2
-        # Where a datum comes within the reach of the loss, the derivative has a jump; where the reach changes, the model has one.
+        # Where a datum comes within the reach of the loss, the derivative jumps; where the reach changes, the model does.
         smooth = (before == used).all(-1) & (after == used).all(-1)
         smooth &= (high + low - 2 * value).abs() < 0.2 * difference.abs().max()
         compared.append(smooth)

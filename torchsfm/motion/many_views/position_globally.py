@@ -35,8 +35,8 @@ QUARTILE = 0.5754
 EXACT = 1e-5
 """The least standard deviation of rays, in radians."""
 TOLD = 1e-4
-"""That of which deviations are told: eliminating points holds each by about 1e-10 of what its rays say, and were rays more exact
-that would be more than what is expected of a part of free size."""
+"""That of which deviations are told: eliminating points holds each by about 1e-10 of what its rays say, and were rays more
+exact, that would be more than what is expected of a part of free size."""
 MOST_LOST = 0.9
 """Where fewer residuals than a tenth are free, scatter tells no more than that."""
 AGREES = 4.0
@@ -76,7 +76,8 @@ class GlobalPositions:
         component: The smallest camera that each is connected with through points. Components have nothing to do with each
             other.
         deviation: Standard deviation of each centre in its component, by the scatter of the rays but of no less than 1e-4;
-            infinite where it is not known. Zero for the smallest camera, and in components of so many cameras that it is not computed (3,000).
+            infinite where it is not known. Zero for the smallest camera, and in components of so many cameras that it
+            is not computed (3,000).
         angle: Between each ray and the direction to its point, in radians; pi for rays that do not count.
         inliers: Rays that agree to within four standard deviations.
         scale: Standard deviation of the right rays in each of two directions, in radians.
