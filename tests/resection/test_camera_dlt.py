@@ -4,6 +4,7 @@ from chance import seeded
 
 from torchsfm._types import Status
 from torchsfm.resection import camera_dlt, estimate_camera_projective
+from torchsfm.resection.camera_dlt import other_camera
 from torchsfm.robust import Degeneracy
 
 
@@ -140,6 +141,19 @@ def test_robustly_points_on_a_twisted_cubic_leave_the_camera_open(make_problem, 
     x, X, _ = make_problem(40, n=40, noise=noise)
     found = estimate_camera_projective(x, X, threshold=3.0, max_iterations=300, generator=generator)
     assert (found.degeneracy == Degeneracy.NONE).all()
+
+
+@pytest.mark.parametrize("relief", [1e-3, 1e-5, 1e-7])
+def test_rounding_does_not_hide_another_camera(generator, relief):
+    """A cubic next to a line and to a plane, which passes through the centre at 0."""
+    s = torch.rand(100, 40, 1, generator=generator, dtype=torch.float64) * 2 + 0.5
+    axes, P = torch.randn(2, 100, 3, 3, generator=generator, dtype=torch.float64)
+    X = torch.cat((s**3, 0.05 * s**2, relief * s), -1) @ torch.linalg.qr(axes)[0]
+    y = X @ P
+    x = y[..., :2] / y[..., 2:]
+    x, X = ((t - t.mean(1, keepdim=True)) / t.std((1, 2), keepdim=True) for t in (x, X))
+    x = x + 3e-5 * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+    assert other_camera(x, X, torch.ones(100, 40, dtype=torch.bool), x.new_full((100,), 1e-7)).all()
 
 
 def test_a_noisy_plane_and_one_point_off_it(make_problem):

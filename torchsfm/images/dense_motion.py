@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchsfm._types import check_options
+from torchsfm._types import check_one_problem, check_options
 from torchsfm.images.features import Features, detect_features, gray_bytes
 from torchsfm.images.matching import match_features
 from torchsfm.images.reading import Photograph, pixels_of
@@ -145,6 +145,7 @@ def _looks(images: Iterable[Photograph | Tensor]) -> Iterator[tuple[NDArray[np.u
     check_options(images=(images, Iterable))
     for image in images:
         pixels = pixels_of(image)
+        check_one_problem(images=(pixels, "c h>=1 w>=1"))
         yield gray_bytes(pixels), detect_features(pixels)
 
 

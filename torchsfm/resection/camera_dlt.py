@@ -204,12 +204,14 @@ def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
 
 def _blurred(A: Tensor) -> Tensor:
     """Whether cameras of two third rows are as near to the data, in the image."""
-    distance = _squared_distances(A)
-    return distance[..., 1] <= BLURRED**2 * distance[..., 0]
+    distance, rounding = _squared_distances(A)
+    return ~(distance[..., 1] > BLURRED**2 * torch.maximum(distance[..., 0], rounding))
 
 
-def _squared_distances(A: Tensor) -> Tensor:
+def _squared_distances(A: Tensor) -> tuple[Tensor, Tensor]:
     """How near cameras of four third rows are to the data in the image, from the nearest on: mean squares of a coordinate.
+
+    And what of them may be rounding: much, where points are nearly in a plane or on a line.
 
     Noise in the image enters every equation with its depth: of two solutions that of smaller depths leaves less of A p, however
     wrong it is. So what the best first two rows leave is measured by the depths.
@@ -218,7 +220,8 @@ def _squared_distances(A: Tensor) -> Tensor:
     depths = N[..., :4, :4] + N[..., 4:8, 4:8]
     left = N[..., 8:, 8:] - N[..., 8:, :8] @ torch.linalg.solve_ex(N[..., :8, :8], N[..., :8, 8:])[0]
     unit = torch.linalg.inv_ex(torch.linalg.cholesky_ex(depths)[0])[0]
-    return eigvalsh(unit @ left @ unit.mT)[0]
+    rounding = 16 * torch.finfo(A.dtype).eps * N[..., 8:, 8:].diagonal(dim1=-2, dim2=-1).sum(-1)
+    return eigvalsh(unit @ left @ unit.mT)[0], rounding * unit.square().sum((-2, -1))
 
 
 def other_camera(
@@ -239,8 +242,9 @@ def other_camera(
     """
     w = present.to(x.dtype)[..., None].expand(*present.shape, 2)
     x, X = (torch.where(present[..., None], t, 0) for t in (x, X))
-    distance = _squared_distances(_point_rows(x, X, w))
-    return distance[..., 1] <= factor**2 * torch.maximum(distance[..., 0], exact.square())
+    distance, rounding = _squared_distances(_point_rows(x, X, w))
+    # A distance that is no number is known even less.
+    return ~(distance[..., 1] > factor**2 * torch.maximum(distance[..., 0], torch.maximum(exact.square(), rounding)))
 
 
 def _scaled(P: Tensor, X: Tensor, w: Tensor) -> Tensor:
