@@ -75,6 +75,7 @@ def test_dense_problems(generator: torch.Generator, monkeypatch: pytest.MonkeyPa
 
     together, few = found()
     monkeypatch.setattr(dense, "FEW", -1)
+    monkeypatch.setattr(dense, "FEW_BENT", -1)
     singly, many = found()
     assert few < 0.6 * many
     torch.testing.assert_close(together, singly, rtol=1e-6, atol=1e-6)

@@ -120,6 +120,24 @@ def test_given_jacobian_is_used(generator: torch.Generator) -> None:
     torch.testing.assert_close(a.x, b.x, rtol=1e-8, atol=1e-10)
 
 
+def test_given_cost_bends_what_is_minimised(generator: torch.Generator) -> None:
+    """It is asked for nothing but derivatives, which may be those of a function that only touches the cost at x."""
+    _, t, y = decay_data(generator, 5)
+    y, asked = y + 0.3 * torch.randn(y.shape, generator=generator, dtype=F64), 0
+
+    def local_cost(x: Tensor, t: Tensor, y: Tensor) -> Tensor:
+        nonlocal asked
+        asked += 1
+        return decay(x, t, y).square().sum((-1, -2)) / 2 + 7 + (x - x.detach()).pow(3).sum(-1)
+
+    start = torch.ones(5, 3, dtype=F64)
+    a = levenberg_marquardt(decay, start, t, y)
+    b = levenberg_marquardt(decay, start, t, y, local_cost=local_cost)
+    assert asked
+    torch.testing.assert_close(a.x, b.x, rtol=1e-12, atol=1e-12)
+    assert torch.equal(a.iterations, b.iterations)
+
+
 def test_rigid_motion_and_dataclass_parameters(generator: torch.Generator) -> None:
     @dataclasses.dataclass(frozen=True)
     class Motion:
@@ -272,6 +290,8 @@ def test_wrong_shapes(unchecked: None) -> None:
         levenberg_marquardt(lambda x, t: x[..., :1, None] - t[:, None], torch.ones(4, 3), torch.ones(7))
     with pytest.raises(ValueError, match="weights: wanted shape"):
         levenberg_marquardt(lambda x: x[..., None], torch.ones(4, 3), weights=torch.ones(4, 2, 3))
+    with pytest.raises(ValueError, match="local_cost: wanted without weights"):
+        levenberg_marquardt(lambda x: x[..., None], torch.ones(4, 3), weights=torch.ones(4, 3), local_cost=lambda x: x[:, 0])
     with pytest.raises(ValueError, match="weights: wanted device"):
         levenberg_marquardt(lambda x: x[..., None], torch.ones(4, 3), weights=torch.ones(4, 3, device="meta"))
 

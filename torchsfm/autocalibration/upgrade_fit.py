@@ -96,6 +96,7 @@ def fit_upgrade(
         *shared,
         *expected,
         linearize=weighed.linearize,
+        local_cost=weighed.local_cost,
         max_iterations=max_iterations,
         function_tolerance=tolerance,
         step_tolerance=1e-9,
@@ -157,6 +158,28 @@ class _WeighedDepartures:
         r = torch.cat((whole[..., 0], expected), -1)
         return r[..., None], torch.cat((whole[..., 1:], tail), -2)[..., None, :]
 
+    def local_cost(
+        self, x: Tensor, P: Tensor, covariance: Tensor, base: Tensor, present: Tensor, mean: Tensor, precision: Tensor
+    ) -> Tensor:
+        """Half the sum of squares at x, with its first and second derivatives, without those of a decomposition.
+
+        `g' C^-1 g / 2` is the maximum over z of `z'g - z'C z / 2`; one Newton step from the z at x follows it to second order.
+        """
+        found, counts = self._departures(x, P, base, present)
+        b, v = counts.shape
+        B, g = found.by_camera * counts[..., None, None], (found.g * counts[..., None])[..., None]
+        with torch.no_grad():
+            L, scale, added = self._root(B, covariance, counts)
+            scale = scale[..., None]
+            z = (scale * torch.cholesky_solve(scale * g.reshape(scale.shape), L)).reshape(g.shape)
+        w = B.mT @ z
+        spread = covariance.reshape(b, 12 * v, 12 * v) @ w.flatten(1, 2) if self.coupled else covariance @ w
+        Cz = B @ spread.reshape(w.shape) + added.reshape(g.shape) * z
+        short = torch.linalg.solve_triangular(L, scale * (g - Cz).reshape(scale.shape), upper=False)
+        expected = (x[:, : self.spread.shape[-1]] - mean) * precision
+        squares: Tensor = short.flatten(1).square().sum(-1) + expected.square().sum(-1)
+        return (z * (g - Cz / 2)).flatten(1).sum(-1) + squares / 2
+
     def _departures(self, x: Tensor, P: Tensor, base: Tensor, present: Tensor) -> tuple[Departures, Tensor]:
         """Those of all views, and which count: the first is metric by the choice of frame, absent ones say nothing."""
         q = self.spread.shape[-1]
@@ -168,21 +191,25 @@ class _WeighedDepartures:
     def _weigh(self, by_camera: Tensor, covariance: Tensor, counts: Tensor, columns: Tensor) -> Tensor:
         """Columns (b, v, 5, k) times the inverse root of the covariance of the departures, (b, 5 v, k)."""
         b, v = counts.shape
-        by_camera = by_camera * counts[..., None, None]
+        L, scale, _ = self._root(by_camera * counts[..., None, None], covariance, counts)
+        weighed: Tensor = torch.linalg.solve_triangular(L, columns.reshape(*scale.shape, -1) * scale[..., None], upper=False)
+        return weighed.reshape(b, 5 * v, -1)
+
+    def _root(self, by_camera: Tensor, covariance: Tensor, counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """L and s of the covariance `s^-1 L L' s^-1` of the departures, and what was added to its diagonal."""
+        b, v = counts.shape
         idle = (1 - counts)[..., None].expand(b, v, 5)
         if self.coupled:
             half = (by_camera @ covariance.reshape(b, v, 12, 12 * v)).reshape(b, 5 * v, v, 12)
             C = torch.einsum("brvi,bvmi->brvm", half, by_camera).reshape(b, 5 * v, 5 * v)
             C = 0.5 * (C + C.mT)
-            idle, columns = idle.reshape(b, 5 * v), columns.flatten(1, 2)
+            idle = idle.reshape(b, 5 * v)
         else:
             C = by_camera @ covariance @ by_camera.mT
         diagonal = C.diagonal(dim1=-2, dim2=-1)
-        floor = 1e-10 * diagonal.sum(-1, keepdim=True) / diagonal.shape[-1] + 1e-200
-        C = C + torch.diag_embed(idle + floor)
+        added = idle + 1e-10 * diagonal.sum(-1, keepdim=True) / diagonal.shape[-1] + 1e-200
+        C = C + torch.diag_embed(added)
         scale = C.diagonal(dim1=-2, dim2=-1).rsqrt()
         L, info = torch.linalg.cholesky_ex(scale[..., :, None] * C * scale[..., None, :])
         # A covariance that is none makes the residual infinite, and the step is not taken.
-        wrong = torch.where(info == 0, 0.0, torch.nan)[..., None, None]
-        weighed: Tensor = torch.linalg.solve_triangular(L, columns * scale[..., None] + wrong, upper=False)
-        return weighed.reshape(b, 5 * v, -1)
+        return L, torch.where((info == 0)[..., None], scale, torch.nan), added

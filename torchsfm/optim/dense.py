@@ -15,8 +15,11 @@ from torchsfm.optim.pytree import Places, leaves, norm, pick, places, put
 
 Linearize = Callable[..., tuple[Tensor, Tensor]]
 FEW = 1 << 15
-"""Numbers, of variables and data, for which all derivatives are found at once, as calls cost more than arithmetic on so few:
-without the copies that this takes for Hessians, where a call goes through two derivatives, with them for Jacobians."""
+"""Numbers, of variables and data in the copies that this takes, for which all columns of a Jacobian are found at once, as calls
+cost more than arithmetic on so few."""
+FEW_BENT = 1 << 14
+"""The same of a Hessian's rows, where a call goes through two derivatives: numbers of residuals, in the copies, which tell its
+work better, since covariances among the data are many numbers of which each is hardly used."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,10 @@ class DenseProblem:
     """What the cost would be if residuals were as large as data are."""
     enough: Tensor
     """Where there are as many residuals as parameters."""
+    numbers: int
+    """Numbers in the residuals of one problem."""
+    local_cost: Callable[..., Tensor] | None = None
+    """What has the first and second derivatives of the cost, where they take less than those of the residuals."""
     patience: int | None = 0
 
     def over(self, change: Callable[[Any], Any]) -> "DenseProblem":
@@ -162,15 +169,16 @@ class DenseProblem:
     def curve(self, here: DenseSystem, where: Tensor) -> DenseSystem:
         """The exact second derivatives of the cost in some elements; not always positive."""
         (at,) = places(where)
-        t, each = self.tangent, sum(v[0].numel() for v in leaves((here.x, self.data)))
+        t = self.tangent
         # Few problems stand there once for each row of their Hessians, so that one derivative gives them all.
-        together = t if len(at) * each <= FEW else 1
+        together = t if t * len(at) * self.numbers <= FEW_BENT else 1
         copies = (at.repeat_interleave(together),)
         some, x = self.pick(copies), pick(copies, here.x)
         first, rows = leaves(x)[0], []
         with torch.enable_grad():
             delta = first.new_zeros((len(first), t)).requires_grad_()
-            cost = some.cost(self.retract(x, delta)).sum()
+            moved = self.retract(x, delta)
+            cost = (some.cost(moved) if self.local_cost is None else self.local_cost(moved, *some.data)).sum()
             (slope,) = torch.autograd.grad(cost, delta, create_graph=True, materialize_grads=True)
             slope = slope.view(len(at), together, t)
             for i in range(0, t, together):
@@ -200,6 +208,7 @@ def dense_problem(
     data: Any,
     weights: Tensor | None,
     shape: tuple[int, ...],
+    local_cost: Callable[..., Tensor] | None = None,
 ) -> DenseProblem:
     """The problems of data and weights in one batch dimension, whose residuals at x are of a shape (n, d)."""
     first = leaves(x)[0]
@@ -209,4 +218,5 @@ def dense_problem(
     squares = [torch.where(d.isfinite(), d, 0.0).square().mean(1) for d in numbers]
     size = (number if weights is None else weights.double().sum(-1)) * sum(squares, torch.zeros_like(number)) / 2
     epsilon = torch.finfo(first.dtype).eps
-    return DenseProblem(residual, retract, tangent, loss, written, epsilon, data, weights, size, enough)
+    every = (loss, written, epsilon, data, weights, size, enough, shape[0] * shape[1], local_cost)
+    return DenseProblem(residual, retract, tangent, *every)

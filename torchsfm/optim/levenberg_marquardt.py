@@ -64,6 +64,7 @@ def levenberg_marquardt(
     weights: Float[Tensor, "*#batch n"] | Bool[Tensor, "*#batch n"] | None = None,
     loss: Loss | None = None,
     linearize: Linearize | None = None,
+    local_cost: Callable[..., Tensor] | None = None,
     max_iterations: int = 50,
     function_tolerance: float = 1e-10,
     step_tolerance: float = 1e-10,
@@ -91,6 +92,9 @@ def levenberg_marquardt(
         weights: Weight of each of the n residuals' squared norms; 0 or False leaves it out, whatever number it has, NaN too.
         loss: `rho(s)` of squared norms, see `torchsfm.optim.loss`; `s` if not given.
         linearize: `linearize(x, *data) -> (residual (b, n, d), jacobian (b, n, d, size))`, where a hand-written one pays.
+        local_cost: `local_cost(x, *data) -> (b,)`, without `weights` and `loss`: what has the first and second derivatives at
+            x of half the sum of squares, for the exact Hessian, where they take less. It may hold fixed at `x.detach()` what
+            does not change them.
         max_iterations: Most linear solves per problem.
         function_tolerance: A problem is done when no more than this fraction of its cost is left to gain, by the promise of a
             step or by how fast gains fall; or no more than rounding of parameters and data makes of it.
@@ -119,7 +123,10 @@ def levenberg_marquardt(
         step_tolerance=(step_tolerance, "float >= 0"), initial_damping=(initial_damping, "float >= 0"),
         size=(size, "?int >= 1"), residual=(residual, Callable), retract=(retract, Callable | None),
         loss=(loss, Callable | None), linearize=(linearize, Callable | None), weights=(weights, Tensor | None),
+        local_cost=(local_cost, Callable | None),
     )  # fmt: skip
+    if local_cost is not None and (weights is not None or loss is not None):
+        raise ValueError("local_cost: wanted without weights and loss")
     move = retract if retract is not None else _add
     if size is None:
         if not isinstance(x0, Tensor):
@@ -144,7 +151,7 @@ def levenberg_marquardt(
         start = flatten(tensor_map(torch.Tensor.detach, x0), batch)
         flat_data = flatten(tensor_map(torch.Tensor.detach, data), batch, "data")
         flat_weights = None if weights is None else flatten(weights.detach(), batch, "weights")
-        problem = dense_problem(residual, move, size, loss, linearize, start, flat_data, flat_weights, shape[-2:])
+        problem = dense_problem(residual, move, size, loss, linearize, start, flat_data, flat_weights, shape[-2:], local_cost)
         step = max(1, PIECE // max(1, shape[-2] * shape[-1] * size))
         pieces = range(0, max(batch.numel(), 1), step)
         parts = [(problem.over(partial(cut, start=i, end=i + step)), cut(start, i, i + step)) for i in pieces]
