@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry.curves import Cubics, Curve, Segments, segments_of
-from torchsfm.linalg.rows import inner
+from torchsfm.linalg.rows import combine_rows
 
 _LONGEST = 1 / 40
 """Of a curve, by which a place moves at most in one step to a nearer one."""
@@ -31,16 +31,22 @@ class CurvePlaces:
 
     def at(self, place: Float[Tensor, "*batch m"]) -> tuple[Tensor, Tensor, Tensor]:
         """The points at places, and the first and second derivatives by the place."""
-        number = self.number[..., None]
-        last = (number - 1).clamp(min=0)
-        index = place.floor().long()
-        around = index % number.clamp(min=1)
-        inside = torch.minimum(index.clamp(min=0), last)
-        before = torch.where(self.closed[..., None], index, inside)
-        share = place - before
+        x, first, second = self.rows(place)
+        return x.mT, first.mT, second.mT
+
+    def rows(self, place: Float[Tensor, "*batch m"]) -> tuple[Tensor, Tensor, Tensor]:
+        """As `at`, coordinates before places: arithmetic over few coordinates in the last dimension is slow."""
+        number, index = self.number[..., None], place.floor()
+        before = index.long()
+        around = before % number.clamp(min=1)
+        if bool(self.closed.all()):
+            return self.cubics.take(around).rows(place - index)
+        ring = self.closed[..., None]
+        inside = torch.minimum(before.clamp(min=0), (number - 1).clamp(min=0))
+        share = place - torch.where(ring, before, inside)
         on = share.clamp(0, 1)
-        x, first, second = self.cubics.take(torch.where(self.closed[..., None], around, inside)).at(on)
-        beyond = (share - on)[..., None]
+        x, first, second = self.cubics.take(torch.where(ring, around, inside)).rows(on)
+        beyond = (share - on)[..., None, :]
         return x + beyond * first, first, torch.where(beyond == 0, second, 0)
 
     def beyond(self, place: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
@@ -51,11 +57,14 @@ class CurvePlaces:
     def nearest(self, place: Float[Tensor, "*batch m"], y: Float[Tensor, "*batch m d"], steps: int = 4) -> Tensor:
         """The places of the points nearest to `y` that are reached from given places without leaving the curve."""
         longest = _LONGEST * self.number[..., None].to(place.dtype)
+        y = y.mT.contiguous()
         for _ in range(steps):
-            x, first, second = self.at(place)
-            away, speed = x - y, inner(first, first)
-            bent = torch.maximum(speed + inner(away, second), 0.3 * speed)
-            move = inner(away, first) / bent.clamp_min(1e-300)
+            x, *slopes = self.rows(place)
+            away = (x - y).unbind(-2)
+            first, second = (slope.unbind(-2) for slope in slopes)
+            speed = combine_rows(first, first)
+            bent = torch.maximum(speed + combine_rows(away, second), 0.3 * speed)
+            move = combine_rows(away, first) / bent.clamp_min(1e-300)
             place = place - torch.minimum(torch.maximum(move, -longest), longest)
         return place
 

@@ -146,23 +146,29 @@ class Segments(NamedTuple):
         a, b = h * self.slope, h * self.next_slope
         # p = start + a t + c t^2 + e t^3 with the chord and b at its end.
         c, e = 3 * self.chord - 2 * a - b, a + b - 2 * self.chord
-        return Cubics(torch.cat((self.start, a, c, e), -1))
+        return Cubics(torch.cat((self.start, a, c, e), -1).mT.contiguous())
 
 
 class Cubics(NamedTuple):
-    """Points by their share of the way along segments."""
+    """Points by their share of the way along segments; the segments last, as arithmetic over few coordinates there is slow."""
 
-    coefficients: Float[Tensor, "*batch n 4*d"]
+    coefficients: Float[Tensor, "*batch 4*d n"]
     """Of powers of the share from 0 to 3."""
 
     def take(self, index: Int[Tensor, "*batch m"]) -> "Cubics":
         """Some of them."""
-        return Cubics(_rows(self.coefficients, index))
+        rows = self.coefficients
+        return Cubics(rows.gather(-1, index[..., None, :].expand(*rows.shape[:-1], index.shape[-1])))
 
     def at(self, t: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor, Tensor]:
         """The point at a share of each, and the first and second derivative by the share."""
-        start, a, c, e = self.coefficients.chunk(4, -1)
-        t = t[..., None]
+        x, first, second = self.rows(t)
+        return x.mT, first.mT, second.mT
+
+    def rows(self, t: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor, Tensor]:
+        """As `at`, coordinates before segments."""
+        start, a, c, e = self.coefficients.chunk(4, -2)
+        t = t[..., None, :]
         te, c2 = t * e, 2 * c
         return start + t * (a + t * (c + te)), a + t * (c2 + 3 * te), c2 + 6 * te
 

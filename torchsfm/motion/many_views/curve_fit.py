@@ -19,7 +19,7 @@ from torch import Tensor
 from torchsfm.geometry.curve_places import CurvePlaces
 from torchsfm.geometry.homogeneous import divide_safely
 from torchsfm.linalg import solve
-from torchsfm.linalg.rows import inner
+from torchsfm.linalg.rows import combine_rows, inner
 from torchsfm.motion.many_views.bilinear_fit import unit_frame
 from torchsfm.motion.many_views.bilinear_steps import BilinearSystem, Linearisation
 from torchsfm.optim.problem import Problem, Step
@@ -80,10 +80,11 @@ def near_curves(images: CurvePlaces, place: Float[Tensor, "p v c m"], y: Float[T
     """Distances of samples whose images are y from the nearest points of image curves that are reached from given places."""
     points = _points(y, place)
     place = images.nearest(place, points)
-    foot, first, _ = images.at(place)
-    tangent = torch.nn.functional.normalize(first, dim=-1)
-    normal = torch.stack((-tangent[..., 1], tangent[..., 0]), -1)
-    return Near(points, inner(points - foot, normal).flatten(2), _by_image(normal, points, y), place)
+    foot, first, _ = images.rows(place)
+    across, along = torch.nn.functional.normalize(first, dim=-2).unbind(-2)
+    normal = torch.stack((-along, across), -2)
+    r = combine_rows((points.mT - foot).unbind(-2), normal.unbind(-2))
+    return Near(points, r.flatten(2), _by_image(normal.mT, points, y), place)
 
 
 def _points(y: Tensor, place: Tensor) -> Float[Tensor, "p v c m 2"]:
@@ -92,8 +93,8 @@ def _points(y: Tensor, place: Tensor) -> Float[Tensor, "p v c m 2"]:
 
 def _by_image(way: Tensor, points: Tensor, y: Tensor) -> Float[Tensor, "p v 3 n"]:
     """The derivative by y of how far points are along unit vectors."""
-    row = torch.cat((way, -inner(way, points)[..., None]), -1).flatten(2, 3)
-    return divide_safely(row, y[:, :, 2]).mT
+    rows = torch.stack((*way.unbind(-1), -inner(way, points)), 2).flatten(3)
+    return divide_safely(rows.mT, y[:, :, 2]).mT
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.geometry.curves import Cubics
-from torchsfm.linalg.rows import inner
+from torchsfm.linalg.rows import combine_rows, inner
 
 _POWERS = [[1.0, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]
 """Six times the coefficients of a spline after a knot, by the four control points about it."""
@@ -60,24 +60,27 @@ def _images(x: Splines, closed: Bool[Tensor, "p c"]) -> Cubics:
     powers = (x.control.new_tensor(_POWERS) / 6 @ about)[:, None]
     y = powers.flatten(3, 4) @ x.P[:, :, None, :, :3].mT
     y = y.reshape(*y.shape[:3], -1, 4, 3) + torch.nn.functional.pad(x.P[:, :, None, None, None, :, 3], (0, 0, 0, 3))
-    return Cubics(y.flatten(4))
+    return Cubics(y.flatten(4).mT.contiguous())
 
 
 def _seen(images: Cubics, t: Float[Tensor, "p v c n"], closed: Bool[Tensor, "p c"], measured: Tensor) -> Images:
     """Where the points at places are seen."""
-    ring, k = closed[:, None, :, None], images.coefficients.shape[3]
+    ring, k = closed[:, None, :, None], images.coefficients.shape[-1]
     low = _knots(t, ring, k)
     index = low.long()  # in range also where a place is not finite
-    y, first, second = images.take(torch.where(ring, index % k, index.clamp(0, k - 4))).at(t - low)
-    depth = torch.where(y[..., 2:] == 0, 1e-300, y[..., 2:])
-    points = y[..., :2] / depth
-    move = (first[..., :2] - points * first[..., 2:]) / depth
-    bend = (second[..., :2] - points * second[..., 2:] - 2 * move * first[..., 2:]) / depth
-    away, speed = points - measured, inner(move, move)
-    bent = torch.maximum(speed + inner(away, bend), _BENT * speed).clamp_min(1e-300)
-    slope = inner(away, move)
+    y, first, second = images.take(torch.where(ring, index % k, index.clamp(0, k - 4))).rows(t - low)
+    depth = y[..., 2:, :]
+    depth = torch.where(depth == 0, 1e-300, depth)
+    points = y[..., :2, :] / depth
+    move = (first[..., :2, :] - points * first[..., 2:, :]) / depth
+    bend = (second[..., :2, :] - points * second[..., 2:, :] - 2 * move * first[..., 2:, :]) / depth
+    away = points - measured.mT
+    rows, moves = away.unbind(-2), move.unbind(-2)
+    speed = combine_rows(moves, moves)
+    bent = torch.maximum(speed + combine_rows(rows, bend.unbind(-2)), _BENT * speed).clamp_min(1e-300)
+    slope = combine_rows(rows, moves)
     end = torch.where(slope < 0, t >= k - 3, t <= 0)
-    return Images(y, first, points, away, speed, bent, slope, end & ~ring)
+    return Images(y.mT, first.mT, points.mT, away.mT, speed, bent, slope, end & ~ring)
 
 
 def nearest(x: Splines, closed: Bool[Tensor, "p c"], measured: Float[Tensor, "p v c n 2"]) -> tuple[Splines, Images]:
