@@ -34,22 +34,26 @@ def checked(target: Any = None, *, typechecker: Any = None) -> Any:
         if dataclasses.is_dataclass(target) and not hasattr(target.__init__, "__wrapped__"):
             target.__init__ = checked(target.__init__)
         return target
-    key = (target.__module__, target.__qualname__, target.__code__.co_firstlineno)
+    checks = _CHECKS.setdefault((target.__module__, target.__qualname__, target.__code__.co_firstlineno), _Checks())
+    config = jaxtyping.config
 
     @functools.wraps(target)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if jaxtyping.config.jaxtyping_disable:
+        if config.jaxtyping_disable:
             return target(*args, **kwargs)
-        if key not in _CHECKS:
-            _CHECKS[key] = _Checks(_arguments(target), _result(target))
-        checks = _CHECKS[key]
-        given = _kind(args), _kind(kwargs)
-        if given not in checks.passed:
+        given = _kinds(args, kwargs)
+        passed = checks.passed.get(given)
+        if passed is None:
+            checks.make(target)
             with _names_of_axes("context"):
                 checks.arguments(*args, **kwargs)
-            checks.passed[given] = set()
+                checks.passed[given] = passed = set()
+                value = target(*args, **kwargs)
+                checks.result(value)
+                passed.add(_kinds((value,), {}))
+            return value
         value = target(*args, **kwargs)
-        kind, passed = _kind(value), checks.passed[given]
+        kind = _kinds((value,), {})
         if kind not in passed:
             with _names_of_axes("context"):
                 checks.arguments(*args, **kwargs)
@@ -63,14 +67,33 @@ def checked(target: Any = None, *, typechecker: Any = None) -> Any:
 _names_of_axes = jaxtyping.jaxtyped
 
 
-@dataclasses.dataclass(frozen=True)
 class _Checks:
-    """Those of one function."""
+    """Those of one function, once it is called."""
 
     arguments: Callable[..., None]
     result: Callable[[Any], Any]
-    passed: dict[Hashable, set[Hashable]] = dataclasses.field(default_factory=dict)
-    """Kinds of results by those of arguments."""
+
+    def __init__(self) -> None:
+        self.passed: dict[Hashable, set[Hashable]] = {}
+        """Kinds of results by those of arguments."""
+
+    def make(self, target: Callable[..., Any]) -> None:
+        if not hasattr(self, "result"):
+            self.arguments, self.result = _arguments(target), _result(target)
+
+
+def _kinds(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Hashable:
+    """The kinds of arguments; two entries for a tensor, of which the second is a dtype."""
+    kinds: list[Hashable] = []
+    for x in args:
+        what = type(x)
+        if what is Tensor:
+            kinds += (x.shape, x.dtype)
+        else:
+            kinds.append(what if what in _PLAIN else _kind(x))
+    for name in kwargs:
+        kinds += (name, _kind(kwargs[name]))
+    return tuple(kinds)
 
 
 def _kind(x: Any) -> Hashable:
@@ -83,7 +106,7 @@ def _kind(x: Any) -> Hashable:
     if isinstance(x, (str, int, type)):
         return what, x
     if isinstance(x, tuple):
-        return what, *[_kind(value) for value in x]
+        return what, *map(_kind, x)
     if isinstance(x, dict):
         return what, *[(_kind(key), _kind(value)) for key, value in x.items()]
     if isinstance(x, list | set | frozenset):
