@@ -8,6 +8,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -92,12 +93,18 @@ def device(request: pytest.FixtureRequest) -> Iterator[Device]:
         yield Device(torch.device(wanted))
 
 
-def agreeable(call: Callable[..., Any], how: Function) -> tuple[dict[str, Any], Any]:
-    """Arguments that the function accepts, and its answer.
+def agreeable(name: str) -> tuple[dict[str, Any], Any]:
+    """Arguments that the function accepts, and its answer, which tests share.
 
     Some that may be left out belong together, and chance separates them: these are not accepted. What is slow gets one
     problem and few steps: these are enough to see where its numbers lie.
     """
+    return _agreeable(name, torch.get_default_device())
+
+
+@cache
+def _agreeable(name: str, device: torch.device) -> tuple[dict[str, Any], Any]:
+    call, how = public_functions()[name], FUNCTIONS.get(name, Function())
     batch = (1,) if how.slow else (2,)
     for stream in range(20):
         scene = Scene(seeded(stream), batch if how.batched else (), tuple(how.sizes.items()), how.planar, how.centred)
@@ -114,8 +121,7 @@ def agreeable(call: Callable[..., Any], how: Function) -> tuple[dict[str, Any], 
 @pytest.mark.parametrize("name", CALLS)
 @pytest.mark.usefixtures("unchecked")
 def test_functions(name: str, device: Device) -> None:
-    how = FUNCTIONS.get(name, Function())
-    arguments, here = agreeable(CALLS[name], how)
+    arguments, here = agreeable(name)
     if not any(True for _ in tensors(arguments)):
         pytest.skip("takes no tensors")
     device.compare(lambda given: apply(CALLS[name], given), arguments, here)
@@ -166,7 +172,7 @@ INDIFFERENT = (
 def test_the_default_device_is_of_no_account(name: str, device: Device) -> None:
     """Data on the CPU stay there, and what is drawn lies where its generator is."""
     call = public_functions()[name]
-    arguments, here = agreeable(call, FUNCTIONS.get(name, Function()))
+    arguments, here = agreeable(name)
     with by_default(device):
         there = apply(call, arguments)
     alike(there, here)

@@ -3,7 +3,7 @@
 import math
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from enum import IntEnum
 from functools import cache
 from numbers import Integral, Real
@@ -71,8 +71,8 @@ def tensor_map(function: Callable[[Tensor], Tensor], tree: T) -> T:
     value: Any = tree
     if isinstance(value, Tensor):
         value = function(value)
-    elif is_dataclass(value) and not isinstance(value, type):
-        value = replace(value, **{f.name: tensor_map(function, getattr(value, f.name)) for f in fields(value) if f.init})
+    elif (names := _parts(value.__class__)) is not None:
+        value = value.__class__(**{name: tensor_map(function, getattr(value, name)) for name in names})
     elif isinstance(value, tuple):
         items = [tensor_map(function, item) for item in value]
         value = type(value)(*items) if hasattr(value, "_fields") else tuple(items)
@@ -81,6 +81,12 @@ def tensor_map(function: Callable[[Tensor], Tensor], tree: T) -> T:
     elif isinstance(value, dict):
         value = {key: tensor_map(function, item) for key, item in value.items()}
     return value  # type: ignore[no-any-return]
+
+
+@cache
+def _parts(kind: type) -> tuple[str, ...] | None:
+    """The names of what a dataclass is made of; None for others."""
+    return tuple(f.name for f in fields(kind) if f.init) if is_dataclass(kind) else None
 
 
 def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
@@ -142,38 +148,57 @@ def _batches(arguments: dict[str, tuple[Tensor | None, str]]) -> dict[str, torch
     batches: dict[str, torch.Size] = {}
     first: tuple[str, Tensor] | None = None
     floating: tuple[str, Tensor] | None = None
-    for name, (tensor, spec) in arguments.items():
-        if tensor is None and spec.startswith("?"):
+    for name, (tensor, words) in arguments.items():
+        spec = _spec(words)
+        if tensor is None and spec.optional:
             continue
-        shape_spec, _, kind = (part.strip() for part in spec.removeprefix("?").partition(":"))
         if not isinstance(tensor, Tensor):
-            raise ValueError(f"{name}: wanted a torch.Tensor of shape {_words(shape_spec)}, got {type(tensor).__name__}")
-        _check_kind(name, tensor, kind)
-        if kind == "":
+            raise ValueError(f"{name}: wanted a torch.Tensor of shape {_words(spec.shape)}, got {type(tensor).__name__}")
+        _check_kind(name, tensor, spec.kind)
+        if spec.kind == "":
             if floating is not None and tensor.dtype != floating[1].dtype:
                 raise ValueError(f"{name}: wanted dtype {floating[1].dtype} as {floating[0]} has, got {tensor.dtype}")
             floating = floating or (name, tensor)
         if first is not None and tensor.device != first[1].device:
             raise ValueError(f"{name}: wanted device {first[1].device} as {first[0]} has, got {tensor.device}")
         first = first or (name, tensor)
-        tokens = shape_spec.split()
-        if tensor.ndim < len(tokens):
-            raise ValueError(f"{name}: wanted shape {_words(shape_spec)}, got {tuple(tensor.shape)}")
-        trailing = tensor.shape[tensor.ndim - len(tokens) :]
-        for token, size in zip(tokens, trailing, strict=True):
-            label, _, minimum = token.partition(">=")
-            if token.isdigit():
-                if size != int(token):
-                    raise ValueError(f"{name}: wanted shape {_words(shape_spec)}, got {tuple(tensor.shape)}")
+        shape, tokens = tensor.shape, spec.dimensions
+        if len(shape) < len(tokens):
+            raise ValueError(f"{name}: wanted shape {_words(spec.shape)}, got {tuple(shape)}")
+        ahead = len(shape) - len(tokens)
+        for (label, least, exact), size in zip(tokens, shape[ahead:], strict=True):
+            if exact is not None:
+                if size != exact:
+                    raise ValueError(f"{name}: wanted shape {_words(spec.shape)}, got {tuple(shape)}")
                 continue
-            if minimum and size < int(minimum):
-                raise ValueError(f"{name}: wanted {label} >= {minimum} in {_words(shape_spec)}, got {tuple(tensor.shape)}")
-            if label in sizes and sizes[label][0] != size:
-                known, owner = sizes[label]
-                raise ValueError(f"{name}: wanted {label} = {known} as {owner} has, got shape {tuple(tensor.shape)}")
-            sizes.setdefault(label, (size, name))
-        batches[name] = tensor.shape[: tensor.ndim - len(tokens)]
+            if size < least:
+                raise ValueError(f"{name}: wanted {label} >= {least} in {_words(spec.shape)}, got {tuple(shape)}")
+            known, owner = sizes.setdefault(label, (size, name))
+            if known != size:
+                raise ValueError(f"{name}: wanted {label} = {known} as {owner} has, got shape {tuple(shape)}")
+        batches[name] = shape[:ahead]
     return batches
+
+
+class _Spec(NamedTuple):
+    """What a tensor may be."""
+
+    optional: bool
+    shape: str
+    kind: str
+    dimensions: tuple[tuple[str, int, int | None], ...]
+    """Of each its name, its least number, and the number where that is exact."""
+
+
+@cache
+def _spec(words: str) -> _Spec:
+    """What is meant by `?v>=2 n 3 : bool`, say."""
+    shape, _, kind = (part.strip() for part in words.removeprefix("?").partition(":"))
+    dimensions = []
+    for token in shape.split():
+        label, _, least = token.partition(">=")
+        dimensions.append((label, int(least or 0), int(token) if token.isdigit() else None))
+    return _Spec(words.startswith("?"), shape, kind, tuple(dimensions))
 
 
 def check_index(**indices: tuple[Tensor, int]) -> None:
