@@ -79,3 +79,24 @@ def test_dense_problems(generator: torch.Generator, monkeypatch: pytest.MonkeyPa
     singly, many = found()
     assert few < 0.6 * many
     torch.testing.assert_close(together, singly, rtol=1e-6, atol=1e-6)
+
+
+def test_data_of_which_each_number_is_hardly_used(
+    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch, sweeps: list[bool]
+) -> None:
+    """As covariances: the work of a Hessian goes by the residuals."""
+    kind = {"generator": generator, "dtype": F64}
+    A, x, covariance = torch.randn(5, 30, 3, **kind), torch.randn(5, 3, **kind), torch.ones(5, 1 << 15, dtype=F64)
+
+    def residual(x: Tensor, A: Tensor, covariance: Tensor) -> Tensor:
+        return (covariance[..., :1] * (A @ x[..., None])[..., 0].sin())[..., None]
+
+    problem = dense.dense_problem(residual, torch.add, 3, None, None, x, (A, covariance), None, (30, 1))
+    here, hessians, numbers = problem.linearize(x), [], []
+    for most in (dense.FEW_BENT, -1):
+        monkeypatch.setattr(dense, "FEW_BENT", most)
+        before = len(sweeps)
+        hessians.append(problem.curve(here, torch.ones(5, dtype=torch.bool)).hessian)
+        numbers.append(len(sweeps) - before)
+    assert numbers == [2, 4]
+    torch.testing.assert_close(*hessians, rtol=1e-12, atol=1e-12)
