@@ -1,12 +1,17 @@
 """Photographs that were cropped: principal points are found where the images say that they are not in the middle."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
 from torchsfm.reconstruction import SfmResult, growth, reconstruct_tracks
+from torchsfm.reconstruction.cropped import may_be_off_centre
 from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.incremental import MappingOptions
+from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 from torchsfm.simulation import look_at, random_points, simulate_images
 
@@ -75,6 +80,22 @@ def test_crops_of_a_plane_are_doubtful(generator: torch.Generator) -> None:
     result, _, _ = photographs(generator, torch.tensor([1200.0]).double(), share=0.2, relief=0.05)
     assert result.report.calibrations[0].cropped
     assert all("one plane" in image.doubt for image in result.report.images)
+
+
+def test_photographs_of_one_size_are_not_taken_for_crops(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a zoom lens, a bent structure moves principal points, and freeing them bends it more."""
+    asked: list[tuple[Mapping, MappingOptions]] = []
+
+    def remember(model: Mapping, options: MappingOptions) -> bool:
+        asked.append((model, options))
+        return may_be_off_centre(model, options)
+
+    monkeypatch.setattr(growth, "may_be_off_centre", remember)
+    photographs(generator, torch.tensor([1200.0]).double(), share=0.2)
+    model, options = asked[0]
+    assert may_be_off_centre(model, options)
+    same = replace(model.graph, image_size=model.graph.image_size[:1].expand_as(model.graph.image_size))
+    assert not may_be_off_centre(replace(model, graph=same), options)
 
 
 def test_whole_photographs_are_not_made_anew(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

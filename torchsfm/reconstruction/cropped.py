@@ -42,6 +42,8 @@ ENOUGH: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
 def may_be_off_centre(model: Mapping, options: MappingOptions) -> bool:
     """Whether the principal points of cameras that took one image each seem not to be where those of whole images are.
 
+    Of images of one size, which no one cuts out by hand, each by a lens of its own zoom, a bent structure looks so, too.
+
     Args:
         model: A finished model, whose principal points were expected in the middle.
         options: How it was made.
@@ -50,6 +52,8 @@ def may_be_off_centre(model: Mapping, options: MappingOptions) -> bool:
     adjusted = {} if model.adjustment is None else model.adjustment.free
     believed = adjusted.get("principal_point", torch.zeros_like(images, dtype=torch.bool))
     if "principal_point" not in options.free or int(images.sum()) < MIN_IMAGES or bool(((images != 1) | believed).all()):
+        return False
+    if len(torch.unique(model.graph.image_size[model.registered & (images == 1)[model.camera_index]], dim=0)) == 1:
         return False
     gain, excess = _gain_off_centre(model, options)
     # A wrong model has errors of all kinds: where they alone leave it open, a better one will tell.
