@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--losses", nargs="+", default=["squares", "cauchy"], choices=[*LOSSES])
     parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--solver", default="auto", choices=["auto", "dense", "pcg"])
+    parser.add_argument("--solver", default="auto", choices=["auto", "dense", "sparse", "pcg"])
     parser.add_argument("--no-derivatives", dest="derivatives", action="store_false")
     parser.add_argument("--no-real", dest="real", action="store_false")
     parser.add_argument("--each", action="store_true", help="print every problem too")

@@ -322,7 +322,7 @@ def test_wrong_curves(generator: torch.Generator) -> None:
         bundle_adjust(scene.problem, structure=[dataclasses.replace(curves, view=curves.view + 1)])
 
 
-@pytest.mark.parametrize("solver", ["dense", "pcg"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
 @pytest.mark.parametrize("turns", [False, True])
 def test_noise_does_not_carry_the_world_away(generator: torch.Generator, turns: bool, solver: str) -> None:
     """Samples cannot follow the world, so that their residuals say a little of where it is, by noise alone."""

@@ -144,7 +144,7 @@ def engine(blocks: dict[str, Block], terms: list[Term], eliminate: str | None) -
     group = torch.distributed.group.WORLD if torch.distributed.is_initialized() else None
     options: Any = {"eliminate": eliminate, "function_tolerance": 1e-9, "group": group}
     answers: list[Any] = []
-    for solver in ("dense", "pcg"):
+    for solver in ("dense", "sparse", "pcg"):
         result = sparse_levenberg_marquardt(blocks, terms, linear_solver=solver, **options)
         answers.append((result.cost, result.status, result.used, (*result.x.values(), *result.residuals)))
     d = terms[0].data[0].clone().requires_grad_()

@@ -82,7 +82,7 @@ def test_motions_from_pose_to_pose_bend_no_more_than_they_are_sure(scene: Scene,
         error = (found[pairs[:, 1]] @ found[pairs[:, 0]].inverse()) @ motions.inverse()
         return float(rotation_angle(error.R).max()), float(error.t.norm(dim=-1).max())
 
-    for solver in ("dense", "pcg"):
+    for solver in ("dense", "sparse", "pcg"):
         prior = RelativePosePrior(pairs, motions, turned)
         found = bundle_adjust(problem, free=(), priors=[prior], tolerance=1e-12, max_iterations=100, linear_solver=solver)
         # Where images know to a thousandth, motions are believed; translations, of which nothing is said, follow the images.

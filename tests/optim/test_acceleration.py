@@ -13,7 +13,7 @@ from torchsfm.optim import Block, Term, sparse_levenberg_marquardt
 engine = importlib.import_module("torchsfm.optim.sparse_levenberg_marquardt")
 
 
-@pytest.mark.parametrize("solver", ["dense", "pcg"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
 def test_steps_follow_rosenbrocks_valley(solver: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def steps() -> int:
         def residual(p: Tensor) -> Tensor:

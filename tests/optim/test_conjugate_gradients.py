@@ -105,7 +105,7 @@ def test_wrong_solver(chain: tuple[dict[str, Block], list[Term]], unchecked: Non
         sparse_levenberg_marquardt(*chain, linear_solver="qr")
 
 
-@pytest.mark.parametrize("solver", ["dense", "pcg"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
 def test_steps_have_no_part_along_motions_at_rest(chain: tuple[dict[str, Block], list[Term]], solver: schur.Solver) -> None:
     blocks, terms = chain
     road = torch.tensor([1.0, 0.0], dtype=F64)

@@ -39,7 +39,7 @@ def problem(generator: torch.Generator) -> Problem:
     return make(generator)
 
 
-@pytest.fixture(params=["dense", "pcg"])
+@pytest.fixture(params=["dense", "sparse", "pcg"])
 def solver(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

@@ -318,7 +318,7 @@ def test_layout_drops_what_cannot_move(scene: Scene) -> None:
     assert sum(p.slots.numel() for p in found.pieces) == int(((scene.view == 2) | (scene.seen < 10)).sum())
 
 
-@pytest.mark.parametrize("solver", ["dense", "pcg"])
+@pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
 def test_two_families_are_eliminated_as_one_is(generator: torch.Generator, solver: schur.Solver) -> None:
     """Stations see marks of the plane and walls of one number: which of them are eliminated changes nothing but the work."""
     stations, marks, walls = 5, 60, 70

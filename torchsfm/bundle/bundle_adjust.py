@@ -101,7 +101,8 @@ def bundle_adjust(
         tolerance: End when a step lowers the cost by less than this fraction.
         initial_damping: Of the first step, relative to the diagonal of the normal equations. Less saves steps where cameras
             are about where they should be already: it is the last to let long rows of cameras bend.
-        linear_solver: "dense", "pcg" (for thousands of cameras), or "auto"; see `sparse_levenberg_marquardt`.
+        linear_solver: "dense", "sparse" (for films and streets), "pcg" (for thousands of cameras of one place), or "auto"; see
+            `sparse_levenberg_marquardt`.
         hessian: Used for derivatives only: "exact", or "gauss-newton", cheaper and some percent off where residuals are large.
         progress: Called with the number of steps and the cost after each; False, or an interrupt, ends it with the best so far.
         group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same problem and share

@@ -79,6 +79,18 @@ class Layout:
         """Where everything is."""
         return next(iter(self.free.values())).device
 
+    def owners(self) -> Tensor:
+        """The number of the retained variable that each column belongs to; one more for the columns at the end."""
+        ends = [*list(self.first.values())[1:], self.size]
+        owner = torch.empty(self.size + 2, dtype=torch.int64, device=self.device)
+        count = 0
+        for (name, start), end in zip(self.first.items(), ends, strict=True):
+            number = self.free[name].numel()
+            owner[start:end] = count + torch.arange(number, device=self.device).repeat_interleave((end - start) // number)
+            count += number
+        owner[self.size :] = count
+        return owner
+
 
 def lay_out(
     blocks: dict[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None, ranks: Ranks | None = None

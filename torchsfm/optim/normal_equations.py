@@ -12,6 +12,7 @@ from torch import Tensor
 from torchsfm.linalg import eigh
 from torchsfm.linalg.semidefinite import PseudoInverse, pseudo_inverse
 from torchsfm.optim.batched_cholesky import FLAT, Triangle, backward, diagonal, factor, floor, forward, measure, place, product
+from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.layout import Family, Layout
 from torchsfm.optim.problem import Step
 from torchsfm.optim.retained_blocks import RetainedBlocks
@@ -72,6 +73,8 @@ class NormalEquations:
     squares: RetainedBlocks
     plan: Plan | None
     """How to precondition where the reduced system is not formed."""
+    fronts: Fronts | None
+    """Where it is formed, and is not dense."""
     diagonal: Tensor
     """Of the Gauss-Newton U."""
     slope: Tensor
@@ -124,6 +127,8 @@ class NormalEquations:
             return kept, kept.isfinite().all() & (positive or not self.curved), False
         if not size:
             return weight, torch.ones_like(weight, dtype=torch.bool).all(), False
+        if self.fronts is not None:
+            return self._by_fronts(self.fronts, weight, triangles, right)
         S = self.squares.dense()
         for part, L, z in zip(self.eliminated, triangles, right, strict=True):
             part.reduce(S, L, z)
@@ -136,6 +141,19 @@ class NormalEquations:
         half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
         kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
         return kept, (info == 0) & kept.isfinite().all(), False
+
+    def _by_fronts(
+        self, fronts: Fronts, weight: Tensor, triangles: list[Triangle], right: list[Tensor]
+    ) -> tuple[Tensor, Tensor, bool]:
+        """The same where the system is formed front by front."""
+        S = self.squares.filled(fronts)
+        for part, L, z in zip(self.eliminated, triangles, right, strict=True):
+            part.reduce(S, L, z)
+        S = self.layout.ranks.sum(S)
+        kept = fronts.solve(S, weight, -fronts.gradient(S), self._resting)
+        if kept is None:
+            return weight, torch.zeros_like(weight, dtype=torch.bool).any(), False
+        return kept, kept.isfinite().all(), False
 
     def _hold(self, S: Tensor) -> None:
         """Make the reduced system stiff, in place, along motions of which no step has a part."""

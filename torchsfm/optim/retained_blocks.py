@@ -7,6 +7,7 @@ the sum of the squares, each put in its place.
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -79,9 +80,13 @@ class RetainedBlocks:
 
     def dense(self) -> Tensor:
         """The matrix (size + 2, size + 2): row and column `size` are the gradient, the last ones belong to fixed variables."""
-        S = self._nothing.new_zeros((self.size + 2, self.size + 2))
+        return self.filled(DenseMatrix(self.size))
+
+    def filled(self, matrix: "Matrix") -> Tensor:
+        """The numbers of a matrix of some form."""
+        S = matrix.zeros(self._nothing)
         for columns, values in zip(self.columns, self.values, strict=True):
-            add_squares(S, columns, values)
+            add_squares(S, matrix, columns, values)
         return S
 
     def diagonal(self) -> Tensor:
@@ -104,7 +109,39 @@ class RetainedBlocks:
         return out[: self.size]
 
 
-def add_squares(S: Tensor, columns: Tensor, values: Tensor, scale: float = 1.0) -> None:
-    """Add squares `values (slots, c, c)` to S where `columns (slots, c)` say."""
-    places = columns[:, :, None] * S.shape[1] + columns[:, None]
-    S.view(-1).index_add_(0, places.flatten(), values.flatten(), alpha=scale)
+@runtime_checkable
+class Matrix(Protocol):
+    """Where the entries of a symmetric matrix are, with a column for the gradient and one for what belongs to nobody."""
+
+    def zeros(self, some: Tensor) -> Tensor:
+        """The numbers of the matrix."""
+
+    def places(self, row: Tensor, column: Tensor) -> Tensor:
+        """Where entries of either triangle are among the numbers."""
+
+    def squares(self, columns: Tensor) -> Tensor:
+        """Where squares over columns (n, c) are, (n, c, c), both triangles of each."""
+
+
+class DenseMatrix:
+    """All entries, (size + 2, size + 2); of both triangles where squares are added, else of the lower one."""
+
+    def __init__(self, size: int) -> None:
+        self._wide = size + 2
+
+    def zeros(self, some: Tensor) -> Tensor:
+        """The matrix."""
+        return some.new_zeros((self._wide, self._wide))
+
+    def places(self, row: Tensor, column: Tensor) -> Tensor:
+        """Where entries of either triangle are in the lower one."""
+        return torch.maximum(row, column) * self._wide + torch.minimum(row, column)
+
+    def squares(self, columns: Tensor) -> Tensor:
+        """Where squares over columns (n, c) are, (n, c, c)."""
+        return columns[:, :, None] * self._wide + columns[:, None]
+
+
+def add_squares(S: Tensor, matrix: Matrix, columns: Tensor, values: Tensor, scale: float = 1.0) -> None:
+    """Add squares `values (slots, c, c)` to the numbers S of a matrix where `columns (slots, c)` say."""
+    S.view(-1).index_add_(0, matrix.squares(columns).flatten(), values.flatten(), alpha=scale)

@@ -11,6 +11,7 @@ Work comes in three tiers: once per problem (`layout`: who meets whom), once per
 per damping (`NormalEquations.step`), so that a rejected step costs only the last.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -21,6 +22,8 @@ from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import FLAT, hold, place
 from torchsfm.optim.curvature import curvature
+from torchsfm.optim.elimination_order import order_elimination
+from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.multigrid import PairGraph
 from torchsfm.optim.normal_equations import Eliminated, NormalEquations
@@ -29,6 +32,7 @@ from torchsfm.optim.schur_grouped import GroupCoupling, plan_groups
 from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, find_clusters
 from torchsfm.optim.schur_pairwise import PairCoupling, estimate_pairs
 from torchsfm.optim.settling import Seen, Settling, add_squares
+from torchsfm.optim.sparsity import partners
 from torchsfm.optim.terms import (
     Block,
     Term,
@@ -50,8 +54,10 @@ ALONG = 0.1
 """Part of a step by which residuals are moved both ways for their second derivative along it."""
 BENT = 1e-3
 """Eliminated variables are held along directions in which they have no more than this part of the Gauss-Newton curvature."""
-Solver = Literal["auto", "dense", "pcg"]
-"""How the reduced system is solved: by a dense Cholesky factor, or by conjugate gradients without forming it."""
+WORTH = 0.1
+"""Seconds for which it is not worth asking what else would do."""
+Solver = Literal["auto", "dense", "sparse", "pcg"]
+"""How the reduced system is solved: by a dense or a sparse Cholesky factor, or by conjugate gradients without forming it."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +82,15 @@ class _Part:
 class Elimination:
     """Normal equations of a laid-out problem, linearised at one place at a time."""
 
-    def __init__(self, blocks: dict[str, Block], layout: Layout, solver: Solver = "auto", *, spread: bool = False) -> None:
+    def __init__(
+        self,
+        blocks: dict[str, Block],
+        layout: Layout,
+        solver: Solver = "auto",
+        *,
+        spread: bool = False,
+        like: "Elimination | None" = None,
+    ) -> None:
         """Plan what is done once per problem.
 
         Args:
@@ -84,6 +98,7 @@ class Elimination:
             layout: Who meets whom.
             solver: How the reduced system is solved.
             spread: Whether covariances of eliminated variables will be asked for.
+            like: Another one of the same problem, whose plans will do.
         """
         self.blocks = blocks
         self.layout = layout
@@ -104,7 +119,8 @@ class Elimination:
         """What the memory holds."""
         self._second: Elimination | None = None
         self.ranks = layout.ranks
-        iterative = solver == "pcg" or (solver == "auto" and too_large(layout))
+        self.fronts: Fronts | None = plan_fronts(layout, solver) if like is None else like.fronts
+        iterative = solver == "pcg" or (solver == "auto" and self.fronts is None and too_large(layout))
         for family in layout.families:
             V = some.new_empty((family.point_size * (family.point_size + 3) // 2, family.points))
             coupling: GroupCoupling | PairCoupling | RowCoupling | None = None
@@ -112,6 +128,8 @@ class Elimination:
                 pass
             elif iterative:
                 coupling = RowCoupling(family, some)
+            elif self.fronts is not None:
+                coupling = PairCoupling(family, some, self.fronts)
             else:
                 spans, seconds = plan_groups(family)
                 grouped = spread or seconds <= estimate_pairs(family)
@@ -159,7 +177,7 @@ class Elimination:
     def _other(self) -> "Elimination":
         """Memory for a second system."""
         if self._second is None:
-            self._second = Elimination(self.blocks, self.layout, "dense" if self.plan is None else "pcg")
+            self._second = Elimination(self.blocks, self.layout, "dense" if self.plan is None else "pcg", like=self)
         return self._second
 
     def _clear(self) -> None:
@@ -206,7 +224,7 @@ class Elimination:
             self._add(part, x, lifts, ends)
         diagonal, slope = self.ranks.sum(torch.stack((self.squares.diagonal(), self.squares.gradient())))
         self.current = NormalEquations(
-            self.layout, self.eliminated, self.squares, self.plan, diagonal, slope, rest=self._rest(x)
+            self.layout, self.eliminated, self.squares, self.plan, self.fronts, diagonal, slope, rest=self._rest(x)
         )
         return self.current
 
@@ -281,8 +299,33 @@ def _bending(term: Term, x: dict[str, Tensor], ends: Sequence[dict[str, Tensor]]
 
 def too_large(layout: Layout) -> bool:
     """Whether a dense reduced system takes too much memory or time."""
+    return layout.size > LARGEST or layout.size**3 * FLOP > _iterations(layout)
+
+
+def _iterations(layout: Layout) -> float:
+    """Seconds of a solution by conjugate gradients."""
     rows = torch.tensor(sum(piece.slots.numel() for piece in layout.pieces), device=layout.device)
-    return layout.size > LARGEST or layout.size**3 * FLOP > int(layout.ranks.sum(rows)) * PASS
+    return int(layout.ranks.sum(rows)) * PASS
+
+
+def plan_fronts(layout: Layout, solver: Solver) -> Fronts | None:
+    """How to factor the reduced system as a sparse one; None where something else will do as well."""
+    if not layout.size or solver not in ("auto", "sparse"):
+        return None
+    limit = math.inf
+    if solver == "auto":
+        limit = _iterations(layout)
+        if layout.size <= LARGEST:
+            limit = min(limit, layout.size**3 * FLOP)
+        forming = layout.ranks.largest(torch.tensor(sum(map(estimate_pairs, layout.families)), device=layout.device))
+        limit -= float(forming)
+        if limit < WORTH or PairGraph.of(layout) is not None:
+            return None
+    partner, columns = partners(layout)
+    found = order_elimination(partner, [len(c) for c in columns], limit)
+    if found is None or sum(front.seconds for front in found) > limit:
+        return None
+    return Fronts(found, columns)
 
 
 def _parts(number: int, piece: Piece, x: dict[str, Tensor], families: dict[str, int]) -> list[_Part]:

@@ -160,7 +160,7 @@ class Plan(Protocol):
 def find_clusters(layout: Layout, couplings: Sequence[RowCoupling]) -> Clusters:
     """Put variables that occur in the same slots together, on whichever rank."""
     device = layout.device
-    owner = _owners(layout, device)
+    owner = layout.owners()
     variables = int(owner[-1])
     generator = torch.Generator().manual_seed(0)
     mark = torch.randint(2**62, (variables + 1,), generator=generator, device="cpu").to(device)
@@ -186,19 +186,6 @@ def find_clusters(layout: Layout, couplings: Sequence[RowCoupling]) -> Clusters:
     alone = torch.ones_like(mark, dtype=torch.bool).index_fill_(0, owners, False)
     _, cluster = torch.unique(torch.where(alone, mark, signature)[:variables], return_inverse=True)
     return _lay_blocks(layout, couplings, cluster[owner[: layout.size]])
-
-
-def _owners(layout: Layout, device: torch.device) -> Tensor:
-    """The number of the variable that each column belongs to; one more for the columns at the end."""
-    ends = [*list(layout.first.values())[1:], layout.size]
-    owner = torch.empty(layout.size + 2, dtype=torch.int64, device=device)
-    count = 0
-    for (name, start), end in zip(layout.first.items(), ends, strict=True):
-        number = layout.free[name].numel()
-        owner[start:end] = count + torch.arange(number, device=device).repeat_interleave((end - start) // number)
-        count += number
-    owner[layout.size :] = count
-    return owner
 
 
 def _lay_blocks(layout: Layout, couplings: Sequence[RowCoupling], cluster: Tensor) -> Clusters:

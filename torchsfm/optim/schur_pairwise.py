@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import Triangle
 from torchsfm.optim.layout import Family
-from torchsfm.optim.retained_blocks import add_squares, find_runs
+from torchsfm.optim.retained_blocks import DenseMatrix, Matrix, add_squares, find_runs
 from torchsfm.optim.schur_matrix_free import RowCoupling
 from torchsfm.optim.terms import Workspace
 
@@ -25,12 +25,13 @@ BATCH = 4096
 class PairCoupling:
     """`W` as a matrix for each residual, and the plan of all pairs."""
 
-    def __init__(self, family: Family, some: Tensor) -> None:
+    def __init__(self, family: Family, some: Tensor, matrix: Matrix | None = None) -> None:
+        self._matrix = matrix or DenseMatrix(family.size)
         self._rows = RowCoupling(family, some)
         same = (self._rows.columns == self._rows.columns[:1]).all(0)
         self._common, self._own = same.nonzero()[:, 0], (~same).nonzero()[:, 0]
         self._slots = find_runs(self._rows.slots).ends
-        self._plan(self._rows.slots, self._rows.columns.shape[0], family.size + 2)
+        self._plan(self._rows.slots, self._rows.columns.shape[0])
         # One row of zeros more, for padding.
         self._Y = some.new_zeros((self._rows.slots.numel() + 1, self._rows.q, self._rows.width))
         self._work = Workspace(some)
@@ -51,8 +52,8 @@ class PairCoupling:
         """`W point`."""
         return self._rows.lift(point)
 
-    def _plan(self, slots: Tensor, count: int, wide: int) -> None:
-        left, right = _pairs(self._rows.point, slots, count)
+    def _plan(self, slots: Tensor, count: int) -> None:
+        left, right = pairs_of_points(self._rows.point, slots, count)
         key, sort = torch.sort(slots[left] * count + slots[right])
         blocks, sizes = torch.unique_consecutive(key, return_counts=True)
         mean = left.numel() / max(blocks.numel(), 1)
@@ -69,17 +70,17 @@ class PairCoupling:
         columns = self._rows.columns[:, self._own]
         row = columns[torch.div(blocks, max(count, 1), rounding_mode="floor")][:, :, None]
         column = columns[blocks % max(count, 1)][:, None]
-        self._places = (torch.maximum(row, column) * wide + torch.minimum(row, column)).flatten()
+        self._places = self._matrix.places(row, column).flatten()
         self._twice = (row == column).flatten().nonzero()[:, 0]
 
     def reduce(self, S: Tensor, L: Triangle, z: Tensor) -> None:
-        """Subtract `W V^-1 W'` from the lower triangle of S, with `V = L L'`, and `W L'^-1 z` from its column `size`."""
+        """Subtract `W V^-1 W'` from the numbers S of the matrix, with `V = L L'`, and `W L'^-1 z` from its column `size`."""
         q, c = self._rows.q, len(self._own)
         squares = self._rows.squares(L, z, self._Y[:-1])
         if len(self._common):
             self._add_common(squares)
         columns = torch.nn.functional.pad(self._rows.columns, (0, 1), value=self._rows.size)
-        add_squares(S, columns, squares, -1.0)
+        add_squares(S, self._matrix, columns, squares, -1.0)
         if not c:
             return
         flat = (self._Y[:, :, self._own] if len(self._common) else self._Y).view(-1, q * c)
@@ -108,7 +109,7 @@ class PairCoupling:
         squares[:, common[:, None], own] += met[:, own].mT
 
 
-def _pairs(point: Tensor, slots: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def pairs_of_points(point: Tensor, slots: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """All pairs of residuals of one point, the one with the earlier slot on the left."""
     point, order = torch.sort(point, stable=True)
     at = torch.arange(order.numel(), device=order.device)

@@ -85,12 +85,12 @@ def examine(
     outvoted = agreement.balance(v) < 0
     hinged = outvoted_groups(agreement, mapping.registered)
     conflicts = conflicts or missing_correspondences(mapping)
-    refuted = conflicts.refuted
+    refuted, folded = conflicts.refuted, conflicts.folded
     guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL
     degrees = torch.atan(position).rad2deg()
 
     def doubt(i: int) -> str:
-        if conflicts.folded:
+        if folded:
             own = (refuted == i).any(1)
             first, second = (mapping.graph.names[k] for k in refuted[int(own.long().argmax())].tolist())
             return f"things that look alike may be taken for one: {first} and {second} each miss what the other sees"

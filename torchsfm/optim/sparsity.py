@@ -1,0 +1,76 @@
+"""Which retained variables the reduced system brings together: those of one residual, and of two of one eliminated variable."""
+
+import torch
+from torch import Tensor
+
+from torchsfm.optim.elimination_order import members
+from torchsfm.optim.layout import Layout
+from torchsfm.optim.schur_pairwise import pairs_of_points
+
+
+def partners(layout: Layout) -> tuple[list[int], list[Tensor]]:
+    """The partners of each variable as bits, and its columns; variables of the same partners that meet are one."""
+    owner = layout.owners()
+    count = int(owner[-1])
+    # The first column of each variable stands for it.
+    head = torch.ones_like(owner, dtype=torch.bool)
+    head[1:] = owner[1:] != owner[:-1]
+    keys = [owner[:0]]
+    for piece in layout.pieces:
+        keys.append(_met(variables := _variables(piece.columns, owner, head, count), variables, count))
+    for family in layout.families:
+        coupled = [piece for piece in family.pieces if piece.coupled and piece.point is not None]
+        if not coupled:
+            continue
+        found = [_variables(piece.columns, owner, head, count) for piece in coupled]
+        wide = max(v.shape[1] for v in found)
+        of_slot = torch.cat([torch.nn.functional.pad(v, (0, wide - v.shape[1]), value=count) for v in found])
+        starts = [0]
+        for v in found:
+            starts.append(starts[-1] + len(v))
+        slots = torch.cat([piece.slots + start for piece, start in zip(coupled, starts, strict=False)])
+        points = torch.cat([piece.point for piece in coupled if piece.point is not None])
+        left, right = pairs_of_points(points, slots, len(of_slot))
+        both = torch.unique(slots[left] * len(of_slot) + slots[right])
+        first, second = torch.div(both, len(of_slot), rounding_mode="floor"), both % len(of_slot)
+        keys.append(_met(of_slot[first], of_slot[second], count))
+    keys = torch.unique(layout.ranks.gather(torch.unique(torch.cat(keys))))
+    masks = [0] * count
+    for i, j in zip(torch.div(keys, count, rounding_mode="floor").tolist(), (keys % count).tolist(), strict=True):
+        masks[i] |= 1 << j
+        masks[j] |= 1 << i
+    return _merged(masks, owner[: layout.size])
+
+
+def _variables(columns: Tensor, owner: Tensor, head: Tensor, count: int) -> Tensor:
+    """The variables of each slot, (slots, k), `count` for none."""
+    heads = head[columns] & (owner[columns] < count)
+    used = heads.any(0)
+    return torch.where(heads, owner[columns], count)[:, used]
+
+
+def _met(a: Tensor, b: Tensor, count: int) -> Tensor:
+    """Each pair of a variable of a with one of b, of the same row, once: as numbers."""
+    a, b = a[:, :, None], b[:, None]
+    key: Tensor = torch.unique((torch.minimum(a, b) * count + torch.maximum(a, b))[(a < count) & (b < count) & (a != b)])
+    return key
+
+
+def _merged(masks: list[int], owner: Tensor) -> tuple[list[int], list[Tensor]]:
+    """Variables that have the same partners besides each other, as one."""
+    number, of_variable = dict[int, int](), list[int]()
+    for i, mask in enumerate(masks):
+        of_variable.append(number.setdefault(mask | 1 << i, len(number)))
+    kept = dict[int, int]()
+    for i, k in enumerate(of_variable):
+        kept.setdefault(k, i)
+    alone = 0
+    for i in kept.values():
+        alone |= 1 << i
+    found = []
+    renumber = {i: k for k, i in kept.items()}
+    for i in kept.values():
+        found.append(sum(1 << renumber[j] for j in members(masks[i] & alone)))
+    variable = torch.tensor(of_variable, device=owner.device)[owner]
+    order = torch.argsort(variable, stable=True)
+    return found, list(torch.split(order, torch.bincount(variable, minlength=len(number)).tolist()))
