@@ -7,7 +7,19 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.optim import Block, Cauchy, Huber, Term, elimination_order, layout, schur, sparse_levenberg_marquardt
+from torchsfm.optim import (
+    Block,
+    Cauchy,
+    Huber,
+    Term,
+    covariance,
+    elimination_order,
+    layout,
+    marginal_covariance,
+    schur,
+    sparse_covariance,
+    sparse_levenberg_marquardt,
+)
 from torchsfm.optim.elimination_order import members, order_elimination
 from torchsfm.optim.fronts import Fronts
 
@@ -211,10 +223,10 @@ def test_single_precision(generator: torch.Generator) -> None:
 
 def test_auto_takes_it_for_what_is_long(generator: torch.Generator) -> None:
     """Not for what is small, and not where all have to do with all."""
-    for stations, taken in ((60, False), (2500, True)):
+    for stations, wanted in ((60, False), (2500, True)):
         blocks, terms = road(stations, generator)
         found = layout.lay_out(blocks, terms, ("mark", "sign"))
-        assert (schur.plan_fronts(found, "auto") is not None) == taken
+        assert (schur.plan_fronts(found, "auto") is not None) == wanted
     j = torch.arange(20_000).repeat_interleave(3)
     i = torch.randint(2500, (len(j),), generator=generator)
     term = Term(lambda s, m, d: m - s - d, ("station", "mark"), (i, j), (torch.zeros(len(j), 2, dtype=F64),))
@@ -244,3 +256,85 @@ def test_derivatives_are_the_dense_ones(generator: torch.Generator) -> None:
         found.x["station"].square().sum().backward()
         grads.append(d.grad)
     torch.testing.assert_close(*grads, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+@pytest.mark.usefixtures("many_fronts")
+def test_entries_of_the_inverse_and_the_last_front(name: str, generator: torch.Generator) -> None:
+    count, edges = GRAPHS[name]
+    partners, last = graph(count, edges), 1 << count // 2 | 1
+    for i in members(last):
+        partners[i] |= last & ~(1 << i)
+    columns = list(torch.arange(2 * count).split(2))
+    found = order_elimination(partners, [2] * count, 1.0, last)
+    assert found is not None
+    assert sum(1 << i for i in found[-1].pivots) == last
+    fronts = Fronts(found, columns)
+    A = torch.zeros(2 * count, 2 * count, dtype=F64)
+    for i in range(count):
+        for j in (i, *members(partners[i])):
+            A[columns[i][:, None], columns[j]] = torch.randn(2, 2, generator=generator, dtype=F64)
+    A = A + A.mT + torch.diag(2 * A.abs().sum(0) + 2 * A.abs().sum(1) + 1)
+    row, column = A.nonzero().unbind(1)
+    numbers = fronts.zeros(A)
+    numbers[fronts.places(row, column)] = A[row, column]
+    weight = torch.rand(2 * count, generator=generator, dtype=F64)
+    inverse, factor, left = torch.linalg.inv(A + weight.diag()), fronts.factor(numbers, weight), fronts.last(numbers, weight)
+    assert factor is not None
+    assert left is not None
+    torch.testing.assert_close(factor.inverse()[fronts.places(row, column)], inverse[row, column])
+    own = fronts.fronts[-1].pivots
+    torch.testing.assert_close(torch.linalg.inv(left), inverse[own[:, None], own])
+
+
+def taken(monkeypatch: pytest.MonkeyPatch, worth: float) -> None:
+    monkeypatch.setattr(schur, "WORTH", worth)
+    monkeypatch.setattr(schur, "FLOP", 1.0)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("gauge", [False, True])
+@pytest.mark.usefixtures("many_fronts")
+def test_covariances_are_the_dense_ones(
+    closed: bool, gauge: bool, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks, terms = road(300, generator, closed=closed, off=1e-3)
+    if gauge:
+        blocks = {name: dataclasses.replace(b, fixed=None) for name, b in blocks.items()}
+    eliminate = ("mark", "sign")
+    dense = sparse_covariance(blocks, terms, eliminate=eliminate, of_eliminated=False)
+    of_scale, of_station = (marginal_covariance(blocks, terms, name, eliminate=eliminate) for name in ("scale", "station"))
+    taken(monkeypatch, 0.0)
+    planned = []
+    monkeypatch.setattr(covariance, "plan_fronts", lambda *a, **k: planned.append(schur.plan_fronts(*a, **k)) or planned[-1])
+    sparse = sparse_covariance(blocks, terms, eliminate=eliminate, of_eliminated=False, joint=False)
+    torch.testing.assert_close(marginal_covariance(blocks, terms, "scale", eliminate=eliminate), of_scale, rtol=1e-6, atol=0)
+    if not gauge:
+        found = marginal_covariance(blocks, terms, "station", eliminate=eliminate)
+        torch.testing.assert_close(found, of_station, rtol=1e-6, atol=1e-12)
+    assert all(isinstance(fronts, Fronts) for fronts in planned)
+    assert sparse.joint.numel() == 0
+    assert dense.joint.numel()
+    assert (sparse.nullity, sparse.redundancy, sparse.square_sum) == (dense.nullity, dense.redundancy, dense.square_sum)
+    assert dense.nullity == 2 * gauge
+    for name in ("station", "scale"):
+        torch.testing.assert_close(sparse.blocks[name], dense.blocks[name], rtol=1e-5, atol=1e-10)
+        assert torch.equal(sparse.determined[name], dense.determined[name])
+    assert all(torch.equal(sparse.determined[name], dense.determined[name]) for name in eliminate)
+
+
+@pytest.mark.usefixtures("many_fronts")
+def test_covariances_of_two_parts_are_left_to_the_dense_factor(
+    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One front cannot hold both."""
+    blocks, terms = road(300, generator, off=1e-3)
+    blocks = {name: dataclasses.replace(b, fixed=None) for name, b in blocks.items()}
+    blocks["scale"] = dataclasses.replace(blocks["scale"], fixed=torch.ones(3, dtype=torch.bool))
+    half = [term.select(((term.index[0] < 148) == (term.index[-1] < 745)).nonzero()[:, 0]) for term in terms[:2]]
+    half = [t.select(((t.index[0] - 150).abs() > 3).nonzero()[:, 0]) for t in half]
+    dense = sparse_covariance(blocks, half, eliminate=("mark", "sign"), of_eliminated=False)
+    taken(monkeypatch, 0.0)
+    sparse = sparse_covariance(blocks, half, eliminate=("mark", "sign"), of_eliminated=False, joint=False)
+    assert sparse.nullity == dense.nullity
+    torch.testing.assert_close(sparse.blocks["station"], dense.blocks["station"], rtol=1e-5, atol=1e-10)

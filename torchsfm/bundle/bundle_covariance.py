@@ -51,7 +51,12 @@ class BundleCovariance:
 
 
 def bundle_covariance(
-    problem: BundleProblem, *, sigma: float | None = None, points: bool = True, **terms: Unpack[BundleTerms]
+    problem: BundleProblem,
+    *,
+    sigma: float | None = None,
+    points: bool = True,
+    joint: bool = True,
+    **terms: Unpack[BundleTerms],
 ) -> BundleCovariance:
     """Compute the covariance of an adjusted bundle, by the arguments of `bundle_adjust` at its result.
 
@@ -65,6 +70,7 @@ def bundle_covariance(
         sigma: Standard deviation of an image coordinate of weight 1, pixels; estimated from the residuals if not given.
         points: Whether covariances of points (and of other structure) are wanted, which are most of the work. Without, theirs
             are not finite.
+        joint: Whether `everything.joint` is wanted. Without it and points, films take time in proportion to their length.
         **terms: What was adjusted, held and known; see `BundleTerms`.
 
     Returns:
@@ -82,11 +88,11 @@ def bundle_covariance(
         >>> found.poses.shape, found.X.shape, bool(0.2 < found.sigma < 1)  # pixels
         (torch.Size([4, 6, 6]), torch.Size([50, 3, 3]), True)
     """
-    check_options(sigma=(sigma, "?float > 0"), points=(points, bool))
+    check_options(sigma=(sigma, "?float > 0"), points=(points, bool), joint=(joint, bool))
     bundle = Bundle(problem, **terms)
     with torch.no_grad():
         blocks, residuals = bundle.problem()
-        unit = sparse_covariance(blocks, residuals, eliminate=structure_blocks(bundle), of_eliminated=points)
+        unit = sparse_covariance(blocks, residuals, eliminate=structure_blocks(bundle), of_eliminated=points, joint=joint)
     scale = sigma if sigma is not None else (unit.square_sum / max(unit.redundancy, 1)) ** 0.5
     pose, camera, X = (unit.blocks[name] * scale**2 for name in ("pose", "camera", "point"))
     sensor = None if bundle.rig is None else unit.blocks["sensor"] * scale**2

@@ -13,9 +13,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_options
-from torchsfm.optim.layout import lay_out
+from torchsfm.optim.front_covariance import marginal_blocks, retained_covariances
+from torchsfm.optim.fronts import Fronts
+from torchsfm.optim.layout import Layout, lay_out
 from torchsfm.optim.loss import loss_slope
-from torchsfm.optim.schur import Elimination
+from torchsfm.optim.normal_equations import NormalEquations
+from torchsfm.optim.schur import Elimination, Solver, plan_fronts
 from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_residual
 
 
@@ -59,6 +62,7 @@ def sparse_covariance(
     *,
     eliminate: str | Sequence[str] | None = None,
     of_eliminated: bool = True,
+    joint: bool = True,
 ) -> SparseCovariance:
     """Compute covariances at a minimum.
 
@@ -68,6 +72,8 @@ def sparse_covariance(
         eliminate: The blocks to eliminate, as in `sparse_levenberg_marquardt`.
         of_eliminated: Whether covariances of the eliminated variables are wanted too, which are most of the work. Without,
             theirs are infinite.
+        joint: Whether the joint covariance is wanted. Without it and those of the eliminated variables, long chains take time
+            and memory in proportion to their length; `joint` is then (0, 0).
 
     Returns:
         The covariances, float64.
@@ -86,12 +92,21 @@ def sparse_covariance(
         double, counted, _ = prepare(blocks, terms)
         x = {name: b.x for name, b in double.items()}
         layout = lay_out(double, counted, eliminate)
-        engine = Elimination(double, layout, "dense", spread=of_eliminated)
-        inverse = engine.linearize(x).invert()
-        eliminated = {}
-        if of_eliminated:
-            points = zip(layout.families, inverse.point_covariances(), inverse.determined, strict=True)
-            eliminated = {family.name: (of_points, good) for family, of_points, good in points}
+        places = _places(double, layout)
+        quick = None if joint or of_eliminated else _by_fronts(double, layout, x, places)
+        eliminated: dict[str, tuple[Tensor, Tensor]] = {}
+        if quick is not None:
+            engine, retained, rank, good_points = quick
+            whole = next(iter(double.values())).x.new_zeros((0, 0))
+        else:
+            engine = Elimination(double, layout, "dense", spread=of_eliminated)
+            inverse = engine.linearize(x).invert()
+            whole, rank, good_points = inverse.kept, inverse.rank, inverse.determined
+            retained = {name: whole[own[:, :, None], own[:, None]] for name, own in places.items()}
+            if of_eliminated:
+                points = zip(layout.families, inverse.point_covariances(), good_points, strict=True)
+                eliminated = {family.name: (of_points, good) for family, of_points, good in points}
+            whole = whole if joint else whole[:0, :0]
         squares = sum((_square_sum(part.term, x) for part in engine.parts), 0.0)
         rows = sum(part.components * part.term.index[0].shape[0] for part in engine.parts)
     found: dict[str, Tensor] = {}
@@ -109,15 +124,44 @@ def sparse_covariance(
             known[free[good]] = True
             covariance[free[good]] = of_points[good]
         elif name in layout.first:
-            place[free] = layout.first[name] + torch.arange(free.numel() * width, device=free.device).view(-1, width)
-            kept = inverse.kept[place[free][:, :, None], place[free][:, None]]
+            place[free] = places[name]
+            kept = retained[name]
             known[free] = kept.isfinite().all(-1).all(-1)
             covariance[free] = torch.where(known[free][:, None, None], kept, covariance[free])
         found[name], determined[name], columns[name] = covariance, known, place
-    families = zip(layout.families, inverse.determined, strict=True)
-    nullity = layout.size - inverse.rank
+    families = zip(layout.families, good_points, strict=True)
+    nullity = layout.size - rank
     unknowns = layout.size - nullity + sum(int(good.sum()) * family.point_size for family, good in families)
-    return SparseCovariance(found, determined, inverse.kept, columns, nullity, rows - unknowns, squares)
+    return SparseCovariance(found, determined, whole, columns, nullity, rows - unknowns, squares)
+
+
+def _places(blocks: Mapping[str, Block], layout: Layout) -> dict[str, Tensor]:
+    """The columns of the free variables of each retained block, (free, tangent)."""
+    return {
+        name: start + torch.arange(layout.free[name].numel() * blocks[name].tangent, device=layout.device).view(
+            -1, blocks[name].tangent
+        )
+        for name, start in layout.first.items()
+    }  # fmt: skip
+
+
+def _by_fronts(
+    blocks: dict[str, Block], layout: Layout, x: dict[str, Tensor], places: dict[str, Tensor]
+) -> tuple[Elimination, dict[str, Tensor], int, list[Tensor]] | None:
+    """The covariances of retained variables, the rank, and what is determined of others, if a sparse factor tells."""
+    fronts = None if _rests(blocks) else plan_fronts(layout, "auto", exact=True)
+    if fronts is None:
+        return None
+    engine = Elimination(blocks, layout, "sparse", fronts=fronts)
+    found = retained_covariances(engine.linearize(x), fronts, list(places.values()))
+    if found is None:
+        return None
+    return engine, dict(zip(places, found[0], strict=True)), found[1], found[2]
+
+
+def _rests(blocks: Mapping[str, Block]) -> bool:
+    """Whether there are motions of which nothing has a part."""
+    return any(block.rest is not None for block in blocks.values())
 
 
 def marginal_covariance(
@@ -143,10 +187,22 @@ def marginal_covariance(
         >>> torchsfm.optim.marginal_covariance({"x": x}, [measured], "x")[0].diagonal()
         tensor([0.2500, 0.2500], dtype=torch.float64)
     """
-    joint, free = _of_free(blocks, terms, name, eliminate)
-    count, width = blocks[name].x.shape[0], joint.shape[1]
-    own = torch.arange(len(free), device=free.device)
-    return joint.new_zeros((count, width, width)).index_copy_(0, free, joint[own, :, own])
+    _check(blocks, terms, eliminate)
+    check_options(name=(name, tuple(blocks)))
+    with torch.no_grad():
+        double, counted, _ = prepare(blocks, terms)
+        layout = lay_out(double, counted, eliminate)
+        out = double[name].x.new_zeros((double[name].x.shape[0], double[name].tangent, double[name].tangent))
+        free, places = layout.free[name], _places(double, layout)[name]
+        if not places.numel():
+            return out
+        system, fronts = _linearized(double, layout, places.flatten(), together=False)
+        if fronts is not None and places.numel() == layout.size:
+            out[free] = marginal_blocks(system, fronts, places)
+        else:
+            joint, own = _inverse(system.information(places.flatten())), places - places[0, 0]
+            out[free] = joint[own[:, :, None], own[:, None]]
+    return out
 
 
 def joint_covariance(
@@ -172,36 +228,42 @@ def joint_covariance(
         tensor([[1., 1.],
                 [1., 2.]], dtype=torch.float64)
     """
-    joint, free = _of_free(blocks, terms, name, eliminate)
-    count, width = blocks[name].x.shape[0], joint.shape[1]
-    out = joint.new_zeros((count, width, count, width))
-    out[free[:, None], :, free[None]] = joint.movedim(1, 2)
-    return out
-
-
-def _of_free(
-    blocks: Mapping[str, Block], terms: Sequence[Term], name: str, eliminate: str | Sequence[str] | None
-) -> tuple[Float[Tensor, "m k m k"], Int[Tensor, "m"]]:
-    """The covariance of the variables of a block that are free, and which those are."""
     _check(blocks, terms, eliminate)
     check_options(name=(name, tuple(blocks)))
     with torch.no_grad():
         double, counted, _ = prepare(blocks, terms)
-        x = {key: b.x for key, b in double.items()}
         layout = lay_out(double, counted, eliminate)
-        width, free = double[name].tangent, layout.free[name]
-        if not free.numel() or not width:
-            return double[name].x.new_zeros((free.numel(), width, free.numel(), width)), free
-        columns = layout.first[name] + torch.arange(free.numel() * width, device=free.device)
-        information = Elimination(double, layout, "dense").linearize(x).information(columns)
-        held = information.diagonal() <= 0
-        information.diagonal()[held] = 1.0
-        factor, info = torch.linalg.cholesky_ex(information)
-        # The inverse of half a factor raises.
-        whole = torch.where(info == 0, factor, torch.eye(len(factor), dtype=factor.dtype, device=factor.device))
-        joint = torch.where(info == 0, torch.cholesky_inverse(whole), torch.inf)
-        joint.diagonal()[held] = 0.0
-    return joint.view(free.numel(), width, free.numel(), width), free
+        count, width = double[name].x.shape[0], double[name].tangent
+        out = double[name].x.new_zeros((count, width, count, width))
+        free, places = layout.free[name], _places(double, layout)[name]
+        if places.numel():
+            joint = _inverse(_linearized(double, layout, places.flatten(), together=True)[0].information(places.flatten()))
+            out[free[:, None], :, free[None]] = joint.view(len(free), width, len(free), width).movedim(1, 2)
+    return out
+
+
+def _linearized(
+    blocks: dict[str, Block], layout: Layout, columns: Int[Tensor, "m"], *, together: bool
+) -> tuple[NormalEquations, Fronts | None]:
+    """The system in which some columns are alone, or together, by a sparse factor where that is less."""
+    x, whole = {key: b.x for key, b in blocks.items()}, len(columns) == layout.size
+    fronts = None
+    if not (_rests(blocks) or (together and whole)):
+        fronts = plan_fronts(layout, "auto", last=None if whole else columns, exact=True)
+    solver: Solver = "dense" if fronts is None else "sparse"
+    return Elimination(blocks, layout, solver, fronts=fronts).linearize(x), fronts
+
+
+def _inverse(information: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
+    """The covariance by the information: zero where there is none of a column, infinite where it is not definite."""
+    held = information.diagonal() <= 0
+    information.diagonal()[held] = 1.0
+    factor, info = torch.linalg.cholesky_ex(information)
+    # The inverse of half a factor raises.
+    safe = torch.where(info == 0, factor, torch.eye(len(factor), dtype=factor.dtype, device=factor.device))
+    joint = torch.where(info == 0, torch.cholesky_inverse(safe), torch.inf)
+    joint.diagonal()[held] = 0.0
+    return joint
 
 
 def _check(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None) -> None:

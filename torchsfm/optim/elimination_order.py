@@ -44,29 +44,30 @@ def _seconds(p: int, b: int) -> float:
     return FLOP * (p * p * p / 3 + p * p * b + p * b * b) + ENTRY * (b * b + p * p + p * b) + VISIT
 
 
-def order_elimination(partners: Sequence[int], widths: Sequence[int], limit: float) -> list[Front] | None:
+def order_elimination(partners: Sequence[int], widths: Sequence[int], limit: float, last: int = 0) -> list[Front] | None:
     """The fronts, children before what they add to; None if their elimination takes longer than a limit.
 
     Args:
         partners: Of each variable, as bits; not itself.
         widths: Its number of columns.
         limit: In seconds.
+        last: Variables that are the pivots of the last front, as bits.
     """
-    found = _least_partners(partners, widths, limit)
-    return None if found is None else _join(*found, widths)
+    found = _least_partners(partners, widths, limit, last)
+    return None if found is None else _join(*found, widths, last)
 
 
 def _least_partners(
-    partners: Sequence[int], widths: Sequence[int], limit: float
+    partners: Sequence[int], widths: Sequence[int], limit: float, last: int
 ) -> tuple[list[int], list[int], list[int]] | None:
     """The variables in their order, which later ones each has to do with, and the columns of these."""
     left = list(partners)
     columns = [sum(widths[j] for j in members(mask)) for mask in left]
     met = [0] * len(left)
-    heap = [(columns[i], 0, i) for i in range(len(left))]
+    heap = [(columns[i], 0, i) for i in range(len(left)) if not last >> i & 1]
     heapq.heapify(heap)
     order, border, beyond = list[int](), list[int](), list[int]()
-    gone, flops = 0, 0.0
+    gone, flops = 0, float(sum(widths[i] for i in members(last))) ** 3 / 3
     while heap:
         degree, clock, i = heapq.heappop(heap)
         if gone >> i & 1 or degree != columns[i] or -clock != met[i]:
@@ -86,14 +87,16 @@ def _least_partners(
                 columns[j] += sum(widths[k] for k in members(fill))
             columns[j] -= widths[i]
             left[j], met[j] = after, len(order)
+            if last >> j & 1:
+                continue
             heapq.heappush(heap, (columns[j], -met[j], j))
     return order, border, beyond
 
 
-def _join(order: list[int], border: list[int], beyond: list[int], widths: Sequence[int]) -> list[Front]:
+def _join(order: list[int], border: list[int], beyond: list[int], widths: Sequence[int], last: int) -> list[Front]:
     """The fronts, given what each variable has to do with."""
-    rank = {i: k for k, i in enumerate(order)}
-    waiting: list[list[Front]] = [[] for _ in order]
+    rank = {i: len(order) for i in members(last)} | {i: k for k, i in enumerate(order)}
+    waiting: list[list[Front]] = [[] for _ in range(len(order) + 1)]
     fronts = list[Front]()
     for i, mask, wide in zip(order, border, beyond, strict=True):
         here = Front([i], mask, [], widths[i], wide)
@@ -111,6 +114,9 @@ def _join(order: list[int], border: list[int], beyond: list[int], widths: Sequen
             waiting[min(rank[j] for j in members(mask))].append(here)
         else:
             fronts.append(here)
+    if last:
+        own = list(members(last))
+        fronts.append(Front(own, 0, waiting[-1], sum(widths[i] for i in own), 0))
     return _in_order(fronts)
 
 

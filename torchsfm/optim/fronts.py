@@ -63,7 +63,7 @@ class Fronts:
         # In which row of each front a variable begins.
         first = torch.full((len(found), len(columns) + 1), -1, dtype=torch.int32, device="cpu")
         front_of = torch.zeros(len(columns) + 1, dtype=torch.int64, device="cpu")
-        self.total, self.fronts, borders = 0, list[_Place](), list[Tensor]()
+        self.total, self.fronts = 0, list[_Place]()
         for f, front in enumerate(found):
             border = sorted(members(front.border), key=rank.__getitem__)
             own = torch.tensor(front.pivots + border)
@@ -79,7 +79,6 @@ class Fronts:
                 local = first[f].to(device)[self._variable[beyond]] + self._within[beyond]
                 joined.append((number[id(child)], local, int((local < p).sum())))
             self.fronts.append(_Place(self.total, mine[:p], mine[p:], joined))
-            borders.append(mine[p:])
             self.total += len(mine) * p
         self._first, self._front = first.to(device), front_of.to(device)
         self._start = torch.tensor([place.start for place in self.fronts], device=device)
@@ -157,29 +156,53 @@ class Fronts:
         """
         left, factors = dict[int, Tensor](), list[tuple[Tensor, Tensor]]()
         for f, place in enumerate(self.fronts):
-            p, b = len(place.pivots), len(place.border)
-            A = place.of(numbers).clone()
-            A.diagonal().add_(weight[place.pivots])
+            A, square = self._gathered(place, numbers, weight, left)
             if hold is not None and hold[0] == f:
-                A[:p] += hold[1] @ hold[1].mT
-            square = A.new_zeros((b, b))
-            for child, rows, ours in place.children:
-                part = left.pop(child)
-                A[rows[:, None], rows[:ours]] += part[:, :ours]
-                beyond = rows[ours:] - p
-                square[beyond[:, None], beyond] += part[ours:, ours:]
-            lower, info = torch.linalg.cholesky_ex(A[:p])
-            if bool(info):
+                A[: len(place.pivots)] += hold[1] @ hold[1].mT
+            found = _eliminated(A, square)
+            if found is None:
                 return None
-            below = torch.linalg.solve_triangular(lower.mT, A[p:], upper=True, left=False)
-            if b:
-                left[f] = square.addmm_(below, below.mT, alpha=-1)
-            factors.append((lower, below))
+            factors.append(found)
+            left[f] = square
         return FrontFactor(self, factors)
+
+    def last(self, numbers: Tensor, weight: Tensor) -> Tensor | None:
+        """The last front with a diagonal (size) added to the matrix, when all others are eliminated; None if they cannot be."""
+        left = dict[int, Tensor]()
+        for f, place in enumerate(self.fronts[:-1]):
+            A, left[f] = self._gathered(place, numbers, weight, left)
+            if _eliminated(A, left[f]) is None:
+                return None
+        A, _ = self._gathered(self.fronts[-1], numbers, weight, left)
+        return A.tril() + A.tril(-1).mT
+
+    def _gathered(self, place: _Place, numbers: Tensor, weight: Tensor, left: dict[int, Tensor]) -> tuple[Tensor, Tensor]:
+        """A front with what its children leave, which is taken, and what these leave to the square of its border."""
+        p, b = len(place.pivots), len(place.border)
+        A = place.of(numbers).clone()
+        A.diagonal().add_(weight[place.pivots])
+        square = A.new_zeros((b, b))
+        for child, rows, ours in place.children:
+            part = left.pop(child)
+            A[rows[:, None], rows[:ours]] += part[:, :ours]
+            beyond = rows[ours:] - p
+            square[beyond[:, None], beyond] += part[ours:, ours:]
+        return A, square
 
     def widest(self) -> int:
         """The front of the most pivots."""
         return max(range(len(self.fronts)), key=lambda f: len(self.fronts[f].pivots))
+
+
+def _eliminated(A: Tensor, square: Tensor) -> tuple[Tensor, Tensor] | None:
+    """The triangle of a front's pivots and the rows of its border, taken off the square; None if it is not positive."""
+    p = A.shape[1]
+    lower, info = torch.linalg.cholesky_ex(A[:p])
+    if bool(info):
+        return None
+    below = torch.linalg.solve_triangular(lower.mT, A[p:], upper=True, left=False)
+    square.addmm_(below, below.mT, alpha=-1)
+    return lower, below
 
 
 @dataclass(frozen=True)
@@ -201,3 +224,24 @@ class FrontFactor:
             rest = x[place.pivots] - below.mT @ x[place.border]
             x[place.pivots] = torch.linalg.solve_triangular(lower.mT, rest, upper=True)
         return x
+
+    def inverse(self) -> Tensor:
+        """The inverse where the matrix has entries, as its numbers are (Takahashi et al. 1973; Erisman & Tinney 1975)."""
+        out = self.fronts.zeros(self.parts[0][0])
+        borders = dict[int, Tensor]()
+        for f in reversed(range(len(self.parts))):
+            place, (lower, below) = self.fronts.fronts[f], self.parts[f]
+            p = len(place.pivots)
+            # From the last to the first: what a border has in the inverse is known by then.
+            mine = torch.cholesky_inverse(lower)
+            whole = mine
+            if len(place.border):
+                known = borders.pop(f)
+                reach = torch.linalg.solve_triangular(lower, below, upper=False, left=False)
+                cross = -known @ reach
+                mine = mine - reach.mT @ cross
+                whole = torch.cat((torch.cat((mine, cross.mT), 1), torch.cat((cross, known), 1)))
+            place.of(out).copy_(whole[:, :p])
+            for child, rows, _ in place.children:
+                borders[child] = whole[rows[:, None], rows]
+        return out

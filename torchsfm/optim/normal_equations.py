@@ -15,7 +15,7 @@ from torchsfm.optim.batched_cholesky import FLAT, Triangle, backward, diagonal, 
 from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.layout import Family, Layout
 from torchsfm.optim.problem import Step
-from torchsfm.optim.retained_blocks import RetainedBlocks
+from torchsfm.optim.retained_blocks import DenseMatrix, RetainedBlocks
 from torchsfm.optim.schur_grouped import GroupCoupling
 from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, solve_reduced
 from torchsfm.optim.schur_pairwise import PairCoupling
@@ -207,18 +207,7 @@ class NormalEquations:
                 minimum is not a single one (robust losses far from their centre).
         """
         size = self.layout.size
-        S = self.squares.dense()
-        triangles: list[Triangle] = []
-        determined: list[Tensor] = []
-        for part in self.eliminated:
-            pivots = diagonal(part.V, part.q)
-            L, _ = factor(part.V, part.q)
-            for a in range(part.q):
-                # Directions that no residual sees are left out: a basic solution.
-                L[a][a] = torch.where(L[a][a] * L[a][a] * pivots[a] < 1e13, L[a][a], 0.0)
-            part.reduce(S, L, torch.zeros_like(pivots))
-            triangles.append(L)
-            determined.append(torch.stack([L[a][a] > 0 for a in range(part.q)]).all(0))
+        S, triangles, determined = self.formed()
         S = S[:size, :size]
         if like is None:
             scale = self.precision.rsqrt()
@@ -233,17 +222,45 @@ class NormalEquations:
             kept = root @ root.mT
         return Inverse(self, triangles, kept, rank, [known & ok for known in determined], scale, scaled)
 
-    def information(self, columns: Tensor) -> Tensor:
-        """What the problem says of some retained variables: the system left when all other variables are eliminated.
+    def formed(self) -> tuple[Tensor, list[Triangle], list[Tensor]]:
+        """The numbers of the reduced system without damping, the factors of each family's V, and what is determined of it."""
+        S = self.squares.filled(self.fronts or DenseMatrix(self.layout.size))
+        triangles: list[Triangle] = []
+        determined: list[Tensor] = []
+        for part in self.eliminated:
+            pivots = diagonal(part.V, part.q)
+            L, _ = factor(part.V, part.q)
+            for a in range(part.q):
+                # Directions that no residual sees are left out: a basic solution.
+                L[a][a] = torch.where(L[a][a] * L[a][a] * pivots[a] < 1e13, L[a][a], 0.0)
+            part.reduce(S, L, torch.zeros_like(pivots))
+            triangles.append(L)
+            determined.append(torch.stack([L[a][a] > 0 for a in range(part.q)]).all(0))
+        return S, triangles, determined
 
-        A free gauge among the others is held by a damping too weak to count.
-        """
-        size = self.layout.size
-        S = self.squares.dense()
+    def informed(self) -> Tensor:
+        """The numbers of the reduced system, with eliminated variables damped too weakly to count."""
+        S = self.squares.filled(self.fronts or DenseMatrix(self.layout.size))
         for part in self.eliminated:
             V, pivots = part.V.clone(), diagonal(part.V, part.q)
             V[[place(a, a, part.q) for a in range(part.q)]] += NULL * floor(pivots)
             part.reduce(S, factor(V, part.q)[0], torch.zeros_like(pivots))
+        return S
+
+    def information(self, columns: Tensor) -> Tensor:
+        """What the problem says of some retained variables: the system left when all other variables are eliminated.
+
+        A free gauge among the others is held by a damping too weak to count. Formed by fronts, it is not finite if they cannot
+        be eliminated; the last front must have these columns.
+        """
+        size = self.layout.size
+        S = self.informed()
+        if self.fronts is not None:
+            weight = NULL * self.precision
+            weight[columns] = 0.0
+            own = self.fronts.last(S, weight)
+            order = torch.argsort(self.fronts.fronts[-1].pivots)[torch.argsort(torch.argsort(columns))]
+            return S.new_full((len(columns), len(columns)), torch.nan) if own is None else own[order[:, None], order]
         S = S[:size, :size]
         S = S.tril() + S.tril(-1).mT
         self._hold(S)

@@ -89,7 +89,7 @@ class Elimination:
         solver: Solver = "auto",
         *,
         spread: bool = False,
-        like: "Elimination | None" = None,
+        fronts: Fronts | None = None,
     ) -> None:
         """Plan what is done once per problem.
 
@@ -98,7 +98,7 @@ class Elimination:
             layout: Who meets whom.
             solver: How the reduced system is solved.
             spread: Whether covariances of eliminated variables will be asked for.
-            like: Another one of the same problem, whose plans will do.
+            fronts: A plan for the solver "sparse", if there is one already.
         """
         self.blocks = blocks
         self.layout = layout
@@ -119,7 +119,7 @@ class Elimination:
         """What the memory holds."""
         self._second: Elimination | None = None
         self.ranks = layout.ranks
-        self.fronts: Fronts | None = plan_fronts(layout, solver) if like is None else like.fronts
+        self.fronts = fronts or plan_fronts(layout, solver)
         iterative = solver == "pcg" or (solver == "auto" and self.fronts is None and too_large(layout))
         for family in layout.families:
             V = some.new_empty((family.point_size * (family.point_size + 3) // 2, family.points))
@@ -177,7 +177,7 @@ class Elimination:
     def _other(self) -> "Elimination":
         """Memory for a second system."""
         if self._second is None:
-            self._second = Elimination(self.blocks, self.layout, "dense" if self.plan is None else "pcg", like=self)
+            self._second = Elimination(self.blocks, self.layout, "dense" if self.plan is None else "pcg", fronts=self.fronts)
         return self._second
 
     def _clear(self) -> None:
@@ -308,21 +308,28 @@ def _iterations(layout: Layout) -> float:
     return int(layout.ranks.sum(rows)) * PASS
 
 
-def plan_fronts(layout: Layout, solver: Solver) -> Fronts | None:
-    """How to factor the reduced system as a sparse one; None where something else will do as well."""
+def plan_fronts(layout: Layout, solver: Solver, *, last: Tensor | None = None, exact: bool = False) -> Fronts | None:
+    """How to factor the reduced system as a sparse one; None where something else will do as well.
+
+    Args:
+        layout: The problem.
+        solver: What was asked for.
+        last: Columns that are to be the pivots of the last front.
+        exact: Whether conjugate gradients will not do.
+    """
     if not layout.size or solver not in ("auto", "sparse"):
         return None
     limit = math.inf
     if solver == "auto":
-        limit = _iterations(layout)
-        if layout.size <= LARGEST:
+        limit = math.inf if exact else _iterations(layout)
+        if exact or layout.size <= LARGEST:
             limit = min(limit, layout.size**3 * FLOP)
         forming = layout.ranks.largest(torch.tensor(sum(map(estimate_pairs, layout.families)), device=layout.device))
         limit -= float(forming)
-        if limit < WORTH or PairGraph.of(layout) is not None:
+        if limit < WORTH or (not exact and PairGraph.of(layout) is not None):
             return None
-    partner, columns = partners(layout)
-    found = order_elimination(partner, [len(c) for c in columns], limit)
+    partner, columns, final = partners(layout, last)
+    found = order_elimination(partner, [len(c) for c in columns], limit, final)
     if found is None or sum(front.seconds for front in found) > limit:
         return None
     return Fronts(found, columns)

@@ -8,8 +8,11 @@ from torchsfm.optim.layout import Layout
 from torchsfm.optim.schur_pairwise import pairs_of_points
 
 
-def partners(layout: Layout) -> tuple[list[int], list[Tensor]]:
-    """The partners of each variable as bits, and its columns; variables of the same partners that meet are one."""
+def partners(layout: Layout, last: Tensor | None = None) -> tuple[list[int], list[Tensor], int]:
+    """The partners of each variable as bits, its columns, and which have some last columns; like variables are one.
+
+    These are such as have the same partners besides each other, and both some of the last columns, or neither.
+    """
     owner = layout.owners()
     count = int(owner[-1])
     # The first column of each variable stands for it.
@@ -39,7 +42,7 @@ def partners(layout: Layout) -> tuple[list[int], list[Tensor]]:
     for i, j in zip(torch.div(keys, count, rounding_mode="floor").tolist(), (keys % count).tolist(), strict=True):
         masks[i] |= 1 << j
         masks[j] |= 1 << i
-    return _merged(masks, owner[: layout.size])
+    return _merged(masks, owner[: layout.size], set() if last is None else set(owner[last].tolist()))
 
 
 def _variables(columns: Tensor, owner: Tensor, head: Tensor, count: int) -> Tensor:
@@ -56,11 +59,11 @@ def _met(a: Tensor, b: Tensor, count: int) -> Tensor:
     return key
 
 
-def _merged(masks: list[int], owner: Tensor) -> tuple[list[int], list[Tensor]]:
+def _merged(masks: list[int], owner: Tensor, last: set[int]) -> tuple[list[int], list[Tensor], int]:
     """Variables that have the same partners besides each other, as one."""
-    number, of_variable = dict[int, int](), list[int]()
+    number, of_variable = dict[tuple[int, bool], int](), list[int]()
     for i, mask in enumerate(masks):
-        of_variable.append(number.setdefault(mask | 1 << i, len(number)))
+        of_variable.append(number.setdefault((mask | 1 << i, i in last), len(number)))
     kept = dict[int, int]()
     for i, k in enumerate(of_variable):
         kept.setdefault(k, i)
@@ -73,4 +76,5 @@ def _merged(masks: list[int], owner: Tensor) -> tuple[list[int], list[Tensor]]:
         found.append(sum(1 << renumber[j] for j in members(masks[i] & alone)))
     variable = torch.tensor(of_variable, device=owner.device)[owner]
     order = torch.argsort(variable, stable=True)
-    return found, list(torch.split(order, torch.bincount(variable, minlength=len(number)).tolist()))
+    columns = list(torch.split(order, torch.bincount(variable, minlength=len(number)).tolist()))
+    return found, columns, sum(1 << k for k in {of_variable[i] for i in last})

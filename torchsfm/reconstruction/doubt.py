@@ -142,6 +142,7 @@ def pose_deviations(
         loss=LOSS,
         sigma=measure_noise(mapping, LOSS),
         points=False,
+        joint=False,
         **about_cameras(mapping, uncertain, prior),
     )
     view, depth = problem.view, problem.depths()

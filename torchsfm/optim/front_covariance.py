@@ -1,0 +1,84 @@
+"""Covariances of retained variables from a sparse factor: blocks of the inverse, without the rest of it.
+
+Where a gauge is free, one front is held along it. With the motions K that cost nothing, in units in which they are orthonormal,
+the pseudo-inverse is `(1 - K K') Z (1 - K K')` for the inverse Z of the system so held, whichever front that is.
+"""
+
+import torch
+from torch import Tensor
+
+from torchsfm.linalg import eigh
+from torchsfm.linalg.semidefinite import ROUNDS, SHIFT, WIDTH
+from torchsfm.optim.fronts import Fronts
+from torchsfm.optim.normal_equations import NULL, NormalEquations
+
+FIRM = 1e-6
+"""The least part of each motion's square that the front must have which is held."""
+
+
+def retained_covariances(
+    system: NormalEquations, fronts: Fronts, columns: list[Tensor]
+) -> tuple[list[Tensor], int, list[Tensor]] | None:
+    """The covariances of variables, the rank of the system, and which eliminated variables of each family are determined.
+
+    They are those of `NormalEquations.invert`; None if it must tell.
+
+    Args:
+        system: Formed by fronts, of Gauss-Newton.
+        fronts: Where its entries are.
+        columns: Those of the variables of each block, (variables, k).
+    """
+    S, _, determined = system.formed()
+    root = system.precision.sqrt()[:, None]
+    start = torch.randn(fronts.size, WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu").to(S)
+
+    def apply(x: Tensor) -> Tensor:
+        return fronts.product(S, x / root) / root
+
+    basis = torch.linalg.qr(start)[0]
+    for _ in range(ROUNDS):
+        basis = torch.linalg.qr(apply(basis))[0]
+    top = torch.linalg.matrix_norm(apply(basis), 2)
+    factor = fronts.factor(S, SHIFT * top * system.precision)
+    if factor is None:
+        return None
+    basis = torch.linalg.qr(start)[0]
+    for _ in range(ROUNDS):
+        basis = torch.linalg.qr(root * factor.solve(root * basis))[0]
+    values, vectors, ok = eigh(basis.mT @ apply(basis))
+    least = values <= NULL * top
+    if not bool(ok) or bool(least.all()):
+        return None
+    K = basis @ vectors[:, least]
+    hold = None
+    if K.shape[1]:
+        widest = fronts.widest()
+        mine = fronts.fronts[widest].pivots
+        if not bool(torch.linalg.svdvals(K[mine])[-1] ** 2 > FIRM) or len(mine) < K.shape[1]:
+            return None
+        hold = widest, top.sqrt() * root[mine] * K[mine]
+    factor = fronts.factor(S, torch.zeros_like(system.precision), hold)
+    if factor is None:
+        return None
+    Z, Y = factor.inverse(), root * factor.solve(root * K)
+    G = K.mT @ Y
+    found = []
+    for own in columns:
+        Ki, Yi, scale = K[own], Y[own], root[own]
+        moved = Yi @ Ki.mT
+        taken = (moved + moved.mT - Ki @ G @ Ki.mT) / (scale * scale.mT)
+        found.append(Z[fronts.places(own[:, :, None], own[:, None])] - taken)
+    return found, fronts.size - K.shape[1], determined
+
+
+def marginal_blocks(system: NormalEquations, fronts: Fronts, columns: Tensor) -> Tensor:
+    """The blocks of the inverse at columns (n, k), 0 where nothing tells of a column; infinite if it is not positive."""
+    S = system.informed()
+    own = torch.arange(fronts.size, device=S.device)
+    held = S[fronts.places(own, own)] <= 0
+    factor = fronts.factor(S, held.to(S.dtype))
+    if factor is None:
+        return torch.full((*columns.shape, columns.shape[1]), torch.inf, dtype=S.dtype, device=S.device)
+    none = held[columns]
+    blocks = factor.inverse()[fronts.places(columns[:, :, None], columns[:, None])]
+    return torch.where(none[:, :, None] | none[:, None], 0.0, blocks)
