@@ -24,7 +24,7 @@ from torchsfm._types import Status
 from torchsfm.bundle import BundleResult, bundle_adjust_model
 from torchsfm.bundle.bundle_adjust_model import BundleOptions
 from torchsfm.geometry import BundleProblem
-from torchsfm.optim.schur import Solver
+from torchsfm.optim.solver_choice import Solver
 from torchsfm.simulation import random_bundle_problem
 
 FREE = ("focal", "k1", "k2")

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.optim import Block, Huber, Term, layout, schur, schur_matrix_free, sparse_levenberg_marquardt
+from torchsfm.optim import Block, Huber, Term, layout, schur, schur_matrix_free, solver_choice, sparse_levenberg_marquardt
 
 F64 = torch.float64
 
@@ -83,8 +83,8 @@ def test_clusters_are_what_occurs_together(chain: tuple[dict[str, Block], list[T
 def test_auto_takes_it_for_large_systems_only(chain: tuple[dict[str, Block], list[Term]]) -> None:
     blocks, terms = chain
     small = layout.lay_out(blocks, terms, "mark")
-    assert not schur.too_large(small)
-    assert schur.too_large(dataclasses.replace(small, size=schur.LARGEST + 1))
+    assert not solver_choice.too_large(small)
+    assert solver_choice.too_large(dataclasses.replace(small, size=solver_choice.LARGEST + 1))
 
 
 def test_memory_does_not_grow_with_the_square_of_the_retained(generator: torch.Generator) -> None:
@@ -106,7 +106,9 @@ def test_wrong_solver(chain: tuple[dict[str, Block], list[Term]], unchecked: Non
 
 
 @pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
-def test_steps_have_no_part_along_motions_at_rest(chain: tuple[dict[str, Block], list[Term]], solver: schur.Solver) -> None:
+def test_steps_have_no_part_along_motions_at_rest(
+    chain: tuple[dict[str, Block], list[Term]], solver: solver_choice.Solver
+) -> None:
     blocks, terms = chain
     road = torch.tensor([1.0, 0.0], dtype=F64)
     blocks["station"] = dataclasses.replace(blocks["station"], rest=lambda x: road.expand(len(x), 2)[..., None])

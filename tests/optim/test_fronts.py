@@ -17,11 +17,13 @@ from torchsfm.optim import (
     layout,
     marginal_covariance,
     schur,
+    solver_choice,
     sparse_covariance,
     sparse_levenberg_marquardt,
 )
 from torchsfm.optim.elimination_order import members, order_elimination
 from torchsfm.optim.fronts import Fronts
+from torchsfm.optim.sparsity import depth
 
 F64 = torch.float64
 Edges = list[tuple[int, int]]
@@ -128,6 +130,16 @@ def test_where_much_fills_in_it_is_left() -> None:
     assert order_elimination(everything, [6] * 100, 1.0) is not None
 
 
+def test_how_far_it_is_from_end_to_end() -> None:
+    assert depth(graph(60, chain(60, 2))) == 59
+    assert depth(graph(60, ring(60, 2))) == 30
+    assert depth(graph(49, grid(7))) == 12
+    assert depth(graph(5, [])) == 0
+    # What all have to do with is no way.
+    assert depth(graph(61, [(i + 1, j + 1) for i, j in chain(60, 2)] + star(61))) == 59
+    assert depth(graph(90, chain(60, 2) + [(i + 60, j + 60) for i, j in chain(30, 2)])) == 59
+
+
 def measure(s: Tensor, k: Tensor, m: Tensor, around: Tensor, d: Tensor) -> Tensor:
     way = m - s - around
     return (k * way + 0.05 * torch.sin(way) - d) / 0.01
@@ -169,7 +181,7 @@ def road(
     return blocks, terms
 
 
-def stepped(blocks: dict[str, Block], terms: list[Term], solver: schur.Solver, curved: bool = False) -> object:
+def stepped(blocks: dict[str, Block], terms: list[Term], solver: solver_choice.Solver, curved: bool = False) -> object:
     found = layout.lay_out(blocks, terms, ("mark", "sign"))
     engine = schur.Elimination(blocks, found, solver)
     assert (engine.fronts is not None) == (solver == "sparse")
@@ -226,12 +238,12 @@ def test_auto_takes_it_for_what_is_long(generator: torch.Generator) -> None:
     for stations, wanted in ((60, False), (2500, True)):
         blocks, terms = road(stations, generator)
         found = layout.lay_out(blocks, terms, ("mark", "sign"))
-        assert (schur.plan_fronts(found, "auto") is not None) == wanted
+        assert (solver_choice.plan_fronts(found, "auto") is not None) == wanted
     j = torch.arange(20_000).repeat_interleave(3)
     i = torch.randint(2500, (len(j),), generator=generator)
     term = Term(lambda s, m, d: m - s - d, ("station", "mark"), (i, j), (torch.zeros(len(j), 2, dtype=F64),))
     crowd = {"station": Block(torch.zeros(2500, 2, dtype=F64)), "mark": Block(torch.zeros(20_000, 2, dtype=F64))}
-    assert schur.plan_fronts(layout.lay_out(crowd, [term], "mark"), "auto") is None
+    assert solver_choice.plan_fronts(layout.lay_out(crowd, [term], "mark"), "auto") is None
 
 
 def test_what_is_not_determined_is_damped(generator: torch.Generator) -> None:
@@ -288,8 +300,8 @@ def test_entries_of_the_inverse_and_the_last_front(name: str, generator: torch.G
 
 
 def taken(monkeypatch: pytest.MonkeyPatch, worth: float) -> None:
-    monkeypatch.setattr(schur, "WORTH", worth)
-    monkeypatch.setattr(schur, "FLOP", 1.0)
+    monkeypatch.setattr(solver_choice, "WORTH", worth)
+    monkeypatch.setattr(solver_choice, "FLOP", 1.0)
 
 
 @pytest.mark.parametrize("closed", [False, True])
@@ -306,7 +318,9 @@ def test_covariances_are_the_dense_ones(
     of_scale, of_station = (marginal_covariance(blocks, terms, name, eliminate=eliminate) for name in ("scale", "station"))
     taken(monkeypatch, 0.0)
     planned = []
-    monkeypatch.setattr(covariance, "plan_fronts", lambda *a, **k: planned.append(schur.plan_fronts(*a, **k)) or planned[-1])
+    monkeypatch.setattr(
+        covariance, "plan_fronts", lambda *a, **k: planned.append(solver_choice.plan_fronts(*a, **k)) or planned[-1]
+    )
     sparse = sparse_covariance(blocks, terms, eliminate=eliminate, of_eliminated=False, joint=False)
     torch.testing.assert_close(marginal_covariance(blocks, terms, "scale", eliminate=eliminate), of_scale, rtol=1e-6, atol=0)
     if not gauge:

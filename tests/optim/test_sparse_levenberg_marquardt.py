@@ -22,6 +22,7 @@ from torchsfm.optim import (
     schur_grouped,
     schur_matrix_free,
     schur_pairwise,
+    solver_choice,
     sparse_covariance,
     sparse_levenberg_marquardt,
 )
@@ -319,7 +320,7 @@ def test_layout_drops_what_cannot_move(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("solver", ["dense", "sparse", "pcg"])
-def test_two_families_are_eliminated_as_one_is(generator: torch.Generator, solver: schur.Solver) -> None:
+def test_two_families_are_eliminated_as_one_is(generator: torch.Generator, solver: solver_choice.Solver) -> None:
     """Stations see marks of the plane and walls of one number: which of them are eliminated changes nothing but the work."""
     stations, marks, walls = 5, 60, 70
     place = torch.randn(stations, 2, generator=generator, dtype=F64)

@@ -16,7 +16,7 @@ from torchsfm.bundle.structure import Structure
 from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.optim import Loss
 from torchsfm.optim.ranks import Group
-from torchsfm.optim.schur import Solver
+from torchsfm.optim.solver_choice import Solver
 from torchsfm.optim.sparse_derivative import Hessian
 
 

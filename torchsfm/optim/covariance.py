@@ -18,7 +18,8 @@ from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.layout import Layout, lay_out
 from torchsfm.optim.loss import loss_slope
 from torchsfm.optim.normal_equations import NormalEquations
-from torchsfm.optim.schur import Elimination, Solver, plan_fronts
+from torchsfm.optim.schur import Elimination
+from torchsfm.optim.solver_choice import Solver, plan_fronts
 from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_residual
 
 

@@ -54,7 +54,7 @@ def retained_covariances(
     if K.shape[1]:
         widest = fronts.widest()
         mine = fronts.fronts[widest].pivots
-        if not bool(torch.linalg.svdvals(K[mine])[-1] ** 2 > FIRM) or len(mine) < K.shape[1]:
+        if not bool(eigh(K[mine].mT @ K[mine])[0][0] > FIRM):
             return None
         hold = widest, top.sqrt() * root[mine] * K[mine]
     factor = fronts.factor(S, torch.zeros_like(system.precision), hold)

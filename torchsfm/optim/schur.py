@@ -11,18 +11,15 @@ Work comes in three tiers: once per problem (`layout`: who meets whom), once per
 per damping (`NormalEquations.step`), so that a rejected step costs only the last.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import FLAT, hold, place
 from torchsfm.optim.curvature import curvature
-from torchsfm.optim.elimination_order import order_elimination
 from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.layout import CHUNK, Layout, Piece
 from torchsfm.optim.multigrid import PairGraph
@@ -32,7 +29,7 @@ from torchsfm.optim.schur_grouped import GroupCoupling, plan_groups
 from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, find_clusters
 from torchsfm.optim.schur_pairwise import PairCoupling, estimate_pairs
 from torchsfm.optim.settling import Seen, Settling, add_squares
-from torchsfm.optim.sparsity import partners
+from torchsfm.optim.solver_choice import Solver, plan_fronts, too_large
 from torchsfm.optim.terms import (
     Block,
     Term,
@@ -44,20 +41,10 @@ from torchsfm.optim.terms import (
     term_residual,
 )
 
-LARGEST = 9000
-"""Columns of the largest reduced system formed without being asked: its square and factor take 1.3 GB."""
-FLOP = 1.3e-11
-"""Seconds per column cubed of a Cholesky factorisation, on a usual core."""
-PASS = 4e-6
-"""Seconds per residual of a solution by conjugate gradients, of some 100 iterations."""
 ALONG = 0.1
 """Part of a step by which residuals are moved both ways for their second derivative along it."""
 BENT = 1e-3
 """Eliminated variables are held along directions in which they have no more than this part of the Gauss-Newton curvature."""
-WORTH = 0.1
-"""Seconds for which it is not worth asking what else would do."""
-Solver = Literal["auto", "dense", "sparse", "pcg"]
-"""How the reduced system is solved: by a dense or a sparse Cholesky factor, or by conjugate gradients without forming it."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +77,7 @@ class Elimination:
         *,
         spread: bool = False,
         fronts: Fronts | None = None,
+        like: "Elimination | None" = None,
     ) -> None:
         """Plan what is done once per problem.
 
@@ -99,6 +87,7 @@ class Elimination:
             solver: How the reduced system is solved.
             spread: Whether covariances of eliminated variables will be asked for.
             fronts: A plan for the solver "sparse", if there is one already.
+            like: Another one of the same problem and solver, whose plans will do.
         """
         self.blocks = blocks
         self.layout = layout
@@ -119,9 +108,9 @@ class Elimination:
         """What the memory holds."""
         self._second: Elimination | None = None
         self.ranks = layout.ranks
-        self.fronts = fronts or plan_fronts(layout, solver)
+        self.fronts: Fronts | None = like.fronts if like is not None else fronts or plan_fronts(layout, solver)
         iterative = solver == "pcg" or (solver == "auto" and self.fronts is None and too_large(layout))
-        for family in layout.families:
+        for k, family in enumerate(layout.families):
             V = some.new_empty((family.point_size * (family.point_size + 3) // 2, family.points))
             coupling: GroupCoupling | PairCoupling | RowCoupling | None = None
             if not any(piece.coupled for piece in family.pieces):
@@ -129,11 +118,14 @@ class Elimination:
             elif iterative:
                 coupling = RowCoupling(family, some)
             elif self.fronts is not None:
-                coupling = PairCoupling(family, some, self.fronts)
+                coupling = PairCoupling(family, some, self.fronts, _pairs_of(like, k))
             else:
                 spans, seconds = plan_groups(family)
                 grouped = spread or seconds <= estimate_pairs(family)
-                coupling = GroupCoupling(family, spans, some) if grouped else PairCoupling(family, some)
+                if grouped:
+                    coupling = GroupCoupling(family, spans, some)
+                else:
+                    coupling = PairCoupling(family, some, None, _pairs_of(like, k))
             self.eliminated.append(Eliminated(family, coupling, V, V))
         if iterative:
             rows = [part.coupling for part in self.eliminated if isinstance(part.coupling, RowCoupling)]
@@ -177,7 +169,7 @@ class Elimination:
     def _other(self) -> "Elimination":
         """Memory for a second system."""
         if self._second is None:
-            self._second = Elimination(self.blocks, self.layout, "dense" if self.plan is None else "pcg", fronts=self.fronts)
+            self._second = Elimination(self.blocks, self.layout, "dense" if self.plan is None else "pcg", like=self)
         return self._second
 
     def _clear(self) -> None:
@@ -291,48 +283,16 @@ class Elimination:
             family.coupling.add(part.piece, part.start, J[:, :c], P[:, :q])
 
 
+def _pairs_of(like: Elimination | None, family: int) -> PairCoupling | None:
+    """What is planned already for a family."""
+    coupling = None if like is None else like.eliminated[family].coupling
+    return coupling if isinstance(coupling, PairCoupling) else None
+
+
 def _bending(term: Term, x: dict[str, Tensor], ends: Sequence[dict[str, Tensor]]) -> Tensor:
     """Second derivatives of the residuals towards the ends; 0 where one of these is out of reach."""
     after, before = (term_residual(term, end) for end in ends)
     return ((after - 2 * term_residual(term, x) + before) / ALONG**2).nan_to_num(0.0, 0.0, 0.0)
-
-
-def too_large(layout: Layout) -> bool:
-    """Whether a dense reduced system takes too much memory or time."""
-    return layout.size > LARGEST or layout.size**3 * FLOP > _iterations(layout)
-
-
-def _iterations(layout: Layout) -> float:
-    """Seconds of a solution by conjugate gradients."""
-    rows = torch.tensor(sum(piece.slots.numel() for piece in layout.pieces), device=layout.device)
-    return int(layout.ranks.sum(rows)) * PASS
-
-
-def plan_fronts(layout: Layout, solver: Solver, *, last: Tensor | None = None, exact: bool = False) -> Fronts | None:
-    """How to factor the reduced system as a sparse one; None where something else will do as well.
-
-    Args:
-        layout: The problem.
-        solver: What was asked for.
-        last: Columns that are to be the pivots of the last front.
-        exact: Whether conjugate gradients will not do.
-    """
-    if not layout.size or solver not in ("auto", "sparse"):
-        return None
-    limit = math.inf
-    if solver == "auto":
-        limit = math.inf if exact else _iterations(layout)
-        if exact or layout.size <= LARGEST:
-            limit = min(limit, layout.size**3 * FLOP)
-        forming = layout.ranks.largest(torch.tensor(sum(map(estimate_pairs, layout.families)), device=layout.device))
-        limit -= float(forming)
-        if limit < WORTH or (not exact and PairGraph.of(layout) is not None):
-            return None
-    partner, columns, final = partners(layout, last)
-    found = order_elimination(partner, [len(c) for c in columns], limit, final)
-    if found is None or sum(front.seconds for front in found) > limit:
-        return None
-    return Fronts(found, columns)
 
 
 def _parts(number: int, piece: Piece, x: dict[str, Tensor], families: dict[str, int]) -> list[_Part]:

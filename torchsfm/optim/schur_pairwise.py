@@ -5,6 +5,8 @@ sums over a run. Best where each eliminated variable sees few of many retained o
 camera of all photographs) meet each residual with the sum over its variable's others: no pairs for these.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -22,16 +24,40 @@ BATCH = 4096
 """Pairs multiplied at once."""
 
 
+@dataclass(frozen=True)
+class _Pairs:
+    """Which residuals are multiplied, and where that goes."""
+
+    run: int
+    """Pairs of a run."""
+    left: Tensor
+    right: Tensor
+    block: Tensor
+    """Of each run."""
+    places: Tensor
+    """Of the entries of all blocks,"""
+    twice: Tensor
+    """and those that count twice."""
+
+
 class PairCoupling:
     """`W` as a matrix for each residual, and the plan of all pairs."""
 
-    def __init__(self, family: Family, some: Tensor, matrix: Matrix | None = None) -> None:
+    def __init__(self, family: Family, some: Tensor, matrix: Matrix | None = None, like: "PairCoupling | None" = None) -> None:
+        """Plan what is done once per problem.
+
+        Args:
+            family: The eliminated variables.
+            some: A number of the kind wanted.
+            matrix: Where the entries of the system are; all of them, if not given.
+            like: Another one of the same family and matrix, whose plan will do.
+        """
         self._matrix = matrix or DenseMatrix(family.size)
         self._rows = RowCoupling(family, some)
         same = (self._rows.columns == self._rows.columns[:1]).all(0)
         self._common, self._own = same.nonzero()[:, 0], (~same).nonzero()[:, 0]
         self._slots = find_runs(self._rows.slots).ends
-        self._plan(self._rows.slots, self._rows.columns.shape[0])
+        self._pairs: _Pairs = self._plan(self._rows.slots, self._rows.columns.shape[0]) if like is None else like._pairs
         # One row of zeros more, for padding.
         self._Y = some.new_zeros((self._rows.slots.numel() + 1, self._rows.q, self._rows.width))
         self._work = Workspace(some)
@@ -52,30 +78,34 @@ class PairCoupling:
         """`W point`."""
         return self._rows.lift(point)
 
-    def _plan(self, slots: Tensor, count: int) -> None:
+    def _plan(self, slots: Tensor, count: int) -> _Pairs:
         left, right = pairs_of_points(self._rows.point, slots, count)
         key, sort = torch.sort(slots[left] * count + slots[right])
         blocks, sizes = torch.unique_consecutive(key, return_counts=True)
         mean = left.numel() / max(blocks.numel(), 1)
-        self._run = 32 if mean > 96 else 16 if mean > 24 else 8 if mean > 8 else 4
-        runs = -torch.div(-sizes, self._run, rounding_mode="floor")
-        starts = (runs.cumsum(0) - runs) * self._run - (sizes.cumsum(0) - sizes)
+        run = 32 if mean > 96 else 16 if mean > 24 else 8 if mean > 8 else 4
+        runs = -torch.div(-sizes, run, rounding_mode="floor")
+        starts = (runs.cumsum(0) - runs) * run - (sizes.cumsum(0) - sizes)
         place = torch.arange(left.numel(), device=left.device) + starts.repeat_interleave(sizes)
-        padded = int(runs.sum()) * self._run
+        padded = int(runs.sum()) * run
         blank = torch.full((padded,), slots.numel(), device=left.device, dtype=torch.int32)
-        self._left = blank.index_copy(0, place, left[sort].int())
-        self._right = blank.index_copy(0, place, right[sort].int())
-        self._block = torch.arange(blocks.numel(), device=blocks.device).repeat_interleave(runs)
+        block = torch.arange(blocks.numel(), device=blocks.device).repeat_interleave(runs)
         # Entries (r, c) and (c, r) both go below the diagonal, so one on it counts twice.
         columns = self._rows.columns[:, self._own]
         row = columns[torch.div(blocks, max(count, 1), rounding_mode="floor")][:, :, None]
         column = columns[blocks % max(count, 1)][:, None]
-        self._places = self._matrix.places(row, column).flatten()
-        self._twice = (row == column).flatten().nonzero()[:, 0]
+        return _Pairs(
+            run,
+            blank.index_copy(0, place, left[sort].int()),
+            blank.index_copy(0, place, right[sort].int()),
+            block,
+            self._matrix.places(row, column).flatten(),
+            (row == column).flatten().nonzero()[:, 0],
+        )
 
     def reduce(self, S: Tensor, L: Triangle, z: Tensor) -> None:
         """Subtract `W V^-1 W'` from the numbers S of the matrix, with `V = L L'`, and `W L'^-1 z` from its column `size`."""
-        q, c = self._rows.q, len(self._own)
+        q, c, pairs = self._rows.q, len(self._own), self._pairs
         squares = self._rows.squares(L, z, self._Y[:-1])
         if len(self._common):
             self._add_common(squares)
@@ -84,19 +114,19 @@ class PairCoupling:
         if not c:
             return
         flat = (self._Y[:, :, self._own] if len(self._common) else self._Y).view(-1, q * c)
-        total = S.new_zeros((self._places.numel() // (c * c), c * c))
-        for begin in range(0, self._left.numel(), BATCH):
+        total = S.new_zeros((pairs.places.numel() // (c * c), c * c))
+        for begin in range(0, pairs.left.numel(), BATCH):
             sides = []
-            for name, index in (("left", self._left), ("right", self._right)):
+            for name, index in (("left", pairs.left), ("right", pairs.right)):
                 chosen = index[begin : begin + BATCH]
                 out = self._work.get(name, chosen.numel(), q * c)
-                sides.append(torch.index_select(flat, 0, chosen, out=out).view(-1, self._run * q, c))
-            block = self._block[begin // self._run : (begin + BATCH) // self._run]
+                sides.append(torch.index_select(flat, 0, chosen, out=out).view(-1, pairs.run * q, c))
+            block = pairs.block[begin // pairs.run : (begin + BATCH) // pairs.run]
             product = self._work.get("pairs", block.numel(), c, c)
             total.index_add_(0, block, torch.bmm(sides[0].mT, sides[1], out=product).view(-1, c * c))
         entries = total.view(-1)
-        entries[self._twice] *= 2
-        S.view(-1).index_add_(0, self._places, entries, alpha=-1)
+        entries[pairs.twice] *= 2
+        S.view(-1).index_add_(0, pairs.places, entries, alpha=-1)
 
     def _add_common(self, squares: Tensor) -> None:
         """Add to the squares of slots what the common columns of each variable's other residuals make with them."""

@@ -16,7 +16,8 @@ from torchsfm.optim.normal_equations import NormalEquations
 from torchsfm.optim.problem import Step
 from torchsfm.optim.pytree import Places
 from torchsfm.optim.ranks import Group, Ranks, share
-from torchsfm.optim.schur import Elimination, Solver, move
+from torchsfm.optim.schur import Elimination, move
+from torchsfm.optim.solver_choice import Solver
 from torchsfm.optim.sparse_derivative import Hessian, attach_sparse_optimum, followed
 from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_cost, term_residual
 

@@ -78,3 +78,26 @@ def _merged(masks: list[int], owner: Tensor, last: set[int]) -> tuple[list[int],
     order = torch.argsort(variable, stable=True)
     columns = list(torch.split(order, torch.bincount(variable, minlength=len(number)).tolist()))
     return found, columns, sum(1 << k for k in {of_variable[i] for i in last})
+
+
+def depth(partners: list[int]) -> int:
+    """How many partners it takes from one end of the longest part to the other, but for those that most have."""
+    near = (1 << len(partners)) - 1
+    for i, mask in enumerate(partners):
+        if 2 * mask.bit_count() > len(partners):
+            near &= ~(1 << i)
+    most, left = 0, near
+    while left:
+        start = left & -left
+        # From anywhere to the farthest one, and from there.
+        for _ in range(2):
+            seen, front, steps, end = start, start, 0, start
+            while front:
+                end, steps, after = front, steps + 1, 0
+                for i in members(front):
+                    after |= partners[i]
+                front = after & near & ~seen
+                seen |= front
+            start = end & -end
+        most, left = max(most, steps - 1), left & ~seen
+    return most
