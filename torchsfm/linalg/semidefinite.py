@@ -5,6 +5,7 @@ matrices all eigenvalues are found; of large ones only those next to zero, by in
 2013, 8.2), and the rest is inverted by a Cholesky factor, which takes less than half of the time.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchsfm.linalg.decompositions import eigh
 
+Apply = Callable[[Tensor], Tensor]
 SMALL = 256
 """Rows of the largest matrix of which all eigenvalues are found."""
 WIDTH, ROUNDS = 16, 6
@@ -62,26 +64,55 @@ def pseudo_inverse(A: Float[Tensor, "n n"], null: float) -> PseudoInverse:
     return PseudoInverse(torch.where(ok, root @ root.mT, torch.inf), root.shape[1], ok, root, None)
 
 
+def largest_value(apply: Apply, some: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """About the largest eigenvalue of a finite symmetric matrix, given its product with columns.
+
+    Args:
+        apply: The product.
+        some: A row of it.
+    """
+    basis = torch.linalg.qr(_start(some))[0]
+    for _ in range(ROUNDS):
+        basis = torch.linalg.qr(apply(basis))[0]
+    top: Tensor = torch.linalg.matrix_norm(apply(basis), 2)
+    return top
+
+
+def small_null_space(
+    apply: Apply, solve: Apply, some: Float[Tensor, "n"], limit: Float[Tensor, ""]
+) -> Float[Tensor, "n k"] | None:
+    """An orthonormal basis of what a symmetric matrix takes to no more than a limit; None if that is not small.
+
+    Args:
+        apply: Its product with columns.
+        solve: The product with the inverse of it, or of it and a little more than nothing.
+        some: A row of it.
+        limit: The largest eigenvalue that counts as zero.
+    """
+    basis = torch.linalg.qr(_start(some))[0]
+    for _ in range(ROUNDS):
+        basis = torch.linalg.qr(solve(basis))[0]
+    values, vectors, _ = eigh(basis.mT @ apply(basis))
+    least = values <= limit
+    return None if bool(least.all()) else basis @ vectors[:, least]
+
+
+def _start(some: Float[Tensor, "n"]) -> Float[Tensor, "n m"]:
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(len(some), WIDTH, generator=generator, dtype=torch.float64, device="cpu").to(some)
+
+
 def _by_factor(A: Float[Tensor, "n n"], null: float) -> PseudoInverse | None:
     """The inverse of a large matrix; None where it is not semidefinite or its null space is not small."""
-    start = torch.randn(len(A), WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu").to(A)
-    basis = torch.linalg.qr(start)[0]
-    for _ in range(ROUNDS):
-        basis = torch.linalg.qr(A @ basis)[0]
-    top = torch.linalg.matrix_norm(A @ basis, 2)
+    top = largest_value(lambda x: A @ x, A[0])
     shifted = A.clone()
     shifted.diagonal().add_(SHIFT * top)
     lower, info = torch.linalg.cholesky_ex(shifted)
     if bool(info):
         return None
-    basis = torch.linalg.qr(start)[0]
-    for _ in range(ROUNDS):
-        basis = torch.linalg.qr(torch.cholesky_solve(basis, lower))[0]
-    values, vectors, _ = eigh(basis.mT @ A @ basis)
-    least = values <= null * top
-    if bool(least.all()):
+    kernel = small_null_space(lambda x: A @ x, lambda x: torch.cholesky_solve(x, lower), A[0], null * top)
+    if kernel is None:
         return None
-    kernel = basis @ vectors[:, least]
     lower, info = torch.linalg.cholesky_ex(A + top * kernel @ kernel.mT)
     if bool(info):
         return None

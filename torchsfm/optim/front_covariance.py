@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsfm.linalg import eigh
-from torchsfm.linalg.semidefinite import ROUNDS, SHIFT, WIDTH
+from torchsfm.linalg.semidefinite import SHIFT, largest_value, small_null_space
 from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.normal_equations import NULL, NormalEquations
 
-FIRM = 1e-6
+FIRM = 1e-9
 """The least part of each motion's square that the front must have which is held."""
 
 
@@ -30,26 +30,20 @@ def retained_covariances(
     """
     S, _, determined = system.formed()
     root = system.precision.sqrt()[:, None]
-    start = torch.randn(fronts.size, WIDTH, generator=torch.Generator().manual_seed(0), dtype=torch.float64, device="cpu").to(S)
+    if not bool(S.isfinite().all()):
+        return None
 
     def apply(x: Tensor) -> Tensor:
         return fronts.product(S, x / root) / root
 
-    basis = torch.linalg.qr(start)[0]
-    for _ in range(ROUNDS):
-        basis = torch.linalg.qr(apply(basis))[0]
-    top = torch.linalg.matrix_norm(apply(basis), 2)
+    top = largest_value(apply, root[:, 0])
     factor = fronts.factor(S, SHIFT * top * system.precision)
     if factor is None:
         return None
-    basis = torch.linalg.qr(start)[0]
-    for _ in range(ROUNDS):
-        basis = torch.linalg.qr(root * factor.solve(root * basis))[0]
-    values, vectors, ok = eigh(basis.mT @ apply(basis))
-    least = values <= NULL * top
-    if not bool(ok) or bool(least.all()):
+    almost = factor
+    K = small_null_space(apply, lambda x: root * almost.solve(root * x), root[:, 0], NULL * top)
+    if K is None:
         return None
-    K = basis @ vectors[:, least]
     hold = None
     if K.shape[1]:
         widest = fronts.widest()
