@@ -19,7 +19,7 @@ from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.evaluation import pose_errors
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
-from torchsfm.reconstruction.missing import missing_correspondences
+from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
 from torchsfm.reconstruction.models import matches_across
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.view_graph import ViewGraph
@@ -164,6 +164,15 @@ def test_conflicts_that_are_known_are_those_that_are_found(generator: torch.Gene
     assert given.doubt == judged(mapping)
     none = missing_correspondences(scene(generator, v=len(mapping.registered)))
     assert not any("look alike" in reason for reason in examine(mapping, conflicts=none, **known).doubt)  # type: ignore[arg-type]
+
+
+def test_whether_a_model_is_folded_is_asked_once(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    mapping, asked = scene(generator, v=8), []
+    whether = Conflicts.folded.fget
+    assert whether is not None
+    monkeypatch.setattr(Conflicts, "folded", property(lambda self: asked.append(1) or whether(self)))
+    judged(mapping)
+    assert len(asked) == 1
 
 
 def test_deviations_of_cameras_do_not_depend_on_where_their_covariance_comes_from(generator: torch.Generator) -> None:
