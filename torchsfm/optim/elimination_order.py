@@ -15,6 +15,8 @@ FLOP = 1.0 / 12e9
 """Seconds for a multiplication with an addition in a dense product, on a usual core."""
 ENTRY = 4e-9
 """Seconds to add an entry of one front into another."""
+MEET = 2e-6
+"""Seconds to look after one partner of one variable while the order is found."""
 VISIT = 2e-4
 """Seconds that a front costs, whatever its size."""
 
@@ -67,7 +69,7 @@ def _least_partners(
     heap = [(columns[i], 0, i) for i in range(len(left)) if not last >> i & 1]
     heapq.heapify(heap)
     order, border, beyond = list[int](), list[int](), list[int]()
-    gone, flops = 0, float(sum(widths[i] for i in members(last))) ** 3 / 3
+    gone, work, flops = 0, 0, float(sum(widths[i] for i in members(last))) ** 3 / 3
     while heap:
         degree, clock, i = heapq.heappop(heap)
         if gone >> i & 1 or degree != columns[i] or -clock != met[i]:
@@ -78,13 +80,16 @@ def _least_partners(
         border.append(own)
         beyond.append(degree)
         flops += widths[i] * degree * degree
-        if flops * FLOP > limit:
+        # All of the border have to do with each other from now on. And finding an order must not take longer than using it.
+        if (flops + degree**3 / 3) * FLOP > limit or work * MEET > limit:
             return None
         for j in members(own):
             before = left[j]
             after = (before | own) & ~(1 << i | 1 << j)
+            work += 1
             if fill := after & ~before:
                 columns[j] += sum(widths[k] for k in members(fill))
+                work += fill.bit_count()
             columns[j] -= widths[i]
             left[j], met[j] = after, len(order)
             if last >> j & 1:

@@ -25,6 +25,8 @@ PASS = 4e-6
 """Seconds per residual of a solution by conjugate gradients, of some 100 iterations."""
 HOPS = 10
 """Partners from one end of a scene to the other for which that many will do: each iteration tells the next partner."""
+FORMED = 3.5
+"""Seconds of forming a sparse system pair by pair that are not too many: the plan of so many pairs takes 1.3 GB."""
 WORTH = 0.1
 """Seconds for which it is not worth asking what else would do."""
 Solver = Literal["auto", "dense", "sparse", "pcg"]
@@ -59,7 +61,7 @@ def plan_fronts(layout: Layout, solver: Solver, *, last: Tensor | None = None, e
             return None
         pairs = torch.tensor(sum(map(estimate_pairs, layout.families)), dtype=torch.float64, device=layout.device)
         forming = float(layout.ranks.largest(pairs))
-        if dense - forming < WORTH:
+        if dense - forming < WORTH or forming > FORMED:
             return None
     partner, columns, final = partners(layout, last)
     limit = math.inf
