@@ -469,8 +469,10 @@ FUNCTIONS: dict[str, Function] = {
         {"residual": lambda _: _fit, "x0": lambda s: s.randn(2), "data": lambda s: (s.randn(12), s.randn(12))}
     ),
     "optim.loss_slope": Function({"loss": Cauchy(1.0), "s": lambda s: s.rand(5)}),
-    "optim.joint_covariance": Function({"blocks": _blocks, "terms": _terms, "name": "p"}, batched=False),
     "optim.marginal_covariance": Function({"blocks": _blocks, "terms": _terms, "name": "p"}, batched=False),
+    "optim.pair_covariance": Function(
+        {"blocks": _blocks, "terms": _terms, "name": "p", "pairs": torch.zeros((1, 2), dtype=torch.long)}, batched=False
+    ),
     "optim.sparse_covariance": Function({"blocks": _blocks, "terms": _terms}, batched=False),
     "optim.sparse_levenberg_marquardt": Function({"blocks": _blocks, "terms": _terms}, batched=False),
     "reconstruction.reconstruct_tracks": Function(
@@ -611,7 +613,7 @@ INNER = {
     "geometry.curve_crossings", "geometry.curve_from_samples", "geometry.foot_points", "geometry.least_number_off",
     "geometry.line_and_plane_distances", "images.describe_images", "images.describe_segments", "images.list_skipped",
     "optim.for_slots",
-    "images.parse_exif", "optim.joint_covariance", "optim.loss_slope", "optim.marginal_covariance",
+    "images.parse_exif", "optim.loss_slope", "optim.marginal_covariance", "optim.pair_covariance",
     "optim.rotation_exponential", "optim.wants_derivative", "robust.check_counts", "robust.check_door",
     "robust.constant_weights", "robust.estimate_robustly",
 }  # fmt: skip

@@ -16,6 +16,7 @@ from torchsfm.optim import (
     elimination_order,
     layout,
     marginal_covariance,
+    pair_covariance,
     schur,
     solver_choice,
     sparse_covariance,
@@ -335,6 +336,34 @@ def test_covariances_are_the_dense_ones(
         torch.testing.assert_close(sparse.blocks[name], dense.blocks[name], rtol=1e-5, atol=1e-10)
         assert torch.equal(sparse.determined[name], dense.determined[name])
     assert all(torch.equal(sparse.determined[name], dense.determined[name]) for name in eliminate)
+
+
+@pytest.mark.usefixtures("many_fronts")
+def test_covariances_of_pairs_are_the_dense_ones(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks, terms = road(300, generator, off=1e-3)
+    blocks["scale"] = dataclasses.replace(blocks["scale"], fixed=torch.ones(3, dtype=torch.bool))
+    eliminate, step = ("mark", "sign"), torch.arange(299)
+    near = torch.stack((step, step + 1), 1)
+    dense = pair_covariance(blocks, terms, "station", near, eliminate=eliminate)
+    whole = sparse_covariance(blocks, terms, eliminate=eliminate, of_eliminated=False)
+    place = whole.columns["station"]
+    a, b = (torch.where(place >= 0, place, 0)[i] for i in near.unbind(1))
+    free = (place[near] >= 0).all(-1).all(-1)[:, None, None]
+    torch.testing.assert_close(dense[1], torch.where(free, whole.joint[a[:, :, None], b[:, None]], 0.0), rtol=1e-6, atol=1e-12)
+    taken(monkeypatch, 0.0)
+    planned = []
+    monkeypatch.setattr(
+        covariance, "plan_fronts", lambda *a, **k: planned.append(solver_choice.plan_fronts(*a, **k)) or planned[-1]
+    )
+    sparse = pair_covariance(blocks, terms, "station", near, eliminate=eliminate)
+    for one, other in zip(sparse, dense, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-12)
+    assert isinstance(planned[0], Fronts)
+    # What is far apart has no entry in the factor.
+    far = torch.tensor([[3, 290], [3, 4]])
+    found = pair_covariance(blocks, terms, "station", far, eliminate=eliminate)[1]
+    a, b = (place[i] for i in far.unbind(1))
+    torch.testing.assert_close(found, whole.joint[a[:, :, None], b[:, None]], rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.usefixtures("many_fronts")

@@ -1,6 +1,6 @@
 """Which parameters make the residuals smallest, and how do they move when the data move? Engines that know no geometry."""
 
-from torchsfm.optim.covariance import SparseCovariance, joint_covariance, marginal_covariance, sparse_covariance
+from torchsfm.optim.covariance import SparseCovariance, marginal_covariance, pair_covariance, sparse_covariance
 from torchsfm.optim.implicit import attach_implicit, attach_optimum, for_slots, wants_derivative
 from torchsfm.optim.levenberg_marquardt import LeastSquaresResult, levenberg_marquardt
 from torchsfm.optim.loss import Cauchy, GemanMcClure, Huber, Loss, SoftL1, Truncated, Tukey, loss_slope
@@ -42,10 +42,10 @@ __all__ = [
     "attach_implicit",
     "attach_optimum",
     "for_slots",
-    "joint_covariance",
     "levenberg_marquardt",
     "loss_slope",
     "marginal_covariance",
+    "pair_covariance",
     "rotation_exponential",
     "sparse_covariance",
     "sparse_levenberg_marquardt",

@@ -12,12 +12,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm._types import check_options
-from torchsfm.optim.front_covariance import marginal_blocks, retained_covariances
-from torchsfm.optim.fronts import Fronts
+from torchsfm._types import check_index, check_one_problem, check_options
+from torchsfm.optim.front_covariance import inverse_entries, retained_covariances
 from torchsfm.optim.layout import Layout, lay_out
 from torchsfm.optim.loss import loss_slope
-from torchsfm.optim.normal_equations import NormalEquations
 from torchsfm.optim.schur import Elimination
 from torchsfm.optim.solver_choice import Solver, plan_fronts
 from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_residual
@@ -188,36 +186,28 @@ def marginal_covariance(
         >>> torchsfm.optim.marginal_covariance({"x": x}, [measured], "x")[0].diagonal()
         tensor([0.2500, 0.2500], dtype=torch.float64)
     """
-    _check(blocks, terms, eliminate)
-    check_options(name=(name, tuple(blocks)))
-    with torch.no_grad():
-        double, counted, _ = prepare(blocks, terms)
-        layout = lay_out(double, counted, eliminate)
-        out = double[name].x.new_zeros((double[name].x.shape[0], double[name].tangent, double[name].tangent))
-        free, places = layout.free[name], _places(double, layout)[name]
-        if not places.numel():
-            return out
-        system, fronts = _linearized(double, layout, places.flatten(), together=False)
-        if fronts is not None and places.numel() == layout.size:
-            out[free] = marginal_blocks(system, fronts, places)
-        else:
-            joint, own = _inverse(system.information(places.flatten())), places - places[0, 0]
-            out[free] = joint[own[:, :, None], own[:, None]]
-    return out
+    nothing = torch.zeros((0, 2), dtype=torch.int64, device=blocks[name].x.device) if name in blocks else None
+    return pair_covariance(blocks, terms, name, nothing, eliminate=eliminate)[0]  # type: ignore[arg-type]
 
 
-def joint_covariance(
-    blocks: Mapping[str, Block], terms: Sequence[Term], name: str, *, eliminate: str | Sequence[str] | None = None
-) -> Float[Tensor, "n k n k"]:
-    """The covariance of all variables of one block together, those of the others as they follow.
+def pair_covariance(
+    blocks: Mapping[str, Block],
+    terms: Sequence[Term],
+    name: str,
+    pairs: Int[Tensor, "m 2"],
+    *,
+    eliminate: str | Sequence[str] | None = None,
+) -> tuple[Float[Tensor, "n k k"], Float[Tensor, "m k k"]]:
+    """The covariance of each variable of one block, and of pairs of them.
 
-    As `marginal_covariance` in all else; the covariance of a difference of two variables is that of the one and the other less
-    twice what they have in common.
+    As `marginal_covariance`, and little more for pairs that share a term or an eliminated variable. A difference has the
+    covariance of the one and the other, less that of the pair and its transpose.
 
     Args:
         blocks: The variables by name, at the optimum.
         terms: The residuals of which it is the optimum.
         name: The block whose covariance is wanted.
+        pairs: Two numbers of variables each.
         eliminate: Blocks that are eliminated first, as points are.
 
     Example:
@@ -225,34 +215,46 @@ def joint_covariance(
         >>> from torchsfm.optim import Block, Term
         >>> pair = torch.arange(2)
         >>> one, other = Term(lambda x: x, ("x",), (pair[:1],)), Term(lambda x, y: y - x, ("x", "x"), (pair[:1], pair[1:]))
-        >>> torchsfm.optim.joint_covariance({"x": Block(torch.zeros(2, 1))}, [one, other], "x")[:, 0, :, 0]
-        tensor([[1., 1.],
-                [1., 2.]], dtype=torch.float64)
+        >>> own, between = torchsfm.optim.pair_covariance({"x": Block(torch.zeros(2, 1))}, [one, other], "x", pair[None])
+        >>> own[:, 0, 0], between[:, 0, 0]
+        (tensor([1., 2.], dtype=torch.float64), tensor([1.], dtype=torch.float64))
     """
     _check(blocks, terms, eliminate)
     check_options(name=(name, tuple(blocks)))
+    check_one_problem(pairs=(pairs, "m 2: int"))
+    check_index(pairs=(pairs, blocks[name].x.shape[0]))
     with torch.no_grad():
         double, counted, _ = prepare(blocks, terms)
         layout = lay_out(double, counted, eliminate)
         count, width = double[name].x.shape[0], double[name].tangent
-        out = double[name].x.new_zeros((count, width, count, width))
+        out = double[name].x.new_zeros((count + len(pairs), width, width))
         free, places = layout.free[name], _places(double, layout)[name]
         if places.numel():
-            joint = _inverse(_linearized(double, layout, places.flatten(), together=True)[0].information(places.flatten()))
-            out[free[:, None], :, free[None]] = joint.view(len(free), width, len(free), width).movedim(1, 2)
-    return out
+            slot = torch.full((count,), -1, device=free.device).index_copy_(
+                0, free, torch.arange(len(free), device=free.device)
+            )
+            both = (slot[pairs] >= 0).all(1).nonzero()[:, 0]
+            a, b = slot[pairs[both]].unbind(1)
+            rows, columns = torch.cat((places, places[a])), torch.cat((places, places[b]))
+            out[torch.cat((free, count + both))] = _entries(double, layout, places, rows[:, :, None], columns[:, None])
+    return out[:count], out[count:]
 
 
-def _linearized(
-    blocks: dict[str, Block], layout: Layout, columns: Int[Tensor, "m"], *, together: bool
-) -> tuple[NormalEquations, Fronts | None]:
-    """The system in which some columns are alone, or together, by a sparse factor where that is less."""
-    x, whole = {key: b.x for key, b in blocks.items()}, len(columns) == layout.size
-    fronts = None
-    if not (_rests(blocks) or (together and whole)):
-        fronts = plan_fronts(layout, "auto", last=None if whole else columns, exact=True)
+def _entries(
+    blocks: dict[str, Block], layout: Layout, places: Int[Tensor, "f k"], row: Tensor, column: Tensor
+) -> Float[Tensor, "n k k"]:
+    """Entries of the covariance of the variables of some columns, by a sparse factor where that is less."""
+    x, own = {key: b.x for key, b in blocks.items()}, places.flatten()
+    whole, fronts = len(own) == layout.size, None
+    if not _rests(blocks):
+        fronts = plan_fronts(layout, "auto", last=None if whole else own, exact=True)
+    if fronts is not None and whole and not bool(fronts.meet(row, column).all()):
+        fronts = None
     solver: Solver = "dense" if fronts is None else "sparse"
-    return Elimination(blocks, layout, solver, fronts=fronts).linearize(x), fronts
+    system = Elimination(blocks, layout, solver, fronts=fronts).linearize(x)
+    if fronts is not None and whole:
+        return inverse_entries(system, fronts, row, column)
+    return _inverse(system.information(own))[row - own[0], column - own[0]]
 
 
 def _inverse(information: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:

@@ -65,14 +65,12 @@ def retained_covariances(
     return found, fronts.size - K.shape[1], determined
 
 
-def marginal_blocks(system: NormalEquations, fronts: Fronts, columns: Tensor) -> Tensor:
-    """The blocks of the inverse at columns (n, k), 0 where nothing tells of a column; infinite if it is not positive."""
+def inverse_entries(system: NormalEquations, fronts: Fronts, row: Tensor, column: Tensor) -> Tensor:
+    """Entries of the inverse where the matrix has some, 0 where nothing tells of a column; infinite if it is not positive."""
     S = system.informed()
     own = torch.arange(fronts.size, device=S.device)
     held = S[fronts.places(own, own)] <= 0
-    factor = fronts.factor(S, held.to(S.dtype))
+    factor, none = fronts.factor(S, held.to(S.dtype)), held[row] | held[column]
     if factor is None:
-        return torch.full((*columns.shape, columns.shape[1]), torch.inf, dtype=S.dtype, device=S.device)
-    none = held[columns]
-    blocks = factor.inverse()[fronts.places(columns[:, :, None], columns[:, None])]
-    return torch.where(none[:, :, None] | none[:, None], 0.0, blocks)
+        return torch.full(none.shape, torch.inf, dtype=S.dtype, device=S.device)
+    return torch.where(none, 0.0, factor.inverse()[fronts.places(row, column)])

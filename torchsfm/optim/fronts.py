@@ -99,6 +99,12 @@ class Fronts:
         nowhere = torch.where(late == self.size, self.total + early, self.total + self.size)
         return torch.where(late < self.size, inside, torch.where(early < self.size, nowhere, self.total + self.size))
 
+    def meet(self, row: Tensor, column: Tensor) -> Tensor:
+        """Whether the matrix has entries there."""
+        first = self._turn[row] <= self._turn[column]
+        early, late = torch.where(first, row, column), torch.where(first, column, row)
+        return self._first[self._front[self._variable[early]], self._variable[late]] >= 0
+
     def squares(self, columns: Tensor) -> Tensor:
         """Where squares over columns (n, c) are, (n, c, c); what lies in the upper triangle is nowhere."""
         row, column = columns[:, :, None], columns[:, None]

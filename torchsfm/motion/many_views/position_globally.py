@@ -23,7 +23,7 @@ from torchsfm._types import Status, check_index, check_one_problem, check_option
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.components import components
 from torchsfm.motion.many_views.triplets import pairs_within
-from torchsfm.optim import Block, Huber, SparseResult, Term, joint_covariance
+from torchsfm.optim import Block, Huber, SparseResult, Term, pair_covariance
 from torchsfm.optim import sparse_levenberg_marquardt as minimise
 
 CORNER = 0.1
@@ -294,22 +294,27 @@ class _Rays:
             Term(_length, ("c", "c"), (first, last), (direction, HELD * apart.norm(dim=-1))),
         ]
         blocks = {"c": Block(c, fixed=component == own), "X": Block(X)}
-        spread = joint_covariance(blocks, terms, "c", eliminate="X").diagonal(dim1=1, dim2=3).sum(-1)
-        own = spread.diagonal()
+        pairs, shared = self._shared(near)
+        spread, between = (
+            t.diagonal(dim1=-2, dim2=-1).sum(-1) for t in pair_covariance(blocks, terms, "c", pairs, eliminate="X")
+        )
         # A part of free size may have come out so small that its deviation is, too, but not beside its own size.
-        shared = self._shared()
-        off = (shared * (own[:, None] + own - 2 * spread)).sum(-1)
-        size = (shared * torch.cdist(c, c).square()).sum(-1)
-        return torch.where(off > FREE**2 * size, torch.inf, own.sqrt())
+        off, size = torch.zeros_like(spread), torch.zeros_like(spread)
+        for i in pairs.unbind(1):
+            off.index_add_(0, i, shared * (spread[pairs].sum(1) - 2 * between))
+            size.index_add_(0, i, shared * (c[pairs[:, 0]] - c[pairs[:, 1]]).square().sum(-1))
+        return torch.where(off > FREE**2 * size, torch.inf, spread.sqrt())
 
-    def _shared(self) -> Float[Tensor, "v v"]:
-        """How many points two cameras share beyond the first, which leaves it open how far apart they are."""
-        different = torch.unique(self.point * self.views + self.view)
-        view, shared = different % self.views, self.v.new_zeros(self.views * self.views)
-        for a, b in pairs_within(different // self.views):
-            shared += torch.bincount(view[a] * self.views + view[b], minlength=len(shared))
-        shared = shared.view(self.views, self.views)
-        return (shared + shared.mT - 1).clamp(min=0)
+    def _shared(self, rays: Int[Tensor, "k"]) -> tuple[Int[Tensor, "q 2"], Float[Tensor, "q"]]:
+        """Pairs of cameras, and how many points they share beyond the first, which leaves open how far apart they are."""
+        different = torch.unique(self.point[rays] * self.views + self.view[rays])
+        view, points = different % self.views, different // self.views
+        found = [torch.unique(view[a] * self.views + view[b], return_counts=True) for a, b in pairs_within(points)]
+        if not found:
+            return self.view.new_zeros((0, 2)), self.v.new_zeros(0)
+        key, place = torch.unique(torch.cat([key for key, _ in found]), return_inverse=True)
+        number = torch.zeros_like(key).index_add_(0, place, torch.cat([count for _, count in found])).to(self.v.dtype)
+        return torch.stack((key // self.views, key % self.views), 1), number - 1
 
     def _sines(self, scale: float, unit: float = 1.0) -> Term:
         """Sines of angles, in a unit."""
