@@ -1,0 +1,143 @@
+"""Sums over rays whose minima are where cameras and points are.
+
+With the direction v of a ray in the world and D from the centre to the point, two sums are minimised one after the other, both
+with three unknowns a camera and a point, points eliminated:
+
+    |D - max(v'D, 1) v|          distances from the half ray that begins one unit ahead of the camera: convex, so the minimum
+                                 does not depend on the start, and there is no collapse into one point
+    |v - max(v'D, 0) D / |D|^2|  the sine of the angle between the two, which does not depend on distances
+
+The first is least unsquared deviations (Ozyesil & Singer, "Robust camera location estimation by convex programming", CVPR
+2015), of rays to points in place of directions between cameras; the second is what global positioning minimises (Pan et al.,
+"Global structure-from-motion revisited", ECCV 2024) with the scale of each ray eliminated.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchsfm.motion.many_views.components import components
+from torchsfm.optim import Block, Huber, SparseResult, Term
+from torchsfm.optim import sparse_levenberg_marquardt as minimise
+
+CORNER = 0.1
+"""Distance from its ray, at one unit ahead of the camera, from which a point pulls with constant force."""
+ROUGH = 1e-3
+"""Part of the cost to which sums are minimised that set the scale of the next."""
+QUARTILE = 0.5754
+"""Of a squared residual of two normal components."""
+EXACT = 1e-5
+"""The least standard deviation of rays, in radians."""
+HUBER = 1.5
+"""Standard deviations from which a ray pulls with constant force in the second sum."""
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The rays that count, turned into the world, in double precision."""
+
+    v: Float[Tensor, "m 3"]
+    view: Int[Tensor, "m"]
+    point: Int[Tensor, "m"]
+    weights: Float[Tensor, "m"] | None
+    views: int
+    points: int
+
+    def component(self) -> Int[Tensor, "v"]:
+        """The smallest camera that each is connected with."""
+        pairs = torch.stack((self.view, self.views + self.point), 1)
+        return components(pairs, self.views + self.points)[: self.views]
+
+    def convex(self, max_iterations: int) -> dict[str, Tensor]:
+        """The minimum of distances from half rays."""
+        zero = {"c": self.v.new_zeros(self.views, 3), "X": self.v.new_zeros(self.points, 3)}
+        term = Term(_ahead, ("c", "X"), (self.view, self.point), (self.v,), Huber(CORNER), self.weights, _linearize_ahead)
+        return self._minimise(zero, term, max_iterations, ROUGH).x
+
+    def angular(self, start: dict[str, Tensor], scale: float, max_iterations: int, tolerance: float) -> SparseResult:
+        """The minimum of the sines of angles."""
+        return self._minimise(start, self.sines(scale), max_iterations, tolerance)
+
+    def scale(self, x: dict[str, Tensor], lost: float) -> float:
+        """The standard deviation of the right rays, if a quarter of all are right.
+
+        Args:
+            x: Centres and points.
+            lost: The part of the residuals' freedom that centres and points have taken.
+        """
+        if not len(self.v):
+            return EXACT
+        square = _sine(x["c"][self.view], x["X"][self.point], self.v).square().sum(-1)
+        quartile = float(square.kthvalue(1 + (len(square) - 1) // 4).values)
+        return max(math.sqrt(quartile / QUARTILE / (1 - lost)), EXACT)
+
+    def anchored(self, found: SparseResult, component: Int[Tensor, "v"]) -> tuple[Tensor, Tensor]:
+        """Centres and points with the gauge of each component fixed."""
+        c, X = found.x["c"], found.x["X"]
+        number = torch.bincount(component, minlength=self.views).clamp(min=1)[:, None]
+        mean = torch.zeros_like(c).index_add(0, component, c) / number
+        square = (c - mean[component]).square().sum(-1, keepdim=True)
+        extent = (torch.zeros_like(square).index_add(0, component, square) / number).clamp(min=1e-60).sqrt()
+        at = torch.zeros(self.points, dtype=torch.long, device=X.device).index_put_((self.point,), component[self.view])
+        return (c - c[component]) / extent[component], (X - c[at]) / extent[at]
+
+    def sines(self, scale: float, unit: float = 1.0) -> Term:
+        """Sines of angles, in a unit."""
+        loss = Huber(unit * HUBER * scale)
+        data = unit * self.v, self.v
+        return Term(_sine_scaled, ("c", "X"), (self.view, self.point), data, loss, self.weights, _linearize_sine)
+
+    def _minimise(self, start: dict[str, Tensor], term: Term, max_iterations: int, tolerance: float) -> SparseResult:
+        blocks = {name: Block(x) for name, x in start.items()}
+        return minimise(blocks, [term], eliminate="X", max_iterations=max_iterations, function_tolerance=tolerance)
+
+
+def _ahead(c: Tensor, X: Tensor, v: Tensor) -> Tensor:
+    """From the nearest point of the half ray to X."""
+    D = X - c
+    return D - (v * D).sum(-1, keepdim=True).clamp(min=1) * v
+
+
+def _linearize_ahead(c: Tensor, X: Tensor, v: Tensor, *, out: list[Tensor | None]) -> Tensor:
+    """The same, and its derivatives: those of X, and for c their negatives."""
+    along = ((X - c) * v).sum(-1)
+    J = torch.eye(3, dtype=v.dtype, device=v.device) - torch.where((along > 1)[:, None, None], v[:, :, None] * v[:, None], 0.0)
+    return _store(J, out, _ahead(c, X, v))
+
+
+def _sine(c: Tensor, X: Tensor, v: Tensor) -> Tensor:
+    """From the nearest point of the line through c and X, or from c where that lies behind, to the end of v."""
+    u = torch.nn.functional.normalize(X - c, dim=-1)
+    return v - (v * u).sum(-1, keepdim=True).clamp(min=0) * u
+
+
+def _sine_scaled(c: Tensor, X: Tensor, scaled: Tensor, v: Tensor) -> Tensor:
+    """The same in the unit of `scaled`, a multiple of v."""
+    u = torch.nn.functional.normalize(X - c, dim=-1)
+    return scaled - (scaled * u).sum(-1, keepdim=True) * torch.where((v * u).sum(-1, keepdim=True) > 0, u, 0.0)
+
+
+def _linearize_sine(c: Tensor, X: Tensor, scaled: Tensor, v: Tensor, *, out: list[Tensor | None]) -> Tensor:
+    """The same, and its derivatives."""
+    D = X - c
+    length = torch.linalg.vector_norm(D, dim=-1).clamp(min=1e-12)
+    u = D / length[:, None]
+    s = (scaled * u).sum(-1)
+    ahead = (v * u).sum(-1) > 0
+    eye = torch.eye(3, dtype=v.dtype, device=v.device)
+    across = scaled - s[:, None] * u
+    J = s[:, None, None] * (eye - u[:, :, None] * u[:, None]) + u[:, :, None] * across[:, None]
+    J = torch.where(ahead[:, None, None], -J / length[:, None, None], 0.0)
+    return _store(J, out, _sine_scaled(c, X, scaled, v))
+
+
+def _store(J: Tensor, out: list[Tensor | None], residual: Tensor) -> Tensor:
+    """Derivatives by X, their negatives by c."""
+    if out[0] is not None:
+        out[0].copy_(-J)
+    if out[1] is not None:
+        out[1].copy_(J)
+    return residual
