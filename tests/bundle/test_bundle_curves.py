@@ -236,7 +236,7 @@ def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> N
     x, normal, tangent = curves.x.clone(), curves.normal.clone(), curves.tangent.clone()
     x[curves.sample == 7], normal[curves.sample == 9], tangent[11] = torch.nan, 0.0, 0.0
     changed = dataclasses.replace(curves, fixed=fixed, weights=weights, x=x, normal=normal, tangent=tangent)
-    result = bundle_adjust(problem, structure=[changed], tolerance=1e-13)
+    result = bundle_adjust(problem, structure=[changed], tolerance=1e-13, max_iterations=200)
     after = adjusted(result, BundleCurves).X
     assert (after == curves.X).all(1).nonzero()[:, 0].tolist() == [3, 5, 7, 9, 11]
     assert after.isfinite().all()
@@ -245,7 +245,7 @@ def test_what_is_held_or_unseen_keeps_every_bit(generator: torch.Generator) -> N
     # They are as if they were not there.
     some = {name: getattr(curves, name)[~dead] for name in ("x", "normal", "curvature", "view", "sample")}
     others = dataclasses.replace(curves, fixed=fixed, **some)
-    again = bundle_adjust(problem, structure=[others], tolerance=1e-13)
+    again = bundle_adjust(problem, structure=[others], tolerance=1e-13, max_iterations=200)
     assert again.cost == pytest.approx(result.cost, rel=1e-7)
     covariance = bundle_covariance(problem, structure=[changed]).structure[0]
     assert torch.equal(covariance[3], torch.zeros(3, 3, dtype=F64))
@@ -292,7 +292,7 @@ def test_derivatives_by_image_curves(generator: torch.Generator, name: str) -> N
     leaf = values.clone().requires_grad_()
     (slope,) = torch.autograd.grad(found(leaf), leaf)
     step = torch.randn(values.shape, generator=generator, dtype=F64)
-    size = {"x": 1e-4, "normal": 1e-3, "curvature": 1e-4}[name]
+    size = {"x": 1e-4, "normal": 1e-3, "curvature": 3e-5}[name]
     numeric = (found(values + size * step) - found(values - size * step)) / (2 * size)
     torch.testing.assert_close((slope * step).sum(), numeric.detach(), rtol=1e-4, atol=1e-7)
 

@@ -34,7 +34,7 @@ _LAST = 12
 _KEPT, _KEPT_OF_FOUR = 8, 16
 """Best different starts that are refined, of more than four conics and of four: these leave one number over, which says little,
 so that what starts cost tells less of where they lead, and several answers are likely."""
-_UNSURE = 0.2
+_UNSURE = 0.1
 """The standard deviation of a parameter (epipoles in radians, as seen in normalised images) that is none."""
 _RIVAL = 9.0
 """In units of the noise: by how much more cost another answer must have."""
