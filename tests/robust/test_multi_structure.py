@@ -176,5 +176,6 @@ def test_adelaide(kind: str, limit: float, data: Path) -> None:
     for i, name in enumerate(names):
         truth = torch.from_numpy(archive[name + "_label"].ravel().astype(int)) - 1
         errors.append(misclassified(found.label[i][mask[i]], truth))
+    # Over seeds the mean is 0.053 and 0.093 with a scatter of 0.005 and 0.008, the median 0.039 and 0.073, 0.005 and 0.012.
     assert np.mean(errors) < limit
-    assert np.median(errors) < 0.08
+    assert np.median(errors) < limit
