@@ -228,8 +228,9 @@ def pair_covariance(
         layout = lay_out(double, counted, eliminate)
         count, width = double[name].x.shape[0], double[name].tangent
         out = double[name].x.new_zeros((count + len(pairs), width, width))
-        free, places = layout.free[name], _places(double, layout)[name]
-        if places.numel():
+        free = layout.free[name]
+        if free.numel() and width:
+            places = _places(double, layout)[name]
             slot = torch.full((count,), -1, device=free.device).index_copy_(
                 0, free, torch.arange(len(free), device=free.device)
             )

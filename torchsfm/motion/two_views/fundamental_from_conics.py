@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
 from torchsfm.linalg import eigh, null_vector, unit_scale, usable
+from torchsfm.motion.two_views.coplanar_conics import may_be_coplanar
 from torchsfm.motion.two_views.epipolar_tangents import (
     ConicPairs,
     EpipolarFrames,
@@ -34,10 +35,12 @@ _LAST = 12
 _KEPT, _KEPT_OF_FOUR = 8, 16
 """Best different starts that are refined, of more than four conics and of four: these leave one number over, which says little,
 so that what starts cost tells less of where they lead, and several answers are likely."""
-_UNSURE = 0.1
+_UNSURE = 0.2
 """The standard deviation of a parameter (epipoles in radians, as seen in normalised images) that is none."""
 _RIVAL = 9.0
 """In units of the noise: by how much more cost another answer must have."""
+_LEAST = 5e-3
+"""The least noise where none is given, for the question whether conics are in one plane: four tell next to nothing of it."""
 _EXACT = 1e-14
 """The mean square of a residual that is rounding."""
 
@@ -167,6 +170,11 @@ def fundamental_from_conics(
         # An estimate from few residuals may be too small by much.
         noise = noise * (1 + 12 / freedom) if covariance1 is None else noise.clamp_min(1.0)
         unsure = _uncertain(state, fixed, weights, noise)
+        if count < 2:
+            # Two points off the plane of conics are enough for F.
+            least = _LEAST if covariance1 is None else _EXACT
+            plane = may_be_coplanar(fixed.c1, fixed.c2, fixed.S1, fixed.S2, seen, noise.clamp_min(least))
+            unsure = unsure | plane
         apart = torch.linalg.matrix_norm(_signed(tried.x.F()) - _signed(state.F())[..., None, :, :]) > 1e-2
         rivals = (apart & (2 * cost <= (2 * final.cost + _RIVAL * noise + _EXACT * rows)[..., None])).any(-1)
         settled = (final.status == Status.OK) | (2 * final.cost < _EXACT * rows)
