@@ -1,6 +1,7 @@
 """F from conics: exact scenes by family, the noise it must have, what does not determine it, and the laws of every door."""
 
 import math
+import sys
 
 import pytest
 import torch
@@ -12,7 +13,8 @@ from torchsfm._types import Status
 from torchsfm.geometry import Ellipse, conic_from_ellipse, dual_conic, ellipse_from_conic, project_points, project_quadric
 from torchsfm.images import fit_ellipse
 from torchsfm.motion import fundamental_from_conics
-from torchsfm.motion.two_views.coplanar_conics import invariants
+from torchsfm.motion.two_views.coplanar_conics import invariants, may_be_coplanar
+from torchsfm.motion.two_views.fundamental_from_conics import ConicEpipolarFit
 from torchsfm.simulation import SimulatedConics, simulate_conics
 from torchsfm.tensors import fundamental_from_cameras
 
@@ -55,11 +57,23 @@ def test_coplanar_conics_are_told(generator):
 
 
 @pytest.mark.parametrize(("conics", "noise"), [(4, 0.3), (6, 1.0)])
-def test_noisy_coplanar_conics_are_told(conics, noise, generator):
+def test_noisy_coplanar_conics_are_told(conics, noise, generator, monkeypatch):
     scene = simulate_conics((20,), conics=conics, views=2, coplanar=True, noise=noise, generator=generator)
     C = conic_from_ellipse(fit_ellipse(scene.x).model)
+    flat: list[Tensor] = []
+
+    def remember(*data):
+        flat.append(may_be_coplanar(*data))
+        return flat[-1]
+
+    monkeypatch.setattr(sys.modules[ConicEpipolarFit.__module__], "may_be_coplanar", remember)
     found = fundamental_from_conics(C[:, 0], C[:, 1], starts=8, generator=generator)
-    assert_share(found.status != Status.OK, 0.99)
+    assert_share(flat[0], 0.97)
+    assert (found.status[flat[0]] != Status.OK).all()
+    apart = simulate_conics((20,), conics=conics, views=2, noise=noise, generator=generator)
+    C = conic_from_ellipse(fit_ellipse(apart.x).model)
+    fundamental_from_conics(C[:, 0], C[:, 1], starts=8, generator=generator)
+    assert_share(~flat[1], 0.97)
 
 
 def test_conics_of_a_plane_have_the_same_invariants_in_all_images(generator):
@@ -104,8 +118,8 @@ def test_four_conics_with_two_answers_are_told():
     t = torch.arange(60, dtype=F64) * (2 * math.pi / 60)
     fits = fit_ellipse(Ellipse(shapes[..., :2], shapes[..., 2:4], shapes[..., 4]).points(t))
     C, S = conic_from_ellipse(fits.model), 0.25 * fits.covariance
-    told = [fundamental_from_conics(*C, covariance1=S[0], covariance2=S[1], generator=seeded(k)).status for k in range(4)]
-    # One start in some tens leads to the other answer.
+    told = [fundamental_from_conics(*C, covariance1=S[0], covariance2=S[1], generator=seeded(k)).status for k in range(12)]
+    # A search misses the other answer in 3 of 60 cases.
     assert_share(torch.stack(told) == Status.DEGENERATE, 0.95)
 
 

@@ -123,7 +123,9 @@ def check_spread(door: Door, error: Tensor, covariance: Tensor) -> None:
     # What few data tell, their scatter tells badly: each covariance may be too small, their mean is not.
     values, vectors = torch.linalg.eigh(covariance.mean(0))
     # Of directions that vary enough to be seen next to the curvature of the manifold.
-    assert_unit_variance(((error @ vectors) / values.clamp(min=1e-300).sqrt())[:, -min(door.rank, 4) :], dim=0)
+    scores = ((error @ vectors) / values.clamp(min=1e-300).sqrt())[:, -min(door.rank, 4) :]
+    assert_unit_variance(scores)
+    assert_unit_variance(scores, dim=0)
 
 
 @every_door

@@ -19,6 +19,7 @@ from torchsfm.optim.loss import loss_slope
 from torchsfm.optim.schur import Elimination
 from torchsfm.optim.solver_choice import Solver, plan_fronts
 from torchsfm.optim.terms import Block, Term, check_eliminate, prepare, term_residual
+from torchsfm.optim.undamped import information, invert
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ def sparse_covariance(
             whole = next(iter(double.values())).x.new_zeros((0, 0))
         else:
             engine = Elimination(double, layout, "dense", spread=of_eliminated)
-            inverse = engine.linearize(x).invert()
+            inverse = invert(engine.linearize(x))
             whole, rank, good_points = inverse.kept, inverse.rank, inverse.determined
             retained = {name: whole[own[:, :, None], own[:, None]] for name, own in places.items()}
             if of_eliminated:
@@ -186,8 +187,10 @@ def marginal_covariance(
         >>> torchsfm.optim.marginal_covariance({"x": x}, [measured], "x")[0].diagonal()
         tensor([0.2500, 0.2500], dtype=torch.float64)
     """
-    nothing = torch.zeros((0, 2), dtype=torch.int64, device=blocks[name].x.device) if name in blocks else None
-    return pair_covariance(blocks, terms, name, nothing, eliminate=eliminate)[0]  # type: ignore[arg-type]
+    check_options(blocks=(blocks, Mapping))
+    check_options(name=(name, tuple(blocks)))
+    nothing = torch.zeros((0, 2), dtype=torch.int64, device=blocks[name].x.device)
+    return pair_covariance(blocks, terms, name, nothing, eliminate=eliminate)[0]
 
 
 def pair_covariance(
@@ -255,14 +258,14 @@ def _entries(
     system = Elimination(blocks, layout, solver, fronts=fronts).linearize(x)
     if fronts is not None and whole:
         return inverse_entries(system, fronts, row, column)
-    return _inverse(system.information(own))[row - own[0], column - own[0]]
+    return _inverse(information(system, own))[row - own[0], column - own[0]]
 
 
-def _inverse(information: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
+def _inverse(known: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
     """The covariance by the information: zero where there is none of a column, infinite where it is not definite."""
-    held = information.diagonal() <= 0
-    information.diagonal()[held] = 1.0
-    factor, info = torch.linalg.cholesky_ex(information)
+    held = known.diagonal() <= 0
+    known.diagonal()[held] = 1.0
+    factor, info = torch.linalg.cholesky_ex(known)
     # The inverse of half a factor raises.
     safe = torch.where(info == 0, factor, torch.eye(len(factor), dtype=factor.dtype, device=factor.device))
     joint = torch.where(info == 0, torch.cholesky_inverse(safe), torch.inf)

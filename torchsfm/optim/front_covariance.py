@@ -11,6 +11,7 @@ from torchsfm.linalg import eigh
 from torchsfm.linalg.semidefinite import SHIFT, largest_value, small_null_space
 from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.normal_equations import NULL, NormalEquations
+from torchsfm.optim.undamped import formed, informed
 
 FIRM = 1e-9
 """The least part of each motion's square that the front must have which is held."""
@@ -21,14 +22,14 @@ def retained_covariances(
 ) -> tuple[list[Tensor], int, list[Tensor]] | None:
     """The covariances of variables, the rank of the system, and which eliminated variables of each family are determined.
 
-    They are those of `NormalEquations.invert`; None if it must tell.
+    They are those of `invert`; None if that must tell.
 
     Args:
         system: Formed by fronts, of Gauss-Newton.
         fronts: Where its entries are.
         columns: Those of the variables of each block, (variables, k).
     """
-    S, _, determined = system.formed()
+    S, _, determined = formed(system)
     root = system.precision.sqrt()[:, None]
     if not bool(S.isfinite().all()):
         return None
@@ -67,7 +68,7 @@ def retained_covariances(
 
 def inverse_entries(system: NormalEquations, fronts: Fronts, row: Tensor, column: Tensor) -> Tensor:
     """Entries of the inverse where the matrix has some, 0 where nothing tells of a column; infinite if it is not positive."""
-    S = system.informed()
+    S = informed(system)
     own = torch.arange(fronts.size, device=S.device)
     held = S[fronts.places(own, own)] <= 0
     factor, none = fronts.factor(S, held.to(S.dtype)), held[row] | held[column]

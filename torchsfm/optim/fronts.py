@@ -90,8 +90,7 @@ class Fronts:
 
     def places(self, row: Tensor, column: Tensor) -> Tensor:
         """Where entries of either triangle are."""
-        first = self._turn[row] <= self._turn[column]
-        early, late = torch.where(first, row, column), torch.where(first, column, row)
+        early, late = self._by_turn(row, column)
         front = self._front[self._variable[early]]
         down = self._first[front, self._variable[late]] + self._within[late]
         across = self._first[front, self._variable[early]] + self._within[early]
@@ -101,9 +100,12 @@ class Fronts:
 
     def meet(self, row: Tensor, column: Tensor) -> Tensor:
         """Whether the matrix has entries there."""
-        first = self._turn[row] <= self._turn[column]
-        early, late = torch.where(first, row, column), torch.where(first, column, row)
+        early, late = self._by_turn(row, column)
         return self._first[self._front[self._variable[early]], self._variable[late]] >= 0
+
+    def _by_turn(self, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
+        first = self._turn[row] <= self._turn[column]
+        return torch.where(first, row, column), torch.where(first, column, row)
 
     def squares(self, columns: Tensor) -> Tensor:
         """Where squares over columns (n, c) are, (n, c, c); what lies in the upper triangle is nowhere."""

@@ -1,4 +1,4 @@
-"""Damped normal equations with eliminated variables: steps, solutions for any right-hand side, inverses.
+"""Damped normal equations with eliminated variables: steps, and solutions for any right-hand side.
 
 See `schur` for the notation. Eliminated blocks are factored elementwise, all at once: each entry of a factor is one long row.
 """
@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from torchsfm.linalg import eigh
-from torchsfm.linalg.semidefinite import PseudoInverse, pseudo_inverse
-from torchsfm.optim.batched_cholesky import FLAT, Triangle, backward, diagonal, factor, floor, forward, measure, place, product
+from torchsfm.optim.batched_cholesky import Triangle, backward, diagonal, factor, floor, forward, measure, place, product
 from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.layout import Family, Layout
 from torchsfm.optim.problem import Step
-from torchsfm.optim.retained_blocks import DenseMatrix, RetainedBlocks
+from torchsfm.optim.retained_blocks import RetainedBlocks
 from torchsfm.optim.schur_grouped import GroupCoupling
 from torchsfm.optim.schur_matrix_free import Plan, RowCoupling, solve_reduced
 from torchsfm.optim.schur_pairwise import PairCoupling
@@ -134,7 +133,7 @@ class NormalEquations:
             part.reduce(S, L, z)
         S = self.layout.ranks.sum(S)
         S.diagonal()[:size] += weight
-        self._hold(S[:size, :size])
+        self.hold(S[:size, :size])
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
         if self.curved and size <= LARGEST_BENT and bool(info):
             return *self._downhill(S[:size, :size], S[:size, size]), True
@@ -155,12 +154,12 @@ class NormalEquations:
             return weight, torch.zeros_like(weight, dtype=torch.bool).any(), False
         return kept, kept.isfinite().all(), False
 
-    def _hold(self, S: Tensor) -> None:
+    def hold(self, S: Tensor) -> None:
         """Make the reduced system stiff, in place, along motions of which no step has a part."""
         if (rest := self._resting) is not None:
             S += HELD * rest[1] @ rest[1].mT
 
-    def _without_rest(self, S: Tensor) -> Tensor:
+    def without_rest(self, S: Tensor) -> Tensor:
         """The reduced system, variables in units of their own precision, as if nothing were known of motions at rest."""
         if self._resting is None:
             return S
@@ -198,80 +197,6 @@ class NormalEquations:
         kept = -scale * (vectors @ ((vectors.mT @ (scale * slope)) / values.abs().clamp_min(NULL)))
         return kept, ok & kept.isfinite().all()
 
-    def invert(self, like: "Inverse | None" = None) -> "Inverse":
-        """The inverse without damping; its pseudo-inverse where a gauge is free.
-
-        Args:
-            like: For a system with exact second derivatives, the inverse of the Gauss-Newton one at the same place. What that
-                leaves out is left out, and so are directions in which next to nothing of the curvature is left: there the
-                minimum is not a single one (robust losses far from their centre).
-        """
-        size = self.layout.size
-        S, triangles, determined = self.formed()
-        S = S[:size, :size]
-        if like is None:
-            scale = self.precision.rsqrt()
-            scaled = pseudo_inverse(self._without_rest(scale[:, None] * S * scale), NULL)
-            kept, rank, ok = scale[:, None] * scaled.inverse * scale, scaled.rank, scaled.ok
-        else:
-            scale, scaled = like.scale, like.scaled
-            root = scale[:, None] * scaled.root()
-            values, vectors, ok = eigh(root.mT @ (S.tril() + S.tril(-1).mT) @ root)
-            seen = values > FLAT
-            rank, root = int(seen.sum()), torch.where(ok, root @ vectors[:, seen] * values[seen].rsqrt(), torch.inf)
-            kept = root @ root.mT
-        return Inverse(self, triangles, kept, rank, [known & ok for known in determined], scale, scaled)
-
-    def formed(self) -> tuple[Tensor, list[Triangle], list[Tensor]]:
-        """The numbers of the reduced system without damping, the factors of each family's V, and what is determined of it."""
-        S = self.squares.filled(self.fronts or DenseMatrix(self.layout.size))
-        triangles: list[Triangle] = []
-        determined: list[Tensor] = []
-        for part in self.eliminated:
-            pivots = diagonal(part.V, part.q)
-            L, _ = factor(part.V, part.q)
-            for a in range(part.q):
-                # Directions that no residual sees are left out: a basic solution.
-                L[a][a] = torch.where(L[a][a] * L[a][a] * pivots[a] < 1e13, L[a][a], 0.0)
-            part.reduce(S, L, torch.zeros_like(pivots))
-            triangles.append(L)
-            determined.append(torch.stack([L[a][a] > 0 for a in range(part.q)]).all(0))
-        return S, triangles, determined
-
-    def informed(self) -> Tensor:
-        """The numbers of the reduced system, with eliminated variables damped too weakly to count."""
-        S = self.squares.filled(self.fronts or DenseMatrix(self.layout.size))
-        for part in self.eliminated:
-            V, pivots = part.V.clone(), diagonal(part.V, part.q)
-            V[[place(a, a, part.q) for a in range(part.q)]] += NULL * floor(pivots)
-            part.reduce(S, factor(V, part.q)[0], torch.zeros_like(pivots))
-        return S
-
-    def information(self, columns: Tensor) -> Tensor:
-        """What the problem says of some retained variables: the system left when all other variables are eliminated.
-
-        A free gauge among the others is held by a damping too weak to count. Formed by fronts, it is not finite if they cannot
-        be eliminated; the last front must have these columns.
-        """
-        size = self.layout.size
-        S = self.informed()
-        if self.fronts is not None:
-            weight = NULL * self.precision
-            weight[columns] = 0.0
-            own = self.fronts.last(S, weight)
-            order = torch.argsort(self.fronts.fronts[-1].pivots)[torch.argsort(torch.argsort(columns))]
-            return S.new_full((len(columns), len(columns)), torch.nan) if own is None else own[order[:, None], order]
-        S = S[:size, :size]
-        S = S.tril() + S.tril(-1).mT
-        self._hold(S)
-        others = torch.ones(size, dtype=torch.bool, device=S.device)
-        others[columns] = False
-        A = S[others][:, others]
-        A.diagonal().add_(NULL * self.precision[others])
-        half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(A)[0], S[others][:, columns], upper=False)
-        left: Tensor = S[columns][:, columns] - half.mT @ half
-        return left
-
     def gradient(self) -> Tensor:
         """The largest absolute derivative of the cost, each in units of its variable's own precision."""
         kept = self.slope
@@ -305,53 +230,6 @@ class NormalEquations:
         """The inverse of `split`."""
         kept = [parts[name].reshape(-1) for name in self.layout.first]
         return torch.cat((self.slope[:0], *kept)), [parts[part.family.name].mT for part in self.eliminated]
-
-
-@dataclass(frozen=True)
-class Inverse:
-    """The (pseudo-)inverse of normal equations.
-
-    With a free gauge it is the one under which retained variables move least, in units of their own precision.
-    """
-
-    system: NormalEquations
-    triangles: list[Triangle]
-    """The factors of each family's V."""
-    kept: Tensor
-    """The inverse of the reduced system: the covariance of the retained variables, (size, size)."""
-    rank: int
-    determined: list[Tensor]
-    """Which eliminated variables of each family the residuals determine, given the others."""
-    scale: Tensor
-    """Units of the retained variables,"""
-    scaled: PseudoInverse
-    """and the inverse in these of the Gauss-Newton system."""
-
-    def apply(self, kept: Tensor, points: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
-        """The product with a vector, given and returned in its retained and eliminated parts."""
-        parts = list(zip(self.system.eliminated, self.triangles, strict=True))
-        inner = [forward(L, point) for (_, L), point in zip(parts, points, strict=True)]
-        for (part, L), z in zip(parts, inner, strict=True):
-            if part.coupling is not None:
-                kept = kept - part.coupling.lift(backward(L, z))[: kept.numel()]
-        a = self.kept @ kept
-        found = []
-        for (part, L), z in zip(parts, inner, strict=True):
-            found.append(backward(L, z if part.coupling is None else z - forward(L, part.coupling.product(extend(a)))))
-        return a, found
-
-    def point_covariances(self) -> list[Tensor]:
-        """The covariance of each eliminated variable of each family, (points, q, q)."""
-        found = []
-        for part, L in zip(self.system.eliminated, self.triangles, strict=True):
-            eye = torch.eye(part.q, dtype=self.kept.dtype, device=self.kept.device)
-            inner = eye[:, :, None].expand(-1, -1, part.family.points).clone()
-            if part.coupling is not None:
-                assert isinstance(part.coupling, GroupCoupling), "asked for with spread=True"
-                part.coupling.add_spread(inner, L, self.kept)
-            half = torch.stack([backward(L, inner[:, b]) for b in range(part.q)], 1)
-            found.append(torch.stack([backward(L, half[a]) for a in range(part.q)]).permute(2, 0, 1))
-        return found
 
 
 def extend(kept: Tensor) -> Tensor:

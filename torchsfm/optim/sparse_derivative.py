@@ -17,6 +17,7 @@ from torch.autograd.function import once_differentiable
 from torchsfm.optim.layout import Layout, lay_out
 from torchsfm.optim.schur import Elimination
 from torchsfm.optim.terms import Block, Term, term_cost, term_residual
+from torchsfm.optim.undamped import invert
 
 Hessian = Literal["exact", "gauss-newton"]
 """Which second derivatives of the cost to use."""
@@ -107,9 +108,9 @@ class _Optimum(torch.autograd.Function):
             return _through(problem, layout, leaves, gradients, {})
         engine = Elimination(problem.blocks, layout, "dense")
         system = engine.linearize(at)
-        inverse = system.invert()
+        inverse = invert(system)
         if problem.hessian == "exact":
-            inverse = engine.curve(at, system, minimum=True).invert(inverse)
+            inverse = invert(engine.curve(at, system, minimum=True), inverse)
         v = _pull(problem.blocks, layout, dict(zip(problem.blocks, gradients, strict=True)))
         u = system.split(*inverse.apply(*system.join(v)))
         return _through(problem, layout, leaves, gradients, u)

@@ -42,7 +42,8 @@ ENOUGH: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
 def may_be_off_centre(model: Mapping, options: MappingOptions) -> bool:
     """Whether the principal points of cameras that took one image each seem not to be where those of whole images are.
 
-    Of images of one size, which no one cuts out by hand, each by a lens of its own zoom, a bent structure looks so, too.
+    Photographs of one size are not asked: they are hardly crops, and where each has a focal length of its own, errors of the
+    structure move principal points as well.
 
     Args:
         model: A finished model, whose principal points were expected in the middle.

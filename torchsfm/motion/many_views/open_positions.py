@@ -23,7 +23,7 @@ FAR = 1e4
 FREE = 0.5
 """Standard deviation of the size of what a camera sees together with others, over that size, from which on it is free."""
 LARGEST = 3000
-"""Cameras of the largest component whose deviations are computed, which takes the inverse of a dense matrix."""
+"""Cameras of the largest component whose deviations are computed, which may take the inverse of a dense matrix."""
 
 
 def tell(rays: Rays, inliers: Bool[Tensor, "m"], scale: float) -> Bool[Tensor, "v"]:

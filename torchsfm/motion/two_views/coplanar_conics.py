@@ -49,7 +49,7 @@ def invariants(
     D = conic_of_six(c)
     A = inverse(D)[0]
     det = torch.linalg.det(D)
-    # Of the sign of the determinants alone; ellipses have the same.
+    # Determinants of ellipses have the same sign.
     k = (det[..., None, :] / det[..., :, None]).abs().pow(1 / 3)
     value = k * torch.einsum("...iab,...jba->...ij", D, A)
     unit = conic_of_six(torch.eye(6, dtype=c.dtype, device=c.device))
