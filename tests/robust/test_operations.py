@@ -10,7 +10,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from bench.ransac import ours, part, scenes
 from torchsfm.motion import estimate_fundamental
 
-MOST = {"F": 2800, "H": 1900, "P": 2550, "E": 4200}
+MOST = {"F": 2720, "H": 1880, "P": 2540, "E": 4180}
 """Of 1,000 matches, four in five of which are right, for the pair of nine that takes the least: chance decides of some whether
 the search and the refinement take more rounds."""
 

@@ -91,7 +91,7 @@ def diagnose(
         number: How many these are, or no more than a sample where no more are distinct.
         chance: How many data agree by chance.
     """
-    code = torch.where(solved, int(Degeneracy.NONE), int(Degeneracy.UNDETERMINED)).to(torch.int8)
+    code = torch.full_like(solved, int(Degeneracy.UNDETERMINED), dtype=torch.int8).masked_fill_(solved, int(Degeneracy.NONE))
     if isinstance(problems.estimator, Diagnosed):
         if doubtful is None:
             doubtful = glance(problems, model, problems.limit, near, chance)

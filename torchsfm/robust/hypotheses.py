@@ -1,6 +1,7 @@
 """Hypotheses: models through samples of the data, and the few of them that more and more of the data support."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -154,8 +155,13 @@ def smallest(loss: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]
     and nonsense, of which nothing agrees with anything, feels its neighbours.
     """
     columns = loss.shape[-1]
-    later = torch.arange(columns, device=loss.device, dtype=loss.dtype).mul_(torch.finfo(loss.dtype).eps).add_(1)
-    return (loss * later).topk(min(number, columns), dim=-1, largest=False).indices
+    return (loss * _later(columns, loss.dtype, loss.device)).topk(min(number, columns), dim=-1, largest=False).indices
+
+
+@lru_cache(maxsize=64)
+def _later(columns: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "columns"]:
+    with torch.inference_mode(False):
+        return torch.arange(columns, device=device, dtype=dtype).mul_(torch.finfo(dtype).eps).add_(1)
 
 
 def gather_valid(valid: Bool[Tensor, "g s"], least: int) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:

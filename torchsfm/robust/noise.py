@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple, TypeVar
 
 import torch
@@ -136,8 +137,7 @@ def _first_step(
 
 def _likeliest(ratio: Tensor, there: Tensor, total: Tensor, k: int) -> tuple[Tensor, Noise]:
     """The likeliest of a few scales, and the logarithm of its likelihood."""
-    table = [(v, -0.5 / v, _peak(k) * _WINDOW**k * v ** (-k / 2)) for v in _VARIANCES]
-    variance, slope, peak = torch.tensor(table, dtype=ratio.dtype, device=ratio.device).unsqueeze(-1).unbind(1)
+    variance, slope, peak = _scales(k, ratio.dtype, ratio.device)
     # The density of an inlier in units of that of an outlier.
     density = torch.exp(ratio[:, None] * slope) * peak
     gain, there, some = density - 1, there[:, None], total[:, None].clamp(min=1)
@@ -147,6 +147,14 @@ def _likeliest(ratio: Tensor, there: Tensor, total: Tensor, k: int) -> tuple[Ten
     evidence, index = (there * torch.log1p(share * gain)).sum(-1).max(-1, keepdim=True)
     number = (share[..., 0].gather(-1, index) * total).clamp(min=1)
     return evidence[:, 0], _noise_of(variance[:, 0][index], number, total, k)
+
+
+@cache
+def _scales(k: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, ...]:
+    """The variances to try, the slope of the logarithm of their density, and its peak in units of that of an outlier."""
+    table = [(v, -0.5 / v, _peak(k) * _WINDOW**k * v ** (-k / 2)) for v in _VARIANCES]
+    with torch.inference_mode(False):
+        return torch.tensor(table, dtype=dtype, device=device).unsqueeze(-1).unbind(1)
 
 
 def _maximised(noise: Noise, ratio: Tensor, there: Tensor, total: Tensor, k: int) -> Noise:

@@ -67,7 +67,7 @@ def draw_samples(
     device = count.device
     limit = count[:, None] if pool is None else pool
     random = random_integers(seed, count, first, hypotheses, size)
-    below = limit[:, None] - size + 1 + torch.arange(size, device=device)[:, None]
+    below = limit[:, None] + torch.arange(1 - size, 1, device=device)[:, None]
     index = (random * below) >> 31
     columns, last = torch.split(index, 1, 1), torch.split(below - 1, 1, 1)
     for j in range(1, size):

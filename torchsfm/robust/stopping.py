@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -32,10 +33,16 @@ def rounds(
     drawn, needed = take((drawn, needed), active, len(drawn))
     rest = needed.clamp(min=least, max=most) - drawn
     wanted = torch.minimum(rest, (3 * drawn).clamp(min=max(least, 1)))
-    sizes = torch.tensor((0.0, *ROUNDS), dtype=wanted.dtype, device=drawn.device)
+    sizes = _sizes(wanted.dtype, drawn.device)
     size = sizes[torch.searchsorted(sizes, wanted).clamp(max=len(ROUNDS))]
     for number in sorted(set(size.tolist()) - {0}):
         yield int(number), active[size == number]
+
+
+@cache
+def _sizes(dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.tensor((0.0, *ROUNDS), dtype=dtype, device=device)
 
 
 def around_model(

@@ -83,7 +83,8 @@ def judge(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: 
         agreed, number = agreed.index_copy(0, index, enough), number.index_copy(0, index, few)
     optimal = agreed & (reach > 0)
     reach = torch.where(optimal, reach, 1)
-    fault = torch.where(best.solved, int(Status.NO_CONSENSUS), int(Status.DEGENERATE))
+    status = torch.full_like(agreed, int(Status.DEGENERATE), dtype=torch.int8)
+    status.masked_fill_(best.solved, int(Status.NO_CONSENSUS)).masked_fill_(agreed, int(Status.OK))
     selected = (ratio < (reach / limit)[:, None]) & optimal[:, None]
     inliers, selected = problems.scatter(torch.stack((near, selected)), n).unbind(0)
     return Verdict(
@@ -92,7 +93,7 @@ def judge(problems: Problems, best: Best, squared: Float[Tensor, "p width"], n: 
         support,
         threshold,
         best.iterations,
-        fault.masked_fill(agreed, int(Status.OK)).to(torch.int8),
+        status,
         diagnose(replace(problems, limit=limit), best.model, best.solved, best.doubtful, near, number, expected),
         selected,
         reach,

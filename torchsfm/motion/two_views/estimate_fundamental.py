@@ -19,6 +19,9 @@ from torchsfm.motion.two_views.plane_glance import plane_suspected
 from torchsfm.motion.two_views.sampson_plane import squared_distance, step_equations
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
+_TINY = 1e-30
+"""In place of 0 below a fraction bar: what stands above is then less."""
+
 
 @dataclass(frozen=True)
 class FundamentalEstimator:
@@ -83,9 +86,9 @@ class FundamentalEstimator:
         leaves of the determinant goes with one more step along its gradient: beside the manifold the loss may be less than
         anywhere on it, and every step from there would be one up.
         """
-        A, b = step_equations(model, x1, x2, weigh)
-        model = model.double()
-        F, e = model[..., :3], model[..., 3]
+        F, e = model.split((3, 1), -1)
+        A, b = step_equations(F, e, x1, x2, weigh)
+        F, e = F.double(), e.double()
         f, normal = F.flatten(-2), cofactors(F).flatten(-2)
         # The unit sphere's normal, as large as the rest.
         size = A.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
@@ -94,8 +97,8 @@ class FundamentalEstimator:
         # The determinant is a third of the product with its gradient.
         gap = (normal * torch.sub(f, free, alpha=3)).sum(-1, keepdim=True)
         share = (normal * bound).sum(-1, keepdim=True)
-        f = torch.addcmul(f - free, gap / share.masked_fill(share <= 0, torch.inf), bound, value=-1 / 3)
-        return with_left_epipole(matrices(_determinant_step(f), 3), e).to(x1.dtype)
+        f = torch.addcmul(f - free, gap / share.clamp(min=_TINY), bound, value=-1 / 3)
+        return with_left_epipole(matrices(_determinant_step(f), 3), e[..., 0]).to(x1.dtype)
 
     def retract(self, model: Float[Tensor, "*#batch 3 4"], step: Float[Tensor, "*#batch 7"]) -> Float[Tensor, "*batch 3 4"]:
         """F moved along a basis of the tangent space, then to determinant 0 up to fourth order, and to norm 1."""
@@ -167,9 +170,8 @@ def _determinant_step(f: Tensor) -> Tensor:
     """Move matrices of small determinant towards determinant 0 by a Newton step along its gradient, and to norm 1."""
     c = _cofactors(f)
     square = (c * c).sum(-1, keepdim=True)
-    f = torch.addcmul(f, (c * f).sum(-1, keepdim=True) / square.masked_fill(square == 0, 1), c, value=-1 / 3)
-    square = (f * f).sum(-1, keepdim=True)
-    return f * square.masked_fill(square == 0, 1).rsqrt()
+    f = torch.addcmul(f, (c * f).sum(-1, keepdim=True) / square.clamp(min=_TINY), c, value=-1 / 3)
+    return f / torch.linalg.vector_norm(f, dim=-1, keepdim=True).clamp(min=_TINY)
 
 
 def estimate_fundamental(

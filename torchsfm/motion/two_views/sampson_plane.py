@@ -45,7 +45,7 @@ def squared_distance(
     """The squared distance of points to models [F | e2]; infinite behind a camera."""
     if one_data_set_for_many(model, x1[..., 0]) and model.shape[-3] >= MANY:
         return _squared_distances(model, x1, x2)
-    e, side, _, _, size = _forms(model, homogeneous_rows(x1), homogeneous_rows(x2))
+    e, side, _, _, size = _forms(*model.split((3, 1), -1), homogeneous_rows(x1), homogeneous_rows(x2))
     return infinite_where_positive(e * e / size, side)
 
 
@@ -82,11 +82,13 @@ def _squared_distances(model: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
 
 
 def _forms(
-    model: Float[Tensor, "*#batch 3 4"], h1: Float[Tensor, "*#batch 3 n"], h2: Float[Tensor, "*#batch 3 n"]
+    F: Float[Tensor, "*#batch 3 3"],
+    epipole: Float[Tensor, "*#batch 3 1"],
+    h1: Float[Tensor, "*#batch 3 n"],
+    h2: Float[Tensor, "*#batch 3 n"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The residual, the side, the gradients over the first and over the second point, and their squared length."""
-    F = model[..., :3]
-    lines = apply_rows(torch.cat((F, torch.linalg.cross(model[..., 3:], F, dim=-2)), -2), h1)
+    """The residual, the side, the gradients over the first and (the first two rows) the second point, their squared length."""
+    lines = apply_rows(torch.cat((F, torch.linalg.cross(epipole, F, dim=-2)), -2), h1)
     u, v, w, a, b, c = lines.unbind(-2)
     first = apply_rows(F[..., :2].mT, h2)
     u1, v1 = first.unbind(-2)
@@ -94,20 +96,24 @@ def _forms(
     e = torch.addcmul(torch.addcmul(w, x, u), y, v)
     side = torch.addcmul(torch.addcmul(c, x, a), y, b)
     size = torch.addcmul(torch.addcmul(torch.addcmul(u * u, v, v), u1, u1), v1, v1)
-    return e, side, first, lines[..., :2, :], size.clamp(min=_TINY)
+    return e, side, first, lines, size.clamp(min=_TINY)
 
 
 def step_equations(
-    model: Float[Tensor, "*#batch 3 4"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"], weigh: Weigh
+    F: Float[Tensor, "*#batch 3 3"],
+    epipole: Float[Tensor, "*#batch 3 1"],
+    x1: Float[Tensor, "*#batch n 2"],
+    x2: Float[Tensor, "*#batch n 2"],
+    weigh: Weigh,
 ) -> tuple[Float[Tensor, "*batch 9 9"], Float[Tensor, "*batch 9"]]:
     """J' C J and J' W r of the distance over the nine entries of F, in float64, W and C as `weigh` has them."""
     h1, h2 = homogeneous_rows(x1), homogeneous_rows(x2)
-    e, side, first, second, size = _forms(model, h1, h2)
+    e, side, first, second, size = _forms(F, epipole, h1, h2)
     share = e / size
     weights, curvature = weigh(infinite_where_positive(share * e, side))
     # |g| times the derivative of e / |g|: that of e, less e / |g|^2 times that of |g|^2 / 2.
     row = share[..., None, :]
-    left = _with_ones(torch.addcmul(x2.mT, row, second, value=-1))
+    left = _with_ones(torch.addcmul(x2.mT, row, second[..., :2, :], value=-1))
     J = left[..., :, None, :] * h1[..., None, :, :]
     J[..., :2, :].addcmul_(h2[..., :, None, :], (row * first)[..., None, :, :], value=-1)
     J = J.flatten(-3, -2)
