@@ -13,6 +13,7 @@ from torchsfm.bundle.lines import BundleLines
 from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior, RelativePosePrior
 from torchsfm.bundle.rig import Rig
 from torchsfm.bundle.structure import Structure
+from torchsfm.bundle.track_weights import track_weights
 
 __all__ = [
     "AdjustedModel",
@@ -37,4 +38,5 @@ __all__ = [
     "bundle_adjust_projective",
     "bundle_covariance",
     "intrinsics_covariance",
+    "track_weights",
 ]

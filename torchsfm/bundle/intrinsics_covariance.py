@@ -17,6 +17,7 @@ def intrinsics_covariance(
     *,
     free: Sequence[str] = ("focal",),
     fixed_intrinsics: Mapping[str, Bool[Tensor, "g"]] | None = None,
+    weights: Float[Tensor, "m"] | None = None,
     loss: Loss | None = None,
     intrinsics_sigma: Mapping[str, float | Tensor] | None = None,
     intrinsics_mean: Camera | None = None,
@@ -31,6 +32,7 @@ def intrinsics_covariance(
         problem: The result of the adjustment with its observations.
         free: The intrinsics that were free, by name.
         fixed_intrinsics: By names as in `free`, cameras in which these were held.
+        weights: The weight of each observation's squared distance.
         loss: The robust loss, squares if not given.
         intrinsics_sigma: Standard deviations of the priors on intrinsics, by names as in `free`.
         intrinsics_mean: Where these were centred; the cameras of the problem if not given.
@@ -50,8 +52,8 @@ def intrinsics_covariance(
         torch.Size([4, 2, 2])
     """
     bundle = Bundle(
-        problem, free=free, fixed_intrinsics=fixed_intrinsics, loss=loss, intrinsics_sigma=intrinsics_sigma,
-        intrinsics_mean=intrinsics_mean, priors=priors,
+        problem, free=free, fixed_intrinsics=fixed_intrinsics, weights=weights, loss=loss,
+        intrinsics_sigma=intrinsics_sigma, intrinsics_mean=intrinsics_mean, priors=priors,
     )  # fmt: skip
     with torch.no_grad():
         blocks, terms = bundle.problem()

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Status
@@ -20,6 +20,7 @@ from torchsfm.reconstruction.calibration import (
     folded_cameras,
     images_of_cameras,
     measure_noise,
+    observation_weights,
 )
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
@@ -37,6 +38,7 @@ def adjust(
     free: Free | None = None,
     prior: CameraPrior | None = None,
     moving: Bool[Tensor, "v"] | None = None,
+    weights: Float[Tensor, "m"] | None = None,
     max_iterations: int = 30,
     tolerance: float = 1e-5,
     initial_damping: float = 1e-4,
@@ -49,6 +51,7 @@ def adjust(
         prior: What to expect of the cameras before any image point was seen: wide enough to matter only where the images say
             little. Needed where something is free.
         moving: Images whose poses move; the points they see move with them, everything else is held. All images when None.
+        weights: What the observations count, in their order, where all images move; all alike when None.
         max_iterations: Limit on the steps of the optimiser.
         tolerance: Relative decrease of the cost at which it stops.
         initial_damping: Of the first step; see `bundle_adjust`.
@@ -65,6 +68,7 @@ def adjust(
         mapping.problem(node),
         fixed_poses=fixed_poses,
         fixed_points=fixed_points,
+        weights=weights,
         loss=LOSS,
         max_iterations=max_iterations,
         tolerance=tolerance,
@@ -85,6 +89,7 @@ def adjust_all(
     *,
     faultless: int = 0,
     settled: bool = False,
+    by_tracks: bool = False,
     **limits: Any,
 ) -> Mapping:
     """Adjust everything, and of the cameras what the images determine; the rest is held where it was expected.
@@ -98,19 +103,22 @@ def adjust_all(
         faultless: Cameras that took up to so many photographs count as those of many; see `choose_free`.
         settled: Whether the model has been adjusted so before, and has hardly changed since. Where the images determined all
             numbers then, that is not found out again.
+        by_tracks: Whether observations count by how well their tracks fit before, see `track_weights`: in a model that is
+            nearly right. While it is still bent, the longest tracks fit worst.
         **limits: When to stop; see `adjust`.
     """
     free = dict(mapping.adjustment.free) if settled and mapping.adjustment is not None else {}
     used = images_of_cameras(mapping) > 0
     if set(free) != set(names) or not all(bool(mask[used].all()) for mask in free.values()):
         free = choose_free(mapping, names, prior, loss=LOSS, faultless=faultless)
-    adjusted = adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
+    weights = observation_weights(mapping, LOSS) if by_tracks else None
+    adjusted = adjust(as_expected(mapping, free, prior), free=free, prior=prior, weights=weights, **limits)
     folded = folded_cameras(adjusted)
     if not bool(folded.any()):
         return adjusted
     folded = folded | prior.alike
     free |= {name: free[name] & ~folded for name in mapping.cameras.distortion.parameter_names if name in free}
-    return adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
+    return adjust(as_expected(mapping, free, prior), free=free, prior=prior, weights=weights, **limits)
 
 
 def as_adjusted(mapping: Mapping, result: BundleResult, free: Free | None, prior: CameraPrior | None) -> Mapping:

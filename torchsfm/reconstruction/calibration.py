@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import intrinsics_covariance
+from torchsfm.bundle import intrinsics_covariance, track_weights
 from torchsfm.bundle.intrinsics import free_columns
 from torchsfm.geometry import Distortion
 from torchsfm.geometry.intrinsic_parameters import camera_from_row, intrinsic_labels, row_from_camera
@@ -125,11 +125,17 @@ def calibration_of(
     return replace(found, cropped=prior.cropped, alike=prior.alike)
 
 
+def observation_weights(mapping: Mapping, loss: Cauchy) -> Float[Tensor, "m"]:
+    """What the observations of a finished model count, in their order: less where the track as a whole fits badly."""
+    return track_weights(mapping.problem(), loss=loss, least_noise=LEAST_NOISE)
+
+
 def measure_noise(mapping: Mapping, loss: Cauchy) -> float:
-    """The standard deviation of an image coordinate for which least squares would be as certain as the robust cost is.
+    """The standard deviation of an image coordinate for which weighted least squares would be as certain as the robust cost is.
 
     Huber's proposal for M-estimators: the mean square of the weighted residuals over the square of their mean derivative, times
-    the mean weight, since covariances are computed with weighted normal equations (Huber 1981, 7.6).
+    the mean weight, since covariances are computed with weighted normal equations (Huber 1981, 7.6). It is that of an
+    observation which counts in full.
     """
     node = mapping.observations()
     if not len(node):
@@ -144,10 +150,10 @@ def measure_noise(mapping: Mapping, loss: Cauchy) -> float:
     with torch.enable_grad():
         (slope,) = torch.autograd.grad(loss(s).sum(), s, create_graph=True)
         (bend,) = torch.autograd.grad(slope.sum(), s)
-    s, slope = s.detach(), slope.detach()
-    square = (slope.square() * s).mean() / 2
-    curvature = (slope + bend * s).mean().clamp_min(1e-6)
-    return max(float((square * loss_slope(loss, fitted).mean()).sqrt() / curvature), LEAST_NOISE)
+    s, slope, weights = s.detach(), slope.detach(), observation_weights(mapping, loss)
+    square = (weights.square() * slope.square() * s).mean() / 2
+    curvature = (weights * (slope + bend * s)).mean().clamp_min(1e-6)
+    return max(float((square * (weights * loss_slope(loss, fitted)).mean()).sqrt() / curvature), LEAST_NOISE)
 
 
 def cameras_free(free: Free) -> dict[str, Any]:
@@ -199,6 +205,7 @@ def _information(
         covariance = noise**2 * intrinsics_covariance(
             mapping.problem(),
             free=names,
+            weights=observation_weights(mapping, loss),
             loss=loss,
             **prior.terms(noise, names, used),
         )

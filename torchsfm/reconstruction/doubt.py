@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
-from torchsfm.reconstruction.calibration import measure_noise
+from torchsfm.reconstruction.calibration import measure_noise, observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import PairAgreement, excess_scatter, pair_agreement
 from torchsfm.reconstruction.groups import outvoted_groups
@@ -139,6 +139,7 @@ def pose_deviations(
     uncertain = {name: torch.ones(len(mapping.cameras.K), dtype=torch.bool) for name in open_numbers}
     covariance = bundle_covariance(
         problem,
+        weights=observation_weights(mapping, LOSS),
         loss=LOSS,
         sigma=measure_noise(mapping, LOSS),
         points=False,

@@ -12,7 +12,7 @@ from torchsfm.bundle import BundleLines, bundle_adjust
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.adjust import LOSS, about_cameras, as_adjusted
-from torchsfm.reconstruction.calibration import measure_noise
+from torchsfm.reconstruction.calibration import measure_noise, observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
 from torchsfm.reconstruction.line_tracks import Cameras, ViewSegments, link_lines, propose_lines
@@ -98,6 +98,7 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
     result = bundle_adjust(
         problem,
         structure=[lines.bundle(unit=noise / max(scale, LEAST_SCALE), loss=LINE_LOSS)],
+        weights=observation_weights(mapping, LOSS),
         loss=LOSS,
         **({"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE} | known | limits),
     )

@@ -38,6 +38,9 @@ STANDING = 1e-6
 """Damping of the first step of an adjustment of cameras that stand about where they should: more would only hold back what is
 left, long rows of cameras that bend as a whole."""
 
+REWEIGHTED = 2
+"""Last adjustments: observations count by what the one before says of their tracks."""
+
 
 @dataclass(frozen=True)
 class MappingOptions:
@@ -77,7 +80,7 @@ class MappingOptions:
         """
         names = [name for name in self.free if last or self.cropped or name != "principal_point"]
         faultless = len(model.registered) if self.cropped else int(lone)
-        return adjust_all(model, names, self.prior(model), faultless=faultless, **limits)
+        return adjust_all(model, names, self.prior(model), faultless=faultless, by_tracks=last, **limits)
 
 
 def grow_model(
@@ -211,7 +214,9 @@ def _refine(model: Mapping, options: MappingOptions) -> Mapping:
         settled = changed <= 0.01 * max(1, int((before >= 0).sum()))
         if settled:
             break
-    model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
+    for _ in range(REWEIGHTED):
+        model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
+        settled = True
     lone = not options.cropped and bool((images_of_cameras(model) == 1).any())
     if lone and "principal_point" in options.free:
         freed = options.adjust(model, last=True, lone=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)

@@ -12,6 +12,7 @@ from torchsfm.geometry import Similarity, rotation_angle, similarity_from_points
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS, adjust, adjust_all
 from torchsfm.reconstruction.alignment import align_models
+from torchsfm.reconstruction.calibration import observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
 from torchsfm.reconstruction.joined_points import common_kind, joined_points, joined_views
@@ -224,5 +225,8 @@ def _adjusted(mapping: Mapping, fixed_cameras: bool) -> Mapping:
         mapping = merge_points(mapping, threshold=ERROR)
         if not len(mapping.X):
             return mapping
-        mapping = adjust_all(mapping, names, prior, **limits) if names else adjust(mapping, **limits)
+        if names:
+            mapping = adjust_all(mapping, names, prior, by_tracks=True, **limits)
+        else:
+            mapping = adjust(mapping, weights=observation_weights(mapping, LOSS), **limits)
     return filter_points(mapping, threshold=ERROR, min_angle=ANGLE)

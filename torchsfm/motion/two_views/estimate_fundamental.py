@@ -86,7 +86,7 @@ class FundamentalEstimator:
         leaves of the determinant goes with one more step along its gradient: beside the manifold the loss may be less than
         anywhere on it, and every step from there would be one up.
         """
-        F, e = model.split((3, 1), -1)
+        F, e = torch.split(model, [3, 1], -1)
         A, b = step_equations(F, e, x1, x2, weigh)
         F, e = F.double(), e.double()
         f, normal = F.flatten(-2), cofactors(F).flatten(-2)
@@ -171,7 +171,8 @@ def _determinant_step(f: Tensor) -> Tensor:
     c = _cofactors(f)
     square = (c * c).sum(-1, keepdim=True)
     f = torch.addcmul(f, (c * f).sum(-1, keepdim=True) / square.clamp(min=_TINY), c, value=-1 / 3)
-    return f / torch.linalg.vector_norm(f, dim=-1, keepdim=True).clamp(min=_TINY)
+    length: Tensor = torch.linalg.vector_norm(f, dim=-1, keepdim=True)
+    return f / length.clamp(min=_TINY)
 
 
 def estimate_fundamental(

@@ -45,7 +45,8 @@ def squared_distance(
     """The squared distance of points to models [F | e2]; infinite behind a camera."""
     if one_data_set_for_many(model, x1[..., 0]) and model.shape[-3] >= MANY:
         return _squared_distances(model, x1, x2)
-    e, side, _, _, size = _forms(*model.split((3, 1), -1), homogeneous_rows(x1), homogeneous_rows(x2))
+    F, epipole = torch.split(model, [3, 1], -1)
+    e, side, _, _, size = _forms(F, epipole, homogeneous_rows(x1), homogeneous_rows(x2))
     return infinite_where_positive(e * e / size, side)
 
 

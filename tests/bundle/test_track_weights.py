@@ -1,0 +1,110 @@
+"""Tracks that are no points, but move over the scene as the camera does, should not move the cameras."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from chance import stream_seed
+from torch import Tensor
+
+from torchsfm import Camera, Cauchy, bundle_adjust_model, random_bundle_problem
+from torchsfm.bundle import track_weights
+from torchsfm.geometry import BundleProblem, intrinsics, rotation_angle
+from torchsfm.simulation import orbit_poses
+
+LOSS = Cauchy(1.0)
+
+
+VIEWS, POINTS = 12, 300
+
+
+def scene(g: torch.Generator, outlines: float) -> tuple[BundleProblem, BundleProblem, Tensor]:
+    """Cameras on an arc around points, some of which lie on the left outlines of upright posts: with these, the truth without
+    noise or outlines, and which points are on outlines.
+    """
+    poses = orbit_poses(VIEWS, radius=5.0, height=(0.5, 1.5), sweep=1.3)
+    camera = Camera(intrinsics(torch.tensor(500.0).double(), torch.tensor([320.0, 240.0]).double()))[None]
+    X = 3 * torch.rand(POINTS, 3, generator=g, dtype=torch.float64) - 1.5
+    bad = torch.rand(POINTS, generator=g) < outlines
+    radius = torch.where(bad, 0.05 + 0.1 * torch.rand(POINTS, generator=g, dtype=torch.float64), 0.0)
+    sight = X - poses.centre[:, None]
+    left = torch.nn.functional.normalize(torch.stack((-sight[..., 1], sight[..., 0], torch.zeros_like(sight[..., 0])), -1), dim=-1)
+    seen = camera.project(poses.transform(X + radius[:, None] * left))
+    view, point = torch.meshgrid(torch.arange(VIEWS), torch.arange(POINTS), indexing="ij")
+    view, point, index = view.flatten(), point.flatten(), torch.zeros(VIEWS, dtype=torch.long)
+    x = seen.reshape(-1, 2) + 0.2 * torch.randn(VIEWS * POINTS, 2, generator=g, dtype=torch.float64)
+    truth = BundleProblem(poses, camera, index, X, camera.project(poses.transform(X)).reshape(-1, 2), view, point)
+    return replace(truth, x=x), truth, bad
+
+
+def error(problem: BundleProblem, truth: BundleProblem) -> float:
+    """Root mean square error of relative rotations, degrees."""
+    i, j = torch.combinations(torch.arange(VIEWS), 2).unbind(-1)
+    R, R_true = (p.poses.R[j] @ p.poses.R[i].mT for p in (problem, truth))
+    return float(rotation_angle(R @ R_true.mT).square().mean().sqrt().rad2deg())
+
+
+def adjusted(problem: BundleProblem, rounds: int) -> BundleProblem:
+    """At the minimum with all alike, then by tracks."""
+    free = ("focal", "principal_point")
+    problem = bundle_adjust_model(problem, free=free, loss=LOSS, tolerance=1e-8).model
+    for _ in range(rounds):
+        weights = track_weights(problem, loss=LOSS)
+        problem = bundle_adjust_model(problem, free=free, loss=LOSS, weights=weights, tolerance=1e-8).model
+    return problem
+
+
+def test_tracks_that_drift_hardly_move_cameras() -> None:
+    plain, weighted, share = [], [], []
+    for k in range(5):
+        problem, truth, bad = scene(torch.Generator().manual_seed(stream_seed() + k), 0.25)
+        plain.append(error(adjusted(problem, 0), truth))
+        found = adjusted(problem, 2)
+        weighted.append(error(found, truth))
+        weights = track_weights(found, loss=LOSS)
+        share.append(float(weights[bad[found.point]].mean() / weights[~bad[found.point]].mean()))
+    assert sum(weighted) < 0.8 * sum(plain), (plain, weighted)
+    assert max(share) < 0.3, share
+
+
+def test_where_all_are_points_little_is_lost() -> None:
+    plain, weighted = 0.0, 0.0
+    for k in range(8):
+        problem, truth, _ = scene(torch.Generator().manual_seed(stream_seed() + k), 0.0)
+        plain += error(adjusted(problem, 0), truth) ** 2
+        weighted += error(adjusted(problem, 1), truth) ** 2
+    assert weighted < 1.15 * plain, (plain, weighted)
+
+
+def test_single_wrong_observations_take_less_of_their_track_with_a_robust_loss() -> None:
+    problem, truth, _ = scene(torch.Generator().manual_seed(stream_seed()), 0.0)
+    wrong = torch.zeros(len(truth.x), dtype=torch.bool)
+    wrong[torch.arange(0, POINTS, 10)] = True
+    x = problem.x + torch.where(wrong[:, None], 300.0, 0.0)
+    of_them = torch.zeros(POINTS, dtype=torch.bool)
+    of_them[truth.point[wrong]] = True
+    others = of_them[truth.point] & ~wrong
+    squares, robust = (float(track_weights(replace(problem, x=x), loss=loss)[others].mean()) for loss in (None, LOSS))
+    assert squares < 1e-4 < 0.05 < robust, (squares, robust)
+
+
+def test_exact_missing_and_hidden_observations() -> None:
+    truth = random_bundle_problem(4, 50, 160, noise=0.0, generator=torch.Generator().manual_seed(stream_seed())).truth
+    assert bool((track_weights(truth) > 0.5).all())
+    x, X = truth.x.clone(), truth.X.clone()
+    x[3] = torch.nan
+    X[7] = truth.poses.centre[0] - 5 * truth.poses.R[0, 2]
+    weights = track_weights(replace(truth, x=x, X=X))
+    assert float(weights[3]) == 0.0
+    assert bool((weights[(truth.point == 7) & (truth.view == 0)] == 0).all())
+    assert bool(weights.isfinite().all())
+    none = replace(truth, x=x[:0], view=truth.view[:0], point=truth.point[:0])
+    assert track_weights(none).shape == (0,)
+
+
+def test_bad_options_are_named() -> None:
+    truth = random_bundle_problem(4, 50, 160, generator=torch.Generator().manual_seed(0)).truth
+    with pytest.raises(ValueError, match="dof"):
+        track_weights(truth, dof=0.0)
+    with pytest.raises(ValueError, match="least_noise"):
+        track_weights(truth, least_noise=-1.0)

@@ -1,0 +1,73 @@
+"""Weights for observations whose whole track fits worse than noise lets it."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import check_options
+from torchsfm.geometry import BundleProblem
+from torchsfm.optim import Loss
+
+_EXACT = 1e-12
+"""Standard deviation of image points, as a part of the largest coordinate, below which all is rounding."""
+
+
+def track_weights(
+    problem: BundleProblem, *, loss: Loss | None = None, dof: float = 4.0, least_noise: float = 0.0
+) -> Float[Tensor, "m"]:
+    """How much the observations of each point count, by how well its track as a whole fits: weights for `bundle_adjust`.
+
+    Outlines, highlights and places where one thing passes behind another are matched from image to image, but are no points:
+    they move over the scene as the camera does. Each observation is only a little off, so that no robust loss of single
+    distances tells, and they are off in the same way everywhere in the images, so that cameras follow them. What tells is the
+    track: its distances share a scale of their own. With Student's distribution of all distances of a track at once (Lange,
+    Little & Taylor 1989), a track of m observations, which have d = 2 m - 3 degrees of freedom left, with the sum S of squared
+    distances weighs (dof + d) / (dof + S / s^2), at most 1. The noise s is that of the track in the middle, counted by
+    observations.
+
+    The weights belong to the residuals of the problem as it is. Adjusting with them and finding them anew, two or three times,
+    comes to their fixed point.
+
+    Args:
+        problem: Near its minimum.
+        loss: The robust loss of squared distances that goes with the weights, so that single wrong observations do not take
+            the others of their track with them; squares if not given.
+        dof: Degrees of freedom: the fewer, the faster weights fall.
+        least_noise: Image points are never better than this, pixels.
+
+    Returns:
+        Weights between 0 and 1; 0 for observations that are not finite or whose point is behind the camera.
+
+    Raises:
+        ValueError: An option does not fit.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> g = torch.Generator().manual_seed(0)
+        >>> problem = torchsfm.random_bundle_problem(4, 50, 190, noise=0.5, generator=g).truth
+        >>> problem.x[problem.point == 7] += 9 * torch.tensor([1, -1])  # a track that is none
+        >>> weights = torchsfm.bundle.track_weights(problem)
+        >>> bool(weights[problem.point == 7].max() < 0.2), bool(weights.median() > 0.9)
+        (True, True)
+    """
+    check_options(loss=(loss, Callable | None), dof=(dof, "float > 0"), least_noise=(least_noise, "float >= 0"))
+    point = problem.point
+    square = problem.residuals().detach().double().square()
+    good = square.isfinite() & (problem.depths().detach() > 0)
+    square = torch.where(good, square, 0.0)
+    rho = square if loss is None else loss(square)
+    zero = rho.new_zeros(len(problem.X))
+    length, total = zero.index_add(0, point, good.to(rho.dtype)), zero.index_add(0, point, rho)
+    left = (2 * length - 3).clamp(min=1)
+    # The middle one by its observations: the noise of most of what cameras are made of.
+    order = (total / left).argsort()
+    counted = length[order].cumsum(0)
+    if not len(counted) or not bool(counted[-1] > 0):
+        return torch.zeros_like(problem.x[:, 0])
+    middle = order[torch.searchsorted(counted, counted[-1:] / 2).clamp(max=len(order) - 1)]
+    floor = max(least_noise, _EXACT * float(problem.x.detach().abs()[good].max()))
+    noise = (total / left)[middle].clamp(min=floor**2)
+    weights = ((dof + left) / (dof + total / noise)).clamp(max=1)
+    return (weights[point] * good).to(problem.x.dtype)
