@@ -288,12 +288,12 @@ def test_ransac_recovers_with_40_percent_outliers(kind: type, generator: torch.G
 
 
 def test_ransac_is_deterministic_alone_and_in_a_batch(kind: type, generator: torch.Generator) -> None:
-    scene, data, _ = spoiled(kind, (2, 3), 90, generator)
-    mask = torch.rand(2, 3, 90, generator=generator) < 0.9
+    scene, data, _ = spoiled(kind, (2, 2), 90, generator)
+    mask = torch.rand(2, 2, 90, generator=generator) < 0.9
     together = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seeded(3))
     again = ransac(scene.estimator, *data, threshold=3 * scene.noise, mask=mask, generator=seeded(3))
     assert torch.equal(together.model, again.model)
-    for i, j in ((0, 0), (0, 1), (1, 2)):
+    for i, j in ((0, 0), (0, 1), (1, 1)):
         estimator, own = row(scene, (i, j))[0], [d[i, j] for d in data]
         alone = ransac(estimator, *own, threshold=3 * scene.noise, mask=mask[i, j], generator=seeded(3))
         assert torch.equal(alone.inliers, together.inliers[i, j])
