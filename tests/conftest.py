@@ -18,6 +18,8 @@ from hypothesis import settings
 pytest_plugins = ["scripts"]
 # Nearly all that is made until the tests begin stays: to look for what is no longer used there takes long and finds little.
 gc.disable()
+# Nor is it worth a look at every seven hundred things more, while tests run.
+gc.set_threshold(5_000, 10, 10)
 torch.set_num_threads(1)
 type_checks.install()
 # No run remembers another.
