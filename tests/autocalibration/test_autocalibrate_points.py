@@ -9,6 +9,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.autocalibration import Assumption, autocalibrate_points
 from torchsfm.geometry import project_points, rotation_angle, similarity_from_points
+from torchsfm.optim.dense import DenseProblem
 
 ALL = Assumption(free=("focal", "aspect", "skew", "principal_point"), principal_point_sigma=None)
 VARYING = Assumption(varying=("focal",))
@@ -75,6 +76,21 @@ def test_the_answer_does_not_depend_on_the_frame(generator):
     moved = dataclasses.replace(scene, P=scene.P[order], x=scene.x[order], visible=scene.visible[order])
     ratio = solve(moved).K[:, 0, 0] / found.K[order, 0, 0]
     assert (ratio.log().abs() < 0.01 * found.deviation[order, 0]).all()
+
+
+def test_second_derivatives_are_for_the_best_alone(generator, monkeypatch):
+    """And for what lies off it, two places; not for the search from many."""
+    asked, curve = [], DenseProblem.curve
+
+    def counted(problem, here, where):
+        asked.append(len(where))
+        return curve(problem, here, where)
+
+    monkeypatch.setattr(DenseProblem, "curve", counted)
+    for _ in range(3):
+        solve(projective_scene(generator, 5, noise=1.0), assume=Assumption())
+    assert asked
+    assert max(asked) <= 2
 
 
 def test_noise_stays_within_its_own_estimate(generator):

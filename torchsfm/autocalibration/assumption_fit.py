@@ -18,6 +18,9 @@ from torchsfm.linalg import determinant_3x3, eigh
 
 STARTS, FINALISTS = 8, 3
 """Places of the grid that are refined with each view weighed by itself, and of those the ones refined with all of it."""
+NEAR = 1e-3
+"""Part of its objective that a fit may leave which is only compared with others: they scatter by more. Steps without second
+derivatives come as near."""
 _APART = 0.15
 """Focal lengths this far apart in logarithm are told apart by the data, or the focal length is not determined."""
 _CLEAR = 9.0
@@ -102,20 +105,22 @@ def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumptio
             held[:, k] = 1 - present[:, view]
     precision = (precision + held)[:, None]
     mean = torch.zeros_like(precision)
-    # Near enough to tell minima apart and to rank them; those that are kept go on to their own.
-    rough = fit_upgrade(problem, starts, plane, mean, precision, coupled=False, max_iterations=30, tolerance=1e-4)
+    # Near enough to tell minima apart and to rank them; those that are kept go on, and the best to its end.
+    rough = fit_upgrade(problem, starts, plane, mean, precision, coupled=False, max_iterations=30, tolerance=NEAR)
     ranked = (rough.objective + _impossible(problem, ready, rough.unknowns, rough.plane)).argsort(-1)
     finalists = _distinct(ranked, rough.unknowns[..., is_focal].mean(-1), rough.plane)
     rows = torch.arange(b, device=ready.P.device)[:, None]
     fine = fit_upgrade(
-        problem, rough.unknowns[rows, finalists], rough.plane[rows, finalists], mean, precision, coupled=True, max_iterations=30
+        problem, rough.unknowns[rows, finalists], rough.plane[rows, finalists], mean, precision, coupled=True,
+        max_iterations=30, tolerance=NEAR,
+    )  # fmt: skip
+    total = fine.objective + _impossible(problem, ready, fine.unknowns, fine.plane)
+    winner = total.argmin(-1)[:, None]
+    best = fit_upgrade(
+        problem, fine.unknowns[rows, winner], fine.plane[rows, winner], mean, precision, coupled=True, max_iterations=30
     )
-    wrong = _impossible(problem, ready, fine.unknowns, fine.plane)
-    total = fine.objective + wrong
-    winner = total.argmin(-1)
-    first = torch.arange(b, device=ready.P.device)
-    unknowns, p = fine.unknowns[first, winner], fine.plane[first, winner]
-    chi2, objective = fine.cost[first, winner], total[first, winner]
+    wrong = _impossible(problem, ready, best.unknowns, best.plane)[:, 0]
+    unknowns, p, chi2, objective = best.unknowns[:, 0], best.plane[:, 0], best.cost[:, 0], best.objective[:, 0] + wrong
 
     number = present.sum(-1)
     redundancy = 5 * (number - 1) - 3 - (q - held.sum(-1)) + (precision[:, 0] > 0).sum(-1) - held.sum(-1)
@@ -156,7 +161,7 @@ def solve_assumption(ready: PreparedCameras, base: Tensor, assumption: Assumptio
     for condition, code in (
         (flat | rival | (focal > max_deviation) | (log_focal > math.log(40)), Status.DEGENERATE),
         (chi2 > 200 * redundancy.clamp_min(1), Status.NO_CONSENSUS),
-        (wrong[first, winner] > 0, Status.BEHIND),
+        (wrong > 0, Status.BEHIND),
         ((number < 2) | (redundancy < 0), Status.TOO_FEW),
         (~ready.finite, Status.NOT_FINITE),
         (number < 2, Status.TOO_FEW),
