@@ -104,7 +104,8 @@ def test_costs_and_answers_are_those_of_one_process(count: int, generator: torch
             own_costs, own_tensors, own_status = rank[name]
             assert own_status == status, name
             assert len(own_costs) == len(costs), name
-            torch.testing.assert_close(torch.tensor(own_costs), torch.tensor(costs), rtol=1e-10, atol=1e-16, msg=name)
+            # Conjugate gradients that end early are sensitive to rounding.
+            assert own_costs == pytest.approx(costs, rel=1e-9 if "iterative" in name else 1e-10, abs=1e-16), name
             for mine, one, first in zip(own_tensors, tensors, ranks[0][name][1], strict=True):
                 assert torch.equal(mine, first), name
                 torch.testing.assert_close(mine, one, rtol=1e-6, atol=1e-6, msg=name)

@@ -81,10 +81,13 @@ class PairGraph:
                 D.index_add_(0, i, torch.where((i == j)[:, None, None], (v := values[:, :w, w : 2 * w]) + v.mT, 0.0))
         D = self.ranks.sum(D[:n]) + torch.diag_embed(weight.view(n, w))
         none = torch.zeros(0, dtype=torch.long, device=D.device)
-        i, j, B = (
-            self.ranks.gather(torch.cat(parts)) for parts in zip((none, none, D.new_zeros((0, w, w))), *found, strict=True)
-        )
-        return _Cycle(_summed(i, j, B, D, D.diagonal(dim1=1, dim2=2)))
+        i, j, B = (torch.cat(parts) for parts in zip((none, none, D.new_zeros((0, w, w))), *found, strict=True))
+        i, j, B = _merged(i, j, B, n)
+        # Where there are coarser graphs, each rank keeps its own edges of the finest.
+        ranks = self.ranks
+        if n * w <= FEW:
+            (i, j, B), ranks = _gathered(i, j, B, n, ranks), Ranks()
+        return _Cycle(_level(i, j, B, D, D.diagonal(dim1=1, dim2=2), ranks))
 
 
 @dataclass(frozen=True)
@@ -100,12 +103,20 @@ class _Level:
     """The diagonal blocks."""
     scale: Tensor
     """What the diagonal would be if nothing cancelled."""
+    ranks: Ranks
+    """The processes whose edges these are a part of; all have the diagonal."""
+
+    @property
+    def joined(self) -> bool:
+        """Whether there is an edge on any rank."""
+        return bool(self.ranks.any(torch.tensor(len(self.i) > 0, device=self.i.device)))
 
     def product(self, x: Tensor) -> Tensor:
         """The matrix times a vector (variables, coordinates)."""
-        out = (self.D @ x[:, :, None])[:, :, 0]
+        out = torch.zeros_like(x) if self.ranks.rank else (self.D @ x[:, :, None])[:, :, 0]
         out.index_add_(0, self.i, (self.B @ x[self.j][:, :, None])[:, :, 0])
-        return out.index_add_(0, self.j, (self.B.mT @ x[self.i][:, :, None])[:, :, 0])
+        out.index_add_(0, self.j, (self.B.mT @ x[self.i][:, :, None])[:, :, 0])
+        return self.ranks.sum(out)
 
     def stars(self) -> Tensor:
         """The number of the star of each variable: centres drawn at random, and those that are held strongly to one.
@@ -117,6 +128,7 @@ class _Level:
         strength = torch.linalg.matrix_norm(self.B)
         best = strength.new_zeros(n)
         best.scatter_reduce_(0, self.i, strength, "amax").scatter_reduce_(0, self.j, strength, "amax")
+        best = self.ranks.largest(best)
         strong = strength >= STRONG * torch.minimum(best[self.i], best[self.j])
         i, j = self.i[strong], self.j[strong]
         own = torch.arange(n, device=device)
@@ -129,35 +141,50 @@ class _Level:
             i, j = i[both], j[both]
             above = torch.where(left, rank, n)
             above.scatter_reduce_(0, i, rank[j], "amax").scatter_reduce_(0, j, rank[i], "amax")
+            above = self.ranks.largest(above)
             chosen = left & (above == rank)
             centre = torch.where(chosen, own, centre)
-            if not len(i):
+            # Without an edge between those that were left all are chosen.
+            if torch.equal(chosen, left):
                 star: Tensor = torch.unique(centre, return_inverse=True)[1]
                 return star
             # The others go to the neighbouring centre that was drawn highest.
             found = torch.full_like(own, -1)
             for a, b in ((i, j), (j, i)):
                 found.scatter_reduce_(0, a, torch.where(chosen[b], rank[b], -1), "amax")
+            found = self.ranks.largest(found)
             centre = torch.where((centre < 0) & (found >= 0), member[found.clamp(min=0)], centre)
 
     def coarser(self, star: Tensor) -> "_Level":
         """The matrix over stars whose members move alike."""
         n = int(star.max()) + 1
-        D = self.D.new_zeros((n, *self.D.shape[1:])).index_add_(0, star, self.D)
+        D = self.D.new_zeros((n, *self.D.shape[1:]))
+        if not self.ranks.rank:
+            D.index_add_(0, star, self.D)
         scale = self.scale.new_zeros((n, self.scale.shape[1])).index_add_(0, star, self.scale)
         i, j = star[self.i], star[self.j]
         inside = i == j
-        D.index_add_(0, i[inside], self.B[inside] + self.B[inside].mT)
-        return _summed(i[~inside], j[~inside], self.B[~inside], D, scale)
+        D = self.ranks.sum(D.index_add_(0, i[inside], self.B[inside] + self.B[inside].mT))
+        i, j, B = _gathered(*_merged(i[~inside], j[~inside], self.B[~inside], n), n, self.ranks)
+        return _level(i, j, B, D, scale, Ranks())
 
 
-def _summed(i: Tensor, j: Tensor, B: Tensor, D: Tensor, scale: Tensor) -> _Level:
-    """A level, given edges that may come several times and in any direction."""
-    n = len(D)
+def _level(i: Tensor, j: Tensor, B: Tensor, D: Tensor, scale: Tensor, ranks: Ranks) -> _Level:
+    """A level, its diagonal safe from rounding."""
+    return _Level(i, j, B, D + torch.diag_embed(RIDGE * scale), scale, ranks)
+
+
+def _gathered(i: Tensor, j: Tensor, B: Tensor, n: int, ranks: Ranks) -> tuple[Tensor, Tensor, Tensor]:
+    """The edges of all ranks."""
+    return (i, j, B) if ranks.size == 1 else _merged(ranks.gather(i), ranks.gather(j), ranks.gather(B), n)
+
+
+def _merged(i: Tensor, j: Tensor, B: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Each edge between n variables once and upwards, given edges that may come several times and in any direction."""
     key, place = torch.unique(torch.minimum(i, j) * n + torch.maximum(i, j), return_inverse=True)
     B = torch.where((i > j)[:, None, None], B.mT, B)
     B = B.new_zeros((len(key), *B.shape[1:])).index_add_(0, place, B)
-    return _Level(torch.div(key, n, rounding_mode="floor"), key % n, B, D + torch.diag_embed(RIDGE * scale), scale)
+    return torch.div(key, n, rounding_mode="floor"), key % n, B
 
 
 class _Cycle:
@@ -165,7 +192,7 @@ class _Cycle:
 
     def __init__(self, finest: _Level) -> None:
         self._levels, self._stars = [finest], list[Tensor]()
-        while self._levels[-1].scale.numel() > FEW and len(self._levels[-1].i):
+        while self._levels[-1].scale.numel() > FEW and self._levels[-1].joined:
             self._stars.append(self._levels[-1].stars())
             self._levels.append(self._levels[-1].coarser(self._stars[-1]))
         self._inverse = [_inverse(level.D) for level in self._levels]

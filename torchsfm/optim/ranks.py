@@ -117,7 +117,7 @@ class Share:
 def share(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | Sequence[str] | None, ranks: Ranks) -> Share:
     """Divide a problem that all ranks know, so that each has about as many residuals of each eliminated block, of few retained.
 
-    Residuals of retained variables alone are divided evenly.
+    Residuals of retained variables alone are divided evenly, those of the same variables together.
 
     Raises:
         ValueError: A residual depends on two eliminated variables.
@@ -137,9 +137,9 @@ def share(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | S
         owner[name], number[name] = found[at], at - int((found < ranks.rank).sum())
     own_terms, orders = [], []
     for term, eliminated in zip(terms, met, strict=True):
-        count = len(term.index[0])
         if eliminated is None:
-            where = torch.arange(count, device=term.index[0].device) * ranks.size // max(count, 1)
+            alike = _alike(term)
+            where = _evenly(torch.bincount(alike), ranks.size)[alike]
         else:
             where = owner[eliminated][term.index[term.blocks.index(eliminated)]]
         own = term.select((where == ranks.rank).nonzero()[:, 0])
@@ -177,6 +177,21 @@ def _owners(block: Block, name: str, terms: Sequence[Term], order: Tensor, ranks
         for other, index in zip(term.blocks, term.index, strict=True):
             if other == name:
                 count += torch.bincount(index, minlength=len(count))
-    count = count[order]
+    return _evenly(count[order], ranks)
+
+
+def _evenly(count: Tensor, ranks: int) -> Tensor:
+    """The rank of each of several things with so many residuals, one after the other."""
     end = count.cumsum(0)
     return ((2 * end - count) * ranks // (2 * count.sum().clamp_min(1))).clamp_max(ranks - 1)
+
+
+def _alike(term: Term) -> Tensor:
+    """A number for each residual, the same for those of the same variables, in the order of these."""
+    index = torch.stack(term.index)
+    if len(set(term.blocks)) == 1:
+        index = index.sort(0).values
+    key = torch.zeros_like(index[0])
+    for row in index if index.numel() else []:
+        key = torch.unique(key * (row.max() + 1) + row, return_inverse=True)[1]
+    return key
