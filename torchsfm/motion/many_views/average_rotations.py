@@ -20,6 +20,7 @@ from torchsfm.motion.many_views.rotation_graph import RotationGraph, rotations_o
 from torchsfm.motion.many_views.rotation_loops import count_loops, vouched_parts
 from torchsfm.motion.many_views.triplets import turn_angle
 from torchsfm.optim import GemanMcClure, Huber
+from torchsfm.optim.ranks import Group
 
 ROUNDS = 2
 """Sums of lengths minimised, each with the scale that the last has left."""
@@ -82,6 +83,7 @@ def average_rotations(
     covariance: bool = False,
     max_iterations: int = 100,
     tolerance: float = 1e-6,
+    group: Group | None = None,
 ) -> AveragedRotations:
     """Rotations of all cameras of a view graph, robustly.
 
@@ -101,6 +103,10 @@ def average_rotations(
         covariance: Compute the covariance of each rotation: dense, for up to some thousand cameras.
         max_iterations: Most steps of each of the minimisations.
         tolerance: Part of the cost that the last of them may leave; where rotations are adjusted later, 1e-3 will do.
+        group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same graph and share
+            what the minimisations take: edges are divided, rotations are known to all. Every process has all edges as they are
+            given and by itself finds triangles, start, loops and covariances. All return the same, which is what one process
+            finds, to rounding; see `sparse_levenberg_marquardt`.
 
     Returns:
         Rotations, statuses, components, and what is thought of each edge. Edges that are not finite, whose R is no rotation,
@@ -124,7 +130,7 @@ def average_rotations(
         R=(R, "e 3 3"), edges=(edges, "e 2: int"), deviation=(deviation, "?e 3 3"), weights=(weights, "?e")
     )  # fmt: skip
     check_options(views=(views, "int >= 0"), covariance=(covariance, bool), max_iterations=(max_iterations, "int >= 0"))
-    check_options(tolerance=(tolerance, "float >= 0"))
+    check_options(tolerance=(tolerance, "float >= 0"), group=(group, Group | None))
     check_index(edges=(edges, views))
     edges = edges.long()
     with torch.no_grad():
@@ -132,7 +138,7 @@ def average_rotations(
     kept = counts.nonzero()[:, 0]
     sigma = None if deviation is None else deviation[kept].double()
     weight = None if weights is None else weights[kept].double()
-    graph = RotationGraph.of(R[kept].double(), edges[kept], sigma, weight, views)
+    graph = RotationGraph.of(R[kept].double(), edges[kept], sigma, weight, views, group)
     with torch.no_grad():
         tree, _ = graph.start()
         start = tree

@@ -14,6 +14,7 @@ from torchsfm._types import Status, check_index, check_one_problem, check_option
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.open_positions import deviations, tell
 from torchsfm.motion.many_views.ray_sums import ROUGH, Rays
+from torchsfm.optim.ranks import Group
 
 MOST_LOST = 0.9
 """Where fewer residuals than a tenth are free, scatter tells no more than that."""
@@ -78,6 +79,7 @@ def position_globally(
     weights: Float[Tensor, "m"] | None = None,
     max_iterations: int = 100,
     tolerance: float = 1e-4,
+    group: Group | None = None,
 ) -> GlobalPositions:
     """Centres of cameras of known rotation, and points, robustly and without a start.
 
@@ -91,6 +93,10 @@ def position_globally(
         weights: What each ray counts; 0 leaves it out.
         max_iterations: Most steps of each of the two minimisations.
         tolerance: Part of the cost that the last of them may leave; where all is adjusted later, 1e-3 will do.
+        group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same rays and share
+            what the minimisations take: points and their rays are divided, centres are known to all. Every process has all
+            rays as they are given and by itself finds components, scales and deviations. All return the same, which is what
+            one process finds, to rounding; see `sparse_levenberg_marquardt`.
 
     Returns:
         Centres, points, statuses, and what is thought of each ray. Rays that are not finite or 0, those of cameras whose
@@ -113,7 +119,7 @@ def position_globally(
     """
     check_one_problem(d=(d, "m 3"), view=(view, "m: int"), point=(point, "m: int"), R=(R, "v 3 3"), weights=(weights, "?m"))
     check_options(points=(points, "int >= 0"), max_iterations=(max_iterations, "int >= 0"))
-    check_options(tolerance=(tolerance, "float >= 0"))
+    check_options(tolerance=(tolerance, "float >= 0"), group=(group, Group | None))
     v, view, point = len(R), view.long(), point.long()
     check_index(view=(view, v), point=(point, points))
     with torch.no_grad():
@@ -126,7 +132,7 @@ def position_globally(
     ray = torch.nn.functional.normalize(d[kept].double(), dim=-1)
     ray = (R[view[kept]].double().mT @ ray[..., None])[..., 0]
     weight = None if weights is None else weights[kept].double()
-    rays = Rays(ray, view[kept], point[kept], weight, v, points)
+    rays = Rays(ray, view[kept], point[kept], weight, v, points, group)
     with torch.no_grad():
         component = rays.component()
         start = rays.convex(max_iterations)

@@ -13,6 +13,7 @@ The first is least unsquared deviations (Ozyesil & Singer, "Robust camera locati
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +23,7 @@ from torch import Tensor
 from torchsfm.motion.many_views.components import components
 from torchsfm.optim import Block, Huber, SparseResult, Term
 from torchsfm.optim import sparse_levenberg_marquardt as minimise
+from torchsfm.optim.ranks import Group
 
 CORNER = 0.1
 """Distance from its ray, at one unit ahead of the camera, from which a point pulls with constant force."""
@@ -37,7 +39,7 @@ HUBER = 1.5
 
 @dataclass(frozen=True)
 class Rays:
-    """The rays that count, turned into the world, in double precision."""
+    """The rays that count, turned into the world, in double precision; the processes of a group all have them."""
 
     v: Float[Tensor, "m 3"]
     view: Int[Tensor, "m"]
@@ -45,6 +47,7 @@ class Rays:
     weights: Float[Tensor, "m"] | None
     views: int
     points: int
+    group: Group | None = None
 
     def component(self) -> Int[Tensor, "v"]:
         """The smallest camera that each is connected with."""
@@ -54,7 +57,8 @@ class Rays:
     def convex(self, max_iterations: int) -> dict[str, Tensor]:
         """The minimum of distances from half rays."""
         zero = {"c": self.v.new_zeros(self.views, 3), "X": self.v.new_zeros(self.points, 3)}
-        term = Term(_ahead, ("c", "X"), (self.view, self.point), (self.v,), Huber(CORNER), self.weights, _linearize_ahead)
+        derivatives = _linearize_ahead, _bend_ahead
+        term = Term(_ahead, ("c", "X"), (self.view, self.point), (self.v,), Huber(CORNER), self.weights, *derivatives)
         return self._minimise(zero, term, max_iterations, ROUGH).x
 
     def angular(self, start: dict[str, Tensor], scale: float, max_iterations: int, tolerance: float) -> SparseResult:
@@ -88,11 +92,13 @@ class Rays:
         """Sines of angles, in a unit."""
         loss = Huber(unit * HUBER * scale)
         data = unit * self.v, self.v
-        return Term(_sine_scaled, ("c", "X"), (self.view, self.point), data, loss, self.weights, _linearize_sine)
+        return Term(_sine_scaled, ("c", "X"), (self.view, self.point), data, loss, self.weights, _linearize_sine, _bend_sine)
 
     def _minimise(self, start: dict[str, Tensor], term: Term, max_iterations: int, tolerance: float) -> SparseResult:
         blocks = {name: Block(x) for name, x in start.items()}
-        return minimise(blocks, [term], eliminate="X", max_iterations=max_iterations, function_tolerance=tolerance)
+        return minimise(
+            blocks, [term], eliminate="X", max_iterations=max_iterations, function_tolerance=tolerance, group=self.group
+        )
 
 
 def _ahead(c: Tensor, X: Tensor, v: Tensor) -> Tensor:
@@ -106,6 +112,12 @@ def _linearize_ahead(c: Tensor, X: Tensor, v: Tensor, *, out: list[Tensor | None
     along = ((X - c) * v).sum(-1)
     J = torch.eye(3, dtype=v.dtype, device=v.device) - torch.where((along > 1)[:, None, None], v[:, :, None] * v[:, None], 0.0)
     return _store(J, out, _ahead(c, X, v))
+
+
+def _bend_ahead(c: Tensor, X: Tensor, v: Tensor, *, by: Float[Tensor, "3 m"], wanted: Sequence[bool]) -> Float[Tensor, "n n m"]:
+    """Straight on both sides of where the half ray begins."""
+    n = 3 * sum(wanted)
+    return by.new_zeros((n, n, len(v)))
 
 
 def _sine(c: Tensor, X: Tensor, v: Tensor) -> Tensor:
@@ -132,6 +144,25 @@ def _linearize_sine(c: Tensor, X: Tensor, scaled: Tensor, v: Tensor, *, out: lis
     J = s[:, None, None] * (eye - u[:, :, None] * u[:, None]) + u[:, :, None] * across[:, None]
     J = torch.where(ahead[:, None, None], -J / length[:, None, None], 0.0)
     return _store(J, out, _sine_scaled(c, X, scaled, v))
+
+
+def _bend_sine(
+    c: Tensor, X: Tensor, scaled: Tensor, v: Tensor, *, by: Float[Tensor, "3 m"], wanted: Sequence[bool]
+) -> Float[Tensor, "n n m"]:
+    """The second derivatives of `by . _sine_scaled`, which is `-(scaled'u)(by'u)` and a constant, by c and X."""
+    D = (X - c).mT
+    length = torch.linalg.vector_norm(D, dim=0).clamp(min=1e-12)
+    u, s = D / length, scaled.mT
+    along, across = (s * u).sum(0), (by * u).sum(0)
+    outer = u[:, None] * (across * s + along * by)
+    product = s[:, None] * by
+    eye = torch.eye(3, dtype=D.dtype, device=D.device)[:, :, None]
+    H = 2 * (outer + outer.transpose(0, 1)) - product - product.transpose(0, 1)
+    H = H + 2 * along * across * (eye - 4 * u[:, None] * u)
+    H = torch.where((v.mT * u).sum(0) > 0, H / length.square(), 0.0)
+    if all(wanted):
+        return torch.cat((torch.cat((H, -H), 1), torch.cat((-H, H), 1)), 0)
+    return H
 
 
 def _store(J: Tensor, out: list[Tensor | None], residual: Tensor) -> Tensor:

@@ -10,12 +10,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import cross_matrix, rotvec_from_rotation
+from torchsfm.geometry import rotvec_from_rotation
 from torchsfm.motion.many_views.components import components
+from torchsfm.motion.many_views.rotation_residual import bend, linearize, residual
 from torchsfm.motion.many_views.spanning_rotations import spanning_rotations
 from torchsfm.motion.many_views.triplets import find_triplets, pairs_within
 from torchsfm.optim import Block, Loss, Rotation, SparseResult, Term, marginal_covariance
 from torchsfm.optim import sparse_levenberg_marquardt as minimise
+from torchsfm.optim.ranks import Group
 
 QUARTILE = 1.2125
 """Of a squared residual of three normal components."""
@@ -34,6 +36,7 @@ class RotationGraph:
         W: `W' W` is the inverse of that covariance.
         weights: How much each counts, if not all alike.
         views: How many cameras there are.
+        group: Processes that all have the same graph and minimise together.
     """
 
     R: Float[Tensor, "e 3 3"]
@@ -42,6 +45,7 @@ class RotationGraph:
     W: Float[Tensor, "e 3 3"]
     weights: Float[Tensor, "e"] | None
     views: int
+    group: Group | None = None
 
     @classmethod
     def of(
@@ -51,13 +55,14 @@ class RotationGraph:
         deviation: Float[Tensor, "e 3 3"] | None,
         weights: Float[Tensor, "e"] | None,
         views: int,
+        group: Group | None = None,
     ) -> "RotationGraph":
         """Whiten the edges."""
         W = torch.eye(3, dtype=R.dtype, device=R.device).expand(len(R), 3, 3)
         if deviation is not None:
             lower, _ = torch.linalg.cholesky_ex(deviation)
             W = torch.linalg.solve_triangular(lower, W, upper=False)
-        return cls(R, edges, deviation, W, weights, views)
+        return cls(R, edges, deviation, W, weights, views, group)
 
     def start(self) -> tuple[Tensor, Tensor]:
         """Rotations along the tree of the edges that most triangles speak for; among equals the more precise ones."""
@@ -130,12 +135,12 @@ class RotationGraph:
     def terms(self, loss: Loss) -> list[Term]:
         """All edges."""
         i, j = self.edges.unbind(-1)
-        return [Term(_residual, ("R", "R"), (i, j), (self.R, self.W), loss, self.weights, _linearize)]
+        return [Term(residual, ("R", "R"), (i, j), (self.R, self.W), loss, self.weights, linearize, bend)]
 
     def minimise(self, start: Float[Tensor, "v 3 3"], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
         """The minimum nearest to a start."""
         blocks = {"R": Block(start.mT.flatten(1), Rotation())}
-        return minimise(blocks, self.terms(loss), max_iterations=max_iterations, function_tolerance=tolerance)
+        return minimise(blocks, self.terms(loss), max_iterations=max_iterations, function_tolerance=tolerance, group=self.group)
 
     def covariance(self, model: Tensor, component: Tensor, status: Tensor, loss: Loss, scale: float) -> Float[Tensor, "v 3 3"]:
         """That of each rotation, with the first cameras of all components held."""
@@ -153,26 +158,3 @@ class RotationGraph:
 def rotations_of(found: SparseResult) -> Float[Tensor, "v 3 3"]:
     """The rotations from the world to the cameras that a minimum holds the other way round."""
     return found.x["R"].view(-1, 3, 3).mT
-
-
-def _residual(a: Tensor, b: Tensor, R: Tensor, W: Tensor) -> Tensor:
-    """The whitened rotation vector of `b' a R'`, of rotations a and b from the cameras to the world."""
-    e = rotvec_from_rotation(b.reshape(-1, 3, 3).mT @ a.reshape(-1, 3, 3) @ R.mT)
-    return (W @ e[..., None])[..., 0]
-
-
-def _linearize(a: Tensor, b: Tensor, R: Tensor, W: Tensor, *, out: list[Tensor | None]) -> Tensor:
-    """The same, and its derivatives by turns of both cameras: `log(exp(w) exp(e)) = e + J w` for a turn w in b's frame."""
-    back = b.reshape(-1, 3, 3).mT
-    e = rotvec_from_rotation(back @ a.reshape(-1, 3, 3) @ R.mT)
-    square = (e * e).sum(-1)
-    half = 0.5 * square.clamp(min=1e-6).sqrt()
-    factor = torch.where(square < 1e-6, 1 / 12 + square / 720, (1 - half * half.cos() / half.sin()) / square.clamp(min=1e-6))
-    cross = cross_matrix(e)
-    J = torch.eye(3, dtype=e.dtype, device=e.device) - 0.5 * cross + factor[:, None, None] * (cross @ cross)
-    turned = W @ J @ back
-    if out[0] is not None:
-        out[0].copy_(turned)
-    if out[1] is not None:
-        out[1].copy_(-turned)
-    return (W @ e[..., None])[..., 0]
