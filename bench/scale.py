@@ -4,6 +4,7 @@
     python -m bench.scale features --images 1000 3000 10000   # retrieval and the division of pairs, on simulated features
     python -m bench.scale recall --images 60                  # which verified pairs retrieval finds, k = 5 to 50
     python -m bench.scale bundle --ranks 1 2 4                # memory, bytes and processor time of a bundle over processes
+    python -m bench.scale rotations --ranks 1 2               # of rotation averaging, and of `positions`; --images of each
 
 prints markdown tables. Seconds are those of one processor core (`time.process_time`), so that other work on the machine does
 not count; each row is a process of its own, so that its peak memory is its own. `exponent` is the slope of the logarithms
@@ -162,75 +163,146 @@ def recall(views: int) -> Row:
     return row
 
 
-def bundle(ranks: int, mixed: bool = False) -> list[dict[str, Any]]:
-    """A bundle of 200 cameras over processes: what each of them takes; `mixed` has the points in another order."""
-    from torchsfm._types import tensor_map
+def make_bundle(size: int, mixed: bool) -> Any:
+    """A bundle of cameras along a street; `mixed` has the points in another order."""
     from torchsfm.simulation import random_bundle_problem
 
+    problem = random_bundle_problem(size, 600 * size, 3000 * size, generator=torch.Generator().manual_seed(0)).problem
+    if not mixed:
+        return problem
+    order = torch.randperm(len(problem.X), generator=torch.Generator().manual_seed(0))
+    return replace(problem, X=problem.X[order], point=torch.argsort(order)[problem.point])
+
+
+def make_rotations(size: int, mixed: bool) -> Any:
+    """Edges between cameras along a street, a fifth of them wrong."""
+    from bench.view_graphs import make_view_graph
+
+    graph = make_view_graph("corridor", size, outliers=0.2)
+    order = torch.randperm(len(graph.edges), generator=torch.Generator().manual_seed(0)) if mixed else slice(None)
+    return size, graph.edges[order], graph.R[order], graph.deviation[order]
+
+
+def make_positions(size: int, mixed: bool) -> Any:
+    """Rays of cameras above a field, a thousandth of a radian off."""
+    from bench.view_graphs import look_around
+
+    g = torch.Generator().manual_seed(0)
+    seen = look_around("lawnmower", size, 1100.0, (1000, 750), generator=g)
+    d = torch.cat(((seen.x - torch.tensor([499.5, 374.5])) / 1100.0, torch.ones(len(seen.x), 1).double()), -1)
+    d[:, :2] += 1e-3 * torch.randn(len(d), 2, generator=g, dtype=torch.float64)
+    order = torch.randperm(len(seen.X), generator=g) if mixed else torch.arange(len(seen.X))
+    return d, seen.view, order[seen.point], seen.poses.R, len(seen.X)
+
+
+def solve_bundle(problem: Any, group: Any) -> tuple[list[float], torch.Tensor]:
+    """Its costs after each step, and the places of the cameras."""
+    from torchsfm.bundle import bundle_adjust
+
+    costs: dict[int, float] = {}
+    found = bundle_adjust(
+        problem, free=("focal", "k1", "k2"), linear_solver="pcg", max_iterations=5, tolerance=0.0, group=group,
+        progress=costs.__setitem__,
+    )  # fmt: skip
+    return list(costs.values()), found.poses.centre
+
+
+def solve_rotations(problem: Any, group: Any) -> tuple[list[float], torch.Tensor]:
+    """No costs; the rotations of the cameras."""
+    from torchsfm.motion import average_rotations
+
+    size, edges, R, deviation = problem
+    spread = deviation.square()[:, None, None] * torch.eye(3, dtype=torch.float64)
+    return [], average_rotations(R, edges, views=size, deviation=spread, group=group).model
+
+
+def solve_positions(problem: Any, group: Any) -> tuple[list[float], torch.Tensor]:
+    """No costs; the places of the cameras."""
+    from torchsfm.motion import position_globally
+
+    *rays, points = problem
+    return [], position_globally(*rays, points=points, group=group).centres
+
+
+SHARED: dict[str, tuple[Callable[..., Any], Callable[..., Any], int, int]] = {
+    "bundle": (make_bundle, solve_bundle, 200, 72),
+    "rotations": (make_rotations, solve_rotations, 10_000, 24),
+    "positions": (make_positions, solve_positions, 1_000, 24),
+}
+"""What processes share: how it is made and solved, the number of cameras, and the bytes of one."""
+
+
+def share_out(job: str, size: int, ranks: int, mixed: bool = False) -> list[dict[str, Any]]:
+    """One problem over processes: what each of them takes; `mixed` has the data in another order."""
+    from torchsfm._types import tensor_map
+
     with tempfile.TemporaryDirectory() as folder:
-        problem = random_bundle_problem(200, 120_000, 600_000, generator=torch.Generator().manual_seed(0)).problem
-        if mixed:
-            order = torch.randperm(len(problem.X), generator=torch.Generator().manual_seed(0))
-            problem = replace(problem, X=problem.X[order], point=torch.argsort(order)[problem.point])
         # Views of larger tensors would be saved with all of these.
-        torch.save(tensor_map(torch.clone, problem), Path(folder) / "problem")
-        words = [sys.executable, "-m", "bench.scale", "bundle", "--worker", folder]
+        torch.save(tensor_map(torch.clone, SHARED[job][0](size, mixed)), Path(folder) / "problem")
+        words = [sys.executable, "-m", "bench.scale", job, "--worker", folder, "--images", f"{size}"]
         group = [
             subprocess.Popen(words, env=os.environ | {"RANK": str(rank), "WORLD_SIZE": str(ranks)}, stdout=subprocess.PIPE)
             for rank in range(ranks)
         ]
-        return [json.loads(process.communicate()[0].splitlines()[-1]) for process in group]
+        rows = [json.loads(process.communicate()[0].splitlines()[-1]) for process in group]
+        return [row | {"answer": torch.load(Path(folder) / "answer")} for row in rows]
 
 
-def bundle_worker(folder: str) -> dict[str, Any]:
-    """One rank of `bundle`."""
+def rank_of(job: str, size: int, folder: str) -> dict[str, Any]:
+    """One rank of `share_out`."""
     import torch.distributed as dist
 
-    from torchsfm.bundle import bundle_adjust
+    import torchsfm.bundle
+    import torchsfm.motion  # noqa: F401 - before the clock starts
 
-    ranks = int(os.environ["WORLD_SIZE"])
-    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=int(os.environ["RANK"]), world_size=ranks)
+    ranks, rank = int(os.environ["WORLD_SIZE"]), int(os.environ["RANK"])
+    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=ranks)
     sent: list[int] = []
-    reduce = dist.all_reduce
+    reduce, gather = dist.all_reduce, dist.all_gather
 
     def counted(x: torch.Tensor, *options: Any, **more: Any) -> Any:
         sent.append(x.numel() * x.element_size())
         return reduce(x, *options, **more)
 
-    dist.all_reduce = counted
+    def gathered(found: list[torch.Tensor], x: torch.Tensor, **more: Any) -> Any:
+        sent.append(x.numel() * x.element_size())
+        return gather(found, x, **more)
+
+    dist.all_reduce, dist.all_gather = counted, gathered
     problem = torch.load(Path(folder) / "problem", weights_only=False)
-    costs: dict[int, float] = {}
     before, start = memory(), time.process_time()
-    result = bundle_adjust(
-        problem, free=("focal", "k1", "k2"), linear_solver="pcg", max_iterations=5, tolerance=0.0, group=dist.group.WORLD,
-        progress=costs.__setitem__,
-    )  # fmt: skip
-    spent = time.process_time() - start
-    own = 72 * len(problem.poses.t)
+    costs, answer = SHARED[job][1](problem, dist.group.WORLD)
+    spent, own = time.process_time() - start, SHARED[job][3] * size
+    if not rank:
+        torch.save(answer, Path(folder) / "answer")
     row = {
-        "costs": list(costs.values()),
-        "final cost": result.cost,
+        "costs": costs,
         "cpu s": spent,
         "MB before": before,
         "MB more": memory() - before,
         "messages": len(sent),
-        "of a CG step": sent.count(own),
-        "bytes of others": sum(sent) - own * sent.count(own),
+        "of all cameras": sent.count(own),
+        "MB of others": (sum(sent) - own * sent.count(own)) / 1e6,
     }
     dist.destroy_process_group()
     return row
 
 
-def compare_ranks(numbers: list[int]) -> None:
-    """Print what a bundle over processes takes, and how far its costs are from those of the first number of them."""
-    found = {f"{ranks}": bundle(ranks) for ranks in numbers} | {f"{numbers[0]}, points mixed": bundle(numbers[0], mixed=True)}
-    costs = {name: rows[0].pop("costs") for name, rows in found.items()}
-    most = {ranks: {name: max(row[name] for row in found[f"{ranks}"]) for name in found[f"{ranks}"][0]} for ranks in numbers}
+def compare_ranks(job: str, size: int, numbers: list[int]) -> None:
+    """Print what a problem over processes takes, and how far costs and answers are from those of the first number of them."""
+    found = {f"{ranks}": share_out(job, size, ranks) for ranks in numbers}
+    found[f"{numbers[0]}, in another order"] = share_out(job, size, numbers[0], mixed=True)
+    costs = {name: rows[0]["costs"] for name, rows in found.items()}
+    answers = {name: rows[0]["answer"] for name, rows in found.items()}
+    names = [name for name in found[f"{numbers[0]}"][0] if name not in ("costs", "answer")]
+    most = {ranks: {name: max(row[name] for row in found[f"{ranks}"]) for name in names} for ranks in numbers}
     print(table(most, "ranks"))
-    first = costs[f"{numbers[0]}"]
+    first = f"{numbers[0]}"
     for name, rows in found.items():
-        apart = ", ".join(f"{abs(a / b - 1):.0e}" for a, b in zip(costs[name], first, strict=True))
-        print(f"{name}: {sum(row['cpu s'] for row in rows):.1f} core-seconds in all; costs after each step differ by {apart}")
+        apart = ", ".join(f"{abs(a / b - 1):.0e}" for a, b in zip(costs[name], costs[first], strict=True))
+        off = float((answers[name] - answers[first]).abs().max())
+        print(f"{name}: {sum(row['cpu s'] for row in rows):.1f} core-seconds in all; cameras differ by {off:.0e}", end="")
+        print(f", costs after each step by {apart}" if apart else "")
 
 
 def apart(job: str, size: int, method: str) -> Row:
@@ -285,26 +357,28 @@ def predict(rows: dict[int, Row]) -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Print the tables of one job."""
     parser = argparse.ArgumentParser(prog="python -m bench.scale", description="Growth with the number of photographs.")
-    parser.add_argument("job", choices=("photographs", "features", "recall", "bundle"))
-    parser.add_argument("--images", type=int, nargs="+", default=[50, 100, 200])
+    parser.add_argument("job", choices=("photographs", "features", "recall", *SHARED))
+    parser.add_argument("--images", type=int, nargs="+")
     parser.add_argument("--methods", nargs="+", default=["incremental", "global"], help="mappers of photographs")
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    sizes = options.images or ([SHARED[options.job][2]] if options.job in SHARED else [50, 100, 200])
     jobs: dict[str, Callable[[int], Row]] = {
         "photographs": partial(photographs, method=options.methods[0]),
         "features": simulated,
         "recall": recall,
     }
     if options.worker:
-        row = bundle_worker(options.worker) if options.job == "bundle" else jobs[options.job](options.images[0])
+        row = rank_of(options.job, sizes[0], options.worker) if options.job in SHARED else jobs[options.job](sizes[0])
         print(json.dumps(row))
-    elif options.job == "bundle":
-        compare_ranks(options.ranks)
+    elif options.job in SHARED:
+        for size in sizes:
+            compare_ranks(options.job, size, options.ranks)
     else:
         for method in options.methods if options.job == "photographs" else options.methods[:1]:
-            rows = {size: apart(options.job, size, method) for size in options.images}
+            rows = {size: apart(options.job, size, method) for size in sizes}
             print(table(rows, f"images, {method}" if options.job == "photographs" else "images"), flush=True)
         if options.job == "photographs":
             print("\nSmall photographs: what is said of larger numbers of them is a prediction.\n", predict(rows), sep="\n")

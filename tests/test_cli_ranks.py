@@ -19,6 +19,8 @@ from torchsfm.cli.ranks import Started
 from torchsfm.reconstruction.stages import saved_stages
 
 KILLS = 20
+LAST = {"features": 1, "pairs": 5, "match": 6, "overlays": 7, "verify": 8, "map": 9}
+"""How many files there are when each stage may be under way."""
 LAUNCHED = {"RANK": "1", "WORLD_SIZE": "3", "MASTER_ADDR": "localhost", "MASTER_PORT": "29500"}
 
 
@@ -103,11 +105,10 @@ def test_ranks_killed_at_any_moment(courtyard: Path, tmp_path: Path) -> None:
     """In whatever stage a rank is killed the run ends with the same model, and what was saved is not made again."""
     words, chance = ("reconstruct", courtyard, "--max-features", 600), random.Random(stream_seed())
     assert torchsfm(*words, "--out", tmp_path / "alone")[0] == 0
-    last = {"features": 1, "pairs": 5, "match": 6, "overlays": 7, "verify": 8, "map": 9}
     for k in range(KILLS):
         out = tmp_path / str(k)
         with launch(2, *words, "--out", out) as process:
-            wanted = list(last.values())[k % len(last)]
+            wanted = list(LAST.values())[k % len(LAST)]
             while len(shards(out)) < wanted and process.poll() is None:
                 time.sleep(0.01)
             time.sleep(chance.uniform(0, 0.3))
@@ -123,16 +124,25 @@ def test_ranks_killed_at_any_moment(courtyard: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_begun_with_two_and_finished_with_three(courtyard: Path, tmp_path: Path) -> None:
-    words = ("reconstruct", courtyard, "--max-features", 600, "--out", tmp_path / "out")
+@pytest.mark.parametrize("stage", LAST)
+def test_begun_with_two_and_finished_with_three(stage: str, courtyard: Path, tmp_path: Path) -> None:
+    """Ended from outside in a stage; of the three that go on one is killed, too."""
+    words, chance = ("reconstruct", courtyard, "--max-features", 600, "--out", tmp_path / "out"), random.Random(stream_seed())
     with launch(2, *words) as process:
-        while len(shards(tmp_path / "out")) < 3 and process.poll() is None:
+        while len(shards(tmp_path / "out")) < LAST[stage] and process.poll() is None:
             time.sleep(0.01)
         process.terminate()
-    before = shards(tmp_path / "out")
+    first = shards(tmp_path / "out")
     with launch(3, *words, "--resume") as process:
+        while not (alive := workers(process)) and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(chance.uniform(0, 8))
+        before, alive = shards(tmp_path / "out"), workers(process)
+        if alive:
+            os.kill(chance.choice(alive), signal.SIGKILL)
         assert process.wait() == 0
     after = shards(tmp_path / "out")
     assert {name: after[name] for name in before} == before
+    assert first.items() <= before.items()
     assert torchsfm(*words[:-1], tmp_path / "alone")[0] == 0
     assert same_model(tmp_path / "alone/model.npz", tmp_path / "out/model.npz")
