@@ -1,5 +1,6 @@
 import dataclasses
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -380,3 +381,21 @@ def test_steps_are_lengthened_where_the_loss_bends_down(monkeypatch: pytest.Monk
     assert found.status == Status.OK
     assert found.cost < (1 + 1e-7) * plain.cost
     assert found.iterations <= plain.iterations / 2
+
+
+def test_a_minimum_is_not_linearised_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each linearisation is one that a step is taken from."""
+    places: list[float] = []
+    plain = schur.Elimination.linearize
+
+    def counted(self: schur.Elimination, x: dict[str, Tensor], *ends: Any) -> Any:
+        places.append(float(x["x"]))
+        return plain(self, x, *ends)
+
+    monkeypatch.setattr(schur.Elimination, "linearize", counted)
+    y = torch.tensor([[1.0], [3.0]], dtype=torch.float64)
+    term = Term(lambda x, y: x - y, ("x",), (torch.zeros(2, dtype=torch.int64),), (y,))
+    # So far from the minimum costs tell what steps gain, not slopes.
+    found = sparse_levenberg_marquardt({"x": Block(y[:1])}, [term], function_tolerance=1e-2, initial_damping=1e-2)
+    assert found.status == Status.OK
+    assert len(places) == found.iterations

@@ -143,6 +143,9 @@ def descend(problem: Problem[Any], x0: Any, options: Options, *, enough: Tensor 
     found = Descent(here, cost, count, status)
     try:
         for iteration in range(1, options.max_iterations + 1):
+            # Where all have ended, nothing is linearised any more.
+            if not bool(state.active.any()):
+                break
             slope = state.here.steepest()
             falls = (slope > options.gradient_tolerance) & (slope < torch.inf)
             if not bool(falls.all()):
