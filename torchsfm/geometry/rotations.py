@@ -79,15 +79,16 @@ def rotvec_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batc
         >>> torchsfm.geometry.rotvec_from_rotation(torchsfm.geometry.rotation_from_rotvec(w))
         tensor([ 0.1000, -0.2000,  0.3000])
     """
-    q = quaternion_wxyz_from_rotation(R)
-    w, v = q[..., 0], q[..., 1:]
-    square = (v * v).sum(-1)
+    check_tensors(R=(R, "3 3"))
+    w, *v = _quaternion(R)
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     # For small |v| the scalar part is near 1: angle / sin(angle / 2) from the series of the arctangent.
     small = square < SERIES * SERIES
     ratio = square / torch.where(small, w * w, 1.0)
     series = 2 / torch.where(small, w, 1.0) * (1 - ratio / 3 * (1 - 0.6 * ratio))
     length = torch.where(small, 1.0, square).sqrt()
-    return torch.where(small, series, 2 * torch.atan2(length, w) / length)[..., None] * v
+    factor = torch.where(small, series, 2 * torch.atan2(length, w) / length)
+    return torch.stack([factor * a for a in v], -1)
 
 
 def rotation_from_quaternion_wxyz(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -135,16 +136,22 @@ def quaternion_wxyz_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tenso
         tensor([0., 1., 0., 0.])
     """
     check_tensors(R=(R, "3 3"))
+    return torch.stack(_quaternion(R), -1)
+
+
+def _quaternion(R: Float[Tensor, "*batch 3 3"]) -> list[Float[Tensor, "*batch"]]:
+    """The parts of the quaternions, each by itself: whole rows in one tensor would take several times as long."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.flatten(-2).unbind(-1)
     wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
     xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
     ww, xx, yy, zz = 1 + r00 + r11 + r22, 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22
-    rows = _matrix([ww, wx, wy, wz, wx, xx, xy, xz, wy, xy, yy, yz, wz, xz, yz, zz], 4)
-    best = rows.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-    row = torch.gather(rows, -2, best.expand(*best.shape[:-1], 4)).squeeze(-2)
-    sign = torch.where(row[..., :1] < 0, -1.0, 1.0).to(R.dtype)
-    q: Tensor = sign * row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
-    return q
+    first, second = ww >= xx, yy >= zz
+    above = torch.where(first, ww, xx) >= torch.where(second, yy, zz)
+    rows = zip((ww, wx, wy, wz), (wx, xx, xy, xz), (wy, xy, yy, yz), (wz, xz, yz, zz), strict=True)
+    row = [torch.where(above, torch.where(first, w, x), torch.where(second, y, z)) for w, x, y, z in rows]
+    length = (row[0] * row[0] + row[1] * row[1] + row[2] * row[2] + row[3] * row[3]).sqrt()
+    scale = torch.where(row[0] < 0, -1.0, 1.0).to(R.dtype) / length
+    return [scale * part for part in row]
 
 
 def rotation_from_euler(angles: Float[Tensor, "*batch k"], axes: str) -> Float[Tensor, "*batch 3 3"]:
