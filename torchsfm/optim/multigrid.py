@@ -47,6 +47,12 @@ class PairGraph:
     """Number of variables."""
     ends: list[tuple[Tensor, ...]]
     """For each piece the one or two variables of its slots, `count` for one that is fixed."""
+    edges: "_Edges"
+    """Those between two free variables, piece by piece: all pairs of slots that meet."""
+    rows: list[Tensor]
+    """For each piece the slots of these,"""
+    loops: list[Tensor]
+    """and those in which a variable meets itself."""
     ranks: Ranks
 
     @classmethod
@@ -60,34 +66,62 @@ class PairGraph:
         fits = torch.tensor([piece.columns.shape[1] <= 2 * width for piece in layout.pieces], device=layout.device)
         if not bool(layout.ranks.all(fits.all())):
             return None
-        ends = []
+        none = torch.zeros(0, dtype=torch.long, device=layout.device)
+        ends, rows, loops, pairs = [], [], [], [none[:, None].expand(0, 2)]
         for piece in layout.pieces:
-            ends.append(tuple((piece.columns[:, ::width] // width).clamp(max=count).unbind(1)))
-        return cls(width, count, ends, layout.ranks)
+            own = (piece.columns[:, ::width] // width).clamp(max=count)
+            two = own.shape[1] == 2
+            ends.append(tuple(own.unbind(1)))
+            rows.append(((own < count).all(1) & (own[:, 0] != own[:, -1])).nonzero()[:, 0] if two else none)
+            loops.append((own[:, 0] == own[:, 1]).nonzero()[:, 0] if two else none)
+            pairs.append(own[rows[-1]] if two else pairs[0])
+        i, j = torch.cat(pairs).unbind(1)
+        edges = _Edges.of(i, j, count)
+        return cls(width, count, ends, edges, rows, loops, layout.ranks)
 
     def preconditioner(self, squares: RetainedBlocks, coupled: list[Tensor], weight: Tensor) -> "_Cycle":
         """An approximate inverse of the system; nothing is coupled."""
         w, n = self.columns, self.count
         D = weight.new_zeros((n + 1, w, w))
-        found = []
-        for ends, values in zip(self.ends, squares.values, strict=True):
+        found = [D[:0]]
+        for ends, rows, loops, values in zip(self.ends, self.rows, self.loops, squares.values, strict=True):
             for k, end in enumerate(ends):
                 D.index_add_(0, end, values[:, w * k : w * k + w, w * k : w * k + w])
-            if len(ends) == 2:
-                i, j = ends
-                both = (i < n) & (j < n) & (i != j)
-                found.append((i[both], j[both], values[both, :w, w : 2 * w]))
-                # A variable that meets itself.
-                D.index_add_(0, i, torch.where((i == j)[:, None, None], (v := values[:, :w, w : 2 * w]) + v.mT, 0.0))
+            if len(rows):
+                found.append(values[:, :w, w : 2 * w].index_select(0, rows))
+            if len(loops):
+                own = values[loops, :w, w : 2 * w]
+                D.index_add_(0, ends[0][loops], own + own.mT)
         D = self.ranks.sum(D[:n]) + torch.diag_embed(weight.view(n, w))
-        none = torch.zeros(0, dtype=torch.long, device=D.device)
-        i, j, B = (torch.cat(parts) for parts in zip((none, none, D.new_zeros((0, w, w))), *found, strict=True))
-        i, j, B = _merged(i, j, B, n)
+        i, j, B = self.edges.i, self.edges.j, self.edges.sum(torch.cat(found))
         # Where there are coarser graphs, each rank keeps its own edges of the finest.
         ranks = self.ranks
         if n * w <= FEW:
             (i, j, B), ranks = _gathered(i, j, B, n, ranks), Ranks()
         return _Cycle(_level(i, j, B, D, D.diagonal(dim1=1, dim2=2), ranks))
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges once each and upwards, of such as may come several times and in any direction."""
+
+    i: Tensor
+    j: Tensor
+    place: Tensor
+    """The edge that each given one is,"""
+    down: Tensor
+    """and whether it was given downwards."""
+
+    @classmethod
+    def of(cls, i: Tensor, j: Tensor, n: int) -> "_Edges":
+        """Those between n variables."""
+        key, place = torch.unique(torch.minimum(i, j) * n + torch.maximum(i, j), return_inverse=True)
+        return cls(torch.div(key, max(n, 1), rounding_mode="floor"), key % max(n, 1), place, i > j)
+
+    def sum(self, B: Tensor) -> Tensor:
+        """The blocks of the edges, given those with the rows of i of the given ones."""
+        B = torch.where(self.down[:, None, None], B.mT, B)
+        return B.new_zeros((len(self.i), *B.shape[1:])).index_add_(0, self.place, B)
 
 
 @dataclass(frozen=True)
@@ -180,11 +214,9 @@ def _gathered(i: Tensor, j: Tensor, B: Tensor, n: int, ranks: Ranks) -> tuple[Te
 
 
 def _merged(i: Tensor, j: Tensor, B: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Each edge between n variables once and upwards, given edges that may come several times and in any direction."""
-    key, place = torch.unique(torch.minimum(i, j) * n + torch.maximum(i, j), return_inverse=True)
-    B = torch.where((i > j)[:, None, None], B.mT, B)
-    B = B.new_zeros((len(key), *B.shape[1:])).index_add_(0, place, B)
-    return torch.div(key, n, rounding_mode="floor"), key % n, B
+    """Each edge once and upwards."""
+    edges = _Edges.of(i, j, n)
+    return edges.i, edges.j, edges.sum(B)
 
 
 class _Cycle:

@@ -6,6 +6,7 @@ the sum of the squares, each put in its place.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
@@ -20,19 +21,25 @@ SHORT = 16
 
 @dataclass(frozen=True)
 class Runs:
-    """Where runs begin and end, and the slot of each."""
+    """Where runs begin, how long they are, and the slot of each."""
 
-    ends: list[tuple[int, int]]
+    starts: Tensor
+    lengths: Tensor
     slots: Tensor
     number: Tensor | None
     """The run of each column where runs are short."""
+
+    @cached_property
+    def ends(self) -> list[tuple[int, int]]:
+        """Where each begins and ends."""
+        return list(pairwise([0, *self.lengths.cumsum(0).tolist()]))
 
     def squares(self, Y: Tensor) -> Tensor:
         """`Y Y'` of Y (q, c, m), summed over q: (runs, c, c)."""
         if self.number is None:
             return torch.stack([torch.bmm(Y[:, :, a:b], Y[:, :, a:b].mT) for a, b in self.ends]).sum(1)
         rows = Y.permute(2, 1, 0).contiguous()
-        return rows.new_zeros((len(self.ends), *Y.shape[1:2] * 2)).index_add_(0, self.number, rows @ rows.mT)
+        return rows.new_zeros((len(self.slots), *Y.shape[1:2] * 2)).index_add_(0, self.number, rows @ rows.mT)
 
     def combine(self, steps: Tensor, W: Tensor) -> Tensor:
         """Rows of W (q, c, m) combined by the coefficients (runs, c) of their run: (q, m)."""
@@ -48,7 +55,7 @@ class Runs:
             rows = self._parts(at[:, None])
             return torch.stack([torch.bmm(row, part.mT) for row, part in zip(rows, self._parts(W), strict=True)]).sum(1)[:, 0]
         columns = (W * at[:, None]).sum(0).mT
-        return columns.new_zeros((len(self.ends), W.shape[1])).index_add_(0, self.number, columns)
+        return columns.new_zeros((len(self.slots), W.shape[1])).index_add_(0, self.number, columns)
 
     def _parts(self, W: Tensor) -> tuple[Tensor, ...]:
         """The columns of each run."""
@@ -60,7 +67,7 @@ def find_runs(slots: Tensor) -> Runs:
     found, lengths = torch.unique_consecutive(slots, return_counts=True)
     short = slots.numel() < SHORT * found.numel()
     number = torch.arange(found.numel(), device=slots.device).repeat_interleave(lengths) if short else None
-    return Runs(list(pairwise([0, *lengths.cumsum(0).tolist()])), found, number)
+    return Runs(lengths.cumsum(0) - lengths, lengths, found, number)
 
 
 class RetainedBlocks:

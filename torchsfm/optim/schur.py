@@ -182,9 +182,8 @@ class Elimination:
 
     def _add_curvature(self, part: _Part, x: dict[str, Tensor]) -> None:
         """Add a part's exact second derivatives to the system."""
-        starts = torch.tensor([start for start, _ in part.runs.ends], device=part.runs.slots.device)
-        lengths = [end - start for start, end in part.runs.ends]
-        run = torch.arange(len(lengths), device=starts.device).repeat_interleave(torch.tensor(lengths, device=starts.device))
+        starts = part.runs.starts
+        run = torch.arange(len(starts), device=starts.device).repeat_interleave(part.runs.lengths)
         family = None if part.family is None else self.eliminated[part.family]
         name = None if family is None else family.family.name
         U, W, V = curvature(part.term, x, self.blocks, part.wanted, name, (run, starts))

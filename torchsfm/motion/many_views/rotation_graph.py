@@ -24,6 +24,9 @@ QUARTILE = 1.2125
 EXACT = 1e-4
 """Radians that all edges are taken to be off at least: sharper losses find no way, and gain nothing."""
 
+DAMPING = 1e-6
+"""At the start: cameras are about where they belong, and more would hold long rows of them back."""
+
 
 @dataclass(frozen=True)
 class RotationGraph:
@@ -140,7 +143,10 @@ class RotationGraph:
     def minimise(self, start: Float[Tensor, "v 3 3"], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
         """The minimum nearest to a start."""
         blocks = {"R": Block(start.mT.flatten(1), Rotation())}
-        return minimise(blocks, self.terms(loss), max_iterations=max_iterations, function_tolerance=tolerance, group=self.group)
+        return minimise(
+            blocks, self.terms(loss), max_iterations=max_iterations, function_tolerance=tolerance, initial_damping=DAMPING,
+            group=self.group,
+        )  # fmt: skip
 
     def covariance(self, model: Tensor, component: Tensor, status: Tensor, loss: Loss, scale: float) -> Float[Tensor, "v 3 3"]:
         """That of each rotation, with the first cameras of all components held."""
