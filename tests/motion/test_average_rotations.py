@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from view_graphs import TrueGraph, ring, with_edges
 from torchsfm import Status
 from torchsfm.geometry import random_rotation, rotation_from_rotvec, rotvec_from_rotation
 from torchsfm.motion import average_rotations
+from torchsfm.motion.many_views import rotation_graph
 from torchsfm.motion.many_views.spanning_rotations import spanning_rotations
 from torchsfm.motion.many_views.triplets import find_triplets, turn_angle
 
@@ -31,6 +33,24 @@ def test_exact_edges_give_exact_rotations(dtype: torch.dtype, outliers: float, g
     assert float(errors(graph, found.model).max()) < (1e-7 if dtype == torch.float64 else 1e-4)
     assert torch.equal(found.inliers, ~graph.wrong)
     assert torch.allclose(found.model[0], torch.eye(3, dtype=dtype), atol=1e-6)
+
+
+def test_long_rows_bend_in_few_steps(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 2,000 cameras in a row, as of a few; damping would hold what is soft in it."""
+    steps: list[int] = []
+    plain = rotation_graph.minimise
+
+    def counted(*problem: Any, **options: Any) -> Any:
+        found = plain(*problem, **options)
+        steps.append(found.iterations)
+        return found
+
+    monkeypatch.setattr(rotation_graph, "minimise", counted)
+    start = torch.arange(2000)
+    edges = torch.cat([torch.stack((start[:-k], start[k:]), 1) for k in range(1, 6)])
+    graph = with_edges(random_rotation(2000, generator=generator, dtype=torch.float64), edges, 0.01, 0.2, generator)
+    average_rotations(graph.R, graph.edges, views=2000)
+    assert max(steps) <= 4
 
 
 @pytest.mark.parametrize("stream", range(6))

@@ -138,6 +138,22 @@ def test_conjugate_gradients_send_the_centres_once(generator: torch.Generator, t
     assert 72 < min(longest.values()) <= max(longest.values()) < 73
 
 
+def test_no_process_sends_its_edges(generator: torch.Generator, tmp_path: Path) -> None:
+    """Numbers of cameras go round, whatever the edges; of these a few of the coarser graphs, and what is known of each."""
+    sizes = {}
+    for reach in (4, 8):
+        graph = ring(420, reach, 0.01, 0.1, generator)
+        case = (graph.R, graph.edges), {"views": 420}
+        found, other = processes.run_ranks(2, tmp_path / str(reach), sent, average_rotations, case)
+        assert sorted(found) == sorted(other)
+        reduced = [size for kind, size in found if kind == "reduce"]
+        assert sum(size == 24 * 420 for size in reduced) > 30
+        assert max(reduced) == 72 * 420
+        # Of each edge the residual and whether it counts, once for each minimisation, and blocks of coarser graphs.
+        sizes[reach] = max(size for kind, size in found if kind == "gather") / len(graph.edges)
+    assert max(sizes.values()) <= 24 / 2 + 1
+
+
 @pytest.mark.parametrize("door", [average_rotations, position_globally])
 def test_a_group_is_one_of_processes(door: Callable[..., Any], generator: torch.Generator) -> None:
     cases = rotation_cases(generator) if door is average_rotations else position_cases(generator)
