@@ -155,7 +155,7 @@ def test_no_process_sends_its_edges(generator: torch.Generator, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("door", [average_rotations, position_globally])
-def test_a_group_is_one_of_processes(door: Callable[..., Any], generator: torch.Generator) -> None:
+def test_a_group_is_one_of_processes(unchecked: None, door: Callable[..., Any], generator: torch.Generator) -> None:
     cases = rotation_cases(generator) if door is average_rotations else position_cases(generator)
     tensors, options = next(iter(cases.values()))
     with pytest.raises(ValueError, match="group"):

@@ -104,9 +104,10 @@ def average_rotations(
         max_iterations: Most steps of each of the minimisations.
         tolerance: Part of the cost that the last of them may leave; where rotations are adjusted later, 1e-3 will do.
         group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same graph and share
-            what the minimisations take: edges are divided, rotations are known to all. Every process has all edges as they are
-            given and by itself finds triangles, start, loops and covariances. All return the same, which is what one process
-            finds, to rounding; see `sparse_levenberg_marquardt`.
+            what the minimisations take: edges are divided, rotations and the coarser graphs of `optim.multigrid` are known to
+            all. Each iteration of conjugate gradients sends three numbers of each camera three times. Every process has all
+            edges as they are given and by itself finds triangles, start, loops and covariances. All return the same, which is
+            what one process finds, to rounding; see `sparse_levenberg_marquardt`.
 
     Returns:
         Rotations, statuses, components, and what is thought of each edge. Edges that are not finite, whose R is no rotation,

@@ -94,9 +94,10 @@ def position_globally(
         max_iterations: Most steps of each of the two minimisations.
         tolerance: Part of the cost that the last of them may leave; where all is adjusted later, 1e-3 will do.
         group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same rays and share
-            what the minimisations take: points and their rays are divided, centres are known to all. Every process has all
-            rays as they are given and by itself finds components, scales and deviations. All return the same, which is what
-            one process finds, to rounding; see `sparse_levenberg_marquardt`.
+            what the minimisations take: points and their rays are divided, centres are known to all, and so is the system of
+            centres where it is factored (each process does that by itself). Every process has all rays as they are given and
+            by itself finds components, scales and deviations. All return the same, which is what one process finds, to
+            rounding; see `sparse_levenberg_marquardt`.
 
     Returns:
         Centres, points, statuses, and what is thought of each ray. Rays that are not finite or 0, those of cameras whose
