@@ -1,6 +1,6 @@
 """The essential matrix from corresponding rays of which many are wrong."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Unpack
 
 import torch
@@ -8,14 +8,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.motion.two_views.epipolar_fit import sphere_rows
+from torchsfm.geometry import rotvec_from_rotation
+from torchsfm.motion.two_views.epipolar_fit import cross_rows, sphere_rows
 from torchsfm.motion.two_views.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, squared_transfer
 from torchsfm.motion.two_views.plane_glance import plane_suspected
 from torchsfm.motion.two_views.relative_5pt import relative_5pt
-from torchsfm.motion.two_views.sampson_sphere import pose_step, squared_distance, step_equations, turned
+from torchsfm.motion.two_views.rival_geometry import rank_two_members, rival_explains, rival_suspected
+from torchsfm.motion.two_views.sampson_sphere import pose_step, squared_distance, step_equations, turned, unit_rows
 from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
-from torchsfm.tensors import essential_from_pose
+from torchsfm.tensors import essential_from_pose, poses_from_essential
 
 _SLACK = 2e-3
 """By which angle rays may miss the front where no threshold says how large the noise is, in radians."""
@@ -105,11 +107,12 @@ class RelativePoseEstimator:
         threshold: Float[Tensor, "p"],
         chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
-        """Whether R alone, or R + t n', may relate all inliers but so few as chance explains: a plane at any distance."""
-        h2 = d2.mT
-        h2 = h2 * (h2 * h2).sum(-2, keepdim=True).rsqrt()
+        """Whether R alone, R + t n' or another pose may relate all inliers but so few as chance explains."""
+        h1, h2 = unit_rows(d1), unit_rows(d2)
+        R, t = model[..., :3], model[..., 3]
         limit, spare = 4 * threshold * threshold, most_by_chance(chance, 2)
-        return plane_suspected(model[..., :3], model[..., 3], d1.mT, h2, inliers, limit, spare)
+        flat = plane_suspected(R, t, h1, h2, inliers, limit, spare)
+        return flat | rival_suspected(_unit_essential(R, t), h1, h2, inliers, limit, spare, sphere=True)
 
     def degeneracy(
         self,
@@ -121,7 +124,10 @@ class RelativePoseEstimator:
         threshold: Float[Tensor, "*#batch"],
         chance: Float[Tensor, "*#batch"],
     ) -> Int[Tensor, "*batch"]:
-        """ROTATION: R alone relates the inliers but so few as chance explains, so that t is open; PLANAR: R + t n' does."""
+        """What relates the inliers but so few as chance explains.
+
+        ROTATION: R alone, so that t is open; PLANAR: R + t n'; UNDETERMINED: another pose, as well as this one.
+        """
         R, t, h1, h2 = model[..., :3], model[..., 3], sphere_rows(d1), sphere_rows(d2)
         limit = 4 * threshold * threshold
         turned = inliers & (squared_transfer(R, h1, h2, sphere=True) < limit[..., None])
@@ -129,7 +135,26 @@ class RelativePoseEstimator:
         _, on = dominant_plane(R, t, h1, h2, inliers, limit, sphere=True)
         planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
         code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
-        return torch.where(rotation, int(Degeneracy.ROTATION), code).to(torch.int8)
+        code = torch.where(rotation, int(Degeneracy.ROTATION), code)
+        other = self._has_rival(model, d1, d2, inliers, threshold, chance) & (code == Degeneracy.NONE)
+        return torch.where(other, int(Degeneracy.UNDETERMINED), code).to(torch.int8)
+
+    def _has_rival(
+        self, model: Tensor, d1: Tensor, d2: Tensor, inliers: Tensor, threshold: Tensor, chance: Tensor
+    ) -> Bool[Tensor, "p"]:
+        """Whether the inliers agree with another pose as well: one near to a member of rank 2 in the pencil of solutions."""
+        E = _unit_essential(model[..., :3], model[..., 3])
+        found = rank_two_members(E, unit_rows(d1), unit_rows(d2), inliers, 4 * threshold * threshold, sphere=True)
+        rivals = poses_from_essential(found).model.flatten(1, 2)
+        wide = replace(self, slack=self.slack[:, None])
+
+        def rise(model: Tensor, others: Tensor, weights: Tensor) -> Tensor:
+            A, _ = step_equations(model, d1[:, None], d2[:, None], wide.slack, lambda _: (weights, weights))
+            turn = rotvec_from_rotation(others[..., :3] @ model[..., :3].mT)
+            d = torch.cat((turn, others[..., 3] - model[..., 3]), -1)[..., None]
+            return (d.mT @ A @ d)[..., 0, 0]
+
+        return rival_explains(wide, model, rivals, (d1, d2), inliers, threshold, chance, rise)
 
 
 def estimate_essential(
@@ -143,7 +168,8 @@ def estimate_essential(
 
     LO-RANSAC over the poses of five-point samples, scored by Sampson's distance for rays that meet in front of both cameras,
     then a robust minimum of that distance over the poses. `pose_from_essential` turns the result into a pose. After a pure
-    rotation every translation fits, and points of one plane may fit two poses: `degeneracy` says so.
+    rotation every translation fits, and points of one plane, or of certain ruled quadrics through both centres, may fit two
+    poses: `degeneracy` says so.
 
     Args:
         d1: Rays of the first camera, of any length, pointing to the points.
@@ -155,8 +181,8 @@ def estimate_essential(
     Returns:
         E with d2' E d1 = 0, |E|^2 = 2 and singular values (1, 1, 0); inliers, support, iterations, status, degeneracy
         (ROTATION: a rotation relates all inliers but so few as chance explains, and the translation means nothing; PLANAR: a
-        homography does, and a second pose may fit as well), covariance (9 x 9, of rank 5). E carries its derivatives with
-        respect to the inliers (see `ransac`).
+        homography does, and a second pose may fit as well; UNDETERMINED: a second pose does), covariance (9 x 9, of rank 5). E
+        carries its derivatives with respect to the inliers (see `ransac`).
 
     Raises:
         ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
@@ -179,6 +205,11 @@ def estimate_essential(
 
     d1, d2, dtype = *both_unit_rays(d1, d2), d1.dtype
     return estimate_robustly(estimator, d1, d2, threshold=threshold, dtype=dtype, back=back, **options)
+
+
+def _unit_essential(R: Tensor, t: Tensor) -> Tensor:
+    E: Tensor = cross_rows(t, R) * 0.5**0.5
+    return E
 
 
 def pose_slack(threshold: float | Tensor | None, like: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Solutions
-from torchsfm.linalg import damped_solve, svd
+from torchsfm.linalg import damped_solve, qr, svd
 from torchsfm.motion.two_views.collinear import collinear, collinear_suspected
 from torchsfm.motion.two_views.epipolar_fit import cofactors, cross_rows, matrices, plane_rows, product, with_left_epipole
 from torchsfm.motion.two_views.estimate_homography import HomographyEstimator
@@ -16,7 +16,8 @@ from torchsfm.motion.two_views.normalization import common_scale, largest_positi
 from torchsfm.motion.two_views.oriented_7pt import oriented_7pt
 from torchsfm.motion.two_views.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_alternatives
 from torchsfm.motion.two_views.plane_glance import plane_suspected
-from torchsfm.motion.two_views.sampson_plane import squared_distance, step_equations
+from torchsfm.motion.two_views.rival_geometry import rank_two_members, rival_explains, rival_suspected
+from torchsfm.motion.two_views.sampson_plane import homogeneous_rows, squared_distance, step_equations
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
 _TINY = 1e-30
@@ -131,12 +132,15 @@ class FundamentalEstimator:
         threshold: Float[Tensor, "p"],
         chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
-        """Whether half of the inliers may be in one plane, or all but so few as chance explains, there or on a line."""
+        """Whether half of the inliers, or all but so few as chance explains, may be in a plane, on a line or near another F."""
         F, e = model[..., :3], model[..., 3]
         h1, h2 = (torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0) for x in (x1, x2))
         spare = most_by_chance(chance, 2)
         A = torch.linalg.cross(e[..., None], F, dim=-2)
-        flat = plane_suspected(A, e, h1, h2, inliers, 4 * threshold * threshold, spare)
+        limit = 4 * threshold * threshold
+        flat = plane_suspected(A, e, h1, h2, inliers, limit, spare) | rival_suspected(
+            F, h1, h2, inliers, limit, spare, sphere=False
+        )
         return flat | collinear_suspected((x1, x2), inliers, threshold, chance)
 
     def degeneracy(
@@ -151,7 +155,8 @@ class FundamentalEstimator:
     ) -> Int[Tensor, "*batch"]:
         """What all inliers but so few as chance explains have in common, so that F is open.
 
-        PLANAR: a homography relates them; two dimensions are open. COLLINEAR: in an image they are on a line.
+        PLANAR: a homography relates them; two dimensions are open. COLLINEAR: in an image they are on a line. UNDETERMINED:
+        they agree with another F as well.
         """
         F, e = model[..., :3], model[..., 3]
         limit = 4 * threshold * threshold
@@ -159,7 +164,29 @@ class FundamentalEstimator:
         planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
         code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
         code = torch.where(collinear((x1, x2), inliers, threshold, chance), int(Degeneracy.COLLINEAR), code)
-        return code.to(torch.int8)
+        other = self._has_rival(model, x1, x2, inliers, threshold, chance) & (code == Degeneracy.NONE)
+        return torch.where(other, int(Degeneracy.UNDETERMINED), code).to(torch.int8)
+
+    def _has_rival(
+        self, model: Tensor, x1: Tensor, x2: Tensor, inliers: Tensor, threshold: Tensor, chance: Tensor
+    ) -> Bool[Tensor, "p"]:
+        """Whether the inliers agree with another F as well: one of rank 2 in the pencil of solutions."""
+        F = model[..., :3]
+        h1, h2 = homogeneous_rows(x1), homogeneous_rows(x2)
+        found = rank_two_members(F, h1, h2, inliers, 4 * threshold * threshold, sphere=False)
+        e = with_left_epipole(found, torch.ones_like(found[..., 0]))[..., 3:]
+        rivals = torch.cat([torch.cat((found, side * e), -1) for side in (1, -1)], 1)
+
+        def rise(model: Tensor, others: Tensor, weights: Tensor) -> Tensor:
+            A, _ = step_equations(model, x1[:, None], x2[:, None], lambda _: (weights, weights))
+            f, g = model[..., :3].flatten(-2), others[..., :3].flatten(-2)
+            normals = torch.stack((f, cofactors(matrices(f, 3)).flatten(-2)), -1)
+            basis = qr(normals)[0]
+            d = torch.where((f * g).sum(-1, keepdim=True) < 0, -g, g) - f
+            d = d[..., None] - basis @ (basis.mT @ d[..., None])
+            return (d.mT @ A @ d)[..., 0, 0]
+
+        return rival_explains(self, model, rivals, (x1, x2), inliers, threshold, chance, rise)
 
 
 def _cofactors(f: Tensor) -> Tensor:
@@ -187,7 +214,7 @@ def estimate_fundamental(
     LO-RANSAC over seven-point samples with the oriented epipolar constraint; where most inliers are in a plane, also over its
     homography and pairs of points off it (DEGENSAC); then a robust minimum of Sampson's distance over the matrices of rank 2.
     Computed in float64, hypotheses scored in float32. Points of one plane alone, or a pure rotation of the camera, leave F open
-    in two dimensions: `degeneracy` says so.
+    in two dimensions, and those of a ruled quadric through both centres agree with two or three F: `degeneracy` says so.
 
     Args:
         x1: Points in the first image.
@@ -199,7 +226,8 @@ def estimate_fundamental(
     Returns:
         F with x2' F x1 = 0, |F| = 1 (Frobenius), det F = 0 and its largest entry positive; inliers, support, iterations,
         status, degeneracy (PLANAR: a homography relates all inliers but so few as chance explains: a planar scene, or a camera
-        that only turned; COLLINEAR: so many are on a line in an image; F is then one of many), covariance (9 x 9, of rank 7).
+        that only turned; COLLINEAR: so many are on a line in an image; F is then one of many; UNDETERMINED: another F agrees
+        with them as well), covariance (9 x 9, of rank 7).
         F carries its derivatives with respect to the inliers (see `ransac`).
 
     Raises:

@@ -21,9 +21,10 @@ def fundamental_8pt(
         weights: Weight of each squared error, >= 0; 0 means absent, and what stands there is not looked at. None: all 1.
 
     Returns:
-        F, always finite, without status. Where the weighted points do not determine it (fewer than eight, points in a plane, a
-        pure rotation) it is one of the least-squares solutions; where a coordinate or weight that counts is not finite,
-        diag(1, 1, 0) / sqrt(2). Differentiable in all arguments, with zero derivative along what the data do not determine.
+        F, always finite, without status. Where the weighted points do not determine it (fewer than eight, points in a plane or
+        on a quadric through both centres, a pure rotation) it is one of the least-squares solutions; where a coordinate or
+        weight that counts is not finite, diag(1, 1, 0) / sqrt(2). Differentiable in all arguments, with zero derivative along
+        what the data do not determine.
 
     Raises:
         ValueError: Wrong shape, dtype or device, or n < 8.

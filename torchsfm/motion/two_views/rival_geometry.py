@@ -1,0 +1,208 @@
+"""Is there a second epipolar geometry that the same points agree with, somewhere else altogether?
+
+Points of a ruled quadric through both centres agree with two or three F, and with two E where it is one of a certain kind
+(critical surfaces: Krames 1941; HZ 22.1): noise decides which of them fits best. The equations h2' F h1 = 0 of such points have
+a pencil of solutions, and the F of rank 2 in it are the rivals.
+"""
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchsfm.motion.two_views.epipolar_fit import cofactors
+
+_TINY = 1e-30
+_PARTS, _ROUNDS = 8, 3
+"""Into how many parts to part the points, to begin with, and how often to weigh anew what is near to a second solution."""
+_STEPS, _SETTLED, _SHORTEST = 40, 0.01, 2.0**12
+"""Most steps from a rank-2 member of the pencil to the rival; by what share of the loss one must be better, or be shortened by
+how much in vain, to be one of the last."""
+_DEVIATIONS = 3.0
+"""By how many standard deviations of the difference the points must prefer the one to the other."""
+_APART = 6.0
+"""How many of its own standard deviations the model is from a rival, or this is no other model."""
+
+
+def _second_solution(
+    F: Float[Tensor, "p 3 3"],
+    h1: Float[Tensor, "p 3 n"],
+    h2: Float[Tensor, "p 3 n"],
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p"],
+    sphere: bool,
+) -> tuple[Float[Tensor, "p 9 1"], Float[Tensor, "p n"]]:
+    """The G across F, of norm 1, with the least h2' G h1, robustly; and the squares of these, 0 for what is no inlier.
+
+    They are measured in the unit of the distances to F, and a few that chance has made inliers of F alone count for little.
+    Inverse iteration: it is soon at its end where there is such a G, and else what it has is as far from the points.
+    """
+    k = 3 if sphere else 2
+    sides = torch.cat((torch.bmm(F, h1)[:, :k], torch.bmm(F.mT, h2)[:, :k]), 1)
+    scale = inliers / torch.linalg.vector_norm(sides, dim=1).clamp(min=_TINY)
+    rows = (h2[:, :, None] * (scale[:, None] * h1)[:, None]).flatten(1, 2)
+    f = F.flatten(1)[:, None]
+    rows = torch.baddbmm(rows, f.mT, torch.bmm(f, rows), alpha=-1)
+    # F itself is no second solution; and what nothing speaks against has to be solved for.
+    held = f.mT * f + _eye(f) * 1e-12
+    bound, number = limit[:, None, None], inliers.sum(-1)[:, None, None]
+    g = _of_parts(rows, held * number, bound)
+    for _ in range(_ROUNDS):
+        left = torch.bmm(g.mT, rows)
+        weighted = rows / (1 + left * left / bound)
+        g = _inverse_iteration(torch.baddbmm(held * number, weighted, rows.mT), g)
+    left = torch.bmm(g.mT, rows)[:, 0]
+    return g, left * left
+
+
+def _of_parts(
+    rows: Float[Tensor, "p 9 n"], held: Float[Tensor, "p 9 9"], bound: Float[Tensor, "p 1 1"]
+) -> Float[Tensor, "p 9 1"]:
+    """The second solution of all points, or of a part of them if more points are near to that: some parts hold no wrong one."""
+    n = rows.shape[-1]
+    part = torch.nn.functional.pad(rows, (0, -n % _PARTS)).reshape(len(rows), 9, -1, _PARTS).permute(0, 3, 1, 2)
+    moments = part @ part.mT
+    moments = torch.cat((moments.sum(1, keepdim=True), moments), 1) + held[:, None]
+    g = _inverse_iteration(moments, torch.linspace(1, 2, 9, dtype=rows.dtype, device=rows.device).cos()[:, None].expand(9, 1))
+    left = g[..., 0] @ rows
+    best = (left * left / bound).clamp(max=1).sum(-1).argmin(-1)
+    return g.gather(1, best[:, None, None, None].expand(-1, 1, 9, 1))[:, 0]
+
+
+def _inverse_iteration(A: Float[Tensor, "*batch 9 9"], g: Float[Tensor, "*#batch 9 1"]) -> Float[Tensor, "*batch 9 1"]:
+    g = torch.cholesky_solve(g, torch.linalg.cholesky_ex(A)[0])
+    length: Tensor = torch.linalg.vector_norm(g, dim=-2, keepdim=True)
+    return g / length
+
+
+def _eye(like: Tensor) -> Float[Tensor, "9 9"]:
+    return torch.eye(9, dtype=like.dtype, device=like.device)
+
+
+def rival_suspected(
+    F: Float[Tensor, "p 3 3"],
+    h1: Float[Tensor, "p 3 n"],
+    h2: Float[Tensor, "p 3 n"],
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p"],
+    spare: Float[Tensor, "p"],
+    sphere: bool,
+) -> Bool[Tensor, "p"]:
+    """Whether there is, to first order and whatever its rank, a second solution on the whole within a limit: a glance.
+
+    Args:
+        F: Epipolar geometries, of norm 1.
+        h1: The first points, homogeneous, or rays of unit length.
+        h2: The second points.
+        inliers: Which points agree with them.
+        limit: Squared largest distance.
+        spare: How many inliers need not agree.
+        sphere: Whether points are unit rays.
+    """
+    _, square = _second_solution(F, h1, h2, inliers, limit, sphere)
+    far: Tensor = (square > limit[:, None]).sum(-1)
+    return far <= spare
+
+
+def rank_two_members(
+    F: Float[Tensor, "p 3 3"],
+    h1: Float[Tensor, "p 3 n"],
+    h2: Float[Tensor, "p 3 n"],
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p"],
+    sphere: bool,
+) -> Float[Tensor, "p 2 3 3"]:
+    """The other two of rank 2 in the pencil of F and the second solution; where these are not real, what is nearest to them."""
+    g, _ = _second_solution(F, h1, h2, inliers, limit, sphere)
+    G = g.reshape(-1, 3, 3)
+    # det(a G + b F) = a (a^2 det G + a b cof(G).F + b^2 cof(F).G), as det F = 0.
+    C = cofactors(G)
+    c0, c1, c2 = (C * G).sum((-2, -1)) / 3, (C * F).sum((-2, -1)), (cofactors(F) * G).sum((-2, -1))
+    root = (c1 * c1 - 4 * c0 * c2).clamp(min=0).sqrt()
+    q = -0.5 * (c1 + torch.copysign(root, c1))
+    # The roots b / a, as pairs: q / c2 and c0 / q.
+    a, b = torch.stack((c2, q), -1)[..., None, None], torch.stack((q, c0), -1)[..., None, None]
+    both = a * G[:, None] + b * F[:, None]
+    size: Tensor = torch.linalg.matrix_norm(both, dim=(-2, -1), keepdim=True)
+    return both / size.clamp(min=_TINY)
+
+
+def rival_explains(
+    estimator: Any,
+    model: Float[Tensor, "p 3 4"],
+    rivals: Float[Tensor, "p k 3 4"],
+    data: tuple[Tensor, Tensor],
+    inliers: Bool[Tensor, "p n"],
+    threshold: Float[Tensor, "p"],
+    chance: Float[Tensor, "p"],
+    rise: Any,
+) -> Bool[Tensor, "p"]:
+    """Whether one of the rivals, once refined, agrees with the inliers as well as the model, and is another one.
+
+    As well: all inliers but so few as noise and chance explain are within the threshold, and over these the mean difference
+    of the squared distances is not so many times its own deviation (Vuong 1989). Another one: by the quadratic model around the
+    optimum the distances of what they share would be larger by far.
+
+    Args:
+        estimator: Measures and refines models, its fields for several of each problem.
+        model: The best model.
+        rivals: Where to begin.
+        data: The points.
+        inliers: Which of them agree with the model.
+        threshold: Largest distance of an inlier.
+        chance: How many inliers chance explains.
+        rise: By how much the quadratic model of the sum of weighted squares is larger at others: rise(model, others, weights).
+    """
+    x1, x2 = (x[:, None] for x in data)
+    limit, inside = (threshold * threshold)[:, None, None], inliers[:, None]
+    rivals = _refined(estimator, rivals, x1, x2, inside, limit)
+    own = torch.where(inliers, estimator.squared_residual(model[:, None], x1, x2)[:, 0], 0.0)
+    squared = estimator.squared_residual(rivals, x1, x2)
+    agree = inside & (squared < limit)
+    spare = (inliers.sum(-1) - estimator.dimension).clamp(min=1)
+    variance = own.sum(-1) / spare
+    # Chance puts a few within the threshold of the model alone, anywhere else; and noise a few right beyond that of the rival.
+    tail = inliers.sum(-1) * torch.special.erfc(threshold / (2 * variance).sqrt())
+    enough = _so_few(inside & ~(squared < 4 * limit), chance) & _so_few(inside & ~agree, chance + tail)
+    more = torch.where(agree, squared - own[:, None], 0.0)
+    as_well = more.sum(-1) < _DEVIATIONS * more.square().sum(-1).sqrt()
+    other = rise(model[:, None], rivals, agree.to(squared.dtype)) > _APART**2 * variance[:, None]
+    found: Tensor = (enough & as_well & other).any(-1)
+    return found
+
+
+def _refined(
+    estimator: Any, models: Tensor, x1: Tensor, x2: Tensor, inside: Bool[Tensor, "p 1 n"], limit: Float[Tensor, "p 1 1"]
+) -> Tensor:
+    """Robust Gauss-Newton steps, shorter ones where whole ones lead uphill: rivals that nearly are one are hardly determined.
+
+    Each goes on until it settles, whatever becomes of the others.
+    """
+    best, one = models, torch.ones_like(models[..., 0, 0])
+    least, shorter, active = one * torch.inf, one, one > 0
+    for _ in range(_STEPS):
+        loss = least
+
+        def weigh(squared: Tensor, shorter: Tensor = shorter) -> tuple[Tensor, Tensor]:
+            nonlocal loss
+            share = torch.where(inside & (squared < torch.inf), limit / (limit + squared), 0.0).to(squared.dtype)
+            loss = torch.where(inside, 1 - share, 0.0).sum(-1)
+            return share * share, share * share * shorter[..., None]
+
+        new = estimator.step(models, x1, x2, weigh=weigh)
+        worse = loss > least
+        better = active & (loss < least)
+        unsettled = torch.where(worse, shorter < _SHORTEST, (loss < (1 - _SETTLED) * least) | (shorter > 1))
+        shorter = torch.where(worse, 8 * shorter, torch.where(better, (shorter / 2).clamp(min=1), shorter))
+        best, least = torch.where(better[..., None, None], models, best), torch.where(better, loss, least)
+        models = torch.where(worse[..., None, None], best, new)
+        active = active & unsettled
+        if not bool(active.any()):
+            break
+    return best
+
+
+def _so_few(off: Bool[Tensor, "p k n"], expected: Float[Tensor, "p"]) -> Bool[Tensor, "p k"]:
+    few: Tensor = off.sum(-1) <= (expected + _DEVIATIONS * expected.sqrt())[:, None]
+    return few
