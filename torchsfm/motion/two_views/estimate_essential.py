@@ -108,7 +108,8 @@ class RelativePoseEstimator:
         chance: Float[Tensor, "p"],
     ) -> Bool[Tensor, "p"]:
         """Whether R alone, R + t n' or another pose may relate all inliers but so few as chance explains."""
-        h1, h2 = unit_rows(d1), unit_rows(d2)
+        h1, h2 = d1.mT, d2.mT
+        h2 = h2 * (h2 * h2).sum(-2, keepdim=True).rsqrt()
         R, t = model[..., :3], model[..., 3]
         limit, spare = 4 * threshold * threshold, most_by_chance(chance, 2)
         flat = plane_suspected(R, t, h1, h2, inliers, limit, spare)

@@ -5,6 +5,7 @@ Points of a ruled quadric through both centres agree with two or three F, and wi
 a pencil of solutions, and the F of rank 2 in it are the rivals.
 """
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 from torchsfm.motion.two_views.epipolar_fit import cofactors
 
 _TINY = 1e-30
-_PARTS, _ROUNDS = 8, 3
+_PARTS, _ROUNDS, _GLANCE_ROUNDS = 8, 3, 1
 """Into how many parts to part the points, to begin with, and how often to weigh anew what is near to a second solution."""
 _STEPS, _SETTLED, _SHORTEST = 40, 0.01, 2.0**12
 """Most steps from a rank-2 member of the pencil to the rival; by what share of the loss one must be better, or be shortened by
@@ -32,42 +33,45 @@ def _second_solution(
     inliers: Bool[Tensor, "p n"],
     limit: Float[Tensor, "p"],
     sphere: bool,
-) -> tuple[Float[Tensor, "p 9 1"], Float[Tensor, "p n"]]:
+    rounds: int = _ROUNDS,
+) -> tuple[Float[Tensor, "p 1 9"], Float[Tensor, "p n"]]:
     """The G across F, of norm 1, with the least h2' G h1, robustly; and the squares of these, 0 for what is no inlier.
 
     They are measured in the unit of the distances to F, and a few that chance has made inliers of F alone count for little.
     Inverse iteration: it is soon at its end where there is such a G, and else what it has is as far from the points.
     """
-    k = 3 if sphere else 2
-    sides = torch.cat((torch.bmm(F, h1)[:, :k], torch.bmm(F.mT, h2)[:, :k]), 1)
-    scale = inliers / torch.linalg.vector_norm(sides, dim=1).clamp(min=_TINY)
-    rows = (h2[:, :, None] * (scale[:, None] * h1)[:, None]).flatten(1, 2)
-    f = F.flatten(1)[:, None]
-    rows = torch.baddbmm(rows, f.mT, torch.bmm(f, rows), alpha=-1)
+    sides = (torch.bmm(F, h1), torch.bmm(F.mT, h2))
+    if not sphere:
+        sides = (sides[0][:, :2], sides[1][:, :2])
+    scale = inliers[:, None] / torch.linalg.vector_norm(torch.cat(sides, 1), dim=1, keepdim=True).clamp(min=_TINY)
+    rows = torch.mul(h2[:, :, None], (scale * h1)[:, None]).flatten(1, 2)
+    f, bound, damping, start = F.flatten(1)[:, None], limit[:, None, None], *_constants(F.dtype, F.device)
+    column = f.mT
+    rows = torch.baddbmm(rows, column, torch.bmm(f, rows), alpha=-1)
     # F itself is no second solution; and what nothing speaks against has to be solved for.
-    held = f.mT * f + _eye(f) * 1e-12
-    bound, number = limit[:, None, None], inliers.sum(-1)[:, None, None]
-    g = _of_parts(rows, held * number, bound)
-    for _ in range(_ROUNDS):
-        left = torch.bmm(g.mT, rows)
+    held = torch.addcmul(damping, column, f) * inliers.sum(-1)[:, None, None]
+    g = _of_parts(rows, held, bound, start)
+    other, left = rows.mT, torch.bmm(g, rows)
+    for _ in range(rounds):
         weighted = rows / (1 + left * left / bound)
-        g = _inverse_iteration(torch.baddbmm(held * number, weighted, rows.mT), g)
-    left = torch.bmm(g.mT, rows)[:, 0]
-    return g, left * left
+        g = _inverse_iteration(torch.baddbmm(held, weighted, other), g.mT).mT
+        left = torch.bmm(g, rows)
+    return g, (left * left)[:, 0]
 
 
 def _of_parts(
-    rows: Float[Tensor, "p 9 n"], held: Float[Tensor, "p 9 9"], bound: Float[Tensor, "p 1 1"]
-) -> Float[Tensor, "p 9 1"]:
+    rows: Float[Tensor, "p 9 n"], held: Float[Tensor, "p 9 9"], bound: Float[Tensor, "p 1 1"], start: Float[Tensor, "9 1"]
+) -> Float[Tensor, "p 1 9"]:
     """The second solution of all points, or of a part of them if more points are near to that: some parts hold no wrong one."""
-    n = rows.shape[-1]
-    part = torch.nn.functional.pad(rows, (0, -n % _PARTS)).reshape(len(rows), 9, -1, _PARTS).permute(0, 3, 1, 2)
+    p, _, n = rows.shape
+    even = rows if n % _PARTS == 0 else torch.nn.functional.pad(rows, (0, -n % _PARTS))
+    part = even.view(p, 9, -1, _PARTS).permute(0, 3, 1, 2)
     moments = part @ part.mT
     moments = torch.cat((moments.sum(1, keepdim=True), moments), 1) + held[:, None]
-    g = _inverse_iteration(moments, torch.linspace(1, 2, 9, dtype=rows.dtype, device=rows.device).cos()[:, None].expand(9, 1))
-    left = g[..., 0] @ rows
-    best = (left * left / bound).clamp(max=1).sum(-1).argmin(-1)
-    return g.gather(1, best[:, None, None, None].expand(-1, 1, 9, 1))[:, 0]
+    g = _inverse_iteration(moments, start)[..., 0]
+    left = torch.bmm(g, rows)
+    best = (left * left / bound).clamp_(max=1).sum(-1).argmin(-1)
+    return g[torch.arange(p, device=g.device), best][:, None]
 
 
 def _inverse_iteration(A: Float[Tensor, "*batch 9 9"], g: Float[Tensor, "*#batch 9 1"]) -> Float[Tensor, "*batch 9 1"]:
@@ -76,8 +80,10 @@ def _inverse_iteration(A: Float[Tensor, "*batch 9 9"], g: Float[Tensor, "*#batch
     return g / length
 
 
-def _eye(like: Tensor) -> Float[Tensor, "9 9"]:
-    return torch.eye(9, dtype=like.dtype, device=like.device)
+@cache
+def _constants(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "9 9"], Float[Tensor, "9 1"]]:
+    """What makes a matrix definite, and a vector to begin with, across no second solution."""
+    return 1e-12 * torch.eye(9, dtype=dtype, device=device), torch.linspace(1, 2, 9, dtype=dtype, device=device).cos()[:, None]
 
 
 def rival_suspected(
@@ -100,7 +106,7 @@ def rival_suspected(
         spare: How many inliers need not agree.
         sphere: Whether points are unit rays.
     """
-    _, square = _second_solution(F, h1, h2, inliers, limit, sphere)
+    _, square = _second_solution(F, h1, h2, inliers, limit, sphere, _GLANCE_ROUNDS)
     far: Tensor = (square > limit[:, None]).sum(-1)
     return far <= spare
 
