@@ -60,7 +60,8 @@ def likeliest_stiffness(
     inner = 1 - w + stiff * w
     left = (a.mT + stiff * b.mT).square() / inner.clamp_min(1e-100)
     least = share * size[..., None] * bend.square().sum((-2, -1))[..., None] - left.sum(-1)
-    rank = 3 * (D != 0).any(-1).sum(-1)[..., None]
+    # Equal points have no differences: those of a closed spline, of which there are as many as points, depend on each other.
+    rank = 3 * (D != 0).any(-1).sum(-1).clamp(max=k - 1)[..., None]
     volume = inner.clamp_min(1e-100).log().sum(-1) - rank * share.log()
     told = ((1 - w) / inner.clamp_min(1e-100)).sum(-1)
     best = torch.zeros(len(G), c, 1, dtype=torch.long, device=G.device)
