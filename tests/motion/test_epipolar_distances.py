@@ -85,12 +85,12 @@ def test_the_gradient_of_a_step_vanishes_where_that_of_the_sum_does(rays: bool, 
         squared = wise.squared_residual(model, a[None], b[None])
         return (weights * torch.where(weights > 0, squared, 0)).sum()
 
-    # Near the minimum: data moved onto the model, and off it by little.
-    for _ in range(3):
+    # Near the minimum: data moved onto the model, and off it by little. Distances of rays are angles, whatever their lengths.
+    for _ in range(50):
         free = [v.clone().requires_grad_() for v in (a, b)]
         squared = torch.where(weights > 0, wise.squared_residual(model, free[0][None], free[1][None]), 0)
         for v, g in zip((a, b), torch.autograd.grad(squared.sum(), free), strict=True):
-            v -= 0.5 * g
+            v -= 0.5 * g * (v.square().sum(-1, keepdim=True) if rays else 1)
     a += 1e-3 * torch.randn(a.shape, generator=generator, dtype=a.dtype)
     weights = weights * torch.isfinite(wise.squared_residual(model, a[None], b[None]))
     models = [model]

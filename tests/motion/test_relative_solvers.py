@@ -328,7 +328,9 @@ def test_derivatives(case: Case, generator: torch.Generator) -> None:
     else:
         solve = lambda *s: tensor(case.solve(*s).model)[valid]  # noqa: E731
     assert valid.any(-1).all()
-    assert torch.autograd.gradcheck(solve, [s.requires_grad_() for s in sample], eps=1e-7, atol=1e-4, rtol=1e-3)
+    # Next to a double root focal lengths bend so much that differences need short steps.
+    eps = 1e-8 if case.solve is relative_6pt_focal else 1e-7
+    assert torch.autograd.gradcheck(solve, [s.requires_grad_() for s in sample], eps=eps, atol=1e-4, rtol=1e-3)
 
 
 def test_derivatives_of_a_fit(generator: torch.Generator) -> None:
