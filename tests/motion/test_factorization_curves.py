@@ -191,6 +191,20 @@ def test_what_curves_do_not_determine(generator: torch.Generator, monkeypatch: p
     assert len(anew) <= int((told != Status.DEGENERATE).sum())
 
 
+def test_flat_curves_that_begin_anywhere_are_told(generator: torch.Generator) -> None:
+    """One curve of a plane whose points are put together wrongly makes a fourth dimension that none of the others has."""
+    P, X = cameras(6, 5, generator), space_curves(6, 3, 300, generator)
+    X[..., 2] = 0.3 * X[..., 0] + 0.2
+    x = images(X, P)
+    back = torch.rand(6, 5, 3, 1, generator=generator) < 0.5
+    slot, start = torch.arange(300), torch.randint(300, (6, 5, 3, 1), generator=generator)
+    index = (torch.where(back, -slot, slot) + start) % 300
+    x = x.gather(-2, index[..., None].expand_as(x))[..., ::6, :]
+    x = x + 0.3 * torch.randn(x.shape, generator=generator, dtype=F64)
+    found = factorize_curves(curve_from_samples(x, closed=True), samples=24)
+    assert (found.status != Status.OK).all()
+
+
 def test_images_of_other_curves_have_no_consensus(generator: torch.Generator) -> None:
     P, X = cameras(1, 6, generator), space_curves(2, 3, 200, generator)
     x = images(X[:1], P)

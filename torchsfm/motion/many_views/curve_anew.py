@@ -76,10 +76,7 @@ def _runs(
     images: CurvePlaces, y: Float[Tensor, "1 v c m 2"], use: Bool[Tensor, "1 v c"]
 ) -> tuple[Tensor, Bool[Tensor, "1 v c"]]:
     """Places nearest to points, and which images run the other way; places are on those turned round."""
-    m = y.shape[-2]
-    dense = images.spread(_DENSE * m)
-    gap = torch.cdist(y, images.at(dense)[0])
-    place = images.nearest(dense.gather(-1, gap.nan_to_num(nan=torch.inf).argmin(-1)), y)
+    place = nearest_places(images, y)
     number = images.number[..., None].to(y.dtype)
     ring = images.closed[..., None]
     step = place.diff(dim=-1)
@@ -87,3 +84,10 @@ def _runs(
     back = use & (step.sign().sum(-1) < 0)
     place = torch.cat((place[..., :1], place[..., :1] + step.cumsum(-1)), -1)
     return torch.where(back[..., None], number - place, place), back
+
+
+def nearest_places(images: CurvePlaces, y: Float[Tensor, "p v c m 2"]) -> Float[Tensor, "p v c m"]:
+    """The places on image curves nearest to points, wherever on a curve they are."""
+    dense = images.spread(_DENSE * y.shape[-2])
+    gap = torch.cdist(y, images.at(dense)[0])
+    return images.nearest(dense.gather(-1, gap.nan_to_num(nan=torch.inf).argmin(-1)), y)

@@ -6,12 +6,15 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.geometry.curve_places import CurvePlaces
-from torchsfm.linalg import eigh, eigvalsh
+from torchsfm.geometry.homogeneous import divide_safely
+from torchsfm.linalg import eigh, eigvalsh, solve
 from torchsfm.motion.many_views.bilinear_fit import unit_frame
 from torchsfm.motion.many_views.bilinear_steps import reduced
+from torchsfm.motion.many_views.curve_anew import nearest_places
 from torchsfm.motion.many_views.curve_fit import Scene, pinned
 from torchsfm.motion.many_views.curve_search import Found
-from torchsfm.optim.descent import Options, descend
+from torchsfm.optim.descent import Descent, Options, descend
+from torchsfm.optim.pytree import pick
 
 _RIGHT = 0.8
 """Of all samples that must be measured."""
@@ -61,23 +64,31 @@ def judge(images: CurvePlaces, found: Found, view: Bool[Tensor, "p v"], threshol
     wrong = ~agreed | smooth | (rms > threshold) | (redundancy < 0)
     status = torch.where(found.end.status == Status.OK, int(Status.OK), int(Status.NOT_CONVERGED))
     status = torch.where(wrong, int(Status.NO_CONSENSUS), status)
+    # What is refused anyhow need not be looked at again.
+    asked = (status == Status.OK) & ~loose
+    if bool(asked.any()):
+        loose = loose | (asked & _flat(images, found, v, redundancy, anew=True))
     status = torch.where(loose, int(Status.DEGENERATE), status)
     return torch.where(enough_shown(shown, view), status, int(Status.TOO_FEW))
 
 
-def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor) -> Bool[Tensor, "p"]:
+def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor, anew: bool = False) -> Bool[Tensor, "p"]:
     """Whether space explains no more than noise beyond a plane: curves in one, or views without baseline.
 
     Homographies are fitted too. Of what they leave, a fourth dimension always takes some: of noise, the largest singular value
     of a matrix of 3 v times n, more than the number of its parameters. Three times more must be gone.
+
+    Args:
+        images: The image curves.
+        found: Where the search ended.
+        v: The number of views.
+        redundancy: Measurements less unknowns.
+        anew: Whether to look for homographies by all curves but one, whichever that is, and to find this one's points by them:
+            a fourth dimension may have been made of a curve of a plane whose points were put together wrongly.
     """
+    left = _left_by_planes_anew(images, found) if anew else _left_by_plane(images, found)
     end = found.end.end
-    counts = found.weight * found.measured[:, None]
     seen = found.measured.flatten(1)[:, None]
-    plane = eigh((end.x.u * seen) @ end.x.u.mT)[1][..., 1:]
-    P, u = unit_frame(end.x.P @ plane[:, None], plane.mT @ end.x.u)
-    x = Scene(P, u, end.x.place)
-    left = descend(pinned(images, counts, x), x, Options(_FLAT_STEPS, 1e-3)).cost
     n = seen.sum((-2, -1)).double()
     flat_redundancy = (redundancy + n + 3 * v - 7).clamp(min=1)
     redundancy = redundancy.clamp(min=0).double()
@@ -85,6 +96,43 @@ def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor) -> B
     of_noise = redundancy * redundancy / (redundancy + beyond).clamp(min=1) / flat_redundancy
     cost: Tensor = end.cost
     return cost > of_noise / 3 * left
+
+
+def _by_plane(images: CurvePlaces, x: Scene, counts: Float[Tensor, "p v c m"]) -> Descent:
+    """Homographies and points of a plane at the least squares of the distances that count."""
+    seen = (counts.sum(1) > 0).flatten(1)[:, None]
+    plane = eigh((x.u * seen) @ x.u.mT)[1][..., 1:]
+    P, u = unit_frame(x.P @ plane[:, None], plane.mT @ x.u)
+    flat = Scene(P, u, x.place)
+    return descend(pinned(images, counts, flat), flat, Options(_FLAT_STEPS, 1e-3))
+
+
+def _left_by_plane(images: CurvePlaces, found: Found) -> Float[Tensor, "p"]:
+    left: Tensor = _by_plane(images, found.end.end.x, found.weight * found.measured[:, None]).cost
+    return left
+
+
+def _left_by_planes_anew(images: CurvePlaces, found: Found) -> Float[Tensor, "p"]:
+    """The least that is left by homographies that begin with those of all curves but one."""
+    p, v, c, m = found.weight.shape
+    each = torch.arange(p, device=found.weight.device).repeat_interleave(c)
+    k = torch.arange(c, device=each.device).repeat(p)
+    images, x, counts = pick((each,), (images, found.end.end.x, found.weight * found.measured[:, None]))
+    own = torch.nn.functional.one_hot(k, c)[:, None, :, None] > 0
+    rest = _by_plane(images, x, torch.where(own, 0, counts)).x
+    # The curve's points in the plane, by the view that sees most of it; and those of its images next to theirs.
+    row = torch.arange(len(each), device=each.device)
+    view = counts[row, :, k].sum(-1).argmax(-1)
+    foot = images.at(x.place)[0][row, view, k]
+    points = solve(rest.P[row, view], torch.nn.functional.pad(foot, (0, 1), value=1.0).mT)[0]
+    points = torch.nn.functional.normalize(points, dim=1)
+    u = torch.where(own[:, 0, :, 0].repeat_interleave(m, -1)[:, None], points.repeat(1, 1, c), rest.u)
+    y = rest.P @ u[:, None]
+    y = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).reshape(len(each), v, c, m, 2)
+    place = torch.where(own, nearest_places(images, y), rest.place)
+    flat = Scene(rest.P, u, place)
+    left: Tensor = descend(pinned(images, counts, flat), flat, Options(_FLAT_STEPS, 1e-3)).cost
+    return left.view(p, c).amin(-1)
 
 
 def _roughness(images: CurvePlaces, found: Found, counts: Tensor) -> Float[Tensor, "p"]:
