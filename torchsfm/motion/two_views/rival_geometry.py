@@ -22,6 +22,8 @@ _STEPS, _SETTLED, _SHORTEST = 40, 0.01, 2.0**12
 how much in vain, to be one of the last."""
 _DEVIATIONS = 3.0
 """By how many standard deviations of the difference the points must prefer the one to the other."""
+_EXACT = 1e-4
+"""Distances below this part of the threshold are none."""
 _APART = 6.0
 """How many of its own standard deviations the model is from a rival, or this is no other model."""
 
@@ -167,12 +169,14 @@ def rival_explains(
     squared = estimator.squared_residual(rivals, x1, x2)
     agree = inside & (squared < limit)
     spare = (inliers.sum(-1) - estimator.dimension).clamp(min=1)
-    variance = own.sum(-1) / spare
+    # Exact data have no scatter but rounding, which tells nothing.
+    variance = torch.maximum(own.sum(-1) / spare, (_EXACT * threshold).square())
     # Chance puts a few within the threshold of the model alone, anywhere else; and noise a few right beyond that of the rival.
     tail = inliers.sum(-1) * torch.special.erfc(threshold / (2 * variance).sqrt())
     enough = _so_few(inside & ~(squared < 4 * limit), chance) & _so_few(inside & ~agree, chance + tail)
     more = torch.where(agree, squared - own[:, None], 0.0)
-    as_well = more.sum(-1) < _DEVIATIONS * more.square().sum(-1).sqrt()
+    rounding = (_EXACT * threshold).square() * inliers.sum(-1)
+    as_well = more.sum(-1) < _DEVIATIONS * more.square().sum(-1).sqrt() + rounding[:, None]
     other = rise(model[:, None], rivals, agree.to(squared.dtype)) > _APART**2 * variance[:, None]
     found: Tensor = (enough & as_well & other).any(-1)
     return found
