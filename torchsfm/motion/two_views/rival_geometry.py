@@ -51,7 +51,7 @@ def _second_solution(
     column = f.mT
     rows = torch.baddbmm(rows, column, torch.bmm(f, rows), alpha=-1)
     # F itself is no second solution; and what nothing speaks against has to be solved for.
-    held = torch.addcmul(damping, column, f) * inliers.sum(-1)[:, None, None]
+    held = torch.addcmul(damping, column, f) * inliers.shape[-1]
     g = _of_parts(rows, held, bound, start)
     other, left = rows.mT, torch.bmm(g, rows)
     for _ in range(rounds):
