@@ -28,7 +28,8 @@ def scene(g: torch.Generator, outlines: float) -> tuple[BundleProblem, BundlePro
     bad = torch.rand(POINTS, generator=g) < outlines
     radius = torch.where(bad, 0.05 + 0.1 * torch.rand(POINTS, generator=g, dtype=torch.float64), 0.0)
     sight = X - poses.centre[:, None]
-    left = torch.nn.functional.normalize(torch.stack((-sight[..., 1], sight[..., 0], torch.zeros_like(sight[..., 0])), -1), dim=-1)
+    across = torch.stack((-sight[..., 1], sight[..., 0], torch.zeros_like(sight[..., 0])), -1)
+    left = across / across.norm(dim=-1, keepdim=True)
     seen = camera.project(poses.transform(X + radius[:, None] * left))
     view, point = torch.meshgrid(torch.arange(VIEWS), torch.arange(POINTS), indexing="ij")
     view, point, index = view.flatten(), point.flatten(), torch.zeros(VIEWS, dtype=torch.long)

@@ -178,9 +178,10 @@ class FundamentalEstimator:
         rivals = torch.cat([torch.cat((found, side * e), -1) for side in (1, -1)], 1)
 
         def rise(model: Tensor, others: Tensor, weights: Tensor) -> Tensor:
-            A, _ = step_equations(model, x1[:, None], x2[:, None], lambda _: (weights, weights))
-            f, g = model[..., :3].flatten(-2), others[..., :3].flatten(-2)
-            normals = torch.stack((f, cofactors(matrices(f, 3)).flatten(-2)), -1)
+            F, e = torch.split(model, [3, 1], -1)
+            A, _ = step_equations(F, e, x1[:, None], x2[:, None], lambda _: (weights, weights))
+            f, g = F.flatten(-2), others[..., :3].flatten(-2)
+            normals = torch.stack((f, cofactors(F).flatten(-2)), -1)
             basis = qr(normals)[0]
             d = torch.where((f * g).sum(-1, keepdim=True) < 0, -g, g) - f
             d = d[..., None] - basis @ (basis.mT @ d[..., None])
