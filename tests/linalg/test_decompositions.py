@@ -7,7 +7,19 @@ import torch
 from chance import assert_share
 from torch import Tensor
 
-from torchsfm.linalg import eigh, eigvals, eigvalsh, inverse, null_vector, qr, solve, svd, svdvals, triangular_factor
+from torchsfm.linalg import (
+    decompositions,
+    eigh,
+    eigvals,
+    eigvalsh,
+    inverse,
+    null_vector,
+    qr,
+    solve,
+    svd,
+    svdvals,
+    triangular_factor,
+)
 
 F64 = torch.float64
 NAN, INF = float("nan"), float("inf")
@@ -118,3 +130,22 @@ def test_null_vectors_do_not_depend_on_the_unit(power: int, generator: torch.Gen
     moved, finite = null_vector(A * 2.0 ** (power // 2) * 2.0 ** (power - power // 2))
     assert finite.all()
     torch.testing.assert_close(moved, v)
+
+
+def test_what_gives_up_in_a_batch_only_takes_no_neighbour_along(generator: torch.Generator) -> None:
+    A = torch.randn(8, 5, 5, generator=generator)
+    A[2, 0, 0], A[5, 0, 0] = 7.0, 7.0
+
+    def scale(a: Tensor) -> tuple[Tensor, ...]:
+        """Twice a matrix; on some of a batch it gives up, on none alone, and alone it is rounded otherwise."""
+        if a.ndim == 2:
+            return (torch.nextafter(2 * a, torch.full_like(a, INF)),)
+        if bool((a[:, 0, 0] == 7).any()):
+            k = int((a[:, 0, 0] == 7).to(torch.int8).argmax())
+            raise torch.linalg.LinAlgError(f"linalg.scale: (Batch element {k}): The algorithm failed to converge.")
+        return (2 * a,)
+
+    (found,) = decompositions._attempt(scale, A)
+    given_up = torch.arange(8) % 3 == 2
+    assert torch.equal(found[~given_up], 2 * A[~given_up])
+    assert found[given_up].isnan().all()

@@ -6,6 +6,7 @@ neighbours have the very numbers that they have without it. Derivatives are thos
 (of `solve` and `inverse` not finite there).
 """
 
+import re
 from collections.abc import Callable
 
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from torchsfm.linalg.magnitude import all_below
 
 _GaveUp: type[RuntimeError] = torch.linalg.LinAlgError  # type: ignore[attr-defined]
+_BATCH_ELEMENT = re.compile(r"Batch element (\d+)")
 _ROOM = 2.0**20
 """How far below the largest number entries have to stay: sums of products with unit vectors must not overflow."""
 
@@ -218,11 +220,16 @@ def _attempt(decompose: Callable[[Tensor], tuple[Tensor, ...]], A: Tensor) -> tu
         pieces = [_alone(decompose, matrix) for matrix in A.reshape(-1, *A.shape[-2:])]
         parts = tuple(torch.stack(part).reshape(*A.shape[:-2], *part[0].shape) for part in zip(*pieces, strict=True))
         kept = ~torch.isnan(parts[0]).flatten(A.ndim - 2).any(-1)
-        try:
-            again = decompose(_or_axes(A, kept))
-        except _GaveUp:
-            return parts
-        return tuple(torch.where(kept.view(*kept.shape, *[1] * (p.ndim - kept.ndim)), p, torch.nan) for p in again)
+        while True:
+            try:
+                again = decompose(_or_axes(A, kept))
+                return tuple(torch.where(kept.view(*kept.shape, *[1] * (p.ndim - kept.ndim)), p, torch.nan) for p in again)
+            except _GaveUp as error:
+                # On some it gives up in one place of memory only.
+                named = _BATCH_ELEMENT.search(str(error))
+                if named is None or not bool(kept.view(-1)[int(named[1])]):
+                    return parts
+                kept.view(-1)[int(named[1])] = False
 
 
 def _alone(decompose: Callable[[Tensor], tuple[Tensor, ...]], matrix: Tensor) -> tuple[Tensor, ...]:
