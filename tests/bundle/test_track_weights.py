@@ -5,44 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 from chance import stream_seed
-from torch import Tensor
+from outline_scenes import POINTS, outline_scene, rotation_error
 
-from torchsfm import Camera, Cauchy, bundle_adjust_model, random_bundle_problem
+from torchsfm import Cauchy, bundle_adjust_model, random_bundle_problem
 from torchsfm.bundle import track_weights
-from torchsfm.geometry import BundleProblem, intrinsics, rotation_angle
-from torchsfm.simulation import orbit_poses
+from torchsfm.geometry import BundleProblem
 
 LOSS = Cauchy(1.0)
-
-
-VIEWS, POINTS = 12, 300
-
-
-def scene(g: torch.Generator, outlines: float) -> tuple[BundleProblem, BundleProblem, Tensor]:
-    """Cameras on an arc around points, some of which lie on the left outlines of upright posts: with these, the truth without
-    noise or outlines, and which points are on outlines.
-    """
-    poses = orbit_poses(VIEWS, radius=5.0, height=(0.5, 1.5), sweep=1.3)
-    camera = Camera(intrinsics(torch.tensor(500.0).double(), torch.tensor([320.0, 240.0]).double()))[None]
-    X = 3 * torch.rand(POINTS, 3, generator=g, dtype=torch.float64) - 1.5
-    bad = torch.rand(POINTS, generator=g) < outlines
-    radius = torch.where(bad, 0.05 + 0.1 * torch.rand(POINTS, generator=g, dtype=torch.float64), 0.0)
-    sight = X - poses.centre[:, None]
-    across = torch.stack((-sight[..., 1], sight[..., 0], torch.zeros_like(sight[..., 0])), -1)
-    left = across / across.norm(dim=-1, keepdim=True)
-    seen = camera.project(poses.transform(X + radius[:, None] * left))
-    view, point = torch.meshgrid(torch.arange(VIEWS), torch.arange(POINTS), indexing="ij")
-    view, point, index = view.flatten(), point.flatten(), torch.zeros(VIEWS, dtype=torch.long)
-    x = seen.reshape(-1, 2) + 0.2 * torch.randn(VIEWS * POINTS, 2, generator=g, dtype=torch.float64)
-    truth = BundleProblem(poses, camera, index, X, camera.project(poses.transform(X)).reshape(-1, 2), view, point)
-    return replace(truth, x=x), truth, bad
-
-
-def error(problem: BundleProblem, truth: BundleProblem) -> float:
-    """Root mean square error of relative rotations, degrees."""
-    i, j = torch.combinations(torch.arange(VIEWS), 2).unbind(-1)
-    R, R_true = (p.poses.R[j] @ p.poses.R[i].mT for p in (problem, truth))
-    return float(rotation_angle(R @ R_true.mT).square().mean().sqrt().rad2deg())
 
 
 def adjusted(problem: BundleProblem, rounds: int) -> BundleProblem:
@@ -58,10 +27,10 @@ def adjusted(problem: BundleProblem, rounds: int) -> BundleProblem:
 def test_tracks_that_drift_hardly_move_cameras() -> None:
     plain, weighted, share = [], [], []
     for k in range(5):
-        problem, truth, bad = scene(torch.Generator().manual_seed(stream_seed() + k), 0.25)
-        plain.append(error(adjusted(problem, 0), truth))
+        problem, truth, bad = outline_scene(torch.Generator().manual_seed(stream_seed() + k), 0.25)
+        plain.append(rotation_error(adjusted(problem, 0), truth))
         found = adjusted(problem, 2)
-        weighted.append(error(found, truth))
+        weighted.append(rotation_error(found, truth))
         weights = track_weights(found, loss=LOSS)
         share.append(float(weights[bad[found.point]].mean() / weights[~bad[found.point]].mean()))
     assert sum(weighted) < 0.8 * sum(plain), (plain, weighted)
@@ -71,14 +40,14 @@ def test_tracks_that_drift_hardly_move_cameras() -> None:
 def test_where_all_are_points_little_is_lost() -> None:
     plain, weighted = 0.0, 0.0
     for k in range(8):
-        problem, truth, _ = scene(torch.Generator().manual_seed(stream_seed() + k), 0.0)
-        plain += error(adjusted(problem, 0), truth) ** 2
-        weighted += error(adjusted(problem, 1), truth) ** 2
+        problem, truth, _ = outline_scene(torch.Generator().manual_seed(stream_seed() + k), 0.0)
+        plain += rotation_error(adjusted(problem, 0), truth) ** 2
+        weighted += rotation_error(adjusted(problem, 1), truth) ** 2
     assert weighted < 1.15 * plain, (plain, weighted)
 
 
 def test_single_wrong_observations_take_less_of_their_track_with_a_robust_loss() -> None:
-    problem, truth, _ = scene(torch.Generator().manual_seed(stream_seed()), 0.0)
+    problem, truth, _ = outline_scene(torch.Generator().manual_seed(stream_seed()), 0.0)
     wrong = torch.zeros(len(truth.x), dtype=torch.bool)
     wrong[torch.arange(0, POINTS, 10)] = True
     x = problem.x + torch.where(wrong[:, None], 300.0, 0.0)

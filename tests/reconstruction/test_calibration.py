@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from chance import assert_unit_variance
+from chance import assert_unit_variance, stream_seed
+from outline_scenes import outline_scene, rotation_error
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import bundle_covariance, intrinsics_covariance
+from torchsfm.bundle import bundle_adjust_model, bundle_covariance, intrinsics_covariance
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_from_rotvec
 from torchsfm.optim import Cauchy
 from torchsfm.plot import write_page
@@ -60,6 +61,19 @@ def test_forward_motion_finds_its_focal_length(generator: torch.Generator) -> No
     assert found.status == Status.OK
     error, sigma = abs(float(found.values[0, 0]) - focal), float(found.deviation[0, 0])
     assert error < 4 * sigma < 0.2 * focal
+
+
+def test_cameras_follow_points_and_not_outlines() -> None:
+    found, alike = 0.0, 0.0
+    for k in range(4):
+        problem, truth, _ = outline_scene(torch.Generator().manual_seed(stream_seed() + k), 0.25)
+        sizes = torch.tensor([[640, 480]] * len(truth.poses.R))
+        (model,) = reconstruct_tracks(problem.x, problem.view, problem.point, sizes, shared_camera=True).models
+        assert bool(model.registered.all())
+        found += rotation_error(model, truth)
+        free = ("focal", "principal_point", "k1", "k2")
+        alike += rotation_error(bundle_adjust_model(model, free=free, loss=Cauchy(1.0), tolerance=1e-8).model, truth)
+    assert found < 0.8 * alike, (found, alike)
 
 
 def test_deviations_are_those_of_the_whole_covariance(generator: torch.Generator) -> None:
