@@ -30,6 +30,8 @@ NEIGHBOURS = 8
 
 LOSS = Cauchy(1.0)
 """The loss of reprojection errors in pixels."""
+REWEIGHTED, ROUGHLY = 4, 1e-4
+"""How often observations are weighed by what the adjustment before says of their tracks; the tolerance of all but the last."""
 
 
 def adjust(
@@ -73,7 +75,7 @@ def adjust(
         max_iterations=max_iterations,
         tolerance=tolerance,
         initial_damping=initial_damping,
-        **about_cameras(mapping, free, prior),
+        **about_cameras(mapping, free, prior, weights),
     )
     if result.status == Status.INTERRUPTED:
         # There is more to do than this: let the interrupt through.
@@ -89,7 +91,6 @@ def adjust_all(
     *,
     faultless: int = 0,
     settled: bool = False,
-    by_tracks: bool = False,
     **limits: Any,
 ) -> Mapping:
     """Adjust everything, and of the cameras what the images determine; the rest is held where it was expected.
@@ -103,22 +104,37 @@ def adjust_all(
         faultless: Cameras that took up to so many photographs count as those of many; see `choose_free`.
         settled: Whether the model has been adjusted so before, and has hardly changed since. Where the images determined all
             numbers then, that is not found out again.
-        by_tracks: Whether observations count by how well their tracks fit before, see `track_weights`: in a model that is
-            nearly right. While it is still bent, the longest tracks fit worst.
         **limits: When to stop; see `adjust`.
     """
     free = dict(mapping.adjustment.free) if settled and mapping.adjustment is not None else {}
     used = images_of_cameras(mapping) > 0
     if set(free) != set(names) or not all(bool(mask[used].all()) for mask in free.values()):
         free = choose_free(mapping, names, prior, loss=LOSS, faultless=faultless)
-    weights = observation_weights(mapping, LOSS) if by_tracks else None
-    adjusted = adjust(as_expected(mapping, free, prior), free=free, prior=prior, weights=weights, **limits)
+    adjusted = adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
     folded = folded_cameras(adjusted)
     if not bool(folded.any()):
         return adjusted
     folded = folded | prior.alike
     free |= {name: free[name] & ~folded for name in mapping.cameras.distortion.parameter_names if name in free}
-    return adjust(as_expected(mapping, free, prior), free=free, prior=prior, weights=weights, **limits)
+    return adjust(as_expected(mapping, free, prior), free=free, prior=prior, **limits)
+
+
+def adjust_by_tracks(mapping: Mapping, prior: CameraPrior, *, tolerance: float, **limits: Any) -> Mapping:
+    """Adjust a finished model once more, observations counting by how well their tracks fit as a whole (`track_weights`).
+
+    Not before it is finished: in a model that is still bent the longest tracks fit worst.
+
+    Args:
+        mapping: The model. Of its cameras the same is free as in its last adjustment.
+        prior: What is expected of the cameras.
+        tolerance: Relative decrease of the cost at which the last adjustment stops.
+        **limits: When else to stop; see `adjust`.
+    """
+    free = None if mapping.adjustment is None else mapping.adjustment.free
+    for until in (ROUGHLY,) * (REWEIGHTED - 1) + (tolerance,):
+        weights = observation_weights(mapping, LOSS)
+        mapping = adjust(mapping, free=free, prior=prior, weights=weights, tolerance=until, **limits)
+    return mapping
 
 
 def as_adjusted(mapping: Mapping, result: BundleResult, free: Free | None, prior: CameraPrior | None) -> Mapping:
@@ -130,11 +146,13 @@ def as_adjusted(mapping: Mapping, result: BundleResult, free: Free | None, prior
     return replace(mapping, poses=result.poses, cameras=cameras, X=result.X, adjustment=adjustment)
 
 
-def about_cameras(mapping: Mapping, free: Free | None, prior: CameraPrior | None) -> dict[str, Any]:
+def about_cameras(
+    mapping: Mapping, free: Free | None, prior: CameraPrior | None, weights: Float[Tensor, "m"] | None = None
+) -> dict[str, Any]:
     """What is free in the cameras and expected of it, in the words of `bundle_adjust`."""
     if not free or prior is None:
         return {"free": ()}
-    noise = measure_noise(mapping, LOSS)
+    noise = measure_noise(mapping, LOSS, weights)
     return cameras_free(free) | prior.terms(noise, free, images_of_cameras(mapping) > 0)
 
 

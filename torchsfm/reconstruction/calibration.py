@@ -91,6 +91,7 @@ def calibration_of(
     prior: CameraPrior,
     *,
     loss: Cauchy,
+    weights: Float[Tensor, "m"] | None = None,
     covariance: tuple[Sequence[str], Float[Tensor, "g k k"]] | None = None,
 ) -> Calibration:
     """How the cameras of an adjusted mapping were found.
@@ -99,6 +100,7 @@ def calibration_of(
         mapping: The finished model.
         prior: What was expected of the cameras.
         loss: The loss of the adjustment.
+        weights: What the observations counted in it.
         covariance: Numbers of cameras, and their covariance by the noise of the image points, where that is known.
     """
     labels = intrinsic_labels(type(mapping.cameras.distortion))
@@ -110,10 +112,10 @@ def calibration_of(
         torch.zeros_like(values, dtype=torch.bool),
     )
     adjusted = mapping.adjustment or Adjustment(Status.OK, 0, {})
-    noise = measure_noise(mapping, loss)
+    noise = measure_noise(mapping, loss, weights)
     if adjusted.free:
         given = covariance[1] if covariance is not None and set(covariance[0]) == set(adjusted.free) else None
-        known = _information(mapping, tuple(adjusted.free), prior, loss, given)
+        known = _information(mapping, tuple(adjusted.free), prior, loss, given, weights)
         chosen = torch.zeros(known.prior.shape, dtype=torch.bool)
         for name, mask in adjusted.free.items():
             chosen[:, known.places(name)] = mask[:, None]
@@ -130,12 +132,12 @@ def observation_weights(mapping: Mapping, loss: Cauchy) -> Float[Tensor, "m"]:
     return track_weights(mapping.problem(), loss=loss, least_noise=LEAST_NOISE)
 
 
-def measure_noise(mapping: Mapping, loss: Cauchy) -> float:
+def measure_noise(mapping: Mapping, loss: Cauchy, weights: Float[Tensor, "m"] | None = None) -> float:
     """The standard deviation of an image coordinate for which weighted least squares would be as certain as the robust cost is.
 
     Huber's proposal for M-estimators: the mean square of the weighted residuals over the square of their mean derivative, times
-    the mean weight, since covariances are computed with weighted normal equations (Huber 1981, 7.6). It is that of an
-    observation which counts in full.
+    the mean weight, since covariances are computed with weighted normal equations (Huber 1981, 7.6). Where observations have
+    weights, it is that of one which counts in full.
     """
     node = mapping.observations()
     if not len(node):
@@ -150,7 +152,7 @@ def measure_noise(mapping: Mapping, loss: Cauchy) -> float:
     with torch.enable_grad():
         (slope,) = torch.autograd.grad(loss(s).sum(), s, create_graph=True)
         (bend,) = torch.autograd.grad(slope.sum(), s)
-    s, slope, weights = s.detach(), slope.detach(), observation_weights(mapping, loss)
+    s, slope, weights = s.detach(), slope.detach(), torch.ones_like(fitted) if weights is None else weights
     square = (weights.square() * slope.square() * s).mean() / 2
     curvature = (weights * (slope + bend * s)).mean().clamp_min(1e-6)
     return max(float((square * (weights * loss_slope(loss, fitted)).mean()).sqrt() / curvature), LEAST_NOISE)
@@ -196,16 +198,17 @@ def _information(
     prior: CameraPrior,
     loss: Cauchy,
     covariance: Float[Tensor, "g k k"] | None = None,
+    weights: Float[Tensor, "m"] | None = None,
 ) -> _Information:
     used = images_of_cameras(mapping) > 0
-    noise = measure_noise(mapping, loss)
+    noise = measure_noise(mapping, loss, weights)
     model = type(mapping.cameras.distortion)
     columns = free_columns(names, model)
     if covariance is None:
         covariance = noise**2 * intrinsics_covariance(
             mapping.problem(),
             free=names,
-            weights=observation_weights(mapping, loss),
+            weights=weights,
             loss=loss,
             **prior.terms(noise, names, used),
         )

@@ -20,13 +20,7 @@ from torchsfm.autocalibration import focal_from_fundamentals
 from torchsfm.geometry import Camera
 from torchsfm.reconstruction.adjust import LOSS, adjust, support
 from torchsfm.reconstruction.beginning import Grown
-from torchsfm.reconstruction.calibration import (
-    calibration_of,
-    choose_free,
-    images_of_cameras,
-    measure_noise,
-    observation_weights,
-)
+from torchsfm.reconstruction.calibration import calibration_of, choose_free, images_of_cameras, measure_noise
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA, telling_pairs
 from torchsfm.reconstruction.consistency import excess_scatter
 from torchsfm.reconstruction.incremental import MappingOptions, extend_model
@@ -86,11 +80,10 @@ def _gain_off_centre(model: Mapping, options: MappingOptions) -> tuple[float, fl
     prior, wide = (replace(options, cropped=cropped).prior(model) for cropped in (False, True))
     free = choose_free(model, options.free, prior, loss=LOSS, faultless=1)
     free["principal_point"] = free["principal_point"] | lone
-    weights = observation_weights(model, LOSS)
-    far = adjust(model, free=free, prior=wide, weights=weights, **ENOUGH)
+    far = adjust(model, free=free, prior=wide, **ENOUGH)
     excess = excess_scatter(far, threshold=options.reprojection)
-    near = adjust(far, free=free, prior=prior.against(excess), weights=weights, **ENOUGH)
-    far = adjust(near, free=free, prior=wide.against(excess), weights=weights, **ENOUGH)
+    near = adjust(far, free=free, prior=prior.against(excess), **ENOUGH)
+    far = adjust(near, free=free, prior=wide.against(excess), **ENOUGH)
     if near.adjustment is None or far.adjustment is None:
         return 0.0, 1.0
     return (near.adjustment.cost - far.adjustment.cost) / (measure_noise(far, LOSS) ** 2 * excess), excess
@@ -186,7 +179,7 @@ def _one_camera(model: Mapping, options: MappingOptions) -> bool:
     if model.adjustment is None:
         return False
     prior = replace(options, alike=False).prior(model)
-    far = adjust(model, free=model.adjustment.free, prior=prior, weights=observation_weights(model, LOSS), **ENOUGH)
+    far = adjust(model, free=model.adjustment.free, prior=prior, **ENOUGH)
     excess = excess_scatter(far, threshold=options.reprojection)
     found = calibration_of(far, prior, loss=LOSS)
     used = images_of_cameras(model) > 0

@@ -137,14 +137,15 @@ def pose_deviations(
     problem = mapping.problem()
     # A number that was held where it was expected is as uncertain as it was expected to be.
     uncertain = {name: torch.ones(len(mapping.cameras.K), dtype=torch.bool) for name in open_numbers}
+    weights = observation_weights(mapping, LOSS)
     covariance = bundle_covariance(
         problem,
-        weights=observation_weights(mapping, LOSS),
+        weights=weights,
         loss=LOSS,
-        sigma=measure_noise(mapping, LOSS),
+        sigma=measure_noise(mapping, LOSS, weights),
         points=False,
         joint=False,
-        **about_cameras(mapping, uncertain, prior),
+        **about_cameras(mapping, uncertain, prior, weights),
     )
     view, depth = problem.view, problem.depths()
     seen = torch.bincount(view, minlength=len(mapping.registered))

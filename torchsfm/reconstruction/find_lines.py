@@ -89,16 +89,17 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
     """
     free = None if mapping.adjustment is None else mapping.adjustment.free
     problem = mapping.problem()
-    noise = measure_noise(mapping, LOSS)
+    weights = observation_weights(mapping, LOSS)
+    noise = measure_noise(mapping, LOSS, weights)
     apart = segment_distances(mapping.poses, mapping.cameras[mapping.camera_index], lines.bundle())
     # Of robust mean size: two distances a segment, less the four numbers of each line.
     redundancy = max(0.1, 1 - 4 * len(lines) / max(apart.numel(), 1))
     scale = float((apart.abs() * lines.weight.sqrt()[:, None]).median()) / 0.6745 / redundancy**0.5
-    known = about_cameras(mapping, free, prior)
+    known = about_cameras(mapping, free, prior, weights)
     result = bundle_adjust(
         problem,
         structure=[lines.bundle(unit=noise / max(scale, LEAST_SCALE), loss=LINE_LOSS)],
-        weights=observation_weights(mapping, LOSS),
+        weights=weights,
         loss=LOSS,
         **({"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE} | known | limits),
     )

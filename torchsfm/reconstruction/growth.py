@@ -14,7 +14,7 @@ from torchsfm.reconstruction.cameras import group_cameras
 from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.consistency import PairAgreement
 from torchsfm.reconstruction.cropped import map_cropped, may_be_off_centre
-from torchsfm.reconstruction.incremental import MappingOptions, extend_model
+from torchsfm.reconstruction.incremental import MappingOptions, extend_model, finish
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import Conflicts
 from torchsfm.reconstruction.projective import projective_start
@@ -113,6 +113,10 @@ class Component:
         """With a model whose cameras are elsewhere, for which what pairs and missing correspondences said does not hold."""
         return self if model is self.model else replace(self, model=model, conflicts=None, agreement=None)
 
+    def finished(self) -> "Component":
+        """Adjusted by how well each track fits. Noise alone moves it: what pairs said of it holds."""
+        return replace(self, model=finish(self.model, self.options))
+
 
 @dataclass
 class Growth:
@@ -189,7 +193,7 @@ class Growth:
             if self.copies and self.method != "projective":
                 component = self._unfolded(component)
             self.taken, number = self.taken | component.model.registered, number + 1
-            yield component
+            yield component.finished()
 
     def _from_cameras(self) -> tuple[Component, dict[int, str]] | None:
         """A model from first cameras, and why images that were tried do not fit."""

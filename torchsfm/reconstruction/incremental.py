@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import Camera
-from torchsfm.reconstruction.adjust import adjust, adjust_all, neighbourhood, support
+from torchsfm.reconstruction.adjust import adjust, adjust_all, adjust_by_tracks, neighbourhood, support
 from torchsfm.reconstruction.calibration import images_of_cameras, lone_cameras_plausible
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
@@ -37,9 +37,6 @@ LAST_ITERATIONS, LAST_TOLERANCE = 300, 1e-7
 STANDING = 1e-6
 """Damping of the first step of an adjustment of cameras that stand about where they should: more would only hold back what is
 left, long rows of cameras that bend as a whole."""
-
-REWEIGHTED = 2
-"""Last adjustments: observations count by what the one before says of their tracks."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class MappingOptions:
         """
         names = [name for name in self.free if last or self.cropped or name != "principal_point"]
         faultless = len(model.registered) if self.cropped else int(lone)
-        return adjust_all(model, names, self.prior(model), faultless=faultless, by_tracks=last, **limits)
+        return adjust_all(model, names, self.prior(model), faultless=faultless, **limits)
 
 
 def grow_model(
@@ -214,11 +211,16 @@ def _refine(model: Mapping, options: MappingOptions) -> Mapping:
         settled = changed <= 0.01 * max(1, int((before >= 0).sum()))
         if settled:
             break
-    for _ in range(REWEIGHTED):
-        model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
-        settled = True
+    model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
     lone = not options.cropped and bool((images_of_cameras(model) == 1).any())
     if lone and "principal_point" in options.free:
         freed = options.adjust(model, last=True, lone=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
         model = freed if lone_cameras_plausible(freed, options.prior(freed)) else model
+    return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+
+
+def finish(model: Mapping, options: MappingOptions) -> Mapping:
+    """A model that stays as it is but for noise: what is no point in the world no longer moves its cameras."""
+    limits: dict[str, Any] = {"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE, "initial_damping": STANDING}
+    model = adjust_by_tracks(model, options.prior(model), **limits)
     return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)

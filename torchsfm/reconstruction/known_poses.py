@@ -247,7 +247,6 @@ def _adjust(
     result = bundle_adjust(
         mapping.problem(),
         fixed_poses=~moving,
-        weights=observation_weights(mapping, LOSS),
         loss=LOSS,
         max_iterations=LAST_ITERATIONS,
         tolerance=LAST_TOLERANCE,

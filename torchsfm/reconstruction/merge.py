@@ -10,9 +10,8 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.geometry import Similarity, rotation_angle, similarity_from_points
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.adjust import LOSS, adjust, adjust_all
+from torchsfm.reconstruction.adjust import LOSS, adjust, adjust_all, adjust_by_tracks
 from torchsfm.reconstruction.alignment import align_models
-from torchsfm.reconstruction.calibration import observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
 from torchsfm.reconstruction.joined_points import common_kind, joined_points, joined_views
@@ -225,8 +224,6 @@ def _adjusted(mapping: Mapping, fixed_cameras: bool) -> Mapping:
         mapping = merge_points(mapping, threshold=ERROR)
         if not len(mapping.X):
             return mapping
-        if names:
-            mapping = adjust_all(mapping, names, prior, by_tracks=True, **limits)
-        else:
-            mapping = adjust(mapping, weights=observation_weights(mapping, LOSS), **limits)
+        mapping = adjust_all(mapping, names, prior, **limits) if names else adjust(mapping, **limits)
+    mapping = adjust_by_tracks(mapping, prior, **limits)
     return filter_points(mapping, threshold=ERROR, min_angle=ANGLE)

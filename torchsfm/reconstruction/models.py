@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchsfm.reconstruction.adjust import LOSS
-from torchsfm.reconstruction.calibration import Calibration, calibration_of
+from torchsfm.reconstruction.calibration import Calibration, calibration_of, observation_weights
 from torchsfm.reconstruction.cropped import crops_of_one_plane
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
@@ -102,7 +102,8 @@ def _judged(component: Component, growth: Growth, graph: ViewGraph, wanted: Want
         elsewhere=matches_across(graph, model.registered, others), flat=crops_of_one_plane(model, options),
     )  # fmt: skip
     covariance = None if standing.intrinsics is None or component.off_centre else (wanted.free, standing.intrinsics)
-    return standing, calibration_of(model, options.prior(model), loss=LOSS, covariance=covariance)
+    weights = observation_weights(model, LOSS)
+    return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
 
 
 def _report(
