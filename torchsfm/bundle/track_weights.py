@@ -52,7 +52,12 @@ def track_weights(
         >>> bool(weights[problem.point == 7].max() < 0.2), bool(weights.median() > 0.9)
         (True, True)
     """
-    check_options(loss=(loss, Callable | None), dof=(dof, "float > 0"), least_noise=(least_noise, "float >= 0"))
+    check_options(
+        problem=(problem, BundleProblem),
+        loss=(loss, Callable | None),
+        dof=(dof, "float > 0"),
+        least_noise=(least_noise, "float >= 0"),
+    )
     point = problem.point
     square = problem.residuals().detach().double().square()
     good = square.isfinite() & (problem.depths().detach() > 0)
