@@ -12,7 +12,7 @@ from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction.adjust import LOSS, adjust
-from torchsfm.reconstruction.calibration import calibration_of
+from torchsfm.reconstruction.calibration import calibration_of, observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.doubt import Standing, examine
@@ -183,12 +183,13 @@ def test_deviations_of_cameras_do_not_depend_on_where_their_covariance_comes_fro
     prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), 0.5, dtype=torch.float64))
     known = examine(mapping, open_numbers=names, prior=prior, threshold=4.0).intrinsics
     assert known is not None
-    plain = calibration_of(mapping, prior, loss=LOSS)
-    given = calibration_of(mapping, prior, loss=LOSS, covariance=(names, known))
+    plain, given, other = (
+        calibration_of(mapping, prior, loss=LOSS, weights=observation_weights(mapping, LOSS), covariance=covariance)
+        for covariance in (None, (names, known), (("focal",), torch.eye(1).double()[None]))
+    )
     assert bool((plain.deviation > 0).all())
     assert given.deviation.allclose(plain.deviation, rtol=1e-4)
     # Of other numbers it says nothing.
-    other = calibration_of(mapping, prior, loss=LOSS, covariance=(("focal",), torch.eye(1).double()[None]))
     assert other.deviation.equal(plain.deviation)
 
 
