@@ -105,7 +105,8 @@ def test_points_unevenly_along_splines_do_not_count_as_bends(generator: torch.Ge
             terms, x = approach_splines(terms, x)
         ends.append(fit_splines(terms, x, 50, 1e-6).cost)
         stiffness.append(terms.stiffness)
-    assert float((ends[1] / ends[0]).log().median().abs()) < 0.02
+    # Over 24 seeds the median of four scatters by 0.009, and is 0.0001 in the mean; without the approach it is 0.4 to 0.8.
+    assert float((ends[1] / ends[0]).log().median().abs()) < 0.05
     assert float((stiffness[1] / stiffness[0]).log().median().abs()) < 0.2
 
 
