@@ -78,3 +78,9 @@ def test_bad_options_are_named() -> None:
         track_weights(truth, dof=0.0)
     with pytest.raises(ValueError, match="least_noise"):
         track_weights(truth, least_noise=-1.0)
+
+
+def test_an_index_beyond_the_points_is_named() -> None:
+    truth = random_bundle_problem(4, 50, 160, generator=torch.Generator().manual_seed(0)).truth
+    with pytest.raises(ValueError, match="point"):
+        track_weights(replace(truth, X=truth.X[:10]))

@@ -68,8 +68,11 @@ def test_cameras_follow_points_and_not_outlines() -> None:
     for k in range(4):
         problem, truth, _ = outline_scene(torch.Generator().manual_seed(stream_seed() + k), 0.25)
         sizes = torch.tensor([[640, 480]] * len(truth.poses.R))
-        (model,) = reconstruct_tracks(problem.x, problem.view, problem.point, sizes, shared_camera=True).models
+        result = reconstruct_tracks(problem.x, problem.view, problem.point, sizes, shared_camera=True)
+        model = result.model
         assert bool(model.registered.all())
+        # That of the points, 0.2, and not of the outlines: 0.188 to 0.191 over six seeds, 0.245 and more where all are alike.
+        assert 0.17 < result.report.calibrations[0].noise < 0.22
         found += rotation_error(model, truth)
         free = ("focal", "principal_point", "k1", "k2")
         alike += rotation_error(bundle_adjust_model(model, free=free, loss=Cauchy(1.0), tolerance=1e-8).model, truth)

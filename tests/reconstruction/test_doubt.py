@@ -181,10 +181,11 @@ def test_deviations_of_cameras_do_not_depend_on_where_their_covariance_comes_fro
     free = {name: torch.ones(1, dtype=torch.bool) for name in names}
     mapping = replace(mapping, adjustment=Adjustment(Status.OK, 3, free))
     prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), 0.5, dtype=torch.float64))
-    known = examine(mapping, open_numbers=names, prior=prior, threshold=4.0).intrinsics
+    weights = observation_weights(mapping, LOSS)
+    known = examine(mapping, open_numbers=names, prior=prior, threshold=4.0, weights=weights).intrinsics
     assert known is not None
     plain, given, other = (
-        calibration_of(mapping, prior, loss=LOSS, weights=observation_weights(mapping, LOSS), covariance=covariance)
+        calibration_of(mapping, prior, loss=LOSS, weights=weights, covariance=covariance)
         for covariance in (None, (names, known), (("focal",), torch.eye(1).double()[None]))
     )
     assert bool((plain.deviation > 0).all())

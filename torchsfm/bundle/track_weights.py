@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import check_options
+from torchsfm._types import check_index, check_options
 from torchsfm.geometry import BundleProblem
 from torchsfm.optim import Loss
 
@@ -32,8 +32,8 @@ def track_weights(
 
     Args:
         problem: Near its minimum.
-        loss: The robust loss of squared distances that goes with the weights, so that single wrong observations do not take
-            the others of their track with them; squares if not given.
+        loss: The robust loss of squared distances that goes with the weights, so that a single wrong observation takes less of
+            the weight of the others of its track; squares if not given.
         dof: Degrees of freedom: the fewer, the faster weights fall.
         least_noise: Image points are never better than this, pixels.
 
@@ -41,7 +41,7 @@ def track_weights(
         Weights between 0 and 1; 0 for observations that are not finite or whose point is behind the camera.
 
     Raises:
-        ValueError: An option does not fit.
+        ValueError: An option or an index of the problem does not fit.
 
     Example:
         >>> import torch, torchsfm
@@ -58,6 +58,7 @@ def track_weights(
         dof=(dof, "float > 0"),
         least_noise=(least_noise, "float >= 0"),
     )
+    check_index(view=(problem.view, len(problem.poses.R)), point=(problem.point, len(problem.X)))
     point = problem.point
     square = problem.residuals().detach().double().square()
     good = square.isfinite() & (problem.depths().detach() > 0)

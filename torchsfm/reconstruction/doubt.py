@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
-from torchsfm.reconstruction.calibration import measure_noise, observation_weights
+from torchsfm.reconstruction.calibration import measure_noise
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import PairAgreement, excess_scatter, pair_agreement
 from torchsfm.reconstruction.groups import outvoted_groups
@@ -53,6 +53,7 @@ def examine(
     open_numbers: Sequence[str],
     prior: CameraPrior,
     threshold: float,
+    weights: Float[Tensor, "m"] | None = None,
     uncertain: Bool[Tensor, "v"] | None = None,
     conflicts: Conflicts | None = None,
     agreement: PairAgreement | None = None,
@@ -66,6 +67,7 @@ def examine(
         open_numbers: Intrinsic parameters that are not given, whether the images were found to determine them or not.
         prior: What was expected of the cameras before any image point was seen.
         threshold: Largest reprojection error of an observation, in pixels.
+        weights: What the observations counted in the last adjustment, in their order; all alike when None.
         uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
         conflicts: What missing correspondences say of this model where that is known; else it is found.
         agreement: How all pairs agree with this model where that is known; else it is found.
@@ -74,7 +76,7 @@ def examine(
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
-    rotation, position, intrinsics = pose_deviations(mapping, open_numbers, prior)
+    rotation, position, intrinsics = pose_deviations(mapping, open_numbers, prior, weights)
     excess = excess_scatter(mapping, threshold=threshold) ** 0.5
     rotation, position = rotation * excess, position * excess
     agreement = agreement or pair_agreement(mapping, threshold=threshold)
@@ -131,13 +133,12 @@ def examine(
 
 
 def pose_deviations(
-    mapping: Mapping, open_numbers: Sequence[str], prior: CameraPrior
+    mapping: Mapping, open_numbers: Sequence[str], prior: CameraPrior, weights: Float[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"], Float[Tensor, "g k k"]]:
     """Standard deviations of rotations (degrees) and of places (over the median depth), and intrinsics, as in `Standing`."""
     problem = mapping.problem()
     # A number that was held where it was expected is as uncertain as it was expected to be.
     uncertain = {name: torch.ones(len(mapping.cameras.K), dtype=torch.bool) for name in open_numbers}
-    weights = observation_weights(mapping, LOSS)
     covariance = bundle_covariance(
         problem,
         weights=weights,

@@ -14,7 +14,7 @@ from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, similarity_from_p
 from torchsfm.images import MAX_PIXELS
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.adjust import LOSS, about_cameras, adjust
-from torchsfm.reconstruction.calibration import choose_free, observation_weights
+from torchsfm.reconstruction.calibration import choose_free
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.doubt import examine
 from torchsfm.reconstruction.image_reports import image_reports
@@ -106,9 +106,7 @@ def triangulate_photographs(
         mapping = _structure(mapping, options)
         if refine_poses:
             for _ in range(2):
-                weights = observation_weights(mapping, LOSS)
-                mapping = adjust(mapping, weights=weights, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
-                mapping = _structure(mapping, options)
+                mapping = _structure(adjust(mapping, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE), options)
             mapping = _moved_back(mapping, given)
         if register and len(mapping.X):
             mapping, reasons = place_images(mapping, options, own, report)

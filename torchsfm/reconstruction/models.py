@@ -96,13 +96,13 @@ def _judged(component: Component, growth: Growth, graph: ViewGraph, wanted: Want
         uncertain = uncertain | hanging_on_copies(graph, model, others, threshold=threshold)
     # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
     widest = replace(options, cropped=options.cropped or component.off_centre).prior(model)
+    weights = observation_weights(model, LOSS)
     standing = examine(
-        model, open_numbers=wanted.free, prior=widest, threshold=threshold, uncertain=uncertain,
+        model, open_numbers=wanted.free, prior=widest, threshold=threshold, weights=weights, uncertain=uncertain,
         conflicts=component.conflicts, agreement=component.agreement,
         elsewhere=matches_across(graph, model.registered, others), flat=crops_of_one_plane(model, options),
     )  # fmt: skip
     covariance = None if standing.intrinsics is None or component.off_centre else (wanted.free, standing.intrinsics)
-    weights = observation_weights(model, LOSS)
     return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
 
 

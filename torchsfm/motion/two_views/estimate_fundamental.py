@@ -134,13 +134,12 @@ class FundamentalEstimator:
     ) -> Bool[Tensor, "p"]:
         """Whether half of the inliers, or all but so few as chance explains, may be in a plane, on a line or near another F."""
         F, e = model[..., :3], model[..., 3]
-        h1, h2 = (torch.nn.functional.pad(x.mT, (0, 0, 0, 1), value=1.0) for x in (x1, x2))
+        h1, h2 = homogeneous_rows(x1), homogeneous_rows(x2)
         spare = most_by_chance(chance, 2)
         A = torch.linalg.cross(e[..., None], F, dim=-2)
         limit = 4 * threshold * threshold
-        flat = plane_suspected(A, e, h1, h2, inliers, limit, spare) | rival_suspected(
-            F, h1, h2, inliers, limit, spare, sphere=False
-        )
+        flat = plane_suspected(A, e, h1, h2, inliers, limit, spare)
+        flat |= rival_suspected(F, h1, h2, inliers, limit, spare, sphere=False)
         return flat | collinear_suspected((x1, x2), inliers, threshold, chance)
 
     def degeneracy(

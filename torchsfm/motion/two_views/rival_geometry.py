@@ -5,6 +5,7 @@ Points of a ruled quadric through both centres agree with two or three F, and wi
 a pencil of solutions, and the F of rank 2 in it are the rivals.
 """
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -144,7 +145,7 @@ def rival_explains(
     inliers: Bool[Tensor, "p n"],
     threshold: Float[Tensor, "p"],
     chance: Float[Tensor, "p"],
-    rise: Any,
+    rise: Callable[[Tensor, Tensor, Tensor], Tensor],
 ) -> Bool[Tensor, "p"]:
     """Whether one of the rivals, once refined, agrees with the inliers as well as the model, and is another one.
 
