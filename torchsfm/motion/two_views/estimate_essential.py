@@ -13,7 +13,12 @@ from torchsfm.motion.two_views.epipolar_fit import cross_rows, sphere_rows
 from torchsfm.motion.two_views.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, squared_transfer
 from torchsfm.motion.two_views.plane_glance import plane_suspected
 from torchsfm.motion.two_views.relative_5pt import relative_5pt
-from torchsfm.motion.two_views.rival_geometry import rank_two_members, rival_explains, rival_suspected
+from torchsfm.motion.two_views.rival_geometry import (
+    rank_two_members,
+    rival_explains,
+    rival_suspected,
+    undetermined_where_rivalled,
+)
 from torchsfm.motion.two_views.sampson_sphere import pose_step, squared_distance, step_equations, turned, unit_rows
 from torchsfm.optim import UnitSphere, rotation_exponential
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
@@ -137,25 +142,24 @@ class RelativePoseEstimator:
         planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
         code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
         code = torch.where(rotation, int(Degeneracy.ROTATION), code)
-        other = self._has_rival(model, d1, d2, inliers, threshold, chance) & (code == Degeneracy.NONE)
-        return torch.where(other, int(Degeneracy.UNDETERMINED), code).to(torch.int8)
+        known = (self.slack, 0), (model, 2), (d1, 2), (d2, 2), (inliers, 1), (threshold, 0), (chance, 0)
+        return undetermined_where_rivalled(code, self._has_rival, *known)
 
     def _has_rival(
-        self, model: Tensor, d1: Tensor, d2: Tensor, inliers: Tensor, threshold: Tensor, chance: Tensor
+        self, slack: Tensor, model: Tensor, d1: Tensor, d2: Tensor, inliers: Tensor, threshold: Tensor, chance: Tensor
     ) -> Bool[Tensor, "p"]:
         """Whether the inliers agree with another pose as well: one near to a member of rank 2 in the pencil of solutions."""
         E = _unit_essential(model[..., :3], model[..., 3])
         found = rank_two_members(E, unit_rows(d1), unit_rows(d2), inliers, 4 * threshold * threshold, sphere=True)
-        rivals = poses_from_essential(found).model.flatten(1, 2)
-        wide = replace(self, slack=self.slack[:, None])
+        rivals = poses_from_essential(found).model
 
         def rise(model: Tensor, others: Tensor, weights: Tensor) -> Tensor:
-            A, _ = step_equations(model, d1[:, None], d2[:, None], wide.slack, lambda _: (weights, weights))
+            A, _ = step_equations(model, d1[:, None], d2[:, None], slack[:, None], lambda _: (weights, weights))
             turn = rotvec_from_rotation(others[..., :3] @ model[..., :3].mT)
             d = torch.cat((turn, others[..., 3] - model[..., 3]), -1)[..., None]
             return (d.mT @ A @ d)[..., 0, 0]
 
-        return rival_explains(wide, model, rivals, (d1, d2), inliers, threshold, chance, rise)
+        return rival_explains(replace(self, slack=slack), model, rivals, (d1, d2), inliers, threshold, chance, rise)
 
 
 def estimate_essential(

@@ -16,7 +16,12 @@ from torchsfm.motion.two_views.normalization import common_scale, largest_positi
 from torchsfm.motion.two_views.oriented_7pt import oriented_7pt
 from torchsfm.motion.two_views.plane_and_parallax import dominant_plane, more_than_chance, most_by_chance, plane_alternatives
 from torchsfm.motion.two_views.plane_glance import plane_suspected
-from torchsfm.motion.two_views.rival_geometry import rank_two_members, rival_explains, rival_suspected
+from torchsfm.motion.two_views.rival_geometry import (
+    rank_two_members,
+    rival_explains,
+    rival_suspected,
+    undetermined_where_rivalled,
+)
 from torchsfm.motion.two_views.sampson_plane import homogeneous_rows, squared_distance, step_equations
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
@@ -163,8 +168,8 @@ class FundamentalEstimator:
         planar = on.any(-1) & ~more_than_chance((inliers & ~on).sum(-1), chance, 2)
         code = torch.where(planar, int(Degeneracy.PLANAR), int(Degeneracy.NONE))
         code = torch.where(collinear((x1, x2), inliers, threshold, chance), int(Degeneracy.COLLINEAR), code)
-        other = self._has_rival(model, x1, x2, inliers, threshold, chance) & (code == Degeneracy.NONE)
-        return torch.where(other, int(Degeneracy.UNDETERMINED), code).to(torch.int8)
+        known = (model, 2), (x1, 2), (x2, 2), (inliers, 1), (threshold, 0), (chance, 0)
+        return undetermined_where_rivalled(code, self._has_rival, *known)
 
     def _has_rival(
         self, model: Tensor, x1: Tensor, x2: Tensor, inliers: Tensor, threshold: Tensor, chance: Tensor
@@ -174,7 +179,7 @@ class FundamentalEstimator:
         h1, h2 = homogeneous_rows(x1), homogeneous_rows(x2)
         found = rank_two_members(F, h1, h2, inliers, 4 * threshold * threshold, sphere=False)
         e = with_left_epipole(found, torch.ones_like(found[..., 0]))[..., 3:]
-        rivals = torch.cat([torch.cat((found, side * e), -1) for side in (1, -1)], 1)
+        rivals = torch.stack([torch.cat((found, side * e), -1) for side in (1, -1)], 2)
 
         def rise(model: Tensor, others: Tensor, weights: Tensor) -> Tensor:
             F, e = torch.split(model, [3, 1], -1)

@@ -7,13 +7,16 @@ a pencil of solutions, and the F of rank 2 in it are the rivals.
 
 from collections.abc import Callable
 from functools import cache
+from operator import itemgetter
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import tensor_map
 from torchsfm.motion.two_views.epipolar_fit import cofactors
+from torchsfm.robust import Degeneracy
 
 _TINY = 1e-30
 _PARTS, _ROUNDS, _GLANCE_ROUNDS = 8, 3, 1
@@ -114,6 +117,26 @@ def rival_suspected(
     return far <= spare
 
 
+def undetermined_where_rivalled(
+    code: Int[Tensor, "*batch"], has_rival: Callable[..., Bool[Tensor, "p"]], *known: tuple[Tensor, int]
+) -> Int[Tensor, "*batch"]:
+    """Degeneracies, as int8, of which NONE becomes UNDETERMINED where another geometry agrees as well.
+
+    Only there is it looked for, which takes as long as a search: of points of a plane, which have rivals as well, it is known.
+
+    Args:
+        code: What is known already.
+        has_rival: Says so of some problems, given what is known of them.
+        *known: Tensors, each with the number of its own dimensions, the last ones.
+    """
+    row = (code.flatten() == Degeneracy.NONE).nonzero()[:, 0]
+    found = code.flatten().to(torch.int8)
+    if len(row):
+        some = [t.expand(*code.shape, *t.shape[t.ndim - own :]).reshape(-1, *t.shape[t.ndim - own :])[row] for t, own in known]
+        found[row[has_rival(*some)]] = int(Degeneracy.UNDETERMINED)
+    return found.view(code.shape)
+
+
 def rank_two_members(
     F: Float[Tensor, "p 3 3"],
     h1: Float[Tensor, "p 3 n"],
@@ -140,7 +163,7 @@ def rank_two_members(
 def rival_explains(
     estimator: Any,
     model: Float[Tensor, "p 3 4"],
-    rivals: Float[Tensor, "p k 3 4"],
+    rivals: Float[Tensor, "p k sides 3 4"],
     data: tuple[Tensor, Tensor],
     inliers: Bool[Tensor, "p n"],
     threshold: Float[Tensor, "p"],
@@ -154,20 +177,24 @@ def rival_explains(
     optimum the distances of what they share would be larger by far.
 
     Args:
-        estimator: Measures and refines models, its fields for several of each problem.
+        estimator: Measures and refines models, its fields one of each problem.
         model: The best model.
-        rivals: Where to begin.
+        rivals: Where to begin: models that differ by where points are in front alone, of which the best side is meant.
         data: The points.
         inliers: Which of them agree with the model.
         threshold: Largest distance of an inlier.
         chance: How many inliers chance explains.
         rise: By how much the quadratic model of the sum of weighted squares is larger at others: rise(model, others, weights).
     """
+    p, k, sides = rivals.shape[:3]
     x1, x2 = (x[:, None] for x in data)
-    limit, inside = (threshold * threshold)[:, None, None], inliers[:, None]
-    rivals = _refined(estimator, rivals, x1, x2, inside, limit)
-    own = torch.where(inliers, estimator.squared_residual(model[:, None], x1, x2)[:, 0], 0.0)
-    squared = estimator.squared_residual(rivals, x1, x2)
+    wide, limit, inside = tensor_map(lambda t: t[:, None], estimator), (threshold * threshold)[:, None, None], inliers[:, None]
+    squared = wide.squared_residual(rivals.flatten(1, 2), x1, x2)
+    side = (inside & (squared < limit)).sum(-1).view(p, k, sides).argmax(-1)
+    rivals = rivals.flatten(0, 1)[torch.arange(p * k, device=side.device), side.flatten()]
+    rivals = _refined(estimator, rivals, data, inliers, limit[:, 0]).view(p, k, 3, 4)
+    own = torch.where(inliers, wide.squared_residual(model[:, None], x1, x2)[:, 0], 0.0)
+    squared = wide.squared_residual(rivals, x1, x2)
     agree = inside & (squared < limit)
     spare = (inliers.sum(-1) - estimator.dimension).clamp(min=1)
     # Exact data have no scatter but rounding, which tells nothing.
@@ -184,34 +211,46 @@ def rival_explains(
 
 
 def _refined(
-    estimator: Any, models: Tensor, x1: Tensor, x2: Tensor, inside: Bool[Tensor, "p 1 n"], limit: Float[Tensor, "p 1 1"]
-) -> Tensor:
+    estimator: Any,
+    models: Float[Tensor, "r 3 4"],
+    data: tuple[Tensor, Tensor],
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p 1"],
+) -> Float[Tensor, "r 3 4"]:
     """Robust Gauss-Newton steps, shorter ones where whole ones lead uphill: rivals that nearly are one are hardly determined.
 
-    Each goes on until it settles, whatever becomes of the others.
+    Each goes on until it settles, whatever becomes of the others; those of a problem stand together.
     """
-    best, one = models, torch.ones_like(models[..., 0, 0])
-    least, shorter, active = one * torch.inf, one, one > 0
+    found, row = models.clone(), torch.arange(len(models), device=models.device)
+    some = tensor_map(lambda t: t[row // (len(models) // len(inliers))], (estimator, *data, inliers, limit))
+    one = torch.ones_like(models[:, 0, 0])
+    state = models, models, one * torch.inf, one, one > 0
     for _ in range(_STEPS):
+        (own, x1, x2, inside, bound), (new, best, least, shorter, active) = some, state
         loss = least
 
-        def weigh(squared: Tensor, shorter: Tensor = shorter) -> tuple[Tensor, Tensor]:
+        def weigh(squared: Tensor, known: tuple[Tensor, Tensor, Tensor] = (inside, bound, shorter)) -> tuple[Tensor, Tensor]:
             nonlocal loss
-            share = torch.where(inside & (squared < torch.inf), limit / (limit + squared), 0.0).to(squared.dtype)
+            inside, bound, shorter = known
+            share = torch.where(inside & (squared < torch.inf), bound / (bound + squared), 0.0).to(squared.dtype)
             loss = torch.where(inside, 1 - share, 0.0).sum(-1)
-            return share * share, share * share * shorter[..., None]
+            return share * share, share * share * shorter[:, None]
 
-        new = estimator.step(models, x1, x2, weigh=weigh)
-        worse = loss > least
-        better = active & (loss < least)
+        stepped = own.step(new, x1, x2, weigh=weigh)
+        worse, better = loss > least, active & (loss < least)
         unsettled = torch.where(worse, shorter < _SHORTEST, (loss < (1 - _SETTLED) * least) | (shorter > 1))
         shorter = torch.where(worse, 8 * shorter, torch.where(better, (shorter / 2).clamp(min=1), shorter))
-        best, least = torch.where(better[..., None, None], models, best), torch.where(better, loss, least)
-        models = torch.where(worse[..., None, None], best, new)
+        best, least = torch.where(better[:, None, None], new, best), torch.where(better, loss, least)
         active = active & unsettled
-        if not bool(active.any()):
-            break
-    return best
+        state = torch.where(worse[:, None, None], best, stepped), best, least, shorter, active
+        going = active.nonzero()[:, 0]
+        if 2 * len(going) <= len(row):
+            found[row] = best
+            row, some, state = tensor_map(itemgetter(going), (row, some, state))
+            if not len(going):
+                break
+    found[row] = state[1]
+    return found
 
 
 def _so_few(off: Bool[Tensor, "p k n"], expected: Float[Tensor, "p"]) -> Bool[Tensor, "p k"]:
