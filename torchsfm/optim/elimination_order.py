@@ -10,6 +10,7 @@ partners. Such variables join to fronts, dense matrices, while a few zeros cost 
 import heapq
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 FLOP = 1.0 / 12e9
 """Seconds for a multiplication with an addition in a dense product, on a usual core."""
@@ -46,8 +47,13 @@ def _seconds(p: int, b: int) -> float:
     return FLOP * (p * p * p / 3 + p * p * b + p * b * b) + ENTRY * (b * b + p * p + p * b) + VISIT
 
 
-def order_elimination(partners: Sequence[int], widths: Sequence[int], limit: float, last: int = 0) -> list[Front] | None:
+@lru_cache(maxsize=2)
+def order_elimination(
+    partners: tuple[int, ...], widths: tuple[int, ...], limit: float, last: int = 0
+) -> tuple[Front, ...] | None:
     """The fronts, children before what they add to; None if their elimination takes longer than a limit.
+
+    The last answers are kept: several adjustments of the same cameras and points follow each other.
 
     Args:
         partners: Of each variable, as bits; not itself.
@@ -56,7 +62,7 @@ def order_elimination(partners: Sequence[int], widths: Sequence[int], limit: flo
         last: Variables that are the pivots of the last front, as bits.
     """
     found = _least_partners(partners, widths, limit, last)
-    return None if found is None else _join(*found, widths, last)
+    return None if found is None else tuple(_join(*found, widths, last))
 
 
 def _least_partners(

@@ -70,7 +70,7 @@ def plan_fronts(layout: Layout, solver: Solver, *, last: Tensor | None = None, e
         if not exact:
             limit = min(limit, _iterations(layout) * max(1.0, depth(partner) / HOPS))
         limit -= forming
-    found = order_elimination(partner, [len(c) for c in columns], limit, final)
+    found = order_elimination(tuple(partner), tuple(map(len, columns)), limit, final)
     if found is None or sum(front.seconds for front in found) > limit:
         return None
     return Fronts(found, columns)
