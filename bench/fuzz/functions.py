@@ -351,6 +351,7 @@ FUNCTIONS: dict[str, Function] = {
     "bundle.bundle_adjust_projective": Function(PROJECTIVE | {"max_iterations": 10}, BUNDLE_SIZES, batched=False),
     "bundle.bundle_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
     "bundle.intrinsics_covariance": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
+    "bundle.match_weights": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
     "bundle.track_weights": Function(ADJUSTED, BUNDLE_SIZES, batched=False),
     "geometry.conic_distance": Function({"C": lambda s: conic_from_ellipse(_ellipse(s))}),
     "geometry.conic_from_ellipse": Function({"ellipse": _ellipse}),

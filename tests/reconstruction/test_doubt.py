@@ -404,3 +404,21 @@ def test_a_model_of_images_that_have_more_in_common_with_another(generator: torc
         elsewhere = torch.where(torch.arange(8) < 3, matches + more, 0)
         doubt = examine(mapping, elsewhere=elsewhere, **known).doubt  # type: ignore[arg-type]
         assert [("another model" in reason) for reason in doubt] == [i < doubtful for i in range(8)]
+
+
+def test_tracks_of_two_views_wait_for_cameras_that_longer_ones_place(generator: torch.Generator) -> None:
+    poses, X = cameras_on_an_arc(6, 1.5), cloud(320, generator, (-3, -3, -3), (3, 3, 3))
+    sees = torch.zeros(6, 320, dtype=torch.bool)
+    sees[:5, :200] = True
+    sees[0:2, 200:240] = sees[4:, 240:280] = sees[3:, 280:] = True
+    mapping = mapping_of(poses, X, sees, generator)
+    first, then = (observation_weights(mapping, LOSS, long_tracks_first=early) for early in (True, False))
+    problem = mapping.problem()
+    length = torch.bincount(problem.point)
+    placed, open_end = ((length == 2) & (torch.bincount(problem.point, problem.view == v) > 0) for v in (1, 5))
+    long = (length > 2)[problem.point]
+    assert float(first[placed[problem.point]].max()) <= 0.01
+    # The last image has forty long tracks alone, and needs the others.
+    assert float(first[open_end[problem.point]].median()) > 0.4
+    assert first[long].equal(then[long])
+    assert float(then[~long].median()) > 0.6

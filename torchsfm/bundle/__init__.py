@@ -10,6 +10,7 @@ from torchsfm.bundle.curves import BundleCurves
 from torchsfm.bundle.gauge import Gauge
 from torchsfm.bundle.intrinsics_covariance import intrinsics_covariance
 from torchsfm.bundle.lines import BundleLines
+from torchsfm.bundle.match_weights import match_weights
 from torchsfm.bundle.priors import CentrePrior, PointPrior, PosePrior, Prior, RelativePosePrior
 from torchsfm.bundle.rig import Rig
 from torchsfm.bundle.structure import Structure
@@ -38,5 +39,6 @@ __all__ = [
     "bundle_adjust_projective",
     "bundle_covariance",
     "intrinsics_covariance",
+    "match_weights",
     "track_weights",
 ]

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_index, check_options
@@ -12,6 +12,8 @@ from torchsfm.optim import Loss
 
 _EXACT = 1e-12
 """Standard deviation of image points, as a part of the largest coordinate, below which all is rounding."""
+_LEAST = 1e-100
+"""It is never less, not even where all points are the origin."""
 
 
 def track_weights(
@@ -52,17 +54,9 @@ def track_weights(
         >>> bool(weights[problem.point == 7].max() < 0.2), bool(weights.median() > 0.9)
         (True, True)
     """
-    check_options(
-        problem=(problem, BundleProblem),
-        loss=(loss, Callable | None),
-        dof=(dof, "float > 0"),
-        least_noise=(least_noise, "float >= 0"),
-    )
-    check_index(view=(problem.view, len(problem.poses.R)), point=(problem.point, len(problem.X)))
+    check_options(loss=(loss, Callable | None), dof=(dof, "float > 0"))
+    square, good, floor = squared_distances(problem, least_noise)
     point = problem.point
-    square = problem.residuals().detach().double().square()
-    good = square.isfinite() & (problem.depths().detach() > 0)
-    square = torch.where(good, square, 0.0)
     rho = square if loss is None else loss(square)
     zero = rho.new_zeros(len(problem.X))
     length, total = zero.index_add(0, point, good.to(rho.dtype)), zero.index_add(0, point, rho)
@@ -73,7 +67,16 @@ def track_weights(
     if not len(counted) or not bool(counted[-1] > 0):
         return torch.zeros_like(problem.x[:, 0])
     middle = order[torch.searchsorted(counted, counted[-1:] / 2).clamp(max=len(order) - 1)]
-    floor = max(least_noise, _EXACT * float(problem.x.detach().abs()[good].max()))
     noise = (total / left)[middle].clamp(min=floor**2)
     weights = ((dof + left) / (dof + total / noise)).clamp(max=1)
     return (weights[point] * good).to(problem.x.dtype)
+
+
+def squared_distances(problem: BundleProblem, least_noise: float) -> tuple[Float[Tensor, "m"], Bool[Tensor, "m"], float]:
+    """Of each observation, 0 where it does not count; where it does; and the least that the noise can be, pixels."""
+    check_options(problem=(problem, BundleProblem), least_noise=(least_noise, "float >= 0"))
+    check_index(view=(problem.view, len(problem.poses.R)), point=(problem.point, len(problem.X)))
+    square = problem.residuals().detach().double().square()
+    good = square.isfinite() & (problem.depths().detach() > 0)
+    largest = float(problem.x.detach().abs()[good].max()) if bool(good.any()) else 0.0
+    return torch.where(good, square, 0.0), good, max(least_noise, _EXACT * largest, _LEAST)

@@ -30,8 +30,9 @@ NEIGHBOURS = 8
 
 LOSS = Cauchy(1.0)
 """The loss of reprojection errors in pixels."""
-REWEIGHTED, ROUGHLY = 4, 1e-4
-"""How often observations are weighed by what the adjustment before says of their tracks; the tolerance of all but the last."""
+REWEIGHTED, WITHOUT, ROUGHLY = 4, 2, 1e-4
+"""How often observations are weighed by what the adjustment before says of their tracks, and how often of these nearly without
+tracks of two views; the tolerance of all but the last."""
 
 
 def adjust(
@@ -122,7 +123,8 @@ def adjust_all(
 def adjust_by_tracks(mapping: Mapping, prior: CameraPrior, *, tolerance: float, **limits: Any) -> Mapping:
     """Adjust a finished model once more, observations counting by how well their tracks fit as a whole (`track_weights`).
 
-    Not before it is finished: in a model that is still bent the longest tracks fit worst.
+    Not before it is finished: in a model that is still bent the longest tracks fit worst. And tracks of two views by how likely
+    they are right, judged by cameras that longer ones have placed (`match_weights`).
 
     Args:
         mapping: The model. Of its cameras the same is free as in its last adjustment.
@@ -131,8 +133,8 @@ def adjust_by_tracks(mapping: Mapping, prior: CameraPrior, *, tolerance: float, 
         **limits: When else to stop; see `adjust`.
     """
     free = None if mapping.adjustment is None else mapping.adjustment.free
-    for until in (ROUGHLY,) * (REWEIGHTED - 1) + (tolerance,):
-        weights = observation_weights(mapping, LOSS)
+    for number, until in enumerate((ROUGHLY,) * (REWEIGHTED - 1) + (tolerance,)):
+        weights = observation_weights(mapping, LOSS, long_tracks_first=number < WITHOUT)
         mapping = adjust(mapping, free=free, prior=prior, weights=weights, tolerance=until, **limits)
     return mapping
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.bundle import intrinsics_covariance, track_weights
+from torchsfm.bundle import intrinsics_covariance, match_weights, track_weights
 from torchsfm.bundle.intrinsics import free_columns
 from torchsfm.geometry import Distortion
 from torchsfm.geometry.intrinsic_parameters import camera_from_row, intrinsic_labels, row_from_camera
@@ -24,6 +24,8 @@ from torchsfm.reconstruction.mapping import Adjustment, Mapping
 
 LEAST_NOISE = 0.05
 """Image points are never better than this, in pixels."""
+ENOUGH, NEARLY_NONE = 100, 0.01
+"""Observations of long tracks that determine an image by themselves; what tracks of two views count beside them at first."""
 MIN_IMAGES = 3
 """Two images leave the cameras as they were expected."""
 FAULTS = 3.0
@@ -127,9 +129,21 @@ def calibration_of(
     return replace(found, cropped=prior.cropped, alike=prior.alike)
 
 
-def observation_weights(mapping: Mapping, loss: Cauchy) -> Float[Tensor, "m"]:
-    """What the observations of a finished model count, in their order: less where the track as a whole fits badly."""
-    return track_weights(mapping.problem(), loss=loss, least_noise=LEAST_NOISE)
+def observation_weights(mapping: Mapping, loss: Cauchy, *, long_tracks_first: bool = False) -> Float[Tensor, "m"]:
+    """What the observations of a finished model count, in their order: less where the track as a whole fits badly.
+
+    Tracks of two views count by how likely they are right: cameras that had to fit them hide which are wrong, so those that
+    longer tracks determine are first adjusted nearly without them.
+    """
+    problem = mapping.problem()
+    weights = track_weights(problem, loss=loss, least_noise=LEAST_NOISE)
+    if not long_tracks_first:
+        return weights * match_weights(problem, least_noise=LEAST_NOISE)
+    length = torch.bincount(problem.point, minlength=len(problem.X))
+    long = torch.bincount(problem.view[length[problem.point] > 2], minlength=len(problem.poses.R))
+    need = (1 - long.to(weights.dtype) / ENOUGH).clamp(min=NEARLY_NONE)[problem.view]
+    need = need.new_zeros(len(problem.X)).scatter_reduce(0, problem.point, need, "amax")
+    return weights * torch.where(length == 2, need, 1.0)[problem.point]
 
 
 def measure_noise(mapping: Mapping, loss: Cauchy, weights: Float[Tensor, "m"] | None = None) -> float:
