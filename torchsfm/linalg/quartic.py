@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.linalg.polynomial import attach_roots, cubic_rows
+from torchsfm.linalg.vectors import fma
 
 _DOUBLE = 1e-6
 """Down to minus this, relative to its parts, a discriminant may be zero: rounding moves double roots off the real line."""
@@ -54,21 +55,28 @@ def quartic_rows(c: Float[Tensor, "5 *batch"]) -> tuple[Float[Tensor, "4 *batch"
         maybe += [twice, torch.zeros_like(twice)]
     x, value = _newton(torch.stack(y) + shift, a3, a2, a1, a0)
     size = x.abs()
-    size = (((size + a3.abs()) * size + a2.abs()) * size + a1.abs()) * size + a0.abs()
+    size = _value(size, a3.abs(), a2.abs(), a1.abs(), a0.abs())
     tiny = value.abs() <= _ROUNDING * torch.finfo(x.dtype).eps * size
     real = torch.stack(sure) | (torch.stack(maybe) & tiny)
     return x, real & torch.isfinite(size) & torch.isfinite(lead) & (lead != 0)
 
 
 def _newton(x: Tensor, a3: Tensor, a2: Tensor, a1: Tensor, a0: Tensor) -> tuple[Tensor, Tensor]:
-    value = (((x + a3) * x + a2) * x + a1) * x + a0
+    """Roots after some steps, those that the steps lead astray as they were, and the values there."""
+    b2, b1 = 3 * a3, 2 * a2
+    start = value = _value(x, a3, a2, a1, a0)
+    new = x
     for _ in range(_STEPS):
-        slope = ((4 * x + 3 * a3) * x + 2 * a2) * x + a1
-        new = x - value / torch.where(slope != 0, slope, torch.inf)
-        after = (((new + a3) * new + a2) * new + a1) * new + a0
-        better = after.abs() < value.abs()
-        x, value = torch.where(better, new, x), torch.where(better, after, value)
-    return torch.where(torch.isfinite(x), x, 0), value
+        slope = fma(fma(torch.add(b2, new, alpha=4), new, b1), new, a1)
+        # No step where there is no slope: what is not finite is not better.
+        new = new - value / slope
+        value = _value(new, a3, a2, a1, a0)
+    better = value.abs() < start.abs()
+    return torch.where(better, new, x).nan_to_num_(0.0, 0.0, 0.0), torch.where(better, value, start)
+
+
+def _value(x: Tensor, a3: Tensor, a2: Tensor, a1: Tensor, a0: Tensor) -> Tensor:
+    return fma(fma(fma(x + a3, x, a2), x, a1), x, a0)
 
 
 def solve_quartic(c: Float[Tensor, "*batch 5"]) -> tuple[Float[Tensor, "*batch 4"], Bool[Tensor, "*batch 4"]]:

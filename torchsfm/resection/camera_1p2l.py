@@ -11,10 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.real_roots import real_root_list
+from torchsfm.linalg.quartic import quartic_rows
 from torchsfm.linalg.rows import take_columns
 from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
 from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, norm_rows, outer_rows
+
+_LEAST = 1e-6
+"""What is zero counts as so much: no root is infinite or double then, and Newton's method on poses makes up for it."""
 
 
 def camera_1p2l(
@@ -65,10 +68,10 @@ def _candidates(s: Sample) -> Candidates:
     (w1, w2), (u1, u2) = w.unbind(1), u.unbind(1)
     k, ww, uu = dot_rows(l1, l2), dot_rows(w1, w2), dot_rows(u1, u2)
     by1, by2 = dot_rows(u1, w2) * a2, dot_rows(w1, u2) * a1
-    # In p = b1 + b2 and q = b1 - b2 = product / p; the unknown scaled to the size of the a's.
+    # In p = b1 + b2 and q = b1 - b2 = product / p, scaled to the size of the a's.
     size = (a1 * a1).addcmul_(a2, a2).sqrt_()
     a1, a2, by1, by2 = (v / size for v in (a1, a2, by1, by2))
-    product = (a2 - a1) * (a2 + a1)
+    product = _not_zero((a2 - a1) * (a2 + a1))
     c = torch.stack(
         (
             -0.25 * (uu + k) * product * product,
@@ -78,22 +81,27 @@ def _candidates(s: Sample) -> Candidates:
             0.25 * (uu - k),
         )
     )
-    # Roots about 1 are told apart best.
-    scale = (c[0].abs() / c[4].abs().clamp_min(1e-300)).sqrt_().sqrt_().clamp_(1e-4, 1e4)
-    power = scale
-    for row in c[1:]:
-        row *= power
-        power = power * scale
-    roots = real_root_list(torch.where(c.isfinite().all(0), c, torch.nan))
-    item = roots.item
-    scale, product, a1, a2, size = take_columns(torch.stack((scale, product, a1, a2, size)), item).unbind(0)
-    p = scale * roots.s / roots.t
+    # The inverse of p where that has the larger leading coefficient.
+    turn = c[0].abs() > c[4].abs()
+    c = torch.where(turn, c.flip(0), c)
+    c[4] = _not_zero(c[4], c.abs().amax(0))
+    roots, real = quartic_rows(c)
+    item, slot = real.mT.nonzero(as_tuple=True)
+    turn, roots = turn[item], roots[slot, item]
+    product, a1, a2, size = take_columns(torch.stack((product, a1, a2, size)), item).unbind(0)
+    p = torch.where(turn, 1 / roots, roots)
     q = product / p
     b1, b2 = 0.5 * (p + q), 0.5 * (p - q)
     depth = (a1 * a1).addcmul_(b1, b1).rsqrt_()
-    (w1, w2), (u1, u2) = (take_columns(v, item).unbind(1) for v in (w, u))
+    w1, w2, u1, u2 = take_columns(torch.cat((w, u), 1), item).unbind(1)
     # A frame does not depend on how long the vectors are.
     world = frame_rows(a1 * w1 + b1 * u1, a2 * w2 + b2 * u2)
-    R = outer_rows([take_columns(v, item) for v in frame_rows(l1, l2)], world)
+    R = outer_rows(take_columns(torch.stack(frame_rows(l1, l2)), item).unbind(0), world)
     one = s.of(item)
-    return Candidates(item, roots.slot(), R, depth / size * one.d[:, 0], one)
+    return Candidates(item, slot, R, depth / size * one.d[:, 0], one)
+
+
+def _not_zero(x: Tensor, size: Tensor | None = None) -> Tensor:
+    """Numbers of some size, or of 1, at least a little off zero."""
+    least = x.abs().clamp_min(_LEAST) if size is None else x.abs().maximum(_LEAST * size)
+    return torch.copysign(least, x)

@@ -56,7 +56,7 @@ def camera_2p1l(
 
 
 def _candidates(s: Sample) -> Candidates:
-    (x1, x2), l, V, A, D = s.d.unbind(1), s.l[:, 0], s.V[:, 0], s.A[:, 0], s.X[:, 1]  # noqa: E741
+    (x1, x2), l, V, A, D = s.d.unbind(1), s.l[:, 0], s.V[:, 0], s.A[:, 0], s.X[:, 0]  # noqa: E741
     # The first point is the origin; lengths in units of D.
     length = norm_rows(D)
     A, D = A / length, D / length

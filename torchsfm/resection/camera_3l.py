@@ -11,13 +11,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.real_roots import real_root_list
+from torchsfm.linalg.real_roots import number_among_equals, real_root_list
 from torchsfm.linalg.rows import add_rows, take_columns
 from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
 from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, outer_rows, turned
 
 CONCURRENT = 1e-7
 """Volume that the unit normals of three planes of sight span, at which they meet in a line but for rounding."""
+_VAGUE = 1e-6
+"""Area that two rows span, below which they are one and the same."""
+_PARALLEL = 1e-3
+"""Sine of the angle between lines that are parallel."""
 
 
 def camera_3l(
@@ -56,6 +60,27 @@ def camera_3l(
 
 def _candidates(s: Sample) -> Candidates:
     l, V = _ordered(s)  # noqa: E741
+    item, R, again = _rotations(l, V)
+    if len(again):
+        # Solutions that turn the first line alike are double roots, as in scenes that are their own mirror images.
+        l, V = (take_columns(v[:, [1, 0, 2]], again) for v in (l, V))  # noqa: E741
+        own, other, _ = _rotations(l, V)
+        keep = ~torch.isin(item, again)
+        item, order = torch.cat((item[keep], again[own])).sort(stable=True)
+        R = take_columns(torch.cat((R[..., keep], other), -1), order)
+    # Concurrent image lines: three planes of sight through one line, along which nothing is told.
+    (l1, l2, l3), one = s.l.unbind(1), s.of(item)
+    e1 = cross_rows(l2, l3)
+    volume = dot_rows(l1, e1)
+    edges = torch.stack((e1, cross_rows(l3, l1), cross_rows(l1, l2)), 1)
+    edges = edges / torch.where(volume.abs() > CONCURRENT, volume, torch.nan)
+    normals = turned(R.transpose(0, 1), one.l)
+    t = turned(take_columns(edges, item), dot_rows(normals, one.A).neg_()[:, None])[:, 0]
+    return Candidates(item, number_among_equals(item), R, t, one, normals=normals)
+
+
+def _rotations(l: Float[Tensor, "3 3 n"], V: Float[Tensor, "3 3 n"]) -> tuple[Tensor, Tensor, Tensor]:  # noqa: E741
+    """The problems that rotations belong to, these (3, 3, m), and problems that lines in another order may tell more of."""
     (l1, l2, l3), (V1, V2, V3) = l.unbind(1), V.unbind(1)
     # The world's frame has the columns 2, 3, 1 of this one, so that V1 is the third axis.
     camera, (f1, f2, f3) = frame_rows(l1, l2), frame_rows(V1, V2)
@@ -63,7 +88,7 @@ def _candidates(s: Sample) -> Candidates:
     q = [dot_rows(f2, V2), dot_rows(f1, V2)], [dot_rows(f, V3) for f in (f2, f3, f1)]
     rows = _two_rows(p, q)
     roots = real_root_list(_on_circle(_circle_point(rows)))
-    slot, item = roots.slot(), roots.item
+    item = roots.item
     # tan(alpha / 2) = s / t.
     size = 1 / (roots.s.square() + roots.t.square())
     cos, sin = (roots.t - roots.s) * (roots.t + roots.s) * size, 2 * roots.s * roots.t * size
@@ -75,19 +100,14 @@ def _candidates(s: Sample) -> Candidates:
     length = torch.copysign((cos_b * cos_b).addcmul_(sin_b, sin_b).sqrt_(), length)
     cos_b, sin_b = cos_b / length, sin_b / length
     # Columns of Rx(alpha) Rz(beta) in the camera's frame.
-    x, y, z = (take_columns(v, item) for v in camera)
+    x, y, z, *world = take_columns(torch.stack((*camera, f2, f3, f1)), item).unbind(0)
     y, z = (cos * y).addcmul_(sin, z), (cos * z).addcmul_(sin, y, value=-1)
     x, y = (cos_b * x).addcmul_(sin_b, y), (cos_b * y).addcmul_(sin_b, x, value=-1)
-    R = outer_rows((x, y, z), [take_columns(v, item) for v in (f2, f3, f1)])
-    # Concurrent image lines: three planes of sight through one line, along which nothing is told.
-    (l1, l2, l3), one = s.l.unbind(1), s.of(item)
-    e1 = cross_rows(l2, l3)
-    volume = dot_rows(l1, e1)
-    edges = torch.stack((e1, cross_rows(l3, l1), cross_rows(l1, l2)), 1)
-    edges = edges / torch.where(volume.abs() > CONCURRENT, volume, torch.nan)
-    offset = dot_rows(one.l, turned(R, one.A))
-    t = turned(take_columns(edges, item), -offset[:, None])[:, 0]
-    return Candidates(item, slot, R, t, one)
+    again = torch.unique(torch.cat((roots.double, item[length.abs() < _VAGUE])))
+    if len(again):
+        across = cross_rows(*(take_columns(v, again) for v in (V2, V3)))
+        again = again[dot_rows(across, across) > _PARALLEL**2]
+    return item, outer_rows((x, y, z), world), again
 
 
 def _two_rows(p: tuple[list[Tensor], list[Tensor]], q: tuple[list[Tensor], list[Tensor]]) -> list[Tensor]:

@@ -18,7 +18,7 @@ from torchsfm.linalg.portions import portions
 from torchsfm.linalg.rows import add_rows, take_columns
 from torchsfm.linalg.vectors import across
 from torchsfm.optim import attach_implicit, for_slots, rotation_exponential, wants_derivative
-from torchsfm.resection.vector_rows import cross_rows, dot_rows, length_rows, turned, unit_rows
+from torchsfm.resection.vector_rows import cross_rows, dot_rows, length_rows, norm_rows, turned, unit_rows
 
 _STEPS = 3
 _MET = 1e-9
@@ -42,24 +42,23 @@ class Sample(NamedTuple):
 
     d: Float[Tensor, "3 p n"]
     """Unit rays."""
-    X: Float[Tensor, "3 p n"]
+    X: Float[Tensor, "3 q n"]
+    """The points but for the first, which is the origin."""
     l: Float[Tensor, "3 k n"]  # noqa: E741
     """Unit normals of the planes of sight."""
     V: Float[Tensor, "3 k n"]
     """Unit directions."""
     A: Float[Tensor, "3 k n"]
     """The point of each line that is nearest to the origin."""
-    points: Float[Tensor, "3 p n"]
-    """The points as they came."""
-    feet: Float[Tensor, "3 k n"]
-    """The point of each line that is nearest to the origin of the world."""
-    origin: Float[Tensor, "3 1 n"]
-    unit: Float[Tensor, "1 1 n"]
+    origin: Float[Tensor, "3 n"]
+    unit: Float[Tensor, " n"]
+    rounding: Float[Tensor, " n"]
+    """Of places in the world, in units."""
     sound: Bool[Tensor, " n"]
     """Finite, with directions."""
 
     def of(self, item: Int[Tensor, " m"]) -> "Sample":
-        """The problems of a list, but for what is sound."""
+        """What the problems of a list show."""
         return self._replace(**{name: take_columns(v, item) for name, v in self._asdict().items() if v.ndim == 3})
 
     def times(self, slots: int) -> "Sample":
@@ -78,6 +77,17 @@ class Candidates(NamedTuple):
     """`Sample.of(item)`."""
     apart: int = 1
     """How far apart in the list the candidates of a problem are."""
+    normals: Float[Tensor, "3 k m"] | None = None
+    """Of the planes of sight, turned into the world, where they are known."""
+
+
+class _Fit(NamedTuple):
+    """How well poses satisfy the equations: first those of points, then those of lines."""
+
+    left: Float[Tensor, "e m"]
+    """What is left of each, as absolute numbers: of points, then of the directions and of the places of lines."""
+    reach: Float[Tensor, "r m"]
+    """What it is about: the depths of points, the distances of lines."""
 
 
 def equations(
@@ -122,21 +132,25 @@ def solve_poses(
     dtype, number, data = L.dtype, batch.numel(), [t.expand(*batch, *t.shape[-2:]) for t in (d, X, l, L)]
     with torch.no_grad():
         flat = [t.detach().double().reshape(number, *t.shape[-2:]) for t in data]
-        model = torch.eye(3, 4, dtype=dtype, device=L.device).flatten().repeat(number * slots, 1)
-        valid = torch.zeros(number * slots, dtype=torch.bool, device=L.device)
+        # One column more, for what is no solution.
+        none = slots * number
+        rows = torch.zeros(3, 4, none + 1, dtype=dtype, device=L.device)
+        rows.diagonal(dim1=0, dim2=1).fill_(1)
+        real = torch.zeros(none + 1, dtype=torch.bool, device=L.device)
         for some in portions(number, _CHUNK, L.device):
-            rows = [t[some].permute(2, 1, 0).contiguous() for t in flat]
-            sample = _prepare(rows, torch.finfo(dtype).eps)
-            item, slot, pose = _finish(sample, candidates(sample), slots)
-            if dtype != pose.dtype:
+            sample = _prepare([t[some].permute(2, 1, 0).contiguous() for t in flat], torch.finfo(dtype).eps)
+            found = candidates(sample)
+            R, t, good = _finish(sample, found, slots)
+            if dtype != R.dtype:
                 # What passes for a number in float64 may be none here.
-                pose = pose.to(dtype)
-                (keep,) = pose.isfinite().all(0).nonzero(as_tuple=True)
-                item, slot, pose = item[keep], slot[keep], pose[:, keep]
-            place = (item + some.start).mul_(slots).add_(slot)
-            model.index_copy_(0, place, pose.mT)
-            valid.index_fill_(0, place, True)
-        model, valid = model.reshape(*batch, slots, 3, 4), valid.reshape(*batch, slots)
+                R, t = R.to(dtype), t.to(dtype)
+                good &= R.isfinite().flatten(0, 1).all(0) & t.isfinite().all(0)
+            place = torch.where(good, (found.slot * number).add_(found.item).add_(some.start), none)
+            rows[:, :3].scatter_(2, place.expand(3, 3, -1), R)
+            rows[:, 3].scatter_(1, place.expand(3, -1), t)
+            real.index_fill_(0, place, True)
+        model = rows[..., :none].view(3, 4, slots, *batch).movedim((2, 0, 1), (-3, -2, -1))
+        valid = real[:none].view(slots, *batch).movedim(0, -1)
     if wants_derivative(*data):
         model = attach_implicit(equations, model, *(for_slots(t, batch) for t in data), dims=2, valid=valid)
     return Solutions(model, valid)
@@ -155,16 +169,16 @@ def _prepare(data: list[Tensor], eps: float) -> Sample:
     sound = sound & (size > 1e-150).all(0)
     V, m = L[:3] / size, L[3:] / size
     A = cross_rows(V, m)
-    points, feet = X, A
-    origin = (X[:, 0] if X.shape[1] else _nearest_to_all(V, A))[:, None]
-    X, A = X - origin, A - origin
+    origin = X[:, 0] if X.shape[1] else _nearest_to_all(V, A)
+    far = torch.cat((X, A), 1).flatten(0, 1).abs().amax(0)
+    X, A = X[:, 1:] - origin[:, None], A - origin[:, None]
     A = A - dot_rows(A, V) * V
     unit = add_rows(torch.cat((X, A), 1).flatten(0, 1).square()).sqrt()
     unit = torch.where(unit > 0, unit, 1.0)
     # A moment that is not across the direction is none, but for rounding.
     off = dot_rows(V, m).abs()
     sound = sound & (off <= eps**0.5 * (unit + length_rows(origin))).all(0)
-    return Sample(d, X / unit, l, V, A / unit, points, feet, origin, unit[None, None], sound)
+    return Sample(d, X / unit, l, V, A / unit, origin, unit, _ROUNDING * far / unit, sound)
 
 
 def _nearest_to_all(V: Tensor, A: Tensor) -> Tensor:
@@ -185,19 +199,20 @@ def _nearest_to_all(V: Tensor, A: Tensor) -> Tensor:
 
 
 def _finish(s: Sample, found: Candidates, slots: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the candidates those that are solutions: item, slot and pose (12, m) in the world, row by row."""
-    item, slot, one = found.item, found.slot, found.problem
-    R, t, left = _polished(one, found.R, found.t)
+    """The candidates in the world, and which of them are solutions, each once."""
+    R, t, fit = _polished(found)
     far = length_rows(t).clamp_min_(1.0)
+    table = torch.cat((s.origin, torch.stack((s.unit, s.rounding, s.sound.to(t.dtype)))))
+    x, y, z, unit, rounding, sound = take_columns(table, found.item).unbind(0)
     # No comparison holds where anything is not finite.
-    good = left.amax(0) <= _MET * far
-    good &= s.sound.index_select(0, item) & (slot < slots)
-    shift = one.unit[0] * t - turned(R, one.origin)[:, 0]
-    good &= _in_world(one, R, shift, far, left[len(left) - 2 * s.V.shape[1] :])
+    good = fit.left.amax(0) <= _MET * far
+    good &= (sound > 0) & (found.slot < slots)
+    good &= _sure(found.problem, R, fit, far, rounding)
     good[_repeated(found, R, t, good, slots)] = False
-    (keep,) = good.nonzero(as_tuple=True)
-    pose = torch.cat((take_columns(R, keep), take_columns(shift, keep)[:, None]), 1).flatten(0, 1)
-    return item.index_select(0, keep), slot.index_select(0, keep), pose
+    shift = unit * t
+    for column, v in zip(R.unbind(1), (x, y, z), strict=True):
+        shift.addcmul_(column, v, value=-1)
+    return R, shift, good
 
 
 def _repeated(found: Candidates, R: Tensor, t: Tensor, good: Tensor, slots: int) -> Tensor:
@@ -220,30 +235,30 @@ def _repeated(found: Candidates, R: Tensor, t: Tensor, good: Tensor, slots: int)
     return (~alive).nonzero()[:, 0]
 
 
-def _in_world(one: Sample, R: Tensor, t: Tensor, far: Tensor, lines: Tensor) -> Tensor:
-    """Which poses of the world satisfy the equations there, with points in front; `lines` is what is left of those of lines.
+def _sure(s: Sample, R: Tensor, fit: _Fit, far: Tensor, rounding: Tensor) -> Tensor:
+    """Which poses are rotations that satisfy the equations of each point and line, also in the world, with points in front.
 
     What is small against far points need not be so against a near line.
     """
-    left = [*(dot_rows(R, R) - 1).unbind(0), *dot_rows(R[:, :2], R[:, 1:]).unbind(0), dot_rows(R[:, 0], R[:, 2])]
-    # Directions are the same in every frame.
-    left += lines[: one.V.shape[1]].unbind(0)
-    good = torch.stack(left).abs_().amax(0) <= _LEFT
-    if one.X.shape[1]:
-        Y = turned(R, one.points) + t[:, None]
-        good &= (dot_rows(Y, one.d) > _FLAT * far * one.unit[0]).all(0)
-        off = cross_rows(one.d, Y)
-        good &= dot_rows(off, off).addcmul_(dot_rows(Y, Y), Y.new_tensor(_LEFT**2), value=-1).amax(0) <= 0
-    if one.V.shape[1]:
-        Y = turned(R, one.feet) + t[:, None]
-        good &= dot_rows(one.l, Y).square_().addcmul_(dot_rows(Y, Y), Y.new_tensor(_LEFT**2), value=-1).amax(0) <= 0
+    points, lines = s.d.shape[1], s.V.shape[1]
+    gram = torch.empty_like(R.flatten(0, 1)[:6])
+    gram[:3], gram[3:5], gram[5] = dot_rows(R, R).sub_(1), dot_rows(R[:, :2], R[:, 1:]), dot_rows(R[:, 0], R[:, 2])
+    good = gram.abs_().amax(0) <= _LEFT
+    bound = (_LEFT * fit.reach).sub_(rounding)
+    if points:
+        good &= (fit.left[: 3 * points].view(3, points, -1) <= bound[:points]).flatten(0, 1).all(0)
+        good &= (fit.reach[:points] > rounding + _FLAT * far).all(0)
+    if lines:
+        left = fit.left[3 * points :].view(2, lines, -1)
+        good &= (left[1] <= bound[points:]).all(0) & (left[0] <= _LEFT).all(0)
     return good
 
 
-def _polished(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Newton's method where rounding has left something: poses, and what is left of the equations of each."""
-    left = _left(s, R, t)
-    (rough,) = (left.amax(0) > _ROUNDING).nonzero(as_tuple=True)
+def _polished(found: Candidates) -> tuple[Tensor, Tensor, _Fit]:
+    """Newton's method where rounding has left something: poses, and how well they fit."""
+    s, R, t = found.problem, found.R, found.t
+    fit = _fit(s, R, t, found.normals)
+    (rough,) = (fit.left.amax(0) > _ROUNDING).nonzero(as_tuple=True)
     for _ in range(_STEPS):
         if not len(rough):
             break
@@ -253,30 +268,42 @@ def _polished(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
         new_R = (rotation_exponential(step[:, :3]) @ old_R.permute(2, 0, 1)).permute(1, 2, 0)
         new_t = old_t + step[:, 3:].mT
-        new_left = _left(part, new_R, new_t)
-        worst = new_left.amax(0)
-        better = worst < left[:, rough].amax(0)
+        new = _fit(part, new_R, new_t)
+        worst = new.left.amax(0)
+        better = worst < fit.left[:, rough].amax(0)
         place = rough[better]
-        R[..., place], t[..., place], left[:, place] = new_R[..., better], new_t[..., better], new_left[:, better]
+        R[..., place], t[..., place] = new_R[..., better], new_t[..., better]
+        for old_rows, rows in zip(fit, new, strict=True):
+            old_rows[:, place] = rows[:, better]
         rough = rough[better & (worst > _ROUNDING)]
-    return R, t, left
+    return R, t, fit
 
 
-def _left(s: Sample, R: Tensor, t: Tensor) -> Tensor:
-    """What is left of the equations, as absolute numbers: of points, then of the directions and of the places of lines."""
-    rows: list[Tensor] = []
-    if s.X.shape[1]:
-        rows.append(cross_rows(s.d, turned(R, s.X) + t[:, None]).flatten(0, 1))
+def _fit(s: Sample, R: Tensor, t: Tensor, normals: Tensor | None = None) -> _Fit:
+    """What is left of the equations, in the frame of the camera for points and that of the world for lines."""
+    left: list[Tensor] = []
+    reach: list[Tensor] = []
+    if s.d.shape[1]:
+        Y = t[:, None]
+        if s.X.shape[1]:
+            Y = torch.cat((Y, turned(R, s.X) + Y), 1)
+        left.append(cross_rows(s.d, Y).flatten(0, 1))
+        reach.append(dot_rows(s.d, Y))
     if s.V.shape[1]:
-        rows += [dot_rows(s.l, turned(R, s.V)), dot_rows(s.l, turned(R, s.A) + t[:, None])]
-    return torch.cat(rows).abs_()
+        back = R.transpose(0, 1)
+        normals = turned(back, s.l) if normals is None else normals
+        A = s.A + turned(back, t[:, None])
+        left += [dot_rows(normals, s.V), dot_rows(normals, A)]
+        reach.append(norm_rows(A))
+    return _Fit(torch.cat(left).abs_(), torch.cat(reach))
 
 
 def _linearized(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives (m, 6, 6) of the equations along a turn from the left and a shift, and the equations' negatives (m, 6, 1)."""
     X, V, A = (turned(R, v) for v in (s.X, s.V, s.A))
     rows, slopes = [], []
-    if s.X.shape[1]:
+    if s.d.shape[1]:
+        X = torch.cat((torch.zeros_like(s.d[:, :1]), X), 1)
         sides = across(s.d)
         rows += [dot_rows(e, X + t[:, None]) for e in sides]
         slopes += [torch.cat((cross_rows(X, e), e)) for e in sides]

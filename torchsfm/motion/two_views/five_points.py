@@ -60,7 +60,7 @@ def five_point_roots(
     rows, p = polynomial(basis)
     # Without five independent equations there is no polynomial and no root.
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
-    item, s, t = real_root_list(torch.where(fine, p, torch.nan), in_order=False)
+    item, s, t, _ = real_root_list(torch.where(fine, p, torch.nan), in_order=False)
     return FivePointRoots(item, s, t, take_columns(rows, item), take_columns(basis, item), d1, d2)
 
 
