@@ -168,3 +168,18 @@ def test_what_repeats_itself_does_not_draw_a_frame_from_its_guess(generator: tor
     anywhere = register(mapping, last)
     assert anywhere is not None
     assert torch.linalg.vector_norm(anywhere.poses.t[last] - frames().t[last]) < 0.02
+
+
+def test_outlines_that_slide_do_not_turn_cameras(generator: torch.Generator) -> None:
+    """One curve in four is an outline: what frames show of it moves aside from the middle on, by up to 1.6 px."""
+    slide = 0.25 * (torch.arange(FRAMES, dtype=F64) - (FRAMES - 1) / 2).square()
+    outline = (torch.arange(CURVES) % 4 == 0).repeat_interleave(SAMPLES)
+    off = []
+    for _ in range(4):
+        X, poses = wavy(generator), frames()
+        edges = [replace(e, x=e.x + (s * outline)[:, None] * e.normal) for e, s in zip(seen(X, poses), slide, strict=True)]
+        mapping = adjust(model(X, edges, torch.arange(FRAMES)), {"free": ()}, rounds=10)
+        back = mapping.poses.R[0].mT @ poses.R[0]
+        off.append(float(rotation_angle(mapping.poses.R @ back @ poses.R.mT).rad2deg().amax()))
+    # Of fourteen scenes 0.001 degrees at most; 0.009 to 0.27 where each edge counts for itself. One may be lost.
+    assert sorted(off)[-2] < 0.004

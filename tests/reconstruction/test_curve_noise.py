@@ -11,7 +11,7 @@ from torchsfm.bundle import bundle_adjust_model
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics, random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction import Curves
-from torchsfm.reconstruction.curve_noise import alike, measured_weights
+from torchsfm.reconstruction.curve_noise import alike, measured_weights, sample_weights
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.track_graph import graph_from_tracks
 
@@ -131,3 +131,25 @@ def test_weights_are_inverse_variances_of_what_is_independent(generator: torch.G
     assert weights[0] == pytest.approx(1 / 2.5**2, rel=0.25)
     assert weights[0] / weights[1] == pytest.approx(19, rel=0.4)
     assert measured_weights(curves, torch.full_like(apart, torch.nan)) is curves
+
+
+def test_samples_that_fit_badly_as_a_whole_count_less(generator: torch.Generator) -> None:
+    """Edges each a little off, of one curve four times as far; samples that cannot be measured keep what they have."""
+    mapping, curves = make_scene(generator)
+    model = dataclasses.replace(mapping.reconstruction(), curves=curves)
+    apart = edge_distances(model.poses, model.cameras[model.camera_index], curves.bundle())
+    apart = apart + torch.randn(apart.shape, generator=generator, dtype=F64)
+    bad = curves.curve[curves.sample] == 3
+    apart[bad] *= 4
+    weights = sample_weights(curves, apart)
+    assert bool(((weights > 0) & (weights <= 1)).all())
+    assert weights[bad].mean() < 0.3
+    assert weights[~bad].mean() > 0.75
+    # All of a sample count alike, and only the sizes of distances among each other matter.
+    own = torch.full_like(curves.X[:, 0], torch.nan).index_copy(0, curves.sample, weights)
+    assert torch.equal(own[curves.sample], weights)
+    assert torch.allclose(sample_weights(curves, 10 * apart), weights)
+    broken = apart.clone()
+    broken[curves.sample == 0] = torch.nan
+    assert (sample_weights(curves, broken)[curves.sample == 0] == 1).all()
+    assert (sample_weights(curves, torch.full_like(apart, torch.nan)) == 1).all()

@@ -17,7 +17,7 @@ from torchsfm.images.edge_field import EdgeField, edge_field
 from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_directions import across_own_curves, own_directions
 from torchsfm.reconstruction.curve_fusion import near_pairs
-from torchsfm.reconstruction.curve_noise import measured_weights
+from torchsfm.reconstruction.curve_noise import measured_weights, sample_weights
 from torchsfm.reconstruction.curve_pieces import image_pieces
 from torchsfm.reconstruction.curve_resection import Resection, pose_from_edges
 from torchsfm.reconstruction.curve_tracks import track_samples
@@ -188,10 +188,14 @@ def _loss(mapping: CurveMapping) -> GemanMcClure:
 
 
 def terms(mapping: CurveMapping) -> dict[str, Any]:
-    """The samples as a part of a bundle, weighed by what is measured; edges much farther away than most have no say."""
+    """The samples as a part of a bundle, weighed by what is measured; edges much farther away than most have no say.
+
+    Samples that fit badly as a whole have less.
+    """
     r, _ = distances(mapping)
     loss = _loss(mapping)
-    curves = measured_weights(mapping.curves, r).bundle(loss=loss)
+    weighed = measured_weights(mapping.curves, r)
+    curves = replace(weighed, weight=weighed.weight * sample_weights(mapping.curves, r)).bundle(loss=loss)
     return {"structure": (across_own_curves(curves, mapping.poses, mapping.one_camera, loss.slope(r.square())),)}
 
 

@@ -15,6 +15,8 @@ LAGS = 64
 """Samples along a curve, the most, whose distances from edges may still be alike."""
 ALIKE = 0.05
 """Correlation, the least, that is told from none."""
+_DOF = 4.0
+"""Degrees of freedom of the distribution of all distances of a sample: the fewer, the faster weights of samples fall."""
 
 
 def measured_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
@@ -35,6 +37,36 @@ def measured_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
     redundancy = max(0.1, 1 - 2 * len(torch.unique(sample)) / len(r))
     scale = max(float(r.abs().median()) / 0.6745 / redundancy**0.5, LEAST_SCALE)
     return replace(curves, weight=curves.weight / (scale**2 * alike(r, view, sample, curves.curve)))
+
+
+def sample_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
+    """How much the edge points of each sample count, by how well all of them fit one place: factors of their weights.
+
+    Outlines of what is smooth, and highlights, move over the scene as the camera does. From a frame to the next they hardly do,
+    so that most of their edges are as near to a sample as others are, and no loss of single distances tells; what tells is all
+    of a sample, over many frames. With Student's distribution of all its distances at once, a sample of m edge points, of which
+    d = m - 2 are left over, with the sum S of squared distances weighs (dof + d) / (dof + S / s^2), at most 1, as a track of
+    points does (`track_weights`). The noise s is that of the sample in the middle, counted by edge points left over.
+
+    Args:
+        curves: The curves.
+        apart: Signed distances of samples from each edge point, also of those much farther away than most.
+    """
+    sound = apart.isfinite()
+    r = torch.where(sound, apart * curves.weight.sqrt(), 0.0)
+    zero = r.new_zeros(len(curves.X))
+    number = zero.index_add(0, curves.sample, sound.to(r.dtype))
+    total = zero.index_add(0, curves.sample, r.square())
+    left = (number - 2).clamp(min=0)
+    rate = torch.where(left > 0, total / left.clamp(min=1), torch.inf)
+    order = rate.argsort()
+    counted = left[order].cumsum(0)
+    if not len(counted) or not bool(counted[-1] > 0):
+        return torch.ones_like(apart)
+    middle = order[torch.searchsorted(counted, counted[-1:] / 2).clamp(max=len(order) - 1)]
+    noise = rate[middle].clamp(min=LEAST_SCALE**2)
+    weights = torch.where(left > 0, (_DOF + left) / (_DOF + total / noise), 1.0).clamp(max=1)
+    return weights[curves.sample]
 
 
 def alike(r: Float[Tensor, "k"], view: Int[Tensor, "k"], sample: Int[Tensor, "k"], curve: Int[Tensor, "n"]) -> float:
