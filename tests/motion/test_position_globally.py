@@ -89,6 +89,22 @@ def test_wrong_rays_have_little_pull(scene, stream: int) -> None:  # type: ignor
     assert float(found.inliers[rays.wrong].double().mean()) < 0.1
 
 
+def test_cameras_in_near_groups_are_as_exact_as_they_are_said_to_be() -> None:
+    """Of each of whose points one ray or two are wrong: with any pull, these move whole groups."""
+    ratio = []
+    for stream in range(12):
+        generator = seeded(stream)
+        places = 4 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+        c = places.repeat_interleave(5, 0) + 0.3 * torch.randn(15, 3, generator=generator, dtype=torch.float64)
+        rays = see(c, 4 * torch.randn(150, 3, generator=generator, dtype=torch.float64), 5, 1e-3, 0.2, generator)
+        found = rays.solve()
+        assert bool((found.status == Status.OK).all())
+        error = (found.centres - truth(rays)[0])[1:].norm(dim=-1)
+        ratio.append((error / found.deviation[1:]).square().max())
+    # Of the least exact camera of each: 1.9 over many scenes, with a scatter of 1.2; 14 to 48 where wrong rays pull.
+    assert float(torch.stack(ratio).mean()) < 5
+
+
 def test_deviations_are_those_of_the_errors() -> None:
     ratio = []
     for stream in range(12):

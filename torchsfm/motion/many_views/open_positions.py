@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.motion.many_views.ray_sums import Rays
+from torchsfm.motion.many_views.ray_sums import REACH, Rays
 from torchsfm.motion.many_views.triplets import pairs_within
-from torchsfm.optim import Block, Term, pair_covariance
+from torchsfm.optim import Block, GemanMcClure, Term, pair_covariance
 
 TOLD = 1e-4
 """That of which deviations are told: eliminating points holds each by about 1e-10 of what its rays say, and were rays more
@@ -66,7 +66,7 @@ def deviations(rays: Rays, c: Tensor, X: Tensor, component: Tensor, scale: float
     # A point is as uncertain as it is far away.
     of_points = (rays.point[near],), (X[rays.point[near]], share[rays.view[near]] / distance[near])
     terms = [
-        rays.sines(scale, 1 / scale).select(near),
+        rays.sines(GemanMcClure(REACH), 1 / scale).select(near),
         Term(_apart, ("c",), (own,), (c, share)),
         Term(_apart, ("X",), *of_points),
         Term(_length, ("c", "c"), (first, last), (direction, HELD * apart.norm(dim=-1))),

@@ -1,6 +1,9 @@
 """Centres of all cameras, and all points, from rotations and rays: every camera and point at once.
 
 Two sums over the rays are minimised one after the other (`ray_sums`): one that needs no start, one that says what was measured.
+The second is minimised again and again while its scale falls, under a loss that leaves wrong rays no pull, and between these
+rounds cameras and points go where more of their rays want them (`reseat_rays`): constant pulls of wrong rays move whole
+groups of cameras, the farther the nearer these stand together.
 What the rays leave open is told afterwards (`open_positions`).
 """
 
@@ -13,13 +16,17 @@ from torch import Tensor
 from torchsfm._types import Status, check_index, check_one_problem, check_options
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.open_positions import deviations, tell
-from torchsfm.motion.many_views.ray_sums import ROUGH, Rays
+from torchsfm.motion.many_views.ray_sums import AGREES, HUBER, REACH, ROUGH, Rays
+from torchsfm.motion.many_views.reseat_rays import reseat
+from torchsfm.optim import GemanMcClure, Huber
 from torchsfm.optim.ranks import Group
 
 MOST_LOST = 0.9
 """Where fewer residuals than a tenth are free, scatter tells no more than that."""
-AGREES = 4.0
-"""Standard deviations within which a ray agrees."""
+SEATS = 4
+"""How often cameras and points are at most put where more rays want them, each time under a loss of the scale then left."""
+SETTLED = 0.9
+"""Part of the last scale from which on another round would change little."""
 OPEN = 0.3
 """Standard deviation of a centre over the extent of its component from which on nothing is known of it."""
 
@@ -139,12 +146,20 @@ def position_globally(
         start = rays.convex(max_iterations)
         unknowns = 3 * (len(torch.unique(rays.view)) + len(torch.unique(rays.point)))
         lost = min(unknowns / max(2 * len(ray), 1), MOST_LOST)
-        start = rays.angular(start, rays.scale(start, 0.0), max_iterations, ROUGH).x
+        start = rays.angular(start, Huber(HUBER * rays.scale(start, 0.0)), max_iterations, ROUGH).x
         scale = rays.scale(start, lost)
-    found = rays.angular(start, scale, max_iterations, tolerance)
+        for _ in range(SEATS):
+            before = scale
+            start = reseat(rays, start, GemanMcClure(REACH * scale), AGREES * scale)
+            start = rays.angular(start, GemanMcClure(REACH * rays.scale(start, lost)), max_iterations, ROUGH).x
+            scale = rays.scale(start, lost)
+            if scale > SETTLED * before:
+                break
+        scale = rays.spread(start, scale)
+    found = rays.angular(start, GemanMcClure(REACH * scale), max_iterations, tolerance)
     c, X = rays.anchored(found, component)
     with torch.no_grad():
-        scale = rays.scale({"c": c, "X": X}, lost)
+        scale = rays.spread({"c": c, "X": X}, scale)
         angle = d.new_full((len(d),), torch.pi)
         u = torch.nn.functional.normalize(X[rays.point] - c[rays.view], dim=-1)
         off = torch.atan2(torch.linalg.cross(rays.v, u).norm(dim=-1), (rays.v * u).sum(-1))

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.motion.many_views.components import components
-from torchsfm.optim import Block, Huber, SparseResult, Term
+from torchsfm.optim import Block, Huber, Loss, SparseResult, Term
 from torchsfm.optim import sparse_levenberg_marquardt as minimise
 from torchsfm.optim.ranks import Group
 
@@ -33,8 +33,14 @@ QUARTILE = 0.5754
 """Of a squared residual of two normal components."""
 EXACT = 1e-5
 """The least standard deviation of rays, in radians."""
+ROUNDS, LEFT = 3, 0.2
+"""How often a scale is found by the rays that agree to the last, and the freedom that each has at least, of 2."""
 HUBER = 1.5
-"""Standard deviations from which a ray pulls with constant force in the second sum."""
+"""Standard deviations from which a ray pulls with constant force in the second sum at first."""
+AGREES = 4.0
+"""Standard deviations within which a ray agrees."""
+REACH = 5.0
+"""Scale of its last loss: where rays lose their pull, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +67,9 @@ class Rays:
         term = Term(_ahead, ("c", "X"), (self.view, self.point), (self.v,), Huber(CORNER), self.weights, *derivatives)
         return self._minimise(zero, term, max_iterations, ROUGH).x
 
-    def angular(self, start: dict[str, Tensor], scale: float, max_iterations: int, tolerance: float) -> SparseResult:
+    def angular(self, start: dict[str, Tensor], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
         """The minimum of the sines of angles."""
-        return self._minimise(start, self.sines(scale), max_iterations, tolerance)
+        return self._minimise(start, self.sines(loss), max_iterations, tolerance)
 
     def scale(self, x: dict[str, Tensor], lost: float) -> float:
         """The standard deviation of the right rays, if a quarter of all are right.
@@ -74,9 +80,26 @@ class Rays:
         """
         if not len(self.v):
             return EXACT
-        square = _sine(x["c"][self.view], x["X"][self.point], self.v).square().sum(-1)
+        square = sine(x["c"][self.view], x["X"][self.point], self.v).square().sum(-1)
         quartile = float(square.kthvalue(1 + (len(square) - 1) // 4).values)
         return max(math.sqrt(quartile / QUARTILE / (1 - lost)), EXACT)
+
+    def spread(self, x: dict[str, Tensor], scale: float) -> float:
+        """The standard deviation of the rays that agree, by the freedom that their cameras and points leave them.
+
+        Args:
+            x: Centres and points.
+            scale: One that is about right; by overfitting, a quartile may be half of it.
+        """
+        off = sine(x["c"][self.view], x["X"][self.point], self.v).norm(dim=-1)
+        for _ in range(ROUNDS):
+            agree = off <= AGREES * scale
+            held = torch.bincount(self.point[agree], minlength=self.points) >= 2
+            agree = agree & held[self.point]
+            number = int(agree.sum())
+            left = 2 * number - 3 * int(held.sum()) - 3 * len(torch.unique(self.view[agree]))
+            scale = max(math.sqrt(float(off[agree].square().sum()) / max(left, LEFT * number, 1)), EXACT)
+        return scale
 
     def anchored(self, found: SparseResult, component: Int[Tensor, "v"]) -> tuple[Tensor, Tensor]:
         """Centres and points with the gauge of each component fixed."""
@@ -88,9 +111,8 @@ class Rays:
         at = torch.zeros(self.points, dtype=torch.long, device=X.device).index_put_((self.point,), component[self.view])
         return (c - c[component]) / extent[component], (X - c[at]) / extent[at]
 
-    def sines(self, scale: float, unit: float = 1.0) -> Term:
+    def sines(self, loss: Loss, unit: float = 1.0) -> Term:
         """Sines of angles, in a unit."""
-        loss = Huber(unit * HUBER * scale)
         data = unit * self.v, self.v
         return Term(_sine_scaled, ("c", "X"), (self.view, self.point), data, loss, self.weights, _linearize_sine, _bend_sine)
 
@@ -120,7 +142,7 @@ def _bend_ahead(c: Tensor, X: Tensor, v: Tensor, *, by: Float[Tensor, "3 m"], wa
     return by.new_zeros((n, n, len(v)))
 
 
-def _sine(c: Tensor, X: Tensor, v: Tensor) -> Tensor:
+def sine(c: Tensor, X: Tensor, v: Tensor) -> Tensor:
     """From the nearest point of the line through c and X, or from c where that lies behind, to the end of v."""
     u = torch.nn.functional.normalize(X - c, dim=-1)
     return v - (v * u).sum(-1, keepdim=True).clamp(min=0) * u
