@@ -65,6 +65,15 @@ def test_solved_to_the_end_it_is_the_dense_step(
         torch.testing.assert_close(iterative[name], step, rtol=1e-7, atol=1e-9)
 
 
+def test_steps_that_are_not_solved_to_the_end_are_no_end(
+    chain: tuple[dict[str, Block], list[Term]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Conjugate gradients that came to their limit promise less than is left."""
+    monkeypatch.setattr(schur_matrix_free, "ITERATIONS", 2)
+    options = {"eliminate": "mark", "linear_solver": "pcg", "function_tolerance": 1e-4, "max_iterations": 200}
+    assert sparse_levenberg_marquardt(*chain, **options).status == Status.NOT_CONVERGED
+
+
 def test_clusters_are_what_occurs_together(chain: tuple[dict[str, Block], list[Term]]) -> None:
     """A scale has two stations: three clusters of each pair; with a scale for each station there is one cluster for both."""
     blocks, terms = chain

@@ -274,11 +274,11 @@ def _left(state: _State, step: Step, exact: Tensor, least: Tensor, active: Tenso
 
 
 def _light(state: _State, where: Tensor) -> Tensor:
-    """What a Gauss-Newton step with hardly any damping promises, in some elements."""
+    """What a Gauss-Newton step with hardly any damping promises, in some elements; inf where that is not all."""
     some = places(where)
     promise = torch.full_like(state.damping, torch.inf)
     step: Step = pick(some, state.here).step(torch.full_like(pick(some, promise), LIGHT))
-    return put(some, promise, step.promise)
+    return put(some, promise, torch.where(step.bent, torch.inf, step.promise))
 
 
 def _end(state: _State, where: Tensor, status: Status) -> _State:

@@ -151,7 +151,7 @@ class Fronts:
             z = factor.solve((r - F @ (E.mT @ r))[:, None])[:, 0]
             return z - E @ (F.mT @ z)
 
-        x, positive = conjugate_gradients(lambda x: self.product(numbers, x) + weight * x, precondition, right, SOLVED)
+        x, positive, _ = conjugate_gradients(lambda x: self.product(numbers, x) + weight * x, precondition, right, SOLVED)
         return x if positive else None
 
     def factor(self, numbers: Tensor, weight: Tensor, hold: tuple[int, Tensor] | None = None) -> "FrontFactor | None":

@@ -114,7 +114,10 @@ class NormalEquations:
         )
 
     def _reduced(self, weight: Tensor, triangles: list[Triangle], right: list[Tensor]) -> tuple[Tensor, Tensor, bool]:
-        """The step of the retained variables, whether there is one, and whether the cost bends down along some."""
+        """The step of the retained variables, whether there is one, and whether more is left than it promises.
+
+        That is so where the cost bends down along some, or conjugate gradients came to their limit.
+        """
         size = self.layout.size
         if self.plan is not None:
             rows = [
@@ -122,8 +125,8 @@ class NormalEquations:
                 for part, L, z in zip(self.eliminated, triangles, right, strict=True)
                 if isinstance(part.coupling, RowCoupling)
             ]
-            kept, positive = solve_reduced(self.squares, rows, self.plan, weight, self._resting)
-            return kept, kept.isfinite().all() & (positive or not self.curved), False
+            kept, positive, exact = solve_reduced(self.squares, rows, self.plan, weight, self._resting)
+            return kept, kept.isfinite().all() & (positive or not self.curved), not exact
         if not size:
             return weight, torch.ones_like(weight, dtype=torch.bool).all(), False
         if self.fronts is not None:

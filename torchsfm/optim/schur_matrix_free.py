@@ -250,8 +250,8 @@ def solve_reduced(
     plan: Plan,
     weight: Tensor,
     rest: tuple[Tensor, Tensor] | None = None,
-) -> tuple[Tensor, bool]:
-    """The step of the retained variables for a damping `weight`, to the accuracy of `FORCING`, and whether there is one.
+) -> tuple[Tensor, bool, bool]:
+    """The step of the retained variables for a damping `weight`, whether there is one, and whether it is as exact as `FORCING`.
 
     Args:
         squares: U and the gradient.
@@ -286,25 +286,25 @@ def solve_reduced(
     return conjugate_gradients(apply, precondition, -right, FORCING)
 
 
-def conjugate_gradients(apply: Apply, precondition: Apply, b: Tensor, forcing: float) -> tuple[Tensor, bool]:
-    """Solve `A x = b` from zero; return x and whether A was found to be positive on the way."""
+def conjugate_gradients(apply: Apply, precondition: Apply, b: Tensor, forcing: float) -> tuple[Tensor, bool, bool]:
+    """Solve `A x = b` from zero; return x, whether A was found to be positive, and whether x is as exact as wanted."""
     x, r = torch.zeros_like(b), b
     z = precondition(r)
     p, rz = z, float(r @ z)
     first, model = rz, 0.0
     for iteration in range(1, ITERATIONS + 1):
         if not rz > 1e-30 * first:
-            return x, True
+            return x, True, True
         product = apply(p)
         curvature = float(p @ product)
         if not curvature > 0:
-            return x, False
+            return x, False, False
         alpha = rz / curvature
         x, r = x + alpha * p, r - alpha * product
         before, model = model, float(x @ (b + r))
         z = precondition(r)
         last, rz = rz, float(r @ z)
         if rz <= forcing**2 * first and iteration * (model - before) <= forcing * model:
-            return x, True
+            return x, True, True
         p = z + rz / last * p
-    return x, True
+    return x, True, False

@@ -110,7 +110,8 @@ def sparse_levenberg_marquardt(
         linear_solver: "dense" forms the reduced system of the retained variables and factors it; so does "sparse", with what
             is not zero alone (long chains, where few fill in); "pcg" solves it by preconditioned conjugate gradients without
             forming it, to a tenth of the decrease the model allows (inexact steps: more of them, in memory that grows with
-            the residuals alone; many where chains are long); "auto" takes what size and sparsity suggest.
+            the residuals alone; many where chains are long, and where 500 iterations are too few, the status is not OK); "auto"
+            takes what size and sparsity suggest.
         hessian: Used for derivatives of the minimum only: "exact", or "gauss-newton", which leaves out second derivatives of
             the residuals and is some percent off where residuals are large.
         progress: Called with the number of iterations and the cost after each. Returning False ends the minimisation; so does
