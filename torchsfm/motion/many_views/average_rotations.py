@@ -26,6 +26,10 @@ ROUNDS = 2
 """Sums of lengths minimised, each with the scale that the last has left."""
 ROUGH = 1e-3
 """Part of the cost to which that is done."""
+SEATS = 3
+"""Rounds at most of the last loss, each with the scale that the last has left, from where most edges want cameras then."""
+SETTLED = 0.75
+"""Part of the last scale from which on another round would change little."""
 REACH = 5.0
 """Scale of the last loss: where edges lose their pull, in standard deviations."""
 AGREES = 4.0
@@ -152,6 +156,14 @@ def average_rotations(
         loss = GemanMcClure(REACH * scale)
         start, tree = (rotations_of(graph.minimise(x, loss, max_iterations, ROUGH)) for x in (start, tree))
         start = graph.better(start, tree, loss)
+        for _ in range(SEATS):
+            left = graph.scale(start)
+            if left > SETTLED * scale:
+                break
+            # It was that of rotations that wrong edges bend, and too large.
+            scale, loss = left, GemanMcClure(REACH * left)
+            moved = graph.reseat(start, AGREES * scale)
+            start = graph.better(start, rotations_of(graph.minimise(moved, loss, max_iterations, ROUGH)), loss)
     found = graph.minimise(start, loss, max_iterations, tolerance)
     model = rotations_of(found)
     with torch.no_grad():
