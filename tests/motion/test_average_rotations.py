@@ -181,14 +181,19 @@ def test_precise_edges_count_for_more(generator: torch.Generator) -> None:
     assert float(torch.stack(ratio).mean()) < 0.85
 
 
-def test_weights_are_repeated_edges(generator: torch.Generator) -> None:
-    graph = ring(10, 4, 0.02, 0.0, generator)
+def test_weights_are_repeated_edges() -> None:
     twice = torch.cat((torch.arange(40), torch.arange(20)))
     weights = torch.ones(40, dtype=torch.float64).index_fill_(0, torch.arange(20), 2.0)
-    repeated = average_rotations(graph.R[twice], graph.edges[twice], views=10)
-    weighted = average_rotations(graph.R, graph.edges, views=10, weights=weights)
-    # The scale is that of edges, not of weights, so the two differ by what a soft threshold makes of it.
-    assert float(turn_angle(repeated.model @ weighted.model.mT).max()) < 2e-3
+    apart = []
+    for stream in range(21):
+        graph = ring(10, 4, 0.02, 0.0, seeded(stream))
+        repeated = average_rotations(graph.R[twice], graph.edges[twice], views=10)
+        found = (average_rotations(graph.R, graph.edges, views=10, weights=w) for w in (weights, None))
+        weighted, plain = (float(turn_angle(repeated.model @ one.model.mT).max()) for one in found)
+        apart.append(weighted / plain)
+    # The scale is that of edges, not of weights, so the two differ by what a soft threshold makes of it: by 0.13 of what
+    # weights do in half of 200 graphs, by 0.34 or more in a tenth.
+    assert sorted(apart)[10] < 0.25, apart
 
 
 def test_covariance_is_that_of_the_errors() -> None:
