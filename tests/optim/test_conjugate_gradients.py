@@ -58,7 +58,7 @@ def test_solved_to_the_end_it_is_the_dense_step(
     x = {name: b.x for name, b in blocks.items()}
     dense, promised, *_ = schur.Elimination(blocks, found, "dense").linearize(x).step(1e-4)
     monkeypatch.setattr(schur_matrix_free, "FORCING", 0.0)
-    iterative, model, solved, _ = schur.Elimination(blocks, found, "pcg").linearize(x).step(1e-4)
+    iterative, model, solved, *_ = schur.Elimination(blocks, found, "pcg").linearize(x).step(1e-4)
     assert solved
     torch.testing.assert_close(model, promised)
     for name, step in dense.items():

@@ -61,7 +61,7 @@ def test_the_step_is_newtons(
     x = {name: b.x for name, b in blocks.items()}
     layout = lay_out(blocks, terms, eliminate)
     engine = schur.Elimination(blocks, layout, "dense")
-    step, promise, solved, _ = engine.curve(x, engine.linearize(x)).step(1e-13)
+    step, promise, solved, *_ = engine.curve(x, engine.linearize(x)).step(1e-13)
     assert solved
     widths = {name: (layout.free[name].numel(), blocks[name].tangent) for name in step}
 

@@ -160,9 +160,8 @@ class Bent:
             self.tried.append(float(damping))
         # Each step gains half of what the last one gained.
         promise = torch.full_like(self.cost, torch.inf) if bent else (self.cost - 1) / 2
-        return Step(
-            torch.zeros_like(self.x), promise, torch.full_like(self.cost, not bent) > 0, torch.zeros_like(self.cost) > 0
-        )
+        none = torch.zeros_like(self.cost) > 0
+        return Step(torch.zeros_like(self.x), promise, torch.full_like(self.cost, not bent) > 0, none, none)
 
 
 @dataclass(frozen=True)

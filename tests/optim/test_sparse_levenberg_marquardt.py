@@ -122,7 +122,7 @@ def test_no_minimum_of_scipys_is_lower(scene: Scene, loss: object, coupling: str
 def undamped_step(blocks: dict[str, Block], terms: list[Term], eliminate: str | None) -> dict[str, Tensor]:
     """Where a step leads. Eliminated variables are damped by their blocks, others by the diagonal: undamped ones all agree."""
     found, x = layout.lay_out(blocks, terms, eliminate), {name: b.x for name, b in blocks.items()}
-    step, _, solved, _ = schur.Elimination(blocks, found, "dense").linearize(x).step(1e-12)
+    step, _, solved, *_ = schur.Elimination(blocks, found, "dense").linearize(x).step(1e-12)
     assert solved
     return schur.move(blocks, found, x, step)
 

@@ -48,7 +48,7 @@ def match_weights(
         >>> import torch, torchsfm
         >>> g = torch.Generator().manual_seed(0)
         >>> problem = torchsfm.random_bundle_problem(2, 100, 200, generator=g).truth
-        >>> problem.x.add_(torch.randn(200, 2, generator=g), alpha=0.2)  # pixels
+        >>> problem.x[:] += 0.2 * torch.randn(200, 2, generator=g)  # pixels
         >>> problem.x[problem.point < 30] += 2 * torch.randn(60, 2, generator=g)  # matches that are none
         >>> weights = torchsfm.bundle.match_weights(problem)
         >>> bool(weights[problem.point < 30].mean() < 0.3), bool(weights[problem.point >= 30].mean() > 0.7)

@@ -59,7 +59,8 @@ class DenseSystem:
         solved = solved & delta.isfinite().all(-1)
         delta = torch.where(solved[..., None], delta, torch.zeros_like(delta))
         promise = torch.where(solved, (delta * (damped * delta - self.gradient)).sum(-1) / 2, torch.inf)
-        return Step(delta, promise, solved, torch.zeros_like(solved))
+        none = torch.zeros_like(solved)
+        return Step(delta, promise, solved, none, none)
 
 
 def dense_system(x: Any, cost: Tensor, gradient: Tensor, metric: Tensor) -> DenseSystem:

@@ -186,7 +186,8 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     # Promises of a smaller part of the cost come from near the minimum, where slopes tell what a step gains, not costs.
     settled = problem.epsilon**0.5 * cost
     near = active & (promise <= settled)
-    if options.step_tolerance > 0 and bool((still := near & (state.damping <= LIGHT) & ~step.bent & ~done).any()):
+    still = near & (state.damping <= LIGHT) & ~(step.bent | step.partial | done)
+    if options.step_tolerance > 0 and bool(still.any()):
         done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
     there = problem.advance(here, step)
     gain = cost - there.cost
@@ -267,7 +268,7 @@ def _left(state: _State, step: Step, exact: Tensor, least: Tensor, active: Tenso
 
     What a heavily damped step promises says nothing, nor what one along which the cost bends down does.
     """
-    hidden = active & (step.promise <= least) & ((state.damping > LIGHT) | step.bent)
+    hidden = active & (step.promise <= least) & ((state.damping > LIGHT) | step.bent | step.partial)
     if not bool(hidden.any()):
         return step.promise, exact
     return torch.where(hidden, _light(state, hidden), step.promise), exact & ~hidden
@@ -278,7 +279,7 @@ def _light(state: _State, where: Tensor) -> Tensor:
     some = places(where)
     promise = torch.full_like(state.damping, torch.inf)
     step: Step = pick(some, state.here).step(torch.full_like(pick(some, promise), LIGHT))
-    return put(some, promise, torch.where(step.bent, torch.inf, step.promise))
+    return put(some, promise, torch.where(step.partial, torch.inf, step.promise))
 
 
 def _end(state: _State, where: Tensor, status: Status) -> _State:

@@ -95,7 +95,7 @@ class NormalEquations:
         factors = [factor(part.V + metric, part.q) for part, metric in zip(self.eliminated, metrics, strict=True)]
         triangles = [L for L, _ in factors]
         right = [forward(L, part.gradient()) for part, L in zip(self.eliminated, triangles, strict=True)]
-        kept, solved, bent = self._reduced(weight, triangles, right)
+        kept, solved, bent, partial = self._reduced(weight, triangles, right)
         promise = kept @ (weight * kept - self.slope)
         own, failed = torch.zeros_like(promise), torch.zeros_like(promise)
         points = []
@@ -111,13 +111,11 @@ class NormalEquations:
             torch.where(solved, promise / 2, torch.inf),
             solved,
             torch.full_like(solved, bent or self.held),
+            torch.full_like(solved, partial),
         )
 
-    def _reduced(self, weight: Tensor, triangles: list[Triangle], right: list[Tensor]) -> tuple[Tensor, Tensor, bool]:
-        """The step of the retained variables, whether there is one, and whether more is left than it promises.
-
-        That is so where the cost bends down along some, or conjugate gradients came to their limit.
-        """
+    def _reduced(self, weight: Tensor, triangles: list[Triangle], right: list[Tensor]) -> tuple[Tensor, Tensor, bool, bool]:
+        """The step of the retained variables, if there is one; whether the cost bends down; whether the step is partial."""
         size = self.layout.size
         if self.plan is not None:
             rows = [
@@ -126,11 +124,11 @@ class NormalEquations:
                 if isinstance(part.coupling, RowCoupling)
             ]
             kept, positive, exact = solve_reduced(self.squares, rows, self.plan, weight, self._resting)
-            return kept, kept.isfinite().all() & (positive or not self.curved), not exact
+            return kept, kept.isfinite().all() & (positive or not self.curved), False, not exact
         if not size:
-            return weight, torch.ones_like(weight, dtype=torch.bool).all(), False
+            return weight, torch.ones_like(weight, dtype=torch.bool).all(), False, False
         if self.fronts is not None:
-            return self._by_fronts(self.fronts, weight, triangles, right)
+            return *self._by_fronts(self.fronts, weight, triangles, right), False, False
         S = self.squares.dense()
         for part, L, z in zip(self.eliminated, triangles, right, strict=True):
             part.reduce(S, L, z)
@@ -139,23 +137,23 @@ class NormalEquations:
         self.hold(S[:size, :size])
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
         if self.curved and size <= LARGEST_BENT and bool(info):
-            return *self._downhill(S[:size, :size], S[:size, size]), True
+            return *self._downhill(S[:size, :size], S[:size, size]), True, False
         half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
         kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
-        return kept, (info == 0) & kept.isfinite().all(), False
+        return kept, (info == 0) & kept.isfinite().all(), False, False
 
     def _by_fronts(
         self, fronts: Fronts, weight: Tensor, triangles: list[Triangle], right: list[Tensor]
-    ) -> tuple[Tensor, Tensor, bool]:
-        """The same where the system is formed front by front."""
+    ) -> tuple[Tensor, Tensor]:
+        """The step of the retained variables, and whether there is one, where the system is formed front by front."""
         S = self.squares.filled(fronts)
         for part, L, z in zip(self.eliminated, triangles, right, strict=True):
             part.reduce(S, L, z)
         S = self.layout.ranks.sum(S)
         kept = fronts.solve(S, weight, -fronts.gradient(S), self._resting)
         if kept is None:
-            return weight, torch.zeros_like(weight, dtype=torch.bool).any(), False
-        return kept, kept.isfinite().all(), False
+            return weight, torch.zeros_like(weight, dtype=torch.bool).any()
+        return kept, kept.isfinite().all()
 
     def hold(self, S: Tensor) -> None:
         """Make the reduced system stiff, in place, along motions of which no step has a part."""

@@ -22,7 +22,9 @@ class Step(NamedTuple):
     """Where there is a step."""
     bent: Tensor
     """Where the cost bends down in some directions, in which the step goes as far as were it up, or not at all: that promises
-    nothing; and where a step was not solved to the end, so that more may be left than it promises."""
+    nothing."""
+    partial: Tensor
+    """Where it was not solved to the end, so that more may be left than it promises."""
 
 
 @runtime_checkable

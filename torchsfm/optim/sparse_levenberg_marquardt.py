@@ -329,8 +329,8 @@ class _SparseProblem:
         return here
 
     def rounding(self, here: _Place) -> Tensor:
-        """What rounding of the data makes of the cost."""
-        return torch.full_like(here.cost, (10 * self.epsilon) ** 2 * self.size)
+        """What rounding of the data, and of what is computed from them, makes of the cost."""
+        return torch.full_like(here.cost, (30 * self.epsilon) ** 2 * self.size)
 
     def is_short(self, here: _Place, delta: dict[str, Tensor], tolerance: float) -> Tensor:
         """Whether no variable moves by more than a fraction of its own norm: one far away says nothing of the others."""

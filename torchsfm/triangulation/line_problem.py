@@ -63,7 +63,8 @@ class LineSystem:
         solved = solved & total.isfinite()
         delta = tuple((found if bool(solved.all()) else torch.where(solved, found, 0.0)).unbind(0))
         promise = combine_rows(delta, [m * d - g for m, d, g in zip(damped, delta, self.gradient, strict=True)]) / 2
-        return Step(delta, torch.where(solved, promise, torch.inf), solved, torch.zeros_like(solved))
+        none = torch.zeros_like(solved)
+        return Step(delta, torch.where(solved, promise, torch.inf), solved, none, none)
 
 
 @dataclass(frozen=True)

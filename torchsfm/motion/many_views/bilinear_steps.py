@@ -132,7 +132,8 @@ def schur_step(S: Tensor, right: Tensor, F: Tensor, rest: Tensor, total: Tensor)
     # The model: right' step + step' S step / 2 and what the points alone bring; twice that in units of the cost.
     promise = -(right * step[..., 0]).sum(-1) + rest[:, 0].square().sum((-2, -1))
     promise = torch.where(solved, promise / total, torch.inf)
-    return Step((step[..., 0], back_substituted(F, rest, step)), promise, solved, torch.zeros_like(solved))
+    none = torch.zeros_like(solved)
+    return Step((step[..., 0], back_substituted(F, rest, step)), promise, solved, none, none)
 
 
 def _hold_frame(S: Tensor, P: Tensor) -> None:

@@ -108,7 +108,8 @@ class SplineSystem:
             torch.where(solved[:, None, None, None], control, 0),
         )
         promise = torch.where(solved, -self.along(delta) / 2, torch.inf)
-        return Step(delta, promise, solved, torch.zeros_like(solved))
+        none = torch.zeros_like(solved)
+        return Step(delta, promise, solved, none, none)
 
 
 @dataclass(frozen=True)
