@@ -294,7 +294,8 @@ def _fit(s: Sample, R: Tensor, t: Tensor, normals: Tensor | None = None) -> _Fit
         normals = turned(back, s.l) if normals is None else normals
         A = s.A + turned(back, t[:, None])
         left += [dot_rows(normals, s.V), dot_rows(normals, A)]
-        reach.append(norm_rows(A))
+        # From the camera to the whole of the line: a point far along it would say little of how it passes.
+        reach.append(norm_rows(A - dot_rows(A, s.V) * s.V))
     return _Fit(torch.cat(left).abs_(), torch.cat(reach))
 
 
