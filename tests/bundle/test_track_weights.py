@@ -1,5 +1,6 @@
 """Tracks that are no points, but move over the scene as the camera does, should not move the cameras."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,7 @@ from chance import stream_seed
 from outline_scenes import POINTS, outline_scene, rotation_error
 
 from torchsfm import Cauchy, bundle_adjust_model, random_bundle_problem
-from torchsfm.bundle import track_weights
+from torchsfm.bundle import match_weights, track_weights
 from torchsfm.geometry import BundleProblem
 
 LOSS = Cauchy(1.0)
@@ -58,29 +59,29 @@ def test_single_wrong_observations_take_less_of_their_track_with_a_robust_loss()
     assert squares < 1e-4 < 0.05 < robust, (squares, robust)
 
 
-def test_exact_missing_and_hidden_observations() -> None:
-    truth = random_bundle_problem(4, 50, 160, noise=0.0, generator=torch.Generator().manual_seed(stream_seed())).truth
-    assert bool((track_weights(truth) > 0.5).all())
+@pytest.mark.parametrize(("weigh", "views", "seen"), [(track_weights, 4, 160), (match_weights, 2, 100)])
+def test_exact_missing_and_hidden_observations(
+    weigh: Callable[[BundleProblem], torch.Tensor], views: int, seen: int, generator: torch.Generator
+) -> None:
+    truth = random_bundle_problem(views, 50, seen, noise=0.0, generator=generator).truth
+    assert bool((weigh(truth) > 0.5).all())
     x, X = truth.x.clone(), truth.X.clone()
     x[3] = torch.nan
     X[7] = truth.poses.centre[0] - 5 * truth.poses.R[0, 2]
-    weights = track_weights(replace(truth, x=x, X=X))
+    weights = weigh(replace(truth, x=x, X=X))
     assert float(weights[3]) == 0.0
     assert bool((weights[(truth.point == 7) & (truth.view == 0)] == 0).all())
     assert bool(weights.isfinite().all())
     none = replace(truth, x=x[:0], view=truth.view[:0], point=truth.point[:0])
-    assert track_weights(none).shape == (0,)
+    assert weigh(none).shape == (0,)
 
 
-def test_bad_options_are_named() -> None:
+@pytest.mark.parametrize("weigh", [track_weights, match_weights])
+def test_bad_options_and_indices_are_named(weigh: Callable[..., torch.Tensor]) -> None:
     truth = random_bundle_problem(4, 50, 160, generator=torch.Generator().manual_seed(0)).truth
     with pytest.raises(ValueError, match="dof"):
-        track_weights(truth, dof=0.0)
+        weigh(truth, dof=0.0)
     with pytest.raises(ValueError, match="least_noise"):
-        track_weights(truth, least_noise=-1.0)
-
-
-def test_an_index_beyond_the_points_is_named() -> None:
-    truth = random_bundle_problem(4, 50, 160, generator=torch.Generator().manual_seed(0)).truth
+        weigh(truth, least_noise=-1.0)
     with pytest.raises(ValueError, match="point"):
-        track_weights(replace(truth, X=truth.X[:10]))
+        weigh(replace(truth, X=truth.X[:10]))

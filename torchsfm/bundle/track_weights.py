@@ -60,16 +60,31 @@ def track_weights(
     rho = square if loss is None else loss(square)
     zero = rho.new_zeros(len(problem.X))
     length, total = zero.index_add(0, point, good.to(rho.dtype)), zero.index_add(0, point, rho)
-    left = (2 * length - 3).clamp(min=1)
-    # The middle one by its observations: the noise of most of what cameras are made of.
-    order = (total / left).argsort()
-    counted = length[order].cumsum(0)
-    if not len(counted) or not bool(counted[-1] > 0):
-        return torch.zeros_like(problem.x[:, 0])
-    middle = order[torch.searchsorted(counted, counted[-1:] / 2).clamp(max=len(order) - 1)]
-    noise = (total / left)[middle].clamp(min=floor**2)
-    weights = ((dof + left) / (dof + total / noise)).clamp(max=1)
+    weights = student_weights(total, (2 * length - 3).clamp(min=1), length, dof, floor)
     return (weights[point] * good).to(problem.x.dtype)
+
+
+def student_weights(
+    total: Float[Tensor, "n"], left: Float[Tensor, "n"], count: Float[Tensor, "n"], dof: float, least: float
+) -> Float[Tensor, "n"]:
+    """Weights of groups of distances that share a scale each, by Student's distribution of all distances of a group at once.
+
+    Args:
+        total: Sums of squares.
+        left: Degrees of freedom that are left of them, 1 at least.
+        count: What the groups count in the choice of the middle one, whose noise is that of all.
+        dof: Degrees of freedom of the distribution.
+        least: The noise is never less.
+    """
+    rate = total / left
+    order = rate.argsort()
+    # The middle one by its observations: the noise of most of what cameras are made of.
+    counted = count[order].cumsum(0)
+    if not len(counted) or not bool(counted[-1] > 0):
+        return torch.ones_like(total)
+    middle = order[torch.searchsorted(counted, counted[-1:] / 2).clamp(max=len(order) - 1)]
+    weights: Tensor = ((dof + left) / (dof + total / rate[middle].clamp(min=least**2))).clamp(max=1)
+    return weights
 
 
 def squared_distances(problem: BundleProblem, least_noise: float) -> tuple[Float[Tensor, "m"], Bool[Tensor, "m"], float]:

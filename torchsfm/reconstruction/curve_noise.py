@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchsfm.bundle.track_weights import student_weights
 from torchsfm.reconstruction.model_curves import Curves
 
 LEAST_SCALE = 0.2
@@ -58,15 +59,8 @@ def sample_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Float[Tensor, "
     number = zero.index_add(0, curves.sample, sound.to(r.dtype))
     total = zero.index_add(0, curves.sample, r.square())
     left = (number - 2).clamp(min=0)
-    rate = torch.where(left > 0, total / left.clamp(min=1), torch.inf)
-    order = rate.argsort()
-    counted = left[order].cumsum(0)
-    if not len(counted) or not bool(counted[-1] > 0):
-        return torch.ones_like(apart)
-    middle = order[torch.searchsorted(counted, counted[-1:] / 2).clamp(max=len(order) - 1)]
-    noise = rate[middle].clamp(min=LEAST_SCALE**2)
-    weights = torch.where(left > 0, (_DOF + left) / (_DOF + total / noise), 1.0).clamp(max=1)
-    return weights[curves.sample]
+    weights = student_weights(total, left.clamp(min=1), left, _DOF, LEAST_SCALE)
+    return torch.where(left > 0, weights, 1.0)[curves.sample]
 
 
 def alike(r: Float[Tensor, "k"], view: Int[Tensor, "k"], sample: Int[Tensor, "k"], curve: Int[Tensor, "n"]) -> float:
