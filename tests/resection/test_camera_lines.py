@@ -94,6 +94,21 @@ def test_recall_of_what_is_its_own_mirror_image(kind, generator, make_scene):
     assert_share(distance(found, P) < 1e-6, 0.998)
 
 
+@pytest.mark.parametrize("far", [1e8, 1e14, 1e30])
+def test_lines_near_a_camera_far_from_the_points_are_seen(kind, sample, far):
+    """Poses that are off by more than how far the camera is from a line do not see it, whatever else is far away."""
+    d, X, l, L, P = sample(kind, 2000)  # noqa: E741
+    X = ((P[:, None, :, :3] @ X[..., None])[..., 0] + P[:, None, :, 3]) * far
+    X = (X - P[:, None, :, 3]) @ P[..., :3]
+    found = kind.solve(d, X, l, L)
+    R, t = found.model[:, :, None, :, :3], found.model[:, :, None, :, 3]
+    V, moment = L[:, None, :, :3, None], L[:, None, :, 3:, None]
+    seen = (R @ moment)[..., 0] + torch.linalg.cross(t.expand(*t.shape[:2], L.shape[1], 3), (R @ V)[..., 0])
+    off = torch.linalg.cross(torch.nn.functional.normalize(l, dim=-1)[:, None].expand_as(seen), seen).norm(dim=-1)
+    wrong = off > 1e-3 * seen.norm(dim=-1).clamp(min=1e-300)
+    assert not bool((wrong.any(-1) & found.valid).any())
+
+
 @pytest.mark.parametrize("width", [0.3, 0.1])
 def test_recall_in_narrow_views(kind, sample, width):
     *data, P = sample(kind, 3000, width=width)

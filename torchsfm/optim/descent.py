@@ -186,9 +186,10 @@ def _stepped(problem: Problem[Any], state: _State, active: Tensor, options: Opti
     # Promises of a smaller part of the cost come from near the minimum, where slopes tell what a step gains, not costs.
     settled = problem.epsilon**0.5 * cost
     near = active & (promise <= settled)
-    still = near & (state.damping <= LIGHT) & ~(step.bent | step.partial | done)
-    if options.step_tolerance > 0 and bool(still.any()):
-        done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
+    if options.step_tolerance > 0:
+        still = near & (state.damping <= LIGHT) & ~(step.bent | step.partial | done)
+        if bool(still.any()):
+            done = done | (still & problem.is_short(here, step.delta, options.step_tolerance))
     there = problem.advance(here, step)
     gain = cost - there.cost
     if bool(near.any()):
@@ -266,7 +267,7 @@ def _next_step(problem: Problem[Any], state: _State) -> tuple[_State, Step, Tens
 def _left(state: _State, step: Step, exact: Tensor, least: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
     """What is left to gain, and where that is by the exact Hessian.
 
-    What a heavily damped step promises says nothing, nor what one along which the cost bends down does.
+    What a heavily damped step promises says nothing, nor what one along which the cost bends down does, or one that is partial.
     """
     hidden = active & (step.promise <= least) & ((state.damping > LIGHT) | step.bent | step.partial)
     if not bool(hidden.any()):
@@ -275,7 +276,7 @@ def _left(state: _State, step: Step, exact: Tensor, least: Tensor, active: Tenso
 
 
 def _light(state: _State, where: Tensor) -> Tensor:
-    """What a Gauss-Newton step with hardly any damping promises, in some elements; inf where that is not all."""
+    """What a Gauss-Newton step with hardly any damping promises, in some elements; inf where that is partial."""
     some = places(where)
     promise = torch.full_like(state.damping, torch.inf)
     step: Step = pick(some, state.here).step(torch.full_like(pick(some, promise), LIGHT))
