@@ -31,7 +31,7 @@ GLOBAL_GROWTH = 1.1
 SMALL = 20
 """Models of up to this many images are adjusted as a whole every time."""
 UNKNOWN_FOCAL = 0.4
-"""Focal lengths more uncertain than this fraction are searched for when the first image of a camera is registered."""
+"""Focal lengths more uncertain than this fraction are guesses, by which no pair of images is judged."""
 LAST_ITERATIONS, LAST_TOLERANCE = 300, 1e-7
 """The last adjustment goes to the minimum, to a small part of the standard deviations; there it is given up."""
 STANDING = 1e-6
@@ -130,8 +130,7 @@ def extend_model(
         The mapping, and for each image that was tried and did not fit the reason.
     """
     v = len(model.registered)
-    focal_known = options.focal_sigma < UNKNOWN_FOCAL
-    focal_known[model.camera_index[model.registered]] = True
+    sigma = options.focal_sigma.index_fill(0, model.camera_index[model.registered], 0.0)
     failed: dict[int, str] = {}
     adjusted_at = int(model.registered.sum())
     second_try = False
@@ -147,7 +146,7 @@ def extend_model(
             continue
         before = model.registered
         model, count, inliers = register_images(
-            model, images, threshold=options.registration, focal_known=focal_known, generator=options.generator
+            model, images, threshold=options.registration, focal_sigma=sigma, generator=options.generator
         )
         new = model.registered & ~before
         for i, n, k in zip(images.tolist(), count.tolist(), inliers.tolist(), strict=True):
@@ -156,7 +155,7 @@ def extend_model(
         if not bool(new.any()):
             continue
         second_try = False
-        focal_known[model.camera_index[new]] = True
+        sigma = sigma.index_fill(0, model.camera_index[new], 0.0)
         model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
         model = complete_tracks(model, threshold=options.reprojection)
         registered = int(model.registered.sum())

@@ -18,7 +18,7 @@ from torchsfm.reconstruction.calibration import choose_free
 from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.doubt import examine
 from torchsfm.reconstruction.image_reports import image_reports
-from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE, UNKNOWN_FOCAL, MappingOptions, next_images
+from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE, MappingOptions, next_images
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.photographs import NEIGHBOURS, MatchedPhotographs, match_photographs
 from torchsfm.reconstruction.reconstruction import Reconstruction
@@ -272,18 +272,18 @@ def place_images(
     """Poses for the images that have none, and why some get none."""
     given, failed = mapping.registered, dict[int, str]()
     nowhere = torch.zeros_like(given)
-    focal_known = options.focal_sigma < UNKNOWN_FOCAL
+    sigma = options.focal_sigma.index_fill(0, mapping.camera_index[given], 0.0)
     while len(images := next_images(mapping, nowhere, failed)):
         before = mapping.registered
         mapping, count, inliers = register_images(
-            mapping, images, threshold=options.registration, focal_known=focal_known, generator=options.generator
+            mapping, images, threshold=options.registration, focal_sigma=sigma, generator=options.generator
         )
         new = mapping.registered & ~before
         for i, n, k in zip(images.tolist(), count.tolist(), inliers.tolist(), strict=True):
             if not new[i]:
                 failed[i] = f"a pose fits only {k} of the {n} points it sees"
         if bool(new.any()):
-            focal_known[mapping.camera_index[new]] = True
+            sigma = sigma.index_fill(0, mapping.camera_index[new], 0.0)
             mapping = _adjust(mapping, moving=mapping.registered & ~given, own=own, options=options)
             mapping = _structure(mapping, options)
             progress("map", int(mapping.registered.sum()), len(given))

@@ -7,16 +7,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import Camera, Pose, krt_from_camera
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.structure import visible_points
-from torchsfm.resection import estimate_camera
+from torchsfm.resection import estimate_camera, estimate_camera_focal
 
 MIN_VISIBLE = 20
 MIN_INLIERS = 15
 MIN_INLIER_RATIO = 0.25
-FOCAL_GRID = torch.logspace(-0.4, 0.6, 12, dtype=torch.float64)
-"""Focal lengths tried for a camera nothing is known of, as multiples of the first guess."""
+SEARCHED = 0.1
+"""Focal lengths that are more uncertain than this, as a fraction, are estimated with the pose of the first image of a camera."""
+DEVIATIONS = 4.0
+"""So many standard deviations of an image point are the largest error of an inlier, as long as a model is rough."""
 
 
 def visibility_scores(mapping: Mapping) -> tuple[Int[Tensor, "v"], Float[Tensor, "v"]]:
@@ -44,7 +46,7 @@ def register_images(
     images: Int[Tensor, "k"],
     *,
     threshold: float,
-    focal_known: Bool[Tensor, "g"],
+    focal_sigma: Float[Tensor, "g"],
     generator: torch.Generator | None,
 ) -> tuple[Mapping, Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Estimate the poses of several images in one batched call, and register those that find enough support.
@@ -53,7 +55,7 @@ def register_images(
         mapping: The model so far.
         images: Images to try.
         threshold: Largest reprojection error of an inlier in pixels.
-        focal_known: Cameras whose focal length is known; for the others a grid of focal lengths is tried as well.
+        focal_sigma: How uncertain the focal lengths are, as a fraction; those of more than `SEARCHED` are estimated as well.
         generator: Source of randomness.
 
     Returns:
@@ -72,34 +74,62 @@ def register_images(
     for row, member in enumerate(members):
         d[row, : len(member)], mask[row, : len(member)] = mapping.rays(node[member])
         X[row, : len(member)] = mapping.X[point[member]]
-    K = mapping.cameras.K[mapping.camera_index[images]]
-    scale = torch.ones(1, dtype=K.dtype) if bool(focal_known[mapping.camera_index[images]].all()) else FOCAL_GRID.to(K.dtype)
-    best_scale = torch.ones(k, dtype=K.dtype)
+    camera = mapping.camera_index[images]
+    K = mapping.cameras.K[camera]
     x = d @ K.mT
     x = x[..., :2] / x[..., 2:].clamp(min=1e-9)
-    if len(scale) > 1:
-        # The pixels of a camera with another focal length are rays of another spread.
-        K_try = K[:, None].repeat(1, len(scale), 1, 1)
-        K_try[..., :2, :2] *= scale[:, None, None]
-        trial = estimate_camera(
-            x[:, None], X[:, None], K_try, threshold=threshold, mask=mask[:, None], generator=generator, max_iterations=200
-        )
-        support = trial.inliers.sum(-1)
-        known = focal_known[mapping.camera_index[images]]
-        support = torch.where(known[:, None] & (scale != 1), -1, support)
-        best = support.argmax(dim=-1)
-        best_scale, K = scale[best], K_try[torch.arange(k), best]
     result = estimate_camera(x, X, K, threshold=threshold, mask=mask, generator=generator)
-    count, inliers = mask.sum(-1), result.inliers.sum(-1)
-    good = (result.status == Status.OK) & (inliers >= MIN_INLIERS) & (inliers >= MIN_INLIER_RATIO * count.double())
+    model, inliers, status = result.model.clone(), result.inliers.clone(), result.status.clone()
+    K, changed = _with_focal_lengths(x, X, K, mask, camera, focal_sigma[camera], result.support, threshold, generator)
+    if len(changed):
+        row = changed
+        again = estimate_camera(x[row], X[row], K[row], threshold=threshold, mask=mask[row], generator=generator)
+        model[row], inliers[row], status[row] = again.model, again.inliers, again.status
+    count, fitting = mask.sum(-1), inliers.sum(-1)
+    good = (status == Status.OK) & (fitting >= MIN_INLIERS) & (fitting >= MIN_INLIER_RATIO * count.double())
     R, t, registered = mapping.poses.R.clone(), mapping.poses.t.clone(), mapping.registered.clone()
     accepted = images[good]
-    R[accepted], t[accepted] = result.model[good][..., :3], result.model[good][..., 3]
+    R[accepted], t[accepted] = model[good][..., :3], model[good][..., 3]
     registered[accepted] = True
     K_all = mapping.cameras.K.clone()
-    changed = good & (best_scale != 1)
-    K_all[mapping.camera_index[images[changed]]] = K[changed]
+    K_all[camera[good]] = K[good]
     mapping = replace(mapping, poses=Pose(R, t), registered=registered, cameras=Camera(K_all, mapping.cameras.distortion))
-    fits = torch.cat([m[result.inliers[row, : len(m)]] for row, m in enumerate(members) if bool(good[row])] or [node[:0]])
+    fits = torch.cat([m[inliers[row, : len(m)]] for row, m in enumerate(members) if bool(good[row])] or [node[:0]])
     mapping = mapping.assign(node[fits], point[fits], mapping.errors(point[fits], node[fits]))
-    return mapping, count, inliers
+    return mapping, count, fitting
+
+
+def _with_focal_lengths(
+    x: Float[Tensor, "k n 2"],
+    X: Float[Tensor, "k n 3"],
+    K: Float[Tensor, "k 3 3"],
+    mask: Bool[Tensor, "k n"],
+    camera: Int[Tensor, "k"],
+    sigma: Float[Tensor, "k"],
+    support: Float[Tensor, "k"],
+    threshold: float,
+    generator: torch.Generator | None,
+) -> tuple[Float[Tensor, "k 3 3"], Int[Tensor, "c"]]:
+    """Intrinsics with the focal lengths that are likelier than those expected, and the rows that have others now.
+
+    Likelier by what the points say of it, and by how far it is from what was expected: points in a plane that faces the
+    camera say nothing, and agree with any.
+    """
+    open_ = (sigma > SEARCHED).nonzero()[:, 0]
+    if not len(open_):
+        return K, open_
+    found = estimate_camera_focal(
+        x[open_], X[open_], K[open_, :2, 2], threshold=threshold, mask=mask[open_], generator=generator
+    )
+    focal = krt_from_camera(found.model)[0][:, 0, 0]
+    gain = (found.support - support[open_]) * DEVIATIONS**2
+    gain = gain - ((focal / K[open_, 0, 0]).log() / sigma[open_]).square()
+    gain = torch.where(found.status == Status.OK, gain, -1.0).nan_to_num(-1.0)
+    K = K.clone()
+    for own in torch.unique(camera[open_]).tolist():
+        # Images of one camera have one focal length: that of the image which tells most of it.
+        row = (camera[open_] == own).nonzero()[:, 0]
+        best = row[gain[row].argmax()]
+        if gain[best] > 0:
+            K[camera == own, :2, :2] *= float(focal[best] / K[open_[best], 0, 0])
+    return K, open_[torch.isin(camera[open_], camera[open_][gain > 0])]
