@@ -173,7 +173,8 @@ class Growth:
         if wanted.shared_camera is None and wanted.K is None and not given.known_cameras and method != "projective":
             apart = part_zoomed(graph, together, torch.tensor([focal is not None for focal in given.exif_focal]))
             if apart is not None:
-                begun, first = better_beginning(begun, begin(apart), partial(_settled, method, progress))
+                own, more = apart
+                begun, first = better_beginning(begun, begin(own), more, partial(_settled, method, progress))
         # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
         family = group_cameras(torch.zeros_like(graph.image_size), given.labels, wanted.shared_camera)
         return cls(begun, method, family, given.track is None, progress, first)

@@ -16,9 +16,10 @@ MIN_VISIBLE = 20
 MIN_INLIERS = 15
 MIN_INLIER_RATIO = 0.25
 SEARCHED = 0.1
-"""Focal lengths that are more uncertain than this, as a fraction, are estimated with the pose of the first image of a camera."""
-DEVIATIONS = 4.0
-"""So many standard deviations of an image point are the largest error of an inlier, as long as a model is rough."""
+"""Focal lengths more uncertain than this, as a fraction, are estimated with the pose of the first image of a camera."""
+DEVIATIONS, TOGETHER = 4.0, 10.0
+"""The largest error of an inlier in standard deviations of image points, as long as a model is rough; so many image points err
+alike, as neighbours and things that look alike do, and count as one."""
 
 
 def visibility_scores(mapping: Mapping) -> tuple[Int[Tensor, "v"], Float[Tensor, "v"]]:
@@ -82,9 +83,10 @@ def register_images(
     model, inliers, status = result.model.clone(), result.inliers.clone(), result.status.clone()
     K, changed = _with_focal_lengths(x, X, K, mask, camera, focal_sigma[camera], result.support, threshold, generator)
     if len(changed):
-        row = changed
-        again = estimate_camera(x[row], X[row], K[row], threshold=threshold, mask=mask[row], generator=generator)
-        model[row], inliers[row], status[row] = again.model, again.inliers, again.status
+        again = estimate_camera(
+            x[changed], X[changed], K[changed], threshold=threshold, mask=mask[changed], generator=generator
+        )
+        model[changed], inliers[changed], status[changed] = again.model, again.inliers, again.status
     count, fitting = mask.sum(-1), inliers.sum(-1)
     good = (status == Status.OK) & (fitting >= MIN_INLIERS) & (fitting >= MIN_INLIER_RATIO * count.double())
     R, t, registered = mapping.poses.R.clone(), mapping.poses.t.clone(), mapping.registered.clone()
@@ -122,7 +124,7 @@ def _with_focal_lengths(
         x[open_], X[open_], K[open_, :2, 2], threshold=threshold, mask=mask[open_], generator=generator
     )
     focal = krt_from_camera(found.model)[0][:, 0, 0]
-    gain = (found.support - support[open_]) * DEVIATIONS**2
+    gain = (found.support - support[open_]) * DEVIATIONS**2 / TOGETHER
     gain = gain - ((focal / K[open_, 0, 0]).log() / sigma[open_]).square()
     gain = torch.where(found.status == Status.OK, gain, -1.0).nan_to_num(-1.0)
     K = K.clone()

@@ -21,18 +21,23 @@ from torchsfm.reconstruction.beginning import Beginning, Grown
 from torchsfm.reconstruction.cameras import FOCAL_SIGMA, telling_pairs
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph
 
 TRIED = 64
 """Common focal lengths that are tried."""
-MORE = 1.05
-"""By how much more of what is seen must be explained: numbers of their own make up for a little of all errors."""
+MORE, MUCH_MORE = 1.01, 1.05
+"""By how much more of what is seen must be explained, as numbers of their own make up for a little of all errors: where the
+pairs say that focal lengths differ, and where so few tell of them that they cannot say."""
+ENOUGH = 2.0
+"""Pairs for each image, of whatever kind, by which models tell focal lengths where pairs do not."""
 MOST = 60
 """Images of one size that are asked: those of the most pairs."""
 
 
-def part_zoomed(graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"]) -> Int[Tensor, "v"] | None:
-    """Give each image a camera of its own where the pairs say that those of one camera have different focal lengths.
+def part_zoomed(
+    graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"]
+) -> tuple[Int[Tensor, "v"], float] | None:
+    """Give each image a camera of its own where the pairs say that those of one have several focal lengths, or cannot tell.
 
     Args:
         graph: Verified pairs.
@@ -40,30 +45,37 @@ def part_zoomed(graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Ten
         told: Images whose file states a focal length: those of one camera have the same.
 
     Returns:
-        Which camera took each image, numbered from 0 in the order of the images; None where it stays as it is.
+        Which camera took each image, numbered from 0 in the order of the images, and how many times as much models with these
+        cameras must explain to be believed; None where it stays as it is.
     """
-    several = [
-        k
+    differ: dict[int, bool | None] = {
+        k: _focal_lengths_differ(graph, camera_index == k)
         for k in torch.unique(camera_index[~told]).tolist()
-        if not bool(told[camera_index == k].any()) and _focal_lengths_differ(graph, camera_index == k)
-    ]
+        if not bool(told[camera_index == k].any())
+    }
+    sure = [k for k, answer in differ.items() if answer]
+    several = sure or [k for k, answer in differ.items() if answer is None]
     if not several:
         return None
     own = torch.isin(camera_index, camera_index.new_tensor(several))
     v = len(camera_index)
     keys = torch.where(own, v + torch.arange(v), camera_index).tolist()
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    return camera_index.new_tensor([order[key] for key in keys])
+    return camera_index.new_tensor([order[key] for key in keys]), MORE if sure else MUCH_MORE
 
 
 def better_beginning(
-    together: Beginning, apart: Beginning, make: Callable[[Mapping, MappingOptions], tuple[Grown, Mapping] | None]
+    together: Beginning,
+    apart: Beginning,
+    more: float,
+    make: Callable[[Mapping, MappingOptions], tuple[Grown, Mapping] | None],
 ) -> tuple[Beginning, Grown | None]:
     """Cameras of their own for some images, if these explain clearly more of what is seen, else those that images share.
 
     Args:
         together: With cameras that images share.
         apart: With cameras of their own.
+        more: How many times as much these must explain.
         make: Makes a model, and what is left of it without images that contradict it.
 
     Returns:
@@ -72,13 +84,16 @@ def better_beginning(
     one, several = (make(begun.empty, begun.options) for begun in (together, apart))
     threshold = together.options.reprojection
     known = 0.0 if one is None else support(one[1], threshold)
-    if several is not None and support(several[1], threshold) > MORE * known:
+    if several is not None and support(several[1], threshold) > more * known:
         return apart, several[0]
     return together, None if one is None else one[0]
 
 
-def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"]) -> bool:
-    """Whether a focal length for each image explains the pairs of some images so much better than one for all."""
+def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"]) -> bool | None:
+    """Whether a focal length for each image explains the pairs of some images so much better than one for all.
+
+    None where too few pairs tell, but models of as many pairs as there are do.
+    """
     telling = telling_pairs(graph) & member[graph.pairs].all(-1)
     pairs = graph.pairs[telling]
     number = torch.bincount(pairs.flatten(), minlength=len(member))
@@ -88,7 +103,8 @@ def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"]) -> bool:
     images, ends = torch.unique(pairs[among], return_inverse=True)
     # Fewer pairs than focal lengths always agree with some.
     if len(ends) <= len(images):
-        return False
+        within = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1)
+        return None if int(within.sum()) >= ENOUGH * int(member.sum()) else False
     F = graph.F[telling][among].double()
     size = graph.image_size[images].double()
     c = (size - 1) / 2
