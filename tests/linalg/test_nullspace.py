@@ -63,3 +63,48 @@ def test_null_vector_degenerate_and_not_finite(generator: torch.Generator) -> No
     v.sum().backward()
     assert A.grad is not None
     assert torch.isfinite(A.grad).all()
+
+
+def _with_singular_values(
+    s: torch.Tensor, rows: int, batch: int, generator: torch.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Matrices, and the vector of the last singular value."""
+    U = torch.linalg.qr(torch.randn(batch, rows, len(s), dtype=F64, generator=generator)).Q
+    V = torch.linalg.qr(torch.randn(batch, len(s), len(s), dtype=F64, generator=generator)).Q
+    return (U * s) @ V.mT, V[..., -1]
+
+
+def _angle(v: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+    return (v - w * (v * w).sum(-1, keepdim=True)).norm(dim=-1)
+
+
+@pytest.mark.parametrize("least", [0.0, 1e-9, 1e-3, 0.1, 0.5, 0.9, 0.999])
+def test_null_vector_next_to_another_singular_value(least: float, generator: torch.Generator) -> None:
+    # What the fastest way does not settle the others must: the error is that of rounding over the gap, whatever the noise.
+    s = torch.tensor([1.0, 0.8, 0.5, 0.3, 0.2, 0.1, 0.05, 0.03, 0.02], dtype=F64)
+    s = torch.cat((s, s.new_tensor([0.02 * least])))
+    A, wanted = _with_singular_values(s, 14, 200, generator)
+    v, finite = null_vector(A)
+    assert finite.all()
+    gap = 0.02**2 * (1 - least**2)
+    assert _angle(v, wanted).max() < 2e-12 + 1e-14 / gap
+
+
+def test_null_vector_is_the_same_whatever_stands_beside_it(generator: torch.Generator) -> None:
+    # Settled in different ways: as many rows as columns, with a clear, a doubtful and no least singular value.
+    clear, _ = _with_singular_values(torch.tensor([1.0, 0.5, 0.2, 1e-9], dtype=F64), 6, 3, generator)
+    doubtful, _ = _with_singular_values(torch.tensor([1.0, 0.5, 0.2, 0.1999], dtype=F64), 6, 3, generator)
+    A = torch.cat((clear, doubtful, torch.zeros(1, 6, 4, dtype=F64)))
+    together = null_vector(A)[0]
+    for i in range(len(A)):
+        assert torch.equal(null_vector(A[i : i + 1])[0][0], together[i])
+    assert torch.equal(null_vector(A.requires_grad_())[0].detach(), together)
+
+
+def test_null_vector_of_dependent_rows_is_in_their_null_space(generator: torch.Generator) -> None:
+    A = torch.randn(20, 8, 9, dtype=F64, generator=generator)
+    A[:10, 3] = A[:10, 2] - 2 * A[:10, 6]
+    A[10:15, 5] = 0
+    v, _ = null_vector(A)
+    torch.testing.assert_close(v.norm(dim=-1), torch.ones(20, dtype=F64))
+    assert (A @ v[..., None]).abs().max() < 1e-12

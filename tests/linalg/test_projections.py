@@ -78,3 +78,20 @@ def test_bad_elements_stay_alone(function, generator: torch.Generator) -> None:
     assert A.grad is not None
     assert torch.isfinite(A.grad).all()
     assert function(A[:0]).shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize(
+    "s", [(1, 0.1, 1e-3), (1, 1e-4, 1e-7), (1, 1e-6, 0), (1, 0.5, 0.45), (1, 1, 1), (1, 0, 0), (1, 1e-14, 0)]
+)
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e40])
+def test_rank_two_of_three(s, size, generator):
+    """Next to, and far from, matrices whose nearest one is not unique, the distance is the least singular value."""
+    U, V = (torch.linalg.qr(torch.randn(50, 3, 3, dtype=torch.float64, generator=generator)).Q for _ in range(2))
+    values = torch.tensor(s, dtype=torch.float64)
+    A = (U * values) @ V.mT
+    B = nearest_rank(A * size, 2) / size
+    assert ((A - B).norm(dim=(-2, -1)) - values[2]).abs().max() < 2e-14
+    assert torch.linalg.svdvals(B)[..., 2].max() < 2e-14
+    one = torch.stack([nearest_rank(a * size, 2) / size for a in A])
+    assert torch.equal(one, B)
+    assert torch.equal(nearest_rank((A * size).requires_grad_(), 2).detach() / size, B)

@@ -5,8 +5,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.linalg.decompositions import eigh, qr
-from torchsfm.linalg.magnitude import unit_scale
+from torchsfm.linalg.derivative import followed
+from torchsfm.linalg.magnitude import all_below, unit_scale
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.rows import combine_rows
+
+_CHUNK = 2048
+"""Matrices at a time, on a CPU."""
+_LIFT = 2e-15
+"""What is added to the diagonal of A'A, over its trace, so that rounding leaves it positive."""
+_SQUARINGS = 5
+_SETTLED = 1e-12
+"""What the last of two steps that shrink at a steady rate may leave."""
+_INDEPENDENT = 1e-12
+"""Smallest distance of a row from the span of those before it, the largest number being about 1, that is not taken for zero."""
 
 
 def orthonormal_nullspace(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n-m"]:
@@ -82,10 +94,12 @@ def null_vector(
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
     """The unit vector v that makes `|A v|` smallest, and its derivative.
 
-    The eigenvector of A'A (formed and solved in float64) is corrected by Newton steps of `A'(A v) = s v` with the residual
-    taken from A itself, which restores the accuracy that squaring loses. The last step is differentiable in A, and its
-    derivative is the derivative of v. Where the two smallest singular values coincide v is not unique: the value is one such
-    vector, the derivative leaves out the directions in which it is not determined.
+    With one row less than columns it comes by reflections, else from powers of the inverse of A'A (formed in float64). Where the
+    two smallest singular values are near to each other or to rounding, or a derivative is asked for, it comes from the
+    eigenvectors of A'A. Newton steps of `A'(A v) = s v` with the residual taken from A itself restore the accuracy that squaring
+    loses. The last step is differentiable in A, and its derivative is the derivative of v. Where the two smallest singular
+    values coincide v is not unique: the value is one such vector, the derivative leaves out the directions in which it is not
+    determined.
 
     Args:
         A: Matrices with m >= n - 1 rows, any scale.
@@ -99,12 +113,77 @@ def null_vector(
         >>> v / v[0], bool(ok)
         (tensor([1.0000, 1.0000, 1.0000]), True)
     """
-    finite = torch.isfinite(A).all(-1).all(-1)
+    flat = A.detach().reshape(-1, *A.shape[-2:])
+    parts = [_least_vector(flat[some]) for some in portions(max(len(flat), 1), _CHUNK, A.device)]
+    v, finite = (torch.cat(part) for part in zip(*parts, strict=True))
+    v, finite = v.reshape(*A.shape[:-2], A.shape[-1]), finite.reshape(A.shape[:-2])
+    if followed(A):
+        same = _by_eigenvectors(_ready(A)[0])
+        v = v + torch.sign((same.detach() * v).sum(-1, keepdim=True)) * (same - same.detach())
+    first = torch.zeros_like(v)
+    first[..., 0] = 1
+    return torch.where(finite[..., None], v, first).to(A.dtype), finite
+
+
+def _ready(A: Float[Tensor, "*batch m n"]) -> tuple[Float[Tensor, "*batch m n"], Bool[Tensor, "*batch"]]:
+    """In float64, the largest number about 1, as squares of very large or small ones would not exist; and which are finite."""
+    finite = all_below(A, torch.inf, 2)
     safe = torch.where(finite[..., None, None], A, 0).double()
-    # Squares of very large or small numbers would not exist.
-    safe = safe * unit_scale(safe)
+    return safe * unit_scale(safe), finite
+
+
+def _least_vector(A: Float[Tensor, "batch m n"]) -> tuple[Float[Tensor, "batch n"], Bool[Tensor, " batch"]]:
+    """The vectors without derivative, and which matrices are finite."""
+    safe, finite = _ready(A)
+    v, settled = (_by_reflections if A.shape[1] == A.shape[2] - 1 else _by_inverse_powers)(safe)
+    rest = (~settled).nonzero()[:, 0]
+    if len(rest):
+        v = v.index_copy(0, rest, _by_eigenvectors(safe.index_select(0, rest)))
+    return v, finite
+
+
+def _by_reflections(A: Float[Tensor, "batch m n"]) -> tuple[Float[Tensor, "batch n"], Bool[Tensor, " batch"]]:
+    """The vectors orthogonal to n - 1 rows, and where these are independent."""
+    basis, pivot = nullspace_columns(A.permute(2, 1, 0).contiguous())
+    return basis[:, 0].mT, pivot > _INDEPENDENT
+
+
+def _by_inverse_powers(A: Float[Tensor, "batch m n"]) -> tuple[Float[Tensor, "batch n"], Bool[Tensor, " batch"]]:
+    """The least singular vectors, and where the last of two corrections left nothing to correct."""
+    n = A.shape[-1]
+    G = A.mT @ A
+    diagonal = G.diagonal(dim1=-2, dim2=-1)
+    diagonal.add_(_LIFT * diagonal.sum(-1, keepdim=True))
+    L, failed = torch.linalg.cholesky_ex(G)
+    root = torch.linalg.solve_triangular(L, torch.eye(n, dtype=A.dtype, device=A.device).expand_as(G), upper=False)
+    inverse = power = root.mT @ root
+    for _ in range(_SQUARINGS):
+        power = power * power.diagonal(dim1=-2, dim2=-1).amax(-1).reciprocal()[:, None, None]
+        power = power @ power
+    # All columns are nearly along v, that with the largest number on the diagonal most of all.
+    longest = power.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    v = _unit(power.gather(-2, longest[:, None, None].expand(-1, 1, n)).mT)
+    sizes = []
+    for _ in range(2):
+        image = A @ v
+        value = torch.linalg.vector_norm(image, dim=-2, keepdim=True).square()
+        step = inverse @ (A.mT @ image).addcmul_(value, v, value=-1)
+        step.addcmul_(v, v.mT @ step, value=-1)
+        v = _unit(v - step)
+        sizes.append(torch.linalg.vector_norm(step, dim=-2)[:, 0])
+    before, last = sizes
+    # False for what is not a number.
+    return v[..., 0], (failed == 0) & (last * last <= _SETTLED * before)
+
+
+def _unit(v: Float[Tensor, "batch n 1"]) -> Float[Tensor, "batch n 1"]:
+    return v * torch.linalg.vector_norm(v, dim=-2, keepdim=True).reciprocal()
+
+
+def _by_eigenvectors(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n"]:
+    """The least singular vectors with their derivatives."""
     with torch.no_grad():
-        base = safe.detach()
+        base = A.detach()
         values, vectors, _ = eigh(base.mT @ base)
         v = vectors[..., :1]
         gaps = values[..., 1:] - values[..., :1]
@@ -114,9 +193,7 @@ def null_vector(
         v = v - others @ (inverse * (others.mT @ (base.mT @ image - (image * image).sum((-2, -1), keepdim=True) * v)))
         image = base @ v
         value = (image * image).sum((-2, -1), keepdim=True)
-    residual = safe.mT @ (safe @ v) - value * v
+    residual = A.mT @ (A @ v) - value * v
     corrected = (v - others @ (inverse * (others.mT @ residual)))[..., 0]
-    unit = corrected / corrected.norm(dim=-1, keepdim=True)
-    first = torch.zeros_like(unit)
-    first[..., 0] = 1
-    return torch.where(finite[..., None], unit, first).to(A.dtype), finite
+    unit: Tensor = corrected / corrected.norm(dim=-1, keepdim=True)
+    return unit

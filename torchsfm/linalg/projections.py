@@ -1,17 +1,25 @@
 """The nearest matrix with a property: a rotation, a rank, no negative eigenvalue. All in the Frobenius norm.
 
-Values come from LAPACK without derivatives; the derivative is then attached as a term that is zero in value and whose
+Values come without derivatives, most from LAPACK; the derivative is then attached as a term that is zero in value and whose
 differential is the analytic one. It stays finite where singular values coincide and the answer is still smooth, and is zero in
 the directions in which the answer is not.
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import check_tensors
 from torchsfm.linalg.decompositions import eigh, svd
 from torchsfm.linalg.derivative import followed
+from torchsfm.linalg.elimination import adjugate_3x3
+from torchsfm.linalg.magnitude import all_below, unit_scale
+
+_SQUARINGS = 4
+_ALONE = 1e-6
+"""What may be left of a second eigenvector, for a step whose error is about its cube."""
+_TWO = 1e-20
+"""Square of the second singular value, about 1 being the first, at which a matrix has rank 1."""
 
 
 def nearest_rotation(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
@@ -69,12 +77,16 @@ def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*b
     check_tensors(A=(A, "m n"))
     if not 1 <= rank <= min(A.shape[-2:]):
         raise ValueError(f"rank: wanted 1 to {min(A.shape[-2:])} for shape {tuple(A.shape)}, got {rank}")
+    B = _nearest_singular(A.detach()) if A.shape[-2:] == (3, 3) and rank == 2 else None
+    if B is not None and not followed(A):
+        return B
     with torch.no_grad():
         U, s, Vh, ok = svd(A.detach())
         U1, U2 = U[..., :rank], U[..., rank:]
         V1, V2 = Vh[..., :rank, :].mT, Vh[..., rank:, :].mT
         s1 = s[..., :rank]
-        B: Tensor = (U1 * s1[..., None, :]) @ V1.mT
+        if B is None:
+            B = (U1 * s1[..., None, :]) @ V1.mT
         # Singular values of U2 and V2, padded with zeros where the matrix is not square.
         s2 = s[..., rank:]
         tall = torch.nn.functional.pad(s2, (0, U2.shape[-1] - s2.shape[-1]))
@@ -89,6 +101,45 @@ def nearest_rank(A: Float[Tensor, "*batch m n"], rank: int) -> Float[Tensor, "*b
     lower = _coupled(s1[..., None, :], tall[..., :, None], c21, _fit(c12.mT, c21.shape), floor)
     moved: Tensor = B + U1 @ c11 @ V1.mT + U1 @ upper @ V2.mT + U2 @ lower @ V1.mT
     return moved
+
+
+def _nearest_singular(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """That of rank 2."""
+    flat = A.reshape(-1, 3, 3)
+    nearest, clear = _without_least(flat)
+    rest = (~clear).nonzero()[:, 0]
+    if len(rest):
+        U, s, Vh, _ = svd(flat.index_select(0, rest))
+        nearest = nearest.index_copy(0, rest, (U[..., :2] * s[..., None, :2]) @ Vh[..., :2, :])
+    return nearest.reshape(A.shape)
+
+
+def _without_least(A: Float[Tensor, "batch 3 3"]) -> tuple[Float[Tensor, "batch 3 3"], Bool[Tensor, " batch"]]:
+    """The same by powers of the adjugate and one Newton step, and where the least singular value stands clear."""
+    scale = unit_scale(A)
+    B = (A * scale).double()
+    K = adjugate_3x3(B)
+    power = K @ K.mT
+    two = power.diagonal(dim1=-2, dim2=-1).sum(-1) > _TWO
+    for _ in range(_SQUARINGS):
+        power = power * power.diagonal(dim1=-2, dim2=-1).sum(-1).reciprocal()[:, None, None]
+        power = power @ power
+    # The trace was 1: that of the square is 1 where one eigenvector alone is left.
+    diagonal = power.diagonal(dim1=-2, dim2=-1)
+    clear = two & (diagonal.sum(-1) > 1 - _ALONE)
+    longest = diagonal.argmax(-1)
+    v = power.gather(-2, longest[:, None, None].expand(-1, 1, 3)).mT
+    v = v * torch.linalg.vector_norm(v, dim=-2, keepdim=True).reciprocal()
+    image = B @ v
+    value = image.mT @ image
+    residual = (B.mT @ image).addcmul_(value, v, value=-1)
+    # Regular by what is added along v, where there is no residual.
+    G = B.mT @ B
+    G.addcmul_(v * G.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], v.mT).diagonal(dim1=-2, dim2=-1).sub_(value[..., 0])
+    v = v - torch.linalg.solve_ex(G, residual)[0]
+    v = v * torch.linalg.vector_norm(v, dim=-2, keepdim=True).reciprocal()
+    nearest = ((B - (B @ v) @ v.mT) / scale).to(A.dtype)
+    return nearest, clear & all_below(nearest, torch.inf, 2)
 
 
 def _fit(A: Tensor, shape: torch.Size) -> Tensor:
