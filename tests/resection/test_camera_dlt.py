@@ -1,6 +1,7 @@
 import pytest
 import torch
 from chance import seeded
+from elsewhere import ELSEWHERE, elsewhere, send
 
 from torchsfm._types import Status
 from torchsfm.resection import camera_dlt, estimate_camera_projective
@@ -246,8 +247,10 @@ def test_derivatives(make_problem, generator):
 
 
 def test_nothing_leaves_the_device():
-    x, X, line, L = (torch.empty(4, 8, k, device="meta") for k in (2, 3, 3, 6))
-    assert camera_dlt(x, X, line, L).model.device.type == "meta"
+    generator = seeded(0)
+    data = (send(torch.randn(4, 8, k, generator=generator)) for k in (2, 3, 3, 6))
+    with elsewhere():
+        assert camera_dlt(*data).model.device == ELSEWHERE
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -94,12 +94,11 @@ def null_vector(
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
     """The unit vector v that makes `|A v|` smallest, and its derivative.
 
-    With one row less than columns it comes by reflections, else from powers of the inverse of A'A (formed in float64). Where the
-    two smallest singular values are near to each other or to rounding, or a derivative is asked for, it comes from the
-    eigenvectors of A'A. Newton steps of `A'(A v) = s v` with the residual taken from A itself restore the accuracy that squaring
-    loses. The last step is differentiable in A, and its derivative is the derivative of v. Where the two smallest singular
-    values coincide v is not unique: the value is one such vector, the derivative leaves out the directions in which it is not
-    determined.
+    With one row less than columns it comes by reflections, else from powers of the inverse of A'A (formed in float64), and
+    where the two smallest singular values are too near to each other or to rounding from the eigenvectors of A'A. Newton steps
+    of `A'(A v) = s v` with the residual taken from A itself restore the accuracy that squaring loses. Such a step is
+    differentiable in A, and its derivative is the derivative of v. Where the two smallest singular values coincide v is not
+    unique: the value is one such vector, the derivative leaves out the directions in which it is not determined.
 
     Args:
         A: Matrices with m >= n - 1 rows, any scale.
@@ -118,6 +117,7 @@ def null_vector(
     v, finite = (torch.cat(part) for part in zip(*parts, strict=True))
     v, finite = v.reshape(*A.shape[:-2], A.shape[-1]), finite.reshape(A.shape[:-2])
     if followed(A):
+        # The value stays what it is without.
         same = _by_eigenvectors(_ready(A)[0])
         v = v + torch.sign((same.detach() * v).sum(-1, keepdim=True)) * (same - same.detach())
     first = torch.zeros_like(v)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchsfm._types import Status, check_tensors
 from torchsfm.geometry import normalizing_similarity
-from torchsfm.linalg import cross, eigh, eigvalsh, svdvals, unit_scale, usable
+from torchsfm.linalg import cross, eigvalsh, null_vector, svdvals, unit_scale, usable
 
 FLAT = 1e-6
 """Singular value, over the largest, at which a second null vector is taken for exact (a plane, in float32 coordinates)."""
@@ -122,10 +122,9 @@ def camera_dlt(
         S = normalizing_similarity(X, present)
     rows.append(_point_rows(_apply(T, x), _apply(S, X), w))
     A = torch.cat(rows, -2)
-    p, singular = _null_vector(A)
+    p, _ = null_vector(A)
     equations = (A.detach() != 0).any(-1).sum(-1)
-    degenerate = (singular[..., 1] <= FLAT * singular[..., -1]) | (singular[..., 1] <= BLURRED * singular[..., 0])
-    degenerate = degenerate | _blurred(A.detach())
+    degenerate = ~_determined(A.detach(), p.detach()) | _blurred(A.detach())
     # A plane and one point off it: the matrix that takes the plane to nothing and the point to its image.
     sees = svdvals(p.detach().reshape(*batch, 3, 4))[0]
     degenerate = degenerate | (sees[..., 2] <= RANK * sees[..., 0])
@@ -170,13 +169,11 @@ def _homogeneous(X: Tensor) -> Tensor:
 
 def _point_rows(x: Tensor, X: Tensor, w: Tensor) -> Tensor:
     """The two equations of each point, (*batch, 2 n, 12)."""
-    h, u, v = _homogeneous(X), x[..., :1], x[..., 1:]
-    zero = torch.zeros_like(h)
     # A zero weight must not meet the derivative of the square root at 0.
     root = torch.where(w > 0, torch.where(w > 0, w, 1.0).sqrt(), 0.0)
-    first = torch.cat((h, zero, -u * h), -1) * root[..., :1]
-    second = torch.cat((zero, h, -v * h), -1) * root[..., 1:]
-    return torch.cat((first, second), -2)
+    # (1, 0, -u) and (0, 1, -v) times the point.
+    covectors = torch.cat((torch.diag_embed(root), (-root * x)[..., None]), -1)
+    return (covectors[..., None] * _homogeneous(X)[..., None, None, :]).flatten(-2).flatten(-3, -2)
 
 
 def _line_rows(line: Tensor, feet: Tensor, directions: Tensor, w: Tensor) -> Tensor:
@@ -186,20 +183,19 @@ def _line_rows(line: Tensor, feet: Tensor, directions: Tensor, w: Tensor) -> Ten
     return torch.cat([(line[..., :, None] * end[..., None, :]).flatten(-2) * root for end in ends], -2)
 
 
-def _null_vector(A: Tensor) -> tuple[Tensor, Tensor]:
-    """The unit vector with the smallest |A p|, with its derivative, and the singular values from the smallest up."""
-    with torch.no_grad():
-        values, vectors, _ = eigh(A.mT @ A)
-        p, others = vectors[..., :1], vectors[..., 1:]
-        gaps = values[..., 1:] - values[..., :1]
-        inverse = torch.where(gaps > 1e-15 * values[..., -1:], 1 / gaps, 0.0)[..., None]
-    # One Newton step with residuals from A itself restores the precision that squaring has lost, and carries the derivative.
-    gradient = A.mT @ (A @ p)
-    p = (p - others @ (inverse * (others.mT @ gradient)))[..., 0]
-    p = p / torch.linalg.vector_norm(p, dim=-1, keepdim=True)
-    # Eigenvalues know small singular values only to the square root of rounding; products with A know them better.
-    singular = torch.linalg.vector_norm(A.detach() @ torch.cat((p.detach()[..., None], others), -1), dim=-2)
-    return p, torch.cat((singular[..., :1], singular[..., 1:].sort(-1).values), -1)
+def _determined(A: Float[Tensor, "*batch m 12"], p: Float[Tensor, "*batch 12"]) -> Bool[Tensor, "*batch"]:
+    """Whether the second smallest singular value is far from zero and from the smallest, whose vector p is.
+
+    So it is where A'A stays positive with its least eigenvalue lifted and a square taken from all; no eigenvalue is needed.
+    """
+    N, v = A.mT @ A, p[..., None]
+    # At least the largest eigenvalue, and not twice as much.
+    largest = torch.linalg.vector_norm(N @ N, dim=(-2, -1)).sqrt()
+    noise = (A @ v).square().sum((-2, -1))
+    limit = torch.maximum(FLAT**2 * largest, BLURRED**2 * noise)
+    lifted = N + (largest[..., None, None] * v) @ v.mT
+    lifted.diagonal(dim1=-2, dim2=-1).sub_(limit[..., None])
+    return torch.linalg.cholesky_ex(lifted)[1] == 0
 
 
 def _blurred(A: Tensor) -> Tensor:
@@ -218,7 +214,9 @@ def _squared_distances(A: Tensor) -> tuple[Tensor, Tensor]:
     """
     N = A.mT @ A
     depths = N[..., :4, :4] + N[..., 4:8, 4:8]
-    left = N[..., 8:, 8:] - N[..., 8:, :8] @ torch.linalg.solve_ex(N[..., :8, :8], N[..., :8, 8:])[0]
+    # Where the first fails the other one does: structure in a plane.
+    half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(N[..., :8, :8])[0], N[..., :8, 8:], upper=False)
+    left = N[..., 8:, 8:] - half.mT @ half
     unit = torch.linalg.inv_ex(torch.linalg.cholesky_ex(depths)[0])[0]
     rounding = 16 * torch.finfo(A.dtype).eps * N[..., 8:, 8:].diagonal(dim1=-2, dim2=-1).sum(-1)
     return eigvalsh(unit @ left @ unit.mT)[0], rounding * unit.square().sum((-2, -1))

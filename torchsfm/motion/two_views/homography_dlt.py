@@ -38,12 +38,10 @@ def homography_dlt(
     """
     check_tensors(x1=(x1, "n>=4 2"), x2=(x2, "n 2"), weights=(weights, "?n"))
     y1, y2, w, T1, T2_inverse, finite = _normalised(x1, x2, weights)
-    u1, v1, u2, v2 = y1[..., 0], y1[..., 1], y2[..., 0], y2[..., 1]
-    one, zero = torch.ones_like(u1), torch.zeros_like(u1)
-    first = torch.stack((u1, v1, one, zero, zero, zero, -u2 * u1, -u2 * v1, -u2), -1)
-    second = torch.stack((zero, zero, zero, u1, v1, one, -v2 * u1, -v2 * v1, -v2), -1)
-    root = w[..., None]
-    h, _ = null_vector(torch.cat((root * first, root * second), -2))
+    # (1, 0, -u2) and (0, 1, -v2) times the point in the first image.
+    covectors = torch.cat((torch.diag_embed(w[..., None].expand_as(y2)), (-w[..., None] * y2)[..., None]), -1)
+    points = torch.cat((y1, torch.ones_like(y1[..., :1])), -1)
+    h, _ = null_vector((covectors[..., None] * points[..., None, None, :]).flatten(-2).flatten(-3, -2))
     H = T2_inverse @ h.reshape(*h.shape[:-1], 3, 3) @ T1
     H = H / (H * H).sum((-2, -1), keepdim=True).sqrt()
     fallback = torch.eye(3, dtype=H.dtype, device=H.device) / 3**0.5
