@@ -177,7 +177,8 @@ def _by_inverse_powers(A: Float[Tensor, "batch m n"]) -> tuple[Float[Tensor, "ba
 
 
 def _unit(v: Float[Tensor, "batch n 1"]) -> Float[Tensor, "batch n 1"]:
-    return v * torch.linalg.vector_norm(v, dim=-2, keepdim=True).reciprocal()
+    unit: Tensor = v * torch.linalg.vector_norm(v, dim=-2, keepdim=True).reciprocal()
+    return unit
 
 
 def _by_eigenvectors(A: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n"]:

@@ -195,7 +195,8 @@ def _determined(A: Float[Tensor, "*batch m 12"], p: Float[Tensor, "*batch 12"]) 
     limit = torch.maximum(FLAT**2 * largest, BLURRED**2 * noise)
     lifted = N + (largest[..., None, None] * v) @ v.mT
     lifted.diagonal(dim1=-2, dim2=-1).sub_(limit[..., None])
-    return torch.linalg.cholesky_ex(lifted)[1] == 0
+    positive: Tensor = torch.linalg.cholesky_ex(lifted)[1] == 0
+    return positive
 
 
 def _blurred(A: Tensor) -> Tensor:
