@@ -20,7 +20,7 @@ from torchsfm.linalg.quadric_pencil import Pencil, determinant
 from torchsfm.linalg.quaternary_forms import (
     CUBIC,
     QUADRATIC,
-    Gradient,
+    Gradients,
     cubic_of_forms,
     minors,
     product_of_forms,
@@ -28,8 +28,9 @@ from torchsfm.linalg.quaternary_forms import (
 )
 from torchsfm.linalg.real_roots import real_root_list
 from torchsfm.linalg.rows import combine_rows, take_columns
+from torchsfm.linalg.vectors import fma, fms
 
-_CHUNK = 512
+_CHUNK = 1024
 """Problems at a time where the work is at all points of the circle at once: what is in use stays in the cache."""
 _MORE = 6
 """Newton steps for those that two steps do not bring to their end."""
@@ -67,17 +68,14 @@ def intersect_quadrics(A: Float[Tensor, "10 batch"], B: Float[Tensor, "10 batch"
     item, v, unsure = _attempt(A, B, C)
     index = unsure.nonzero()[:, 0]
     if len(index):
-        # Other coordinates for the few with a root that led nowhere.
-        forms = [take_columns(q, index) for q in (A, B, C)]
-        others, points = [item], [v]
-        for k in range(_ATTEMPTS):
-            turn, matrices = _rotation(k)
-            turned = [combine_rows(matrices[len(q)].on(q.device, q.dtype)[..., None], q) for q in forms]
-            again, u, _ = _attempt(*turned)
-            others.append(index.index_select(0, again))
-            points.append(combine_rows(turn.on(u.device, u.dtype).T[..., None], u))
-        item, order = torch.cat(others).sort(stable=True)
-        v = take_columns(torch.cat(points, 1), order)
+        # Other coordinates for the few with a root that led nowhere, all of them at once.
+        few, turns = [take_columns(q, index) for q in (A, B, C)], [_rotation(k) for k in range(_ATTEMPTS)]
+        turned = [[combine_rows(m[len(q)].on(q.device, q.dtype)[..., None], q) for _, m in turns] for q in few]
+        again, u, _ = _attempt(*(torch.cat(q, 1) for q in turned))
+        back = torch.stack([turn.on(u.device, u.dtype).T for turn, _ in turns], -1)
+        which = torch.div(again, len(index), rounding_mode="floor")
+        item, order = torch.cat((item, index.index_select(0, again - which * len(index)))).sort(stable=True)
+        v = take_columns(torch.cat((v, combine_rows(take_columns(back, which), u)), 1), order)
         keep = (~_repeated(item, v, torch.ones_like(item, dtype=torch.bool), len(CUBIC) * 2)).nonzero()[:, 0]
         item, v = item.index_select(0, keep), take_columns(v, keep)
     return CommonPoints(item, v)
@@ -87,17 +85,16 @@ def _attempt(A: Tensor, B: Tensor, C: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Problems and unit vectors of common points, and which problems may have more of them."""
     degree = 8 if C.shape[0] == 10 else 12
     nodes, to_coefficients = (t.on(A.device, A.dtype) for t in _circle(degree))
-    forms = []
+    forms, pencil = [], Pencil.of(A, B, C)
     for some in portions(max(A.shape[1], 1), _CHUNK, A.device):
-        a, b, c = (q[:, some] for q in (A, B, C))
-        values = determinant(Pencil.of(a, b).multiply(c, nodes[0][:, None], nodes[1][:, None]))
+        values = determinant(pencil.some(some).multiply(nodes[0][:, None], nodes[1][:, None]))
         forms.append(combine_rows(values, to_coefficients.mT[..., None]))
     form = torch.cat(forms, 1)
     roots = real_root_list(torch.where(torch.isfinite(form).all(0), form, torch.nan))
-    A, B, C = (take_columns(q, roots.item) for q in (A, B, C))
     # A root s : t is z : w.
-    v = Pencil.of(A, B).common_point(C, roots.s, roots.t)
-    v, found, sure = _polished(v, A, B, C)
+    v = pencil.take(roots.item).common_point(roots.s, roots.t)
+    A, B, C = (take_columns(q, roots.item) for q in (A, B, C))
+    v, found, sure = _polished(v, Gradients((A, B, C), None) if degree == 8 else Gradients((A, B), C))
     found = found & ~_repeated(roots.item, v, found, degree)
     # The number of roots is even; a root far from its point comes from an inaccurate form, which may have lost others.
     number = torch.zeros(form.shape[1], dtype=torch.int32, device=form.device)
@@ -127,34 +124,28 @@ def _rotation(number: int) -> tuple[Constant, dict[int, Constant]]:
     return Constant(turn), {10: Constant(quadratic), 20: Constant(cubic)}
 
 
-def _polished(v: Tensor, *forms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _polished(v: Tensor, gradients: Gradients) -> tuple[Tensor, Tensor, Tensor]:
     """Newton's method on the unit sphere, longer for those that need it; where it came to an end, and where it began near."""
-    gradients = [Gradient(form) for form in forms]
     v, first = _newton(v, gradients)
     size = first
     rest = (first > _CONVERGED).nonzero()[:, 0]
-    u, few = take_columns(v, rest), [g.take(rest) for g in gradients]
+    u, few = take_columns(v, rest), gradients.take(rest)
     for _ in range(_MORE):
         if len(rest) == 0:
             break
         u, last = _newton(u, few)
         v, size = v.index_copy(1, rest, u), size.index_copy(0, rest, last)
         going = (last > _CONVERGED).nonzero()[:, 0]
-        rest, u, few = rest.index_select(0, going), take_columns(u, going), [g.take(going) for g in few]
+        rest, u, few = rest.index_select(0, going), take_columns(u, going), few.take(going)
     return v, size <= _CONVERGED, first <= _NEAR
 
 
-_FIRST, _SECOND = [i for i, _ in QUADRATIC], [j for _, j in QUADRATIC]
-
-
-def _newton(v: Tensor, gradients: list[Gradient]) -> tuple[Tensor, Tensor]:
+def _newton(v: Tensor, gradients: Gradients) -> tuple[Tensor, Tensor]:
     """One step orthogonal to v, and its length: Cramer's rule on the rows p, q, r, v."""
-    squares = v[_FIRST] * v[_SECOND] if any(g.degree == 3 for g in gradients) else v
-    p, q, r = (g(v, squares) for g in gradients)
-    a, b, c = (combine_rows(g, v) / form.degree for g, form in zip((p, q, r), gradients, strict=True))
+    (p, q, r), (a, b, c) = gradients(v)
     rv, pq = minors(r, v), minors(p, q)
     first, second, third = triple(q, rv), triple(p, rv), triple(v, pq)
-    step = (a * first - b * second + c * third) / combine_rows(p, first)
+    step = fma(c, third, fms(b, second, a * first)).div_(combine_rows(p, first))
     size = combine_rows(step, step).sqrt()
     v = v - step * (_LONGEST / size).clamp_max(1)
     return v * combine_rows(v, v).rsqrt(), size

@@ -3,39 +3,52 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.linalg.quaternary_forms import Row, minors
-from torchsfm.linalg.rows import combine_rows
+from torchsfm.linalg.rows import combine_rows, take_columns
+from torchsfm.linalg.vectors import fma, fms
+
+_OTHERS = [1, 2, 3, 5, 6, 7, 8, 9]
+"""Monomials of a quadric but x^2 and y^2."""
 
 
 class Pencil(NamedTuple):
-    """x^2 = e x y + ..., y^2 = f x y + ... with coefficients of x, y (linear in z, w) and 1 (quadratic)."""
+    """x^2 = e x y + ..., y^2 = f x y + ... with coefficients of x, y (linear in z, w) and 1 (quadratic), and a third form."""
 
-    turned: Bool[Tensor, " batch"]
+    turned: Bool[Tensor, "1 batch"]
     """Whether (x, y) was turned by 45 degrees."""
-    first: Row
+    first: Float[Tensor, "8 batch"]
     """Coefficients of xy, xz, xw, yz, yw, zz, zw, ww in x^2."""
-    second: Row
+    second: Float[Tensor, "8 batch"]
+    third: Float[Tensor, "m batch"]
+    """The other form, turned likewise."""
 
     @classmethod
-    def of(cls, A: Tensor, B: Tensor) -> "Pencil":
+    def of(cls, A: Tensor, B: Tensor, C: Tensor) -> "Pencil":
         """That of two quadrics."""
         # Of the two directions that the axes may have take the one in which x^2 and y^2 are better determined.
         plain = (A[0] * B[4] - A[4] * B[0]).abs()
         oblique = 0.5 * ((A[0] + A[4]) * B[1] - A[1] * (B[0] + B[4])).abs()
         turned = oblique > plain
-        A, B = _turn(A, turned), _turn(B, turned)
-        inverse = 1 / (A[0] * B[4] - A[4] * B[0])
-        others = (1, 2, 3, 5, 6, 7, 8, 9)
-        first = tuple((A[4] * B[i] - B[4] * A[i]) * inverse for i in others)
-        second = tuple((B[0] * A[i] - A[0] * B[i]) * inverse for i in others)
-        return cls(turned, first, second)
+        A, B, C = (_turn(q, turned) for q in (A, B, C))
+        inverse = 1 / fms(A[4], B[0], A[0] * B[4])
+        a, b = A[_OTHERS], B[_OTHERS]
+        first, second = fms(B[4], a, A[4] * b), fms(A[0], b, B[0] * a)
+        return cls(turned[None], first.mul_(inverse), second.mul_(inverse), C)
 
-    def multiply(self, C: Tensor, z: Tensor, w: Tensor, rows: int = 4) -> list[Row]:
-        """The first rows of the matrix of multiplication by C over 1, x, y, xy, for given z and w."""
-        C = _turn(C, self.turned)
+    def some(self, part: slice) -> "Pencil":
+        """Those of a part of the batch."""
+        return Pencil(*(t[:, part] for t in self))
+
+    def take(self, columns: Tensor) -> "Pencil":
+        """Those of some columns of the batch."""
+        return Pencil(*(take_columns(t, columns) for t in self))
+
+    def multiply(self, z: Tensor, w: Tensor, rows: int = 4) -> list[Row]:
+        """The first rows of the matrix of multiplication by the third form over 1, x, y, xy, for given z and w."""
+        C = self.third
         e, xz, xw, yz, yw, zz, zw, ww = self.first
         square_z, mixed, square_w = z * z, z * w, w * w
         X = _sum((zz, square_z), (zw, mixed), (ww, square_w)), _sum((xz, z), (xw, w)), _sum((yz, z), (yw, w)), e
@@ -91,18 +104,18 @@ class Pencil(NamedTuple):
         ky = by_y(k)
         return [k, by_x(k), ky, by_x(ky)] if rows == 4 else [k, by_x(k), ky]
 
-    def common_point(self, C: Tensor, z: Tensor, w: Tensor) -> Tensor:
+    def common_point(self, z: Tensor, w: Tensor) -> Tensor:
         """Unit vectors (x, y, z, w) of the null vectors (1, x, y, xy)."""
         size = (z * z + w * w).rsqrt()
         z, w = z * size, w * size
         # Orthogonal to the first three rows; of the last one the first three cofactors make the vector (1, x, y).
-        p, q, r = self.multiply(C, z, w, rows=3)
+        p, q, r = self.multiply(z, w, rows=3)
         m = minors(q, r)
-        one = p[1] * m[5] - p[2] * m[4] + p[3] * m[3]
-        x = p[2] * m[2] - p[0] * m[5] - p[3] * m[1]
-        y = p[0] * m[4] - p[1] * m[2] + p[3] * m[0]
+        one = fma(p[3], m[3], fms(p[2], m[4], p[1] * m[5]))
+        x = fms(p[3], m[1], fms(p[0], m[5], p[2] * m[2]))
+        y = fma(p[3], m[0], fms(p[1], m[2], p[0] * m[4]))
         half = 0.5**0.5
-        x, y = torch.where(self.turned, (x - y) * half, x), torch.where(self.turned, (x + y) * half, y)
+        x, y = torch.where(self.turned[0], (x - y) * half, x), torch.where(self.turned[0], (x + y) * half, y)
         v = torch.stack((x, y, z * one, w * one))
         v = v / v.abs().amax(0)
         return v * combine_rows(v, v).rsqrt()

@@ -20,7 +20,7 @@ from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.triangle import ASIDE, NEAREST
 
-_CHUNK = 4096
+_CHUNK = 8192
 """Problems at a time: what is in use stays in the cache."""
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 _DIFFERENCES = ((0.5**0.5, 1 / 6**0.5), (-(0.5**0.5), 1 / 6**0.5), (0.0, -2 / 6**0.5))

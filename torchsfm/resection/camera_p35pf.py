@@ -21,7 +21,7 @@ from torchsfm.linalg.rows import combine_rows, take_columns
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 from torchsfm.resection.focal import camera_of, incidence_rows, scaled, world_camera
 
-_CHUNK = 4096
+_CHUNK = 8192
 _SLOTS = 10
 _INDEPENDENT = 1e-12
 _MET = 1e-7

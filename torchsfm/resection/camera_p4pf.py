@@ -22,7 +22,7 @@ from torchsfm.optim import attach_optimum, wants_derivative
 from torchsfm.resection.camera_p35pf import structure, sum_of_products
 from torchsfm.resection.focal import camera_of, incidence_rows, scaled, world_camera
 
-_CHUNK = 4096
+_CHUNK = 8192
 _INDEPENDENT = 1e-12
 _STEPS = 8
 _EXACT = 1e-22
