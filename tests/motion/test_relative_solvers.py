@@ -134,6 +134,19 @@ def test_recall_on_hard_families(name: str, family: str, generator: torch.Genera
     assert_share(nearest(case, case.solve(*sample), truth) < 1e-6, at_least=0.9995)
 
 
+def test_upright_motion_is_as_exact_as_far_points_let_it_be(generator: torch.Generator) -> None:
+    # A few hundred times the baseline away the determinant is a millionth at its roots of what it is elsewhere.
+    X1, _, _ = two_views("random", 4000, 3, generator)
+    R = rotation_from_rotvec(torch.randn(4000, 3, dtype=F64, generator=generator))
+    t = torch.nn.functional.normalize(torch.randn(4000, 3, dtype=F64, generator=generator), dim=-1)
+    X1 = X1 * 1000 ** torch.rand(4000, 3, 1, dtype=F64, generator=generator)
+    gravity = torch.randn(4000, 3, dtype=F64, generator=generator)
+    found = relative_upright_3pt(X1, X1 @ R.mT + t[:, None], gravity, (R @ gravity[..., None])[..., 0])
+    truth = torch.cat((R, t[..., None]), -1)
+    gap = torch.where(found.valid, pose_gap(found.model, truth[:, None]), 9).amin(-1)
+    assert_share(gap < 1e-9, at_least=0.998)
+
+
 def test_critical_motions_leave_no_focal_length(generator: torch.Generator) -> None:
     """Parallel optical axes, and axes that meet at the same distance from both centres: a family, whatever rounding says."""
     count, middle = 500, torch.tensor([0.0, 0, 6], dtype=F64)

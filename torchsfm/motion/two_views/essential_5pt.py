@@ -26,7 +26,7 @@ _NEAR = 1e-8
 """Distance from the manifold before a Newton step that ends at a solution."""
 _MORE = 6
 """Newton steps for the others, among near-planar points and small baselines, where two solutions are almost one."""
-_POOR = 1e-4
+_POOR = 1e-5
 """Distance of a start from the manifold that casts doubt on the polynomial."""
 _SAME = 1e-5, 2e-7
 """Distance below which two unit matrices are one solution, from two polynomials and from the same one."""

@@ -16,7 +16,8 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross
 from torchsfm.linalg.quartic import quartic_rows
-from torchsfm.linalg.rows import combine_rows
+from torchsfm.linalg.rows import add_rows, combine_rows
+from torchsfm.linalg.vectors import fma, fms
 from torchsfm.motion.two_views.sample_rows import cross_columns, in_chunks, rows_of, unit_rays
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
@@ -26,6 +27,8 @@ _NOTHING = 1e-13
 """A polynomial this small is zero."""
 _PARALLAX = 1e-9
 """Product of two parallaxes, in radians, of rays that have none to rounding."""
+_STEP = 1e-2
+"""Longest Newton step of an angle, in radians."""
 _ANGLES = [2 * math.pi * k / 5 for k in range(5)]
 _FOURIER = [(0.2, *(0.4 * wave(k * angle) for k in (1, 2) for wave in (math.cos, math.sin))) for angle in _ANGLES]
 """Weights of a value in the mean and in the cosines and sines of the angle and its double."""
@@ -136,6 +139,7 @@ def _solve(d1: Tensor, d2: Tensor, g1: Tensor, g2: Tensor) -> tuple[Tensor, Tens
     cos_0, sin_0 = turn[0].index_select(0, start), turn[1].index_select(0, start)
     cosine, sine = cos_0 * cos_b - sin_0 * sin_b, sin_0 * cos_b + cos_0 * sin_b
     # From here on (..., 4, batch): each root has a row of its own, and t is perpendicular to three vectors.
+    cosine, sine = _polished(cosine, sine, C, S, rest)
     n0, n1, n2 = (C[i][:, None] * cosine + S[i][:, None] * sine + rest[i][:, None] for i in range(3))
     crosses = torch.stack([_cross(p, q) for p, q in ((n0, n1), (n1, n2), (n2, n0))])
     square, best = combine_rows(crosses.unbind(1), crosses.unbind(1)).max(0)
@@ -158,6 +162,30 @@ def _solve(d1: Tensor, d2: Tensor, g1: Tensor, g2: Tensor) -> tuple[Tensor, Tens
     empty = torch.eye(3, 4, dtype=pose.dtype, device=pose.device)
     empty[2, 3] = 1
     return torch.where(valid, pose, empty.view(12, 1, 1)), valid
+
+
+def _polished(cosine: Tensor, sine: Tensor, C: Tensor, S: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Angles after two Newton steps on the determinant of the three vectors, where these settle.
+
+    The vectors of far points are small at the roots, and so is what rounding makes of their determinant; that of the quartic's
+    coefficients is as large as the determinant is anywhere.
+    """
+    before, steps = (cosine, sine), []
+    C, S, rest = (t.transpose(0, 1)[:, :, None] for t in (C, S, rest))
+    for _ in range(2):
+        # (coordinate, ray, root, batch).
+        n, slope = fma(S, sine, fma(C, cosine, rest)), fms(C, sine, S * cosine)
+        n0, n1, n2 = n.unbind(1)
+        minors = torch.stack((_cross(n1, n2), _cross(n2, n0), _cross(n0, n1)), 1)
+        step = combine_rows(n0, minors[:, 0]) / add_rows(combine_rows(slope, minors))
+        step = torch.where(step.abs() < _STEP, step, 0)
+        cosine, sine = fma(sine, step, cosine), fms(cosine, step, sine)
+        size = fma(sine, sine, cosine * cosine).rsqrt()
+        cosine, sine = cosine * size, sine * size
+        steps.append(step.abs())
+    # Not so where two roots are almost one.
+    settled = steps[1] <= 0.25 * steps[0]
+    return torch.where(settled, cosine, before[0]), torch.where(settled, sine, before[1])
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
