@@ -2,6 +2,8 @@
 
 import math
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,11 +12,16 @@ from command_line import torchsfm
 from painted_box import photograph
 from torch import Tensor
 
-from torchsfm.geometry import Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
-from torchsfm.images import detect_edges, save_image
+from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
+from torchsfm.geometry.distortion import Radial
+from torchsfm.images import detect_edges, read_image, save_image
 from torchsfm.linalg import nearest_rotation
-from torchsfm.reconstruction import ReconstructionError, reconstruct
-from torchsfm.reconstruction.curve_windows import as_edges
+from torchsfm.reconstruction import ReconstructionError, curve_sequence, reconstruct
+from torchsfm.reconstruction.curve_chains import Chain
+from torchsfm.reconstruction.curve_frames import Frames
+from torchsfm.reconstruction.curve_sequence import Expected, map_sequence
+from torchsfm.reconstruction.curve_start import FirstCameras
+from torchsfm.reconstruction.curve_windows import Window, as_edges, window_at
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.simulation import orbit_poses, paint_shapes
 
@@ -59,6 +66,55 @@ def painted(folder: Path, frames: int, generator: torch.Generator) -> Pose:
         image = paint_shapes(list(x), grey, width=320, height=240, fine=4)
         save_image(folder / f"{i}.png", image + 0.005 * torch.randn(image.shape, dtype=F64, generator=generator))
     return poses
+
+
+def test_windows_are_joined_with_one_focal_length(
+    tmp_path: Path, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows that found 0.88, 1 and 1.12 times the focal length have about one before cameras of all frames begin there."""
+    poses = painted(tmp_path, 8, generator)
+    frames = Frames([ImageEdges.of(read_image(tmp_path / f"{i}.png").pixels) for i in range(8)])
+    centre, zero = torch.tensor([159.5, 119.5], dtype=F64), torch.zeros((), dtype=F64)
+    zooms = dict(enumerate((0.88, 1.0, 1.12)))
+    windows = []
+    for first, zoom in zooms.items():
+        views = torch.arange(first, first + 5)
+        own = poses[views] @ poses[first + 2].inverse()
+        true = Window(views, FirstCameras(own, zero, zero.new_zeros(0, 3), ""))
+        K = intrinsics(zoom * torch.tensor(FOCAL, dtype=F64), centre)
+        windows.append(window_at(frames, first, K, 1e-4, true))
+    # One of which the frames show another motion.
+    roll = rotation_from_rotvec(torch.tensor([[0.0, 0.0, 0.3 * (-1) ** k] for k in range(5)], dtype=F64))
+    lost = replace(windows[1], found=replace(windows[1].found, poses=Pose(roll, windows[1].found.poses.t)))
+    joined: list[Window] = []
+
+    def chains(given: Sequence[Window]) -> list[Chain]:
+        joined.extend(given)
+        return []
+
+    monkeypatch.setattr(curve_sequence, "all_windows", lambda *given: [*windows, lost])
+    monkeypatch.setattr(curve_sequence, "chains", chains)
+    K = intrinsics(torch.tensor(FOCAL, dtype=F64), centre)
+    expected = Expected(Camera(K, Radial(zero, zero)), ("focal",), {"focal": 0.5})
+    assert map_sequence(frames, (240, 320), expected, lambda *news: None)[0] == []
+    *alike, other = joined
+    assert other is lost
+
+    def off(some: Sequence[Window]) -> Tensor:
+        return torch.stack(
+            [
+                rotation_angle(one.found.poses.R @ (poses.R[one.views] @ poses.R[one.middle].mT).mT).rad2deg().amax()
+                for one in (some[0], some[2])
+            ]
+        )
+
+    assert [float(one.found.focal) / FOCAL for one in windows] == pytest.approx(list(zooms.values()), abs=0.01)
+    assert [float(one.found.focal) / FOCAL for one in alike] == pytest.approx([1.0] * 3, abs=0.04)
+    assert bool((off(alike) < 0.7 * off(windows)).all())
+    given = replace(expected, free=())
+    joined.clear()
+    map_sequence(frames, (240, 320), given, lambda *news: None)
+    assert all(one is before for one, before in zip(joined, windows, strict=False))
 
 
 @pytest.mark.slow

@@ -11,11 +11,12 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, Similarity, intrinsics, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.images import read_image
+from torchsfm.reconstruction.curve_chains import chains
 from torchsfm.reconstruction.curve_frames import Frames
 from torchsfm.reconstruction.curve_mapping import CurveMapping
 from torchsfm.reconstruction.curve_sequence import Expected, Settled, apart
 from torchsfm.reconstruction.curve_start import FirstCameras
-from torchsfm.reconstruction.curve_windows import WIDTH, Window, chains, contradictions, focal_of, telling, turns_of, window_at
+from torchsfm.reconstruction.curve_windows import WIDTH, Window, contradictions, focal_of, telling, turns_of, window_at
 from torchsfm.reconstruction.image_edges import ImageEdges
 
 F64 = torch.float64

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchsfm.bundle import RelativePosePrior
 from torchsfm.geometry import Camera, rotation_angle
+from torchsfm.reconstruction.curve_chains import Chain, chains
 from torchsfm.reconstruction.curve_frames import Frames
 from torchsfm.reconstruction.curve_guess import agrees_with_motion, guess_by_motion
 from torchsfm.reconstruction.curve_mapping import (
@@ -25,13 +26,12 @@ from torchsfm.reconstruction.curve_mapping import (
     track,
 )
 from torchsfm.reconstruction.curve_windows import (
-    Chain,
     all_windows,
-    chains,
     contradictions,
     focal_of,
     turns_of,
     windows_by_themselves,
+    with_one_focal,
 )
 from torchsfm.reconstruction.curves import curves_of_edges
 from torchsfm.reconstruction.doubt import DEVIATIONS
@@ -145,7 +145,10 @@ def map_sequence(frames: Frames, size: tuple[int, int], expected: Expected, prog
     if not windows:
         reasons = [window.found.refusal for window in found]
         return [], max(set(reasons), key=reasons.count)
-    told = replace(expected.told(*focal_of(windows)), turns=turns_of(windows))
+    told = expected.told(*focal_of(windows))
+    if "focal" in told.free:
+        windows = with_one_focal(frames, windows, told.camera.K, progress)
+    told = replace(told, turns=turns_of(windows))
     frames = frames.seen_with(told.camera.K)
     grown: list[CurveMapping] = []
     for chain in chains(windows)[:_TRIES]:

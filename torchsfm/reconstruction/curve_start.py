@@ -64,7 +64,7 @@ _PARALLAX = 2.0
 """Pixels, at least, by which near samples move more than far ones."""
 _UNLIKELY = 3.0
 """Standard deviations by which a motion must be less likely than the best one,"""
-_APART = 4.0
+APART = 4.0
 """from which it differs by so many degrees, not to be told as another explanation."""
 
 
@@ -213,6 +213,8 @@ def first_cameras(
     centre: Float[Tensor, "2"],
     sigma: float,
     starts: Float[Tensor, "s v 3 3"] | None = None,
+    *,
+    alone: bool = False,
 ) -> FirstCameras:
     """Cameras from curves that were followed through a few frames.
 
@@ -223,6 +225,7 @@ def first_cameras(
         centre: and the principal point.
         sigma: Standard deviation of the logarithm of the focal length.
         starts: Rotations of all frames that are tried besides, those of each trial in a world of their own.
+        alone: No other ones are tried.
     """
     v = len(curves.x)
     curves = Curve(*(t[:, curve_places(curves).number[reference] >= 3] for t in (curves.x, curves.valid, curves.closed)))
@@ -237,7 +240,7 @@ def first_cameras(
     shown = (places.number[others] >= 3).repeat_interleave(_SAMPLES, 1).to(samples)
     R = rotation_from_rotvec(_turns(samples)[:, None] * (others - reference)[:, None])
     if starts is not None:
-        R = torch.cat((R, starts[:, others] @ starts[:, reference, None].mT))
+        R = torch.cat((R[:0] if alone else R, starts[:, others] @ starts[:, reference, None].mT))
     h = len(R)
     f = focal.expand(h)
     t = _translations(R, samples[reference], samples[others], shown, f)
@@ -265,7 +268,7 @@ def first_cameras(
         motion, cost = descent(scale, 2 * _STEPS, min(1.0, DEVIATION * scale / _TRUSTED))
         k = int(cost.argmin())
         apart = rotation_angle(motion.R @ motion.R[k].mT).rad2deg().amax(-1)
-        rivals = (cost < cost[k] * _equal(shown)) & (apart > _APART)
+        rivals = (cost < cost[k] * _equal(shown)) & (apart > APART)
         if turn + 1 >= _LAST:
             # What still descends is no other minimum: focal lengths and turns are found slowly, together.
             if not bool((rivals & (cost < _ARRIVED * last)).any()):

@@ -1,21 +1,19 @@
-"""What few neighbouring frames at a time say of their cameras, by themselves, and chains of such windows."""
+"""What few neighbouring frames at a time say of their cameras, by themselves."""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.bundle import RelativePosePrior
-from torchsfm.geometry import Curve, Pose, Similarity, rotation_angle
+from torchsfm.geometry import Curve, Pose, rotation_angle
 from torchsfm.images import Edges, track_curves
-from torchsfm.linalg import nearest_rotation
 from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_frames import Frames
-from torchsfm.reconstruction.curve_start import FirstCameras, first_cameras
+from torchsfm.reconstruction.curve_start import APART, FirstCameras, first_cameras
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.similarities import DEVIATION
@@ -40,14 +38,8 @@ _TELLING = 6
 """Curves that a frame must show: a camera is six numbers, and one may be wrong with a curve as a whole,"""
 _LEAST = 3
 """and frames that show so many, of a window."""
-_SHARED = WIDTH // 2 + 1
-"""Frames that two windows of a chain share, at least: the middle one of each is among them."""
-_ONE_TURN = 1.0
+ONE_TURN = 1.0
 """Degrees by which rotations from one window to another may differ, from one shared frame to the other."""
-_BESIDE = 4.0
-"""Pixels between samples of two windows that are on the same edge."""
-_FEWEST = 20
-"""Such samples that tell their scale."""
 
 
 @dataclass(frozen=True)
@@ -65,38 +57,15 @@ class Window:
         return int(self.views[len(self.views) // 2 if self.reference is None else self.reference])
 
 
-@dataclass(frozen=True)
-class Chain:
-    """Cameras of all frames of windows that overlap, in one world."""
-
-    views: Int[Tensor, "k"]
-    poses: Pose
-    sure: Bool[Tensor, "k"]
-    """Frames about which windows do not contradict each other, and of which not only the end of one tells."""
-
-    def begun(self) -> tuple[Int[Tensor, "s"], Pose]:
-        """The frames that are sure; all where these are too few."""
-        there = self.sure if int(self.sure.sum()) >= WIDTH else torch.ones_like(self.sure)
-        return self.views[there], self.poses[there]
-
-    def carried(self, view: int, known: Int[Tensor, "n"], poses: Pose) -> Pose | None:
-        """Where a frame is, seen from the nearest of those whose poses are known elsewhere; None where it tells of none."""
-        own = (self.views == view).nonzero()[:, 0]
-        near = torch.isin(self.views, known).nonzero()[:, 0]
-        if not len(own) or not len(near):
-            return None
-        a = near[(self.views[near] - view).abs().argmin()]
-        return self.poses[own] @ self.poses[a].inverse() @ poses[int(self.views[a])]
-
-
-def window_at(frames: Frames, first: int, K: Float[Tensor, "3 3"], sigma: float = _SURE) -> Window:
+def window_at(frames: Frames, first: int, K: Float[Tensor, "3 3"], sigma: float = _SURE, begun: Window | None = None) -> Window:
     """Cameras of a few frames by what is followed through them.
 
     Args:
         frames: Those of the sequence.
-        first: The window's first frame.
+        first: The first frame that is looked at.
         K: Calibration to expect; the focal length is found,
         sigma: known to such a part of it.
+        begun: The same frames' cameras, from which alone it is begun, as they are with another focal length.
     """
     views = torch.arange(first, min(first + WIDTH, len(frames.edges)))
     motion = frames.motion[first : first + len(views) - 1] if frames.motion else None
@@ -106,7 +75,8 @@ def window_at(frames: Frames, first: int, K: Float[Tensor, "3 3"], sigma: float 
     low, high = telling(curves.valid.any(-1).sum(1).tolist())
     views, own, reference = views[low:high], slice(low, high), len(views) // 2 - low
     curves = Curve(curves.x[own], curves.valid[own], curves.closed[own])
-    found = first_cameras(curves, reference, K[0, 0], K[:2, 2], sigma, frames.starts(views))
+    starts = frames.starts(views) if begun is None else begun.found.poses.R[None]
+    found = first_cameras(curves, reference, K[0, 0], K[:2, 2], sigma, starts, alone=begun is not None)
     return Window(views, found, reference)
 
 
@@ -145,6 +115,22 @@ def all_windows(frames: Frames, K: Float[Tensor, "3 3"], sigma: float, progress:
     return [found[first] for first in sorted(found)]
 
 
+def with_one_focal(frames: Frames, windows: Sequence[Window], K: Float[Tensor, "3 3"], progress: Progress) -> list[Window]:
+    """The windows with about the focal length that all have in common; each stays as it is where it ends in another motion.
+
+    Turns, translations and depths go with the focal length that a window has found: with another one they are wrong together,
+    and a model that is begun so can end in another minimum.
+    """
+    alike, before = [], min(WIDTH, len(frames.edges)) // 2
+    for k, window in enumerate(windows):
+        progress("follow", k, len(windows))
+        anew = window_at(frames, window.middle - before, K, begun=window)
+        apart = rotation_angle(anew.found.poses.R @ window.found.poses.R.mT).rad2deg().amax()
+        alike.append(anew if not anew.found.refusal and apart < APART else window)
+    progress("follow", len(windows), len(windows))
+    return alike
+
+
 def windows_by_themselves(frames: Frames, K: Float[Tensor, "3 3"]) -> list[Window]:
     """Windows from end to end, each sharing its last frame with the next, with a focal length that is known."""
     return [window_at(frames, first, K) for first in _firsts(frames, WIDTH - 1)]
@@ -180,7 +166,7 @@ def turns_of(windows: Sequence[Window]) -> RelativePosePrior:
     ]
     # The median of the length of three normal numbers, and of two windows.
     sigma = float(torch.tensor(off).median()) / (1.54 * math.sqrt(2)) if off else math.inf
-    sigma = min(max(sigma, math.radians(_SURE_TURN)), math.radians(_ONE_TURN))
+    sigma = min(max(sigma, math.radians(_SURE_TURN)), math.radians(ONE_TURN))
     R = torch.stack(turns)
     known = Pose(R, R.new_zeros(len(R), 3))
     return RelativePosePrior(torch.tensor(pairs), known, R.new_tensor([sigma] * 3 + [math.inf] * 3), loss=GemanMcClure(_WRONG))
@@ -188,114 +174,14 @@ def turns_of(windows: Sequence[Window]) -> RelativePosePrior:
 
 def _differences(window: Window, before: Window) -> list[float]:
     """Angles between what two windows say of how the frames that both have are turned from one to the next."""
-    a, b = _shared(window, before)
+    a, b = shared_poses(window, before)
     return rotation_angle((a.R[1:] @ a.R[:-1].mT) @ (b.R[1:] @ b.R[:-1].mT).mT).tolist()
 
 
-def chains(windows: Sequence[Window]) -> list[Chain]:
-    """Cameras of windows that overlap and agree, the longest chain first.
-
-    Args:
-        windows: In the order of their frames, no two of the same, all with an answer.
-    """
-    placed: list[_Placed] = []
-    contested = set[int]()
-    for k, window in enumerate(windows):
-        own = None
-        # Of windows in order, only so many can share a frame with one.
-        for before in reversed(placed[max(k - WIDTH, 0) :]):
-            turn = _turn(window, before.window)
-            if turn.off > _ONE_TURN:
-                contested |= {*window.views.tolist()} & {*before.window.views.tolist()}
-            elif own is None and turn.off <= _ONE_TURN and (step := _step(window, before.window, turn.R)) is not None:
-                own = _Placed(window, before.chain, _after(before.world, step))
-        placed.append(own or _Placed(window, k, _nowhere(window.found.poses)))
-    runs = [[one for one in placed if one.chain == k] for k in dict.fromkeys(one.chain for one in placed)]
-    return sorted((_joined(run, contested) for run in runs), key=lambda chain: -len(chain.begun()[0]))
-
-
-class _Placed(NamedTuple):
-    window: Window
-    chain: int
-    """Number of the window with which its chain begins."""
-    world: Similarity
-    """To that one's world from the window's own."""
-
-
-def _nowhere(like: Pose) -> Similarity:
-    """A world as it is."""
-    return Similarity(like.t.new_ones(()), torch.eye(3, dtype=like.t.dtype), like.t.new_zeros(3))
-
-
-def _joined(run: Sequence[_Placed], contested: set[int]) -> Chain:
-    """Each frame as the window has it whose middle it is nearest to; the end of a single window is not sure of a frame."""
-    frames: dict[int, tuple[int, Pose]] = {}
-    confirmed = set[int]()
-    for window, _, world in run:
-        poses = world.transform_pose(window.found.poses)
-        for k, view in enumerate(window.views.tolist()):
-            away = abs(view - window.middle)
-            if view in frames or away < WIDTH // 2:
-                confirmed.add(view)
-            if view not in frames or away < frames[view][0]:
-                frames[view] = away, poses[k]
-    views = sorted(frames)
-    poses = Pose(*(torch.stack([getattr(frames[i][1], name) for i in views]) for name in ("R", "t")))
-    return Chain(torch.tensor(views), poses, torch.tensor([i in confirmed - contested for i in views]))
-
-
-class _Turn(NamedTuple):
-    R: Float[Tensor, "3 3"]
-    """From the world of a window to that of one before it."""
-    off: float
-    """Degrees by which a frame that both share departs from it; NaN where they share too few."""
-
-
-def _turn(window: Window, before: Window) -> _Turn:
-    """How one window's world is turned in another's."""
-    a, b = _shared(window, before)
-    if len(a.R) < _SHARED:
-        return _Turn(torch.eye(3, dtype=a.R.dtype), math.nan)
-    turns = b.R.mT @ a.R
-    R = nearest_rotation(turns.mean(0))
-    return _Turn(R, float(rotation_angle(turns @ R.mT).rad2deg().amax()))
-
-
-def _step(window: Window, before: Window, R: Float[Tensor, "3 3"]) -> Similarity | None:
-    """From the world of a window to that of one before it, which it is turned against; None where nothing tells its size."""
-    scale = _scale(window, before)
-    if scale is None:
-        return None
-    a, b = _shared(window, before)
-    return Similarity(scale, R, (b.centre - scale * a.centre @ R.mT).mean(0))
-
-
-def _shared(window: Window, before: Window) -> tuple[Pose, Pose]:
+def shared_poses(window: Window, before: Window) -> tuple[Pose, Pose]:
     """The frames that two windows share, as each sees them."""
     own, other = torch.isin(window.views, before.views), torch.isin(before.views, window.views)
     return window.found.poses[own], before.found.poses[other]
-
-
-def _scale(window: Window, before: Window) -> Float[Tensor, ""] | None:
-    """How much larger the world of the window before is, by the depths of samples that are seen on the same edges."""
-    looks = []
-    for one in (window, before):
-        Y = one.found.poses[int((one.views == window.middle).nonzero()[0, 0])].transform(one.found.X)
-        Y = Y[Y[:, 2] > 0]
-        looks.append((one.found.focal * Y[:, :2] / Y[:, 2:], Y[:, 2]))
-    (x, depth), (y, other) = looks
-    if not len(x) or not len(y):
-        return None
-    gap, nearest = torch.cdist(x, y).min(1)
-    same = gap < _BESIDE
-    if int(same.sum()) < _FEWEST:
-        return None
-    return (other[nearest][same] / depth[same]).median()
-
-
-def _after(outer: Similarity, inner: Similarity) -> Similarity:
-    """One map, then the other."""
-    return Similarity(outer.scale * inner.scale, outer.R @ inner.R, outer.transform(inner.t[None])[0])
 
 
 def contradictions(windows: Iterable[Window], poses: Pose, registered: Bool[Tensor, "v"]) -> Float[Tensor, "v"]:
