@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,10 @@ from torch import Tensor
 from view_graphs import ring
 
 from torchsfm.motion import average_rotations, position_globally
+from torchsfm.motion.many_views import average_rotations as door_of_rotations
+from torchsfm.motion.many_views import position_globally as door_of_positions
 from torchsfm.motion.many_views import ray_sums, rotation_graph
+from torchsfm.optim import fronts, multigrid, solver_choice
 
 Case = tuple[tuple[Tensor, ...], dict[str, Any]]
 
@@ -152,6 +156,42 @@ def test_no_process_sends_its_edges(generator: torch.Generator, tmp_path: Path) 
         # Of each edge the residual and whether it counts, once for each minimisation, and blocks of coarser graphs.
         sizes[reach] = max(size for kind, size in found if kind == "gather") / len(graph.edges)
     assert max(sizes.values()) <= 24 / 2 + 1
+
+
+def done_here(cases: list[Case]) -> dict[str, int]:
+    """What this process does of what is not divided, while it shares rotations and then centres."""
+    calls = {"start": 0, "judge": 0, "order": 0, "factor": 0, "coarse": 0}
+
+    def counted(name: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*arguments: Any, **options: Any) -> Any:
+            calls[name] += 1
+            return work(*arguments, **options)
+
+        return run
+
+    for name, owner, work in (
+        ("start", rotation_graph.RotationGraph, "start"), ("judge", door_of_rotations, "_judge"),
+        ("judge", door_of_positions, "_judge"), ("order", solver_choice, "order_elimination"),
+        ("factor", fronts.Fronts, "factor"), ("coarse", multigrid._Cycle, "_coarse"),
+    ):  # fmt: skip
+        setattr(owner, work, counted(name, getattr(owner, work)))
+    # A larger system of centres would have a sparse factor by itself.
+    ray_sums.minimise = partial(ray_sums.minimise, linear_solver="sparse")
+    for door, (tensors, options) in zip((average_rotations, position_globally), cases, strict=True):
+        door(*tensors, **options, group=torch.distributed.group.WORLD)
+    return calls
+
+
+def test_what_is_not_divided_one_process_does(generator: torch.Generator, tmp_path: Path) -> None:
+    """Start, coarser graphs, order and factor of a system, and what is said of the answer: the others only wait for these."""
+    graph, rays = ring(420, 4, 0.01, 0.1, generator), orbit(40, 80, 1e-3, 0.0, generator)
+    shared = [
+        ((graph.R, graph.edges), {"views": 420}),
+        ((rays.d, rays.view, rays.point, rays.R), {"points": 80}),
+    ]
+    first, second = processes.run_ranks(2, tmp_path, done_here, shared)
+    assert min(first.values()) > 0, first
+    assert max(second.values()) == 0, second
 
 
 @pytest.mark.parametrize("door", [average_rotations, position_globally])

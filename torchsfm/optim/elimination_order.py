@@ -30,8 +30,8 @@ class Front:
     """In their order."""
     border: int
     """The later variables that these have to do with, as bits."""
-    children: list["Front"]
-    """Fronts that add to this one."""
+    children: list[int]
+    """Fronts that add to this one, by their place among all."""
     width: int
     """Columns of the pivots,"""
     beyond: int
@@ -107,12 +107,14 @@ def _least_partners(
 def _join(order: list[int], border: list[int], beyond: list[int], widths: Sequence[int], last: int) -> list[Front]:
     """The fronts, given what each variable has to do with."""
     rank = {i: len(order) for i in members(last)} | {i: k for k, i in enumerate(order)}
-    waiting: list[list[Front]] = [[] for _ in range(len(order) + 1)]
-    fronts = list[Front]()
+    found = list[Front]()
+    waiting: list[list[int]] = [[] for _ in range(len(order) + 1)]
+    roots = list[int]()
     for i, mask, wide in zip(order, border, beyond, strict=True):
         here = Front([i], mask, [], widths[i], wide)
         # The child of the most columns first: most often the border of the one is all of the other.
-        for child in sorted(waiting[rank[i]], key=lambda f: -f.width):
+        for number in sorted(waiting[rank[i]], key=lambda f: -found[f].width):
+            child = found[number]
             together, width = _seconds(child.width + here.width, here.beyond), child.width + here.width
             # What comes later will share the cost of a new front, so it must be less for each column, too.
             if together <= min(child.seconds + here.seconds, child.seconds * width / child.width):
@@ -120,24 +122,26 @@ def _join(order: list[int], border: list[int], beyond: list[int], widths: Sequen
                 here.width += child.width
                 here.children += child.children
             else:
-                here.children.append(child)
-        if mask:
-            waiting[min(rank[j] for j in members(mask))].append(here)
-        else:
-            fronts.append(here)
+                here.children.append(number)
+        (waiting[min(rank[j] for j in members(mask))] if mask else roots).append(len(found))
+        found.append(here)
     if last:
         own = list(members(last))
-        fronts.append(Front(own, 0, waiting[-1], sum(widths[i] for i in own), 0))
-    return _in_order(fronts)
+        roots.append(len(found))
+        found.append(Front(own, 0, waiting[-1], sum(widths[i] for i in own), 0))
+    return _in_order(found, roots)
 
 
-def _in_order(roots: list[Front]) -> list[Front]:
-    """Children first."""
-    found, stack = list[Front](), list(roots)
+def _in_order(found: list[Front], roots: list[int]) -> list[Front]:
+    """Those that were not joined, children first."""
+    order, stack = list[int](), list(roots)
     while stack:
-        found.append(stack.pop())
-        stack += found[-1].children
-    return found[::-1]
+        order.append(stack.pop())
+        stack += found[order[-1]].children
+    place = {number: k for k, number in enumerate(reversed(order))}
+    for number in order:
+        found[number].children = [place[child] for child in found[number].children]
+    return [found[number] for number in reversed(order)]
 
 
 def members(mask: int) -> Iterator[int]:

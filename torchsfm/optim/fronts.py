@@ -51,7 +51,7 @@ class Fronts:
         widths = [len(c) for c in columns]
         self.size = sum(widths)
         order = [i for front in found for i in front.pivots]
-        rank, number = {i: k for k, i in enumerate(order)}, {id(front): f for f, front in enumerate(found)}
+        rank = {i: k for k, i in enumerate(order)}
         # Of each column, and of the gradient's and that of fixed variables: its variable, its place there, when its turn is.
         self._variable = torch.full((self.size + 2,), len(columns), device=device)
         self._within, self._turn = torch.zeros_like(self._variable), torch.arange(self.size + 2, device=device)
@@ -75,9 +75,9 @@ class Fronts:
             joined = []
             for child in front.children:
                 # The rows of a border are in the order of their turns, as everywhere.
-                beyond = self.fronts[number[id(child)]].border
+                beyond = self.fronts[child].border
                 local = first[f].to(device)[self._variable[beyond]] + self._within[beyond]
-                joined.append((number[id(child)], local, int((local < p).sum())))
+                joined.append((child, local, int((local < p).sum())))
             self.fronts.append(_Place(self.total, mine[:p], mine[p:], joined))
             self.total += len(mine) * p
         self._first, self._front = first.to(device), front_of.to(device)

@@ -190,7 +190,7 @@ class _Level:
             centre = torch.where((centre < 0) & (found >= 0), member[found.clamp(min=0)], centre)
 
     def coarser(self, star: Tensor) -> "_Level":
-        """The matrix over stars whose members move alike."""
+        """The matrix over stars whose members move alike; the first rank has it, the others know how large it is."""
         n = int(star.max()) + 1
         D = self.D.new_zeros((n, *self.D.shape[1:]))
         if not self.ranks.rank:
@@ -198,8 +198,11 @@ class _Level:
         scale = self.scale.new_zeros((n, self.scale.shape[1])).index_add_(0, star, self.scale)
         i, j = star[self.i], star[self.j]
         inside = i == j
-        D = self.ranks.sum(D.index_add_(0, i[inside], self.B[inside] + self.B[inside].mT))
-        i, j, B = _gathered(*_merged(i[~inside], j[~inside], self.B[~inside], n), n, self.ranks)
+        D = self.ranks.sum_first(D.index_add_(0, i[inside], self.B[inside] + self.B[inside].mT))
+        i, j, B = _merged(i[~inside], j[~inside], self.B[~inside], n)
+        if self.ranks.size > 1:
+            first = self.ranks.gather_first
+            i, j, B = _merged(first(i), first(j), first(B), n)
         return _level(i, j, B, D, scale, Ranks())
 
 
@@ -224,13 +227,18 @@ class _Cycle:
 
     def __init__(self, finest: _Level) -> None:
         self._levels, self._stars = [finest], list[Tensor]()
+        self._ranks = finest.ranks
         while self._levels[-1].scale.numel() > FEW and self._levels[-1].joined:
             self._stars.append(self._levels[-1].stars())
             self._levels.append(self._levels[-1].coarser(self._stars[-1]))
-        self._inverse = [_inverse(level.D) for level in self._levels]
+            if self._ranks.rank:
+                break
+        # Coarser graphs take less time than sending their vectors round would: the first rank works on them alone.
+        mine = self._levels[:1] if self._ranks.rank else self._levels
+        self._inverse = [_inverse(level.D) for level in mine]
         last = self._levels[-1]
         self._last: Tensor | None = None
-        if len(last.i):
+        if len(last.i) and not self._ranks.rank:
             n, w = last.scale.shape
             own = torch.arange(n, device=last.i.device)
             A = last.D.new_zeros((n, n, w, w))
@@ -248,11 +256,16 @@ class _Cycle:
         x = SMOOTH * (inverse @ r[:, :, None])[:, :, 0]
         star, coarse = self._stars[k], self._levels[k + 1]
         right = r.new_zeros(coarse.scale.shape).index_add_(0, star, r - level.product(x))
-        step = self._solve(k + 1, right)
-        for _ in range(VISITS - 1 if k + 2 < len(self._levels) else 0):
-            step = step + self._solve(k + 1, right - coarse.product(step))
-        x = x + LONGER * step[star]
+        step = self._coarse(k + 1, right) if k or not self._ranks.rank else right
+        x = x + LONGER * (step if k else self._ranks.spread(step))[star]
         return x + SMOOTH * (inverse @ (r - level.product(x))[:, :, None])[:, :, 0]
+
+    def _coarse(self, k: int, right: Tensor) -> Tensor:
+        """The steps on a coarser graph."""
+        step = self._solve(k, right)
+        for _ in range(VISITS - 1 if k + 1 < len(self._levels) else 0):
+            step = step + self._solve(k, right - self._levels[k].product(step))
+        return step
 
 
 def _inverse(A: Tensor) -> Tensor:

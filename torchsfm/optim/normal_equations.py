@@ -132,15 +132,28 @@ class NormalEquations:
         S = self.squares.dense()
         for part, L, z in zip(self.eliminated, triangles, right, strict=True):
             part.reduce(S, L, z)
-        S = self.layout.ranks.sum(S)
+        ranks = self.layout.ranks
+        S = ranks.sum_first(S)
+        if ranks.size == 1:
+            return *self._by_square(S, weight), False
+        found = torch.nn.functional.pad(weight, (0, 2))
+        if not ranks.rank:
+            kept, solved, bent = self._by_square(S, weight)
+            found = torch.cat((kept, torch.stack((solved, torch.full_like(solved, bent)))))
+        found = ranks.spread(found)
+        return found[:size], found[size] > 0, bool(found[size + 1]), False
+
+    def _by_square(self, S: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, bool]:
+        """The step of the retained variables, if there is one, and whether the cost bends down, given the dense system."""
+        size = len(weight)
         S.diagonal()[:size] += weight
         self.hold(S[:size, :size])
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
         if self.curved and size <= LARGEST_BENT and bool(info):
-            return *self._downhill(S[:size, :size], S[:size, size]), True, False
+            return *self._downhill(S[:size, :size], S[:size, size]), True
         half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
         kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
-        return kept, (info == 0) & kept.isfinite().all(), False, False
+        return kept, (info == 0) & kept.isfinite().all(), False
 
     def _by_fronts(
         self, fronts: Fronts, weight: Tensor, triangles: list[Triangle], right: list[Tensor]
@@ -149,11 +162,12 @@ class NormalEquations:
         S = self.squares.filled(fronts)
         for part, L, z in zip(self.eliminated, triangles, right, strict=True):
             part.reduce(S, L, z)
-        S = self.layout.ranks.sum(S)
-        kept = fronts.solve(S, weight, -fronts.gradient(S), self._resting)
-        if kept is None:
-            return weight, torch.zeros_like(weight, dtype=torch.bool).any()
-        return kept, kept.isfinite().all()
+        ranks = self.layout.ranks
+        S = ranks.sum_first(S)
+        found = None if ranks.rank else fronts.solve(S, weight, -fronts.gradient(S), self._resting)
+        kept = ranks.spread(torch.full_like(weight, torch.nan) if found is None else found)
+        solved = kept.isfinite().all()
+        return torch.where(solved, kept, weight), solved
 
     def hold(self, S: Tensor) -> None:
         """Make the reduced system stiff, in place, along motions of which no step has a part."""

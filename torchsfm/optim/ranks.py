@@ -4,15 +4,19 @@ What residuals say of retained variables is a sum over residuals, so a rank adds
 What belongs to eliminated variables never leaves their rank before the end.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, ParamSpec, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
 import torch.distributed
 from torch import Tensor
 
+from torchsfm._types import tensor_map
 from torchsfm.optim.terms import Block, Term, block_names, eliminated_block
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 @runtime_checkable
@@ -63,18 +67,57 @@ class Ranks:
 
     def gather(self, x: Tensor) -> Tensor:
         """The rows of all ranks, rank by rank; each may have another number of them."""
+        return x if self.size == 1 else self._gathered(x, everywhere=True)
+
+    def gather_first(self, x: Tensor) -> Tensor:
+        """The same on the first rank; no rows on the others."""
+        return x if self.size == 1 else self._gathered(x, everywhere=False)
+
+    def sum_first(self, x: Tensor) -> Tensor:
+        """The sum over the ranks on the first one; what the others get says nothing."""
+        if self.size > 1:
+            x = x.contiguous()
+            torch.distributed.reduce(x, self._first, group=cast(Any, self.group))
+        return x
+
+    def spread(self, x: Tensor) -> Tensor:
+        """What the first rank has, in the memory of `x` where that is contiguous; others give something of the same shape."""
+        if self.size > 1:
+            x = x.contiguous()
+            torch.distributed.broadcast(x, self._first, group=cast(Any, self.group))
+        return x
+
+    def once(self, device: torch.device, find: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+        """What `find` gives on the first rank, for all: the others wait, which takes no time of their processors.
+
+        Tensors in it come to a device of each rank. It must not communicate.
+        """
         if self.size == 1:
-            return x
+            return find(*arguments, **options)
+        # A view would be sent with all that it is a view of.
+        found = [tensor_map(lambda x: x.cpu().clone(), find(*arguments, **options)) if self.rank == 0 else None]
+        torch.distributed.broadcast_object_list(found, self._first, group=cast(Any, self.group))
+        return cast(T, tensor_map(lambda x: x.to(device), found[0]))
+
+    @property
+    def _first(self) -> int:
+        """What the first rank of the group is called among all processes."""
+        return torch.distributed.get_global_rank(cast(Any, self.group), 0)
+
+    def _gathered(self, x: Tensor, *, everywhere: bool) -> Tensor:
         if x.dtype == torch.bool:
-            return self.gather(x.to(torch.uint8)).bool()
+            return self._gathered(x.to(torch.uint8), everywhere=everywhere).bool()
         count = torch.zeros(self.size, dtype=torch.int64, device=x.device)
         count[self.rank] = len(x)
         counts = self.sum(count).tolist()
         padded = x.new_zeros((max(counts), *x.shape[1:]))
         padded[: len(x)] = x
-        found = [torch.empty_like(padded) for _ in counts]
-        torch.distributed.all_gather(found, padded, group=cast(Any, self.group))
-        return torch.cat([rows[:number] for rows, number in zip(found, counts, strict=True)])
+        found = [torch.empty_like(padded) for _ in counts] if everywhere or self.rank == 0 else []
+        if everywhere:
+            torch.distributed.all_gather(found, padded, group=cast(Any, self.group))
+        else:
+            torch.distributed.gather(padded, found or None, self._first, group=cast(Any, self.group))
+        return torch.cat([rows[:number] for rows, number in zip(found, counts, strict=True)]) if found else x[:0]
 
     def _reduced(self, x: Tensor, how: str) -> Tensor:
         if self.size == 1:

@@ -10,12 +10,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchsfm.optim.elimination_order import order_elimination
+from torchsfm.optim.elimination_order import Front, order_elimination
 from torchsfm.optim.fronts import Fronts
 from torchsfm.optim.layout import Layout
 from torchsfm.optim.multigrid import PairGraph
 from torchsfm.optim.schur_pairwise import estimate_pairs
-from torchsfm.optim.sparsity import depth, partners
+from torchsfm.optim.sparsity import depth, find_met, partners
 
 LARGEST = 9000
 """Columns of the largest reduced system formed without being asked: its square and factor take 1.3 GB."""
@@ -63,14 +63,30 @@ def plan_fronts(layout: Layout, solver: Solver, *, last: Tensor | None = None, e
         forming = float(layout.ranks.largest(pairs))
         if dense - forming < WORTH or forming > FORMED:
             return None
-    partner, columns, final = partners(layout, last)
-    limit = math.inf
+    limit = each = math.inf
     if solver == "auto":
-        limit = dense if exact or layout.size <= LARGEST else math.inf
-        if not exact:
-            limit = min(limit, _iterations(layout) * max(1.0, depth(partner) / HOPS))
-        limit -= forming
-    found = order_elimination(tuple(partner), tuple(map(len, columns)), limit, final)
+        limit = (dense if exact or layout.size <= LARGEST else math.inf) - forming
+        each = math.inf if exact else _iterations(layout)
+    found = layout.ranks.once(layout.device, _order, layout, find_met(layout), last, limit, each, forming)
+    if found is None:
+        return None
+    fronts, columns, widths = found
+    return Fronts(fronts, torch.split(columns, widths))
+
+
+def _order(
+    layout: Layout, met: Tensor, last: Tensor | None, limit: float, each: float, forming: float
+) -> tuple[tuple[Front, ...], Tensor, list[int]] | None:
+    """The fronts, and the columns of their variables with how many these are.
+
+    None if they take longer than a limit, or than conjugate gradients: those take so many seconds `each` way of ten partners
+    from one end to the other, and nothing need be formed for them.
+    """
+    partner, columns, final = partners(layout, met, last)
+    if each < math.inf:
+        limit = min(limit, each * max(1.0, depth(partner) / HOPS) - forming)
+    widths = [len(c) for c in columns]
+    found = order_elimination(tuple(partner), tuple(widths), limit, final)
     if found is None or sum(front.seconds for front in found) > limit:
         return None
-    return Fronts(found, columns)
+    return found, torch.cat(columns), widths

@@ -120,8 +120,8 @@ def sparse_levenberg_marquardt(
         group: Processes (of `torch.distributed`) that call this with the same problem, on processors of one kind: each works
             on some of the eliminated variables and on the residuals that meet them, so that time and memory are divided, and
             all return the same. They add up what concerns retained variables: their numbers once for each step of conjugate
-            gradients, or the dense system once for each step. `progress` of any of them ends it for all; an interrupt is
-            passed on as it is, since the others wait.
+            gradients, or the system once for each step, which the first solves while the others wait. `progress` of any of
+            them ends it for all; an interrupt is passed on as it is, since the others wait.
 
     Returns:
         The minimum. Where data, weights or fixed variables require a gradient, `x` and `residuals` carry their derivatives by

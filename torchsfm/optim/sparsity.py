@@ -8,11 +8,8 @@ from torchsfm.optim.layout import Layout
 from torchsfm.optim.schur_pairwise import pairs_of_points
 
 
-def partners(layout: Layout, last: Tensor | None = None) -> tuple[list[int], list[Tensor], int]:
-    """The partners of each variable as bits, its columns, and which have some last columns; like variables are one.
-
-    These are such as have the same partners besides each other, and both some of the last columns, or neither.
-    """
+def find_met(layout: Layout) -> Tensor:
+    """Each pair of variables brought together on any rank, once, as numbers `i * count + j`; the first rank has them."""
     owner = layout.owners()
     count = int(owner[-1])
     # The first column of each variable stands for it.
@@ -37,9 +34,19 @@ def partners(layout: Layout, last: Tensor | None = None) -> tuple[list[int], lis
         both = torch.unique(slots[left] * len(of_slot) + slots[right])
         first, second = torch.div(both, len(of_slot), rounding_mode="floor"), both % len(of_slot)
         keys.append(_met(of_slot[first], of_slot[second], count))
-    keys = torch.unique(layout.ranks.gather(torch.unique(torch.cat(keys))))
+    met: Tensor = torch.unique(layout.ranks.gather_first(torch.unique(torch.cat(keys))))
+    return met
+
+
+def partners(layout: Layout, met: Tensor, last: Tensor | None = None) -> tuple[list[int], list[Tensor], int]:
+    """The partners of each variable as bits, its columns, and which have some last columns; like variables are one.
+
+    These are such as have the same partners besides each other, and both some of the last columns, or neither.
+    """
+    owner = layout.owners()
+    count = int(owner[-1])
     masks = [0] * count
-    for i, j in zip(torch.div(keys, count, rounding_mode="floor").tolist(), (keys % count).tolist(), strict=True):
+    for i, j in zip(torch.div(met, count, rounding_mode="floor").tolist(), (met % count).tolist(), strict=True):
         masks[i] |= 1 << j
         masks[j] |= 1 << i
     return _merged(masks, owner[: layout.size], set() if last is None else set(owner[last].tolist()))

@@ -7,20 +7,20 @@ algorithm", CVPR 2011), whose scatter then sets the scale of a loss under which 
 by it: equal ones of all cameras change nothing, which is what `optim.multigrid` makes use of.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
-from torchsfm._types import Status, check_index, check_one_problem, check_options
+from torchsfm._types import Status, check_index, check_one_problem, check_options, tensor_map
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.components import components
 from torchsfm.motion.many_views.rotation_graph import RotationGraph, rotations_of
 from torchsfm.motion.many_views.rotation_loops import count_loops, vouched_parts
 from torchsfm.motion.many_views.triplets import turn_angle
-from torchsfm.optim import GemanMcClure, Huber
-from torchsfm.optim.ranks import Group
+from torchsfm.optim import GemanMcClure, Huber, Loss
+from torchsfm.optim.ranks import Group, Ranks
 
 ROUNDS = 2
 """Sums of lengths minimised, each with the scale that the last has left."""
@@ -108,10 +108,10 @@ def average_rotations(
         max_iterations: Most steps of each of the minimisations.
         tolerance: Part of the cost that the last of them may leave; where rotations are adjusted later, 1e-3 will do.
         group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same graph and share
-            what the minimisations take: edges are divided, rotations and the coarser graphs of `optim.multigrid` are known to
-            all. Each iteration of conjugate gradients sends three numbers of each camera three times. Every process has all
-            edges as they are given and by itself finds triangles, start, loops and covariances. All return the same, which is
-            what one process finds, to rounding; see `sparse_levenberg_marquardt`.
+            what the minimisations take: edges are divided, rotations are known to all. Each iteration of conjugate gradients
+            sends three numbers of each camera three times. The first does the rest, the coarser graphs of `optim.multigrid`,
+            triangles, start, loops and covariances, while the others wait. All return the same, which is what one process
+            finds, to rounding; see `sparse_levenberg_marquardt`.
 
     Returns:
         Rotations, statuses, components, and what is thought of each edge. Edges that are not finite, whose R is no rotation,
@@ -138,60 +138,67 @@ def average_rotations(
     check_options(tolerance=(tolerance, "float >= 0"), group=(group, Group | None))
     check_index(edges=(edges, views))
     edges = edges.long()
+    # What is not minimised the first of several processes does alone.
+    ranks, device = Ranks(group), R.device
     with torch.no_grad():
-        counts = _countable(R, edges, deviation, weights)
+        counts = ranks.once(device, _countable, R, edges, deviation, weights)
     kept = counts.nonzero()[:, 0]
     sigma = None if deviation is None else deviation[kept].double()
     weight = None if weights is None else weights[kept].double()
     graph = RotationGraph.of(R[kept].double(), edges[kept], sigma, weight, views, group)
     with torch.no_grad():
-        tree, _ = graph.start()
-        start = tree
+        tree, _ = ranks.once(device, graph.start)
+        start, scale = tree, ranks.once(device, graph.scale, tree)
+        of_tree = scale
         for _ in range(ROUNDS):
-            scale = graph.scale(start)
             start = rotations_of(graph.minimise(start, Huber(scale), max_iterations, ROUGH))
-            start = graph.reseat(start, AGREES * graph.scale(start))
+            start, scale = ranks.once(device, graph.reseated, start, AGREES)
         # A few wrong edges that claim to be very exact outweigh all right ones in a sum of lengths, but not in the tree.
-        scale = min(graph.scale(start), graph.scale(tree))
+        scale = min(scale, of_tree)
         loss = GemanMcClure(REACH * scale)
         start, tree = (rotations_of(graph.minimise(x, loss, max_iterations, ROUGH)) for x in (start, tree))
-        start = graph.better(start, tree, loss)
+        start, left = ranks.once(device, graph.better, start, tree, loss)
         for _ in range(SEATS):
-            left = graph.scale(start)
             if left > SETTLED * scale:
                 break
             # It was that of rotations that wrong edges bend, and too large.
             scale, loss = left, GemanMcClure(REACH * left)
-            moved = graph.reseat(start, AGREES * scale)
-            start = graph.better(start, rotations_of(graph.minimise(moved, loss, max_iterations, ROUGH)), loss)
+            moved = ranks.once(device, graph.reseat, start, AGREES * scale)
+            moved = rotations_of(graph.minimise(moved, loss, max_iterations, ROUGH))
+            start, left = ranks.once(device, graph.better, start, moved, loss)
     found = graph.minimise(start, loss, max_iterations, tolerance)
     model = rotations_of(found)
     with torch.no_grad():
-        plain = model.detach()
-        angle, inliers = R.new_full((len(R),), torch.pi), torch.zeros_like(counts)
-        off = turn_angle(graph.disagreement(plain))
-        angle[kept] = off.to(R.dtype)
-        inliers[kept] = graph.square(plain).sqrt() <= AGREES * scale
-        status = _status(edges, counts, inliers, views, found.status)
-        part = vouched_parts(off, graph.edges, views)
-        vouched = part[edges[:, 0]] == part[edges[:, 1]]
-        supported = torch.bincount(edges[counts & vouched].flatten(), minlength=views) > 0
-        unlikely = ~supported & (status != int(Status.TOO_FEW))
-        status = torch.where(unlikely, int(Status.NO_CONSENSUS), status).to(torch.int8)
-        sure = inliers & vouched & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
-        component = components(edges[sure], views)
-        told = count_loops(edges[sure], component)
-        if told:
-            square = graph.square(plain)[sure[kept]].sum() / (3 * told)
-            scale = max(float(square.sqrt()), graph.least())
-        elif deviation is not None:
-            scale = 1.0
-        spread = None
-        if covariance:
-            known = scale if told or deviation is not None else torch.inf
-            spread = graph.covariance(plain, component, status, loss, known).to(R.dtype)
-    model = (model @ model[component].mT).to(R.dtype)
-    return AveragedRotations(model, status, component, angle, inliers, R.new_tensor(scale), spread)
+        told = ranks.once(device, _judge, graph, model.detach(), found.status, edges, counts, loss, scale, covariance)
+    told = tensor_map(lambda x: x.to(R.dtype) if x.is_floating_point() else x, told)
+    return replace(told, model=(model @ model[told.component].mT).to(R.dtype))
+
+
+def _judge(
+    graph: RotationGraph, model: Tensor, course: Status, edges: Tensor, counts: Tensor, loss: Loss, scale: float, spread: bool
+) -> AveragedRotations:
+    """What a minimum under a loss of some scale says of cameras and edges."""
+    kept, views = counts.nonzero()[:, 0], graph.views
+    angle, inliers = model.new_full((len(edges),), torch.pi), torch.zeros_like(counts)
+    angle[kept] = off = turn_angle(graph.disagreement(model))
+    square = graph.square(model)
+    inliers[kept] = square.sqrt() <= AGREES * scale
+    status = _status(edges, counts, inliers, views, course)
+    part = vouched_parts(off, graph.edges, views)
+    vouched = part[edges[:, 0]] == part[edges[:, 1]]
+    supported = torch.bincount(edges[counts & vouched].flatten(), minlength=views) > 0
+    unlikely = ~supported & (status != int(Status.TOO_FEW))
+    status = torch.where(unlikely, int(Status.NO_CONSENSUS), status).to(torch.int8)
+    sure = inliers & vouched & (status != int(Status.NO_CONSENSUS))[edges].all(-1)
+    component = components(edges[sure], views)
+    loops = count_loops(edges[sure], component)
+    if loops:
+        scale = max(float((square[sure[kept]].sum() / (3 * loops)).sqrt()), graph.least())
+    elif graph.deviation is not None:
+        scale = 1.0
+    known = scale if loops or graph.deviation is not None else torch.inf
+    deviation = graph.covariance(model, component, status, loss, known) if spread else None
+    return AveragedRotations(model, status, component, angle, inliers, model.new_tensor(scale), deviation)
 
 
 def _countable(R: Tensor, edges: Tensor, deviation: Tensor | None, weights: Tensor | None) -> Bool[Tensor, "e"]:

@@ -7,19 +7,19 @@ groups of cameras, the farther the nearer these stand together.
 What the rays leave open is told afterwards (`open_positions`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
-from torchsfm._types import Status, check_index, check_one_problem, check_options
+from torchsfm._types import Status, check_index, check_one_problem, check_options, tensor_map
 from torchsfm.linalg import usable
 from torchsfm.motion.many_views.open_positions import deviations, tell
 from torchsfm.motion.many_views.ray_sums import AGREES, HUBER, REACH, ROUGH, Rays
 from torchsfm.motion.many_views.reseat_rays import reseat
 from torchsfm.optim import GemanMcClure, Huber
-from torchsfm.optim.ranks import Group
+from torchsfm.optim.ranks import Group, Ranks
 
 MOST_LOST = 0.9
 """Where fewer residuals than a tenth are free, scatter tells no more than that."""
@@ -101,10 +101,9 @@ def position_globally(
         max_iterations: Most steps of each of the two minimisations.
         tolerance: Part of the cost that the last of them may leave; where all is adjusted later, 1e-3 will do.
         group: Processes of `torch.distributed`, started by `torchrun` for one, that call this with the same rays and share
-            what the minimisations take: points and their rays are divided, centres are known to all, and so is the system of
-            centres where it is factored (each process does that by itself). Every process has all rays as they are given and
-            by itself finds components, scales and deviations. All return the same, which is what one process finds, to
-            rounding; see `sparse_levenberg_marquardt`.
+            what the minimisations take: points and their rays are divided, centres are known to all. The first factors the
+            system of centres, and finds components, scales and deviations, while the others wait. All return the same, which
+            is what one process finds, to rounding; see `sparse_levenberg_marquardt`.
 
     Returns:
         Centres, points, statuses, and what is thought of each ray. Rays that are not finite or 0, those of cameras whose
@@ -141,44 +140,58 @@ def position_globally(
     ray = (R[view[kept]].double().mT @ ray[..., None])[..., 0]
     weight = None if weights is None else weights[kept].double()
     rays = Rays(ray, view[kept], point[kept], weight, v, points, group)
+    # What is not minimised the first of several processes does alone.
+    ranks, device = Ranks(group), d.device
     with torch.no_grad():
-        component = rays.component()
+        component = ranks.once(device, rays.component)
         start = rays.convex(max_iterations)
         unknowns = 3 * (len(torch.unique(rays.view)) + len(torch.unique(rays.point)))
         lost = min(unknowns / max(2 * len(ray), 1), MOST_LOST)
-        start = rays.angular(start, Huber(HUBER * rays.scale(start, 0.0)), max_iterations, ROUGH).x
-        scale = rays.scale(start, lost)
+        start = rays.angular(start, Huber(HUBER * ranks.once(device, rays.scale, start, 0.0)), max_iterations, ROUGH).x
+        scale = ranks.once(device, rays.scale, start, lost)
         for _ in range(SEATS):
             before = scale
-            start = reseat(rays, start, GemanMcClure(REACH * scale), AGREES * scale)
-            start = rays.angular(start, GemanMcClure(REACH * rays.scale(start, lost)), max_iterations, ROUGH).x
-            scale = rays.scale(start, lost)
+            start, scale = ranks.once(device, _reseated, rays, start, scale, lost)
+            start = rays.angular(start, GemanMcClure(REACH * scale), max_iterations, ROUGH).x
+            scale = ranks.once(device, rays.scale, start, lost)
             if scale > SETTLED * before:
                 break
-        scale = rays.spread(start, scale)
+        scale = ranks.once(device, rays.spread, start, scale)
     found = rays.angular(start, GemanMcClure(REACH * scale), max_iterations, tolerance)
     c, X = rays.anchored(found, component)
     with torch.no_grad():
-        scale = rays.spread({"c": c, "X": X}, scale)
-        angle = d.new_full((len(d),), torch.pi)
-        u = torch.nn.functional.normalize(X[rays.point] - c[rays.view], dim=-1)
-        off = torch.atan2(torch.linalg.cross(rays.v, u).norm(dim=-1), (rays.v * u).sum(-1))
-        angle[kept] = off.to(d.dtype)
-        inliers = torch.zeros_like(good).index_put_((kept,), off <= AGREES * scale)
-        deviation = deviations(rays, c, X, component, scale)
-        seen = torch.bincount(rays.view, minlength=v)
-        known = (deviation < OPEN) & tell(rays, off <= AGREES * scale, scale)
-        code = torch.where(known, int(found.status), int(Status.DEGENERATE))
-        status = torch.where(seen == 0, int(Status.TOO_FEW), code).to(torch.int8)
-        ok = status == int(found.status)
-        deviation = torch.where(ok, deviation, torch.inf)
-        sure = inliers & ok[view]
-        valid = _views_of(point[sure], view[sure], points, v) >= 2
+        told = ranks.once(device, _judge, rays, good, view, point, c.detach(), X.detach(), component, scale, found.status)
+    told = tensor_map(lambda x: x.to(d.dtype) if x.is_floating_point() else x, told)
+    ok = told.status == int(found.status)
     centres = torch.where(ok[:, None], c, 0.0).to(d.dtype)
-    return GlobalPositions(
-        centres, torch.where(valid[:, None], X, 0.0).to(d.dtype), valid, status, component, deviation.to(d.dtype), angle,
-        inliers, d.new_tensor(scale),
-    )  # fmt: skip
+    return replace(told, centres=centres, X=torch.where(told.valid[:, None], X, 0.0).to(d.dtype))
+
+
+def _reseated(rays: Rays, x: dict[str, Tensor], scale: float, lost: float) -> tuple[dict[str, Tensor], float]:
+    """Cameras and points where more of their rays want them, and the scale that is left."""
+    x = reseat(rays, x, GemanMcClure(REACH * scale), AGREES * scale)
+    return x, rays.scale(x, lost)
+
+
+def _judge(
+    rays: Rays, good: Tensor, view: Tensor, point: Tensor, c: Tensor, X: Tensor, component: Tensor, scale: float, course: Status
+) -> GlobalPositions:
+    """What a minimum says of cameras, points and rays; of the rays `good` count."""
+    scale = rays.spread({"c": c, "X": X}, scale)
+    angle = c.new_full((len(good),), torch.pi)
+    u = torch.nn.functional.normalize(X[rays.point] - c[rays.view], dim=-1)
+    angle[good] = off = torch.atan2(torch.linalg.cross(rays.v, u).norm(dim=-1), (rays.v * u).sum(-1))
+    inliers = torch.zeros_like(good).index_put_((good,), off <= AGREES * scale)
+    deviation = deviations(rays, c, X, component, scale)
+    seen = torch.bincount(rays.view, minlength=rays.views)
+    known = (deviation < OPEN) & tell(rays, off <= AGREES * scale, scale)
+    code = torch.where(known, int(course), int(Status.DEGENERATE))
+    status = torch.where(seen == 0, int(Status.TOO_FEW), code).to(torch.int8)
+    ok = status == int(course)
+    deviation = torch.where(ok, deviation, torch.inf)
+    sure = inliers & ok[view]
+    valid = _views_of(point[sure], view[sure], rays.points, rays.views) >= 2
+    return GlobalPositions(c, X, valid, status, component, deviation, angle, inliers, c.new_tensor(scale))
 
 
 def _views_of(point: Tensor, view: Tensor, points: int, views: int) -> Int[Tensor, "p"]:

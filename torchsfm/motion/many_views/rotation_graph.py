@@ -114,13 +114,21 @@ class RotationGraph:
         move = (most > support) & (most > 1)
         return model.index_copy(0, move.nonzero()[:, 0], wish[seat[move]])
 
-    def better(self, first: Float[Tensor, "v 3 3"], second: Float[Tensor, "v 3 3"], loss: Loss) -> Float[Tensor, "v 3 3"]:
-        """Of each connected part of the graph the rotations that cost less; of equals the first."""
+    def reseated(self, model: Float[Tensor, "v 3 3"], agrees: float) -> tuple[Float[Tensor, "v 3 3"], float]:
+        """The same with a reach of so many standard deviations of the right edges; and their standard deviation afterwards."""
+        model = self.reseat(model, agrees * self.scale(model))
+        return model, self.scale(model)
+
+    def better(
+        self, first: Float[Tensor, "v 3 3"], second: Float[Tensor, "v 3 3"], loss: Loss
+    ) -> tuple[Float[Tensor, "v 3 3"], float]:
+        """Of each connected part of the graph the rotations that cost less; of equals the first. And the scale of all."""
         part = components(self.edges, self.views)
         weights = torch.ones_like(self.R[:, 0, 0]) if self.weights is None else self.weights
         gain = weights * (loss(self.square(first)) - loss(self.square(second)))
         gained = gain.new_zeros(self.views).index_add_(0, part[self.edges[:, 0]], gain)
-        return torch.where((gained > 0)[part, None, None], second, first)
+        model = torch.where((gained > 0)[part, None, None], second, first)
+        return model, self.scale(model)
 
     def scale(self, model: Float[Tensor, "v 3 3"]) -> float:
         """The standard deviation of the right edges, if a quarter of those that do not merely fix the model are right."""
