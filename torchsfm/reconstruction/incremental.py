@@ -18,7 +18,7 @@ from torchsfm.reconstruction.calibration import images_of_cameras, lone_cameras_
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.register import MIN_VISIBLE, register_images, visibility_scores
+from torchsfm.reconstruction.register import MIN_VISIBLE, SEARCHED, register_images, visibility_scores
 from torchsfm.reconstruction.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
 
 MAX_STARTS = 5
@@ -26,6 +26,9 @@ MAX_STARTS = 5
 FEW = 6
 """Of so few images a model is made from each of these, as what a start got wrong the others do not put right: a plane seen from
 the wrong side, another focal length."""
+SAME = 0.01
+"""Models of two starts are one where what they explain differs by this part. Starts from focal lengths that are known a little
+for each image alone are tried until two come to the same, or all."""
 GLOBAL_GROWTH = 1.1
 """A model this much larger than at its last global adjustment gets another."""
 SMALL = 20
@@ -99,6 +102,8 @@ def grow_model(
     most = -1.0  # Explained by it.
     available = int((~mapping.registered).sum())
     unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[mapping.camera_index]
+    alone = (options.focal_sigma > SEARCHED) & (torch.bincount(mapping.camera_index, minlength=len(options.focal_sigma)) == 1)
+    uncertain = alone[mapping.camera_index]
     starts = starting_pairs(mapping, unknown_focal, threshold=options.reprojection, generator=options.generator)
     for start in starts[:MAX_STARTS]:
         model = place_start(empty, start, threshold=options.reprojection)
@@ -108,9 +113,10 @@ def grow_model(
             continue
         grown = extend_model(model, mapping.registered, options, progress)
         explained = support(grown[0], options.reprojection)
+        enough = not bool(uncertain[start.pair].any()) or abs(explained - most) < SAME * most
         if explained > most:
             best, most = grown, explained
-        if available > FEW and int(grown[0].registered.sum()) > 0.5 * available:
+        if available > FEW and enough and int(grown[0].registered.sum()) > 0.5 * available:
             break
     return best
 
