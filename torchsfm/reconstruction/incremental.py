@@ -37,6 +37,8 @@ UNKNOWN_FOCAL = 0.4
 """Focal lengths more uncertain than this fraction are guesses, by which no pair of images is judged."""
 LAST_ITERATIONS, LAST_TOLERANCE = 300, 1e-7
 """The last adjustment goes to the minimum, to a small part of the standard deviations; there it is given up."""
+ROUGHLY: dict[str, Any] = {"max_iterations": 20, "tolerance": 1e-4}
+"""How far principal points of lone cameras go before they are looked at."""
 STANDING = 1e-6
 """Damping of the first step of an adjustment of cameras that stand about where they should: more would only hold back what is
 left, long rows of cameras that bend as a whole."""
@@ -219,8 +221,14 @@ def _refine(model: Mapping, options: MappingOptions) -> Mapping:
     model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
     lone = not options.cropped and bool((images_of_cameras(model) == 1).any())
     if lone and "principal_point" in options.free:
-        freed = options.adjust(model, last=True, lone=True, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
-        model = freed if lone_cameras_plausible(freed, options.prior(freed)) else model
+        freed = model
+        # Where that is not plausible soon, it is not worth the way to its minimum.
+        for limits in (ROUGHLY, {"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE}):
+            freed = options.adjust(freed, last=True, lone=True, **limits)
+            if not lone_cameras_plausible(freed, options.prior(freed)):
+                break
+        else:
+            model = freed
     return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
 
 
