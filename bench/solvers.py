@@ -25,7 +25,8 @@ PARTS = ("recall", "speed", "counts", "gradients", "bad")
 def short_row(case: Case, options: argparse.Namespace) -> str:
     """One solver's line of the short table."""
     double, single = (recall.recall(case, "random", options.samples, d).share for d in (torch.float64, torch.float32))
-    hard = min((recall.recall(case, family, options.samples, torch.float64).share, family) for family in case.families)
+    shares = [(recall.recall(case, family, options.samples, torch.float64).share, family) for family in case.families]
+    least, where = min(shares, default=(1.0, ""))
     times = speed.speeds(case, options.batch, options.repeats)
     peers = ", ".join(f"{name} {1e6 * times[name]:.2f}" for name in case.peers if name in times)
     cells = [
@@ -33,7 +34,7 @@ def short_row(case: Case, options: argparse.Namespace) -> str:
         str(case.size),
         str(case.slots),
         f"{double:.4f} / {single:.4f}",
-        f"{hard[0]:.4f}" + (f" ({hard[1]})" if hard[0] < 1 else ""),
+        (f"{least:.4f}" if shares else "") + (f" ({where})" if least < 1 else ""),
     ]
     cells += [f"{1e6 * times['torchsfm']:.2f}", peers]
     return "| " + " | ".join(cells) + " |"
