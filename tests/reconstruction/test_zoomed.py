@@ -1,5 +1,7 @@
 """Images of one size that were taken with several focal lengths, and such that only look so."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -7,6 +9,7 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Radial, intrinsics
 from torchsfm.reconstruction import SfmResult, growth, reconstruct_tracks
 from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.reconstruction.zoomed import part_zoomed
 from torchsfm.simulation import look_at, random_points, simulate_images
 
@@ -65,3 +68,26 @@ def test_what_files_tell_is_not_asked(generator: torch.Generator) -> None:
     index = torch.tensor([0, 1, 0, 0, 1, 0, 0])
     parted = part_zoomed(graph, index, index == 1)
     assert parted is None or parted[0][1] == parted[0][4]
+
+
+@pytest.mark.parametrize(("views", "asked"), [(7, True), (3, False)])
+def test_models_are_asked_where_pairs_show_planes_alone(generator: torch.Generator, views: int, asked: bool) -> None:
+    """Planes tell no focal length, but many images of one do, and two or three do not."""
+    x, view, track = see(torch.full((views,), 900.0, dtype=torch.float64), (499.5, 374.5), 0.0, generator)
+    names, size = [str(i) for i in range(views)], torch.tensor([SIZE] * views)
+    graph, _ = graph_from_tracks(names, size, x, view, track, torch.zeros(len(x), 3), generator=generator)
+    flat = replace(graph, homography_inliers=graph.fundamental_inliers)
+    one, none = torch.zeros(views, dtype=torch.long), torch.zeros(views, dtype=torch.bool)
+    parted = part_zoomed(flat, one, none)
+    assert (parted is not None) is asked
+    if parted is not None:
+        # More is asked of them than where pairs say that focal lengths differ.
+        surely = part_zoomed(graph_of_a_zoom_lens(generator), one, none)
+        assert surely is not None
+        assert parted[1] > surely[1]
+
+
+def graph_of_a_zoom_lens(generator: torch.Generator) -> ViewGraph:
+    x, view, track = see(800 * torch.logspace(0, 0.25, 7, dtype=torch.float64), (499.5, 374.5), -0.05, generator)
+    names, size = [str(i) for i in range(7)], torch.tensor([SIZE] * 7)
+    return graph_from_tracks(names, size, x, view, track, torch.zeros(len(x), 3), generator=generator)[0]
