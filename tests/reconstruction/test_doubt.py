@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -17,10 +19,11 @@ from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.growth import Component, Growth, Wanted
 from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.mapping import Adjustment, Mapping
 from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
-from torchsfm.reconstruction.models import matches_across
+from torchsfm.reconstruction.models import _judged, matches_across
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at
@@ -412,7 +415,7 @@ def test_tracks_of_two_views_wait_for_cameras_that_longer_ones_place(generator: 
     sees[:5, :200] = True
     sees[0:2, 200:240] = sees[4:, 240:280] = sees[3:, 280:] = True
     mapping = mapping_of(poses, X, sees, generator)
-    first, then = (observation_weights(mapping, LOSS, long_tracks_first=early) for early in (True, False))
+    first, then = (observation_weights(mapping, LOSS, by_long_tracks=early) for early in (True, False))
     problem = mapping.problem()
     length = torch.bincount(problem.point)
     placed, open_end = ((length == 2) & (torch.bincount(problem.point, problem.view == v) > 0) for v in (1, 5))
@@ -422,3 +425,39 @@ def test_tracks_of_two_views_wait_for_cameras_that_longer_ones_place(generator: 
     assert float(first[open_end[problem.point]].median()) > 0.4
     assert first[long].equal(then[long])
     assert float(then[~long].median()) > 0.6
+
+
+def test_deviations_do_not_rest_on_tracks_of_two_views(generator: torch.Generator) -> None:
+    """A camera with a focal length of its own before a wall; the little that it sees before the wall, wrong, says 5 % more."""
+    wall, before = cloud(300, generator, (-3, -0.02, -2), (3, 0.02, 2)), cloud(30, generator, (-3, -3, -2), (3, -1, 2))
+    poses = cameras_on_an_arc(6, 1.0)
+    poses = poses[torch.arange(5, -1, -1)]  # The last one looks at the wall from the front.
+    sees = torch.ones(6, 330, dtype=torch.bool)
+    sees[:4, 300:] = False
+    mapping = mapping_of(poses, torch.cat((wall, before)), sees, generator, noise=0.3)
+    cameras = Camera(mapping.cameras.K.repeat(2, 1, 1), Radial(*torch.zeros(2, 2, dtype=torch.float64)))
+    own = mapping.graph.view == 5
+    mapping = replace(mapping, cameras=cameras, camera_index=(torch.arange(6) == 5).long())
+    K = cameras.K.clone()
+    K[:, [0, 1], [0, 1]] *= 1.05
+    farther = replace(poses, t=torch.where(torch.arange(6)[:, None] == 5, 1.05, 1.0) * poses.t)
+    longer = replace(mapping, poses=farther, cameras=replace(cameras, K=torch.stack((cameras.K[0], K[1]))))
+    wrong = (own & (torch.bincount(mapping.point)[mapping.point] == 2)).nonzero()[:, 0]
+    assert len(wrong) > 15
+    x = mapping.graph.x.clone()
+    x[wrong] = longer.project(mapping.point[wrong], mapping.graph.view[wrong])[0]
+    prior = CameraPrior.of(mapping, mapping.cameras, torch.tensor([1e-4, 0.4], dtype=torch.float64))
+    free = {"focal": torch.tensor([False, True])}
+    mapping = replace(longer, graph=replace(mapping.graph, x=x))
+    for _ in range(3):
+        weights = observation_weights(mapping, LOSS)
+        mapping = adjust(mapping, free=free, prior=prior, weights=weights, max_iterations=100)
+    off = abs(float(mapping.cameras.K[1, 0, 0]) - 600)
+    rest = calibration_of(mapping, prior, loss=LOSS, weights=observation_weights(mapping, LOSS)).deviation[1, 0]
+    options = MappingOptions(("focal",), mapping.cameras, torch.tensor([1e-4, 0.4], dtype=torch.float64))
+    begun = SimpleNamespace(options=options)
+    growth = Mock(Growth, begun=begun, taken=mapping.registered, given_up=~mapping.registered)
+    component = Component(mapping, options, off_centre=False)
+    _, told = _judged(component, growth, mapping.graph, Wanted(free_principal_point=False))
+    assert off > 8 * float(rest)
+    assert off < 3 * float(told.deviation[1, 0])

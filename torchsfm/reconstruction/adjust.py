@@ -134,7 +134,7 @@ def adjust_by_tracks(mapping: Mapping, prior: CameraPrior, *, tolerance: float, 
     """
     free = None if mapping.adjustment is None else mapping.adjustment.free
     for number, until in enumerate((ROUGHLY,) * (REWEIGHTED - 1) + (tolerance,)):
-        weights = observation_weights(mapping, LOSS, long_tracks_first=number < WITHOUT)
+        weights = observation_weights(mapping, LOSS, by_long_tracks=number < WITHOUT)
         mapping = adjust(mapping, free=free, prior=prior, weights=weights, tolerance=until, **limits)
     return mapping
 

@@ -129,15 +129,15 @@ def calibration_of(
     return replace(found, cropped=prior.cropped, alike=prior.alike)
 
 
-def observation_weights(mapping: Mapping, loss: Cauchy, *, long_tracks_first: bool = False) -> Float[Tensor, "m"]:
+def observation_weights(mapping: Mapping, loss: Cauchy, *, by_long_tracks: bool = False) -> Float[Tensor, "m"]:
     """What the observations of a finished model count, in their order: less where the track as a whole fits badly.
 
-    Tracks of two views count by how likely they are right: cameras that had to fit them hide which are wrong, so those that
-    longer tracks determine are first adjusted nearly without them.
+    Tracks of two views count by how likely they are right. Wrong ones hide in cameras that had to fit them: `by_long_tracks`,
+    those of cameras that longer tracks determine count next to nothing.
     """
     problem = mapping.problem()
     weights = track_weights(problem, loss=loss, least_noise=LEAST_NOISE)
-    if not long_tracks_first:
+    if not by_long_tracks:
         return weights * match_weights(problem, least_noise=LEAST_NOISE)
     length = torch.bincount(problem.point, minlength=len(problem.X))
     long = torch.bincount(problem.view[length[problem.point] > 2], minlength=len(problem.poses.R))

@@ -96,7 +96,8 @@ def _judged(component: Component, growth: Growth, graph: ViewGraph, wanted: Want
         uncertain = uncertain | hanging_on_copies(graph, model, others, threshold=threshold)
     # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
     widest = replace(options, cropped=options.cropped or component.off_centre).prior(model)
-    weights = observation_weights(model, LOSS)
+    # What few wrong matches of two views hold fast is not known: deviations are those that longer tracks leave.
+    weights = observation_weights(model, LOSS, by_long_tracks=True)
     standing = examine(
         model, open_numbers=wanted.free, prior=widest, threshold=threshold, weights=weights, uncertain=uncertain,
         conflicts=component.conflicts, agreement=component.agreement,
