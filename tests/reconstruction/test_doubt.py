@@ -427,6 +427,14 @@ def test_tracks_of_two_views_wait_for_cameras_that_longer_ones_place(generator: 
     assert float(then[~long].median()) > 0.6
 
 
+def test_few_images_that_do_not_tell_the_focal_length(generator: torch.Generator) -> None:
+    for sweep, doubtful in ((0.1, True), (1.2, False)):
+        X, sees = cloud(120, generator, (-3, -2, -0.5), (3, 2, 0.5)), torch.ones(3, 120, dtype=torch.bool)
+        mapping = mapping_of(cameras_on_an_arc(3, sweep), X, sees, generator)
+        assert [("hardly determine" in reason) for reason in judged(mapping)] == [doubtful] * 3
+        assert not any("hardly determine" in reason for reason in stand(mapping, 1e-3).doubt)
+
+
 def test_deviations_do_not_rest_on_tracks_of_two_views(generator: torch.Generator) -> None:
     """A camera with a focal length of its own before a wall; the little that it sees before the wall, wrong, says 5 % more."""
     wall, before = cloud(300, generator, (-3, -0.02, -2), (3, 0.02, 2)), cloud(30, generator, (-3, -3, -2), (3, -1, 2))

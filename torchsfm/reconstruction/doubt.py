@@ -9,10 +9,11 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.adjust import LOSS, about_cameras
-from torchsfm.reconstruction.calibration import measure_noise
+from torchsfm.reconstruction.calibration import HARDLY, measure_noise
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import PairAgreement, excess_scatter, pair_agreement
 from torchsfm.reconstruction.groups import outvoted_groups
+from torchsfm.reconstruction.incremental import FEW
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
 
@@ -89,6 +90,9 @@ def examine(
     conflicts = conflicts or missing_correspondences(mapping)
     refuted, folded = conflicts.refuted, conflicts.folded
     guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL
+    focal_sigma = torch.zeros_like(rotation)
+    if "focal" in open_numbers:
+        focal_sigma = (intrinsics[:, 0, 0].sqrt() / mapping.cameras.K[:, 0, 0])[mapping.camera_index]
     degrees = torch.atan(position).rad2deg()
 
     def doubt(i: int) -> str:
@@ -116,6 +120,8 @@ def examine(
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
         if count < 3 and bool(guessed[i]):
             return "two images alone, with a guessed focal length"
+        if count <= FEW and bool(guessed[i]) and not focal_sigma[i] < HARDLY:
+            return "few images, which hardly determine the focal length"
         if flat:
             return "the images seem to be cropped, and most pairs of them show little besides one plane"
         if not DEVIATIONS * rotation[i] < WRONG_ANGLE:
