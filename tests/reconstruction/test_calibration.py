@@ -15,9 +15,11 @@ from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_from_ro
 from torchsfm.optim import Cauchy
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import SfmResult, incremental, reconstruct_tracks
-from torchsfm.reconstruction.calibration import folded_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.adjust import LOSS, adjust
+from torchsfm.reconstruction.calibration import choose_free, folded_cameras, lone_cameras_plausible
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.structure import triangulate_tracks
 from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 from torchsfm.simulation import look_at, random_bundle_problem, random_points, simulate_images
@@ -130,13 +132,15 @@ def test_what_is_held_counts_in_what_is_estimated(generator: torch.Generator) ->
     assert bool((found.deviation[0] <= found.prior[0] * (1 + 1e-9)).all())
 
 
-def photographs_of_lone_cameras(generator: torch.Generator) -> tuple[Mapping, CameraPrior]:
+def photographs_of_lone_cameras(
+    generator: torch.Generator, centre: tuple[float, float] = (499.5, 374.5), noise: float = 0.0
+) -> tuple[Mapping, CameraPrior]:
     v = 8
     X, poses = visit(generator, views=v)
-    K = intrinsics(torch.full((v,), 1200.0).double(), torch.tensor([499.5, 374.5]).double().expand(v, 2))
+    K = intrinsics(torch.full((v,), 1200.0).double(), torch.tensor(centre).double().expand(v, 2))
     zero = torch.zeros(v, dtype=torch.float64)
     cameras = Camera(K, Radial(zero, zero))
-    seen = simulate_images(X, poses, cameras, image_size=SIZE, generator=generator)
+    seen = simulate_images(X, poses, cameras, image_size=SIZE, noise=noise, generator=generator)
     view, track = seen.visible.nonzero(as_tuple=True)
     names, size = tuple(f"{i}" for i in range(v)), torch.tensor([SIZE] * v)
     color = torch.zeros(len(view), 3, dtype=torch.float64)
@@ -156,6 +160,30 @@ def test_principal_points_that_scatter_like_no_cameras_are_not_believed(
         K[:, :2, 2] += share * SIZE[0] * torch.randn(len(K), 2, generator=generator, dtype=torch.float64)
         moved = replace(mapping, cameras=replace(mapping.cameras, K=K))
         assert lone_cameras_plausible(moved, prior) is plausible
+
+
+def test_principal_points_of_one_body(generator: torch.Generator) -> None:
+    """All 2 % off the middle: more than half of it is found, and alike, where the zoom lens of one camera took all images."""
+    off = torch.tensor([20.0, -16.0], dtype=torch.float64)
+    mapping, _ = photographs_of_lone_cameras(generator, (519.5, 358.5), noise=1.0)
+    mapping = triangulate_tracks(mapping, threshold=8.0, min_angle=0.02)
+    K = mapping.cameras.K.clone()
+    K[:, :2, 2] -= off
+    expected, sigma = replace(mapping.cameras, K=K), torch.full((8,), 0.5, dtype=torch.float64)
+    names = ("focal", "principal_point")
+    one, several = (CameraPrior.of(mapping, expected, sigma, body=body) for body in (torch.zeros(8, dtype=torch.long), None))
+    held = choose_free(mapping, names, several, loss=LOSS)["principal_point"]
+    assert not held.any()
+    free = choose_free(mapping, names, one, loss=LOSS)
+    assert free["principal_point"].all()
+    assert lone_cameras_plausible(mapping, one)
+    start = adjust(replace(mapping, cameras=expected), max_iterations=100)
+    left = []
+    for prior in (one, several):
+        found = adjust(start, free=free, prior=prior, max_iterations=100, tolerance=1e-7).cameras.K[:, :2, 2] - K[:, :2, 2]
+        left.append(((found - off).norm(dim=-1).mean(), (found - found.mean(0)).norm(dim=-1).mean()))
+    assert left[0][0] < 0.5 * left[1][0]
+    assert left[0][1] < 0.5 * left[1][1]
 
 
 def test_a_folded_lens_is_noticed(generator: torch.Generator) -> None:

@@ -1,6 +1,6 @@
 """What is expected of cameras before any image point was seen."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Dict
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,11 +17,15 @@ from torchsfm.reconstruction.mapping import Mapping
 
 PRINCIPAL_POINT_SIGMA = 0.01
 """How far principal points lie from the middle of the image, as a fraction of its longer side."""
+ONE_BODY = 0.002
+"""By how much the principal points of one camera differ as its lens zooms, in the same unit."""
 CROPPED_SIGMA = 0.1
 """The same where images may have been cut out of larger ones."""
 RADIAL_SIGMA = 0.3
 TANGENTIAL_SIGMA = 0.01
 """How large the distortion parameters of lenses are."""
+NOT_KNOWN = 1e6
+"""Times the width of a prior that says nothing."""
 ALIKE = 1e-3
 """By how much the numbers of one camera may differ, as a fraction of how uncertain they were: a tie that steps can follow."""
 
@@ -35,16 +39,26 @@ class CameraPrior:
         sigma: Standard deviations by the names `bundle_adjust` knows: of "focal" as a fraction, of others in their own unit.
         cropped: Whether images may have been cut out of larger ones.
         alike: Whether all are one camera then: principal points alone differ.
+        body: Cameras of the same number are one with a zoom lens, unless images were cropped: its sensor keeps its place, and
+            their principal points lie off the middle by about the same. Each by itself where None.
     """
 
     mean: Camera
     sigma: Dict[str, Float[Tensor, "g"]]
     cropped: bool = False
     alike: bool = False
+    body: Int[Tensor, "g"] | None = None
 
     @classmethod
     def of(
-        cls, mapping: Mapping, mean: Camera, focal_sigma: Float[Tensor, "g"], *, cropped: bool = False, alike: bool = False
+        cls,
+        mapping: Mapping,
+        mean: Camera,
+        focal_sigma: Float[Tensor, "g"],
+        *,
+        cropped: bool = False,
+        alike: bool = False,
+        body: Int[Tensor, "g"] | None = None,
     ) -> "CameraPrior":
         """The prior of the cameras of a mapping: principal points about the middle, no distortion."""
         g = len(mean.K)
@@ -55,7 +69,7 @@ class CameraPrior:
         for name in mean.distortion.parameter_names:
             width = TANGENTIAL_SIGMA if name in ("p1", "p2") else RADIAL_SIGMA
             sigma[name] = torch.full((g,), width, dtype=mean.K.dtype)
-        return cls(mean, sigma, cropped, alike)
+        return cls(mean, sigma, cropped, alike, None if cropped else body)
 
     def terms(self, noise: float, names: Iterable[str], used: Bool[Tensor, "g"]) -> dict[str, Any]:
         """The prior in the words of `bundle_adjust`, for a cost that takes the image points' noise to be one pixel.
@@ -67,14 +81,38 @@ class CameraPrior:
         """
         known = {name: self.sigma[name] / noise for name in names}
         terms: dict[str, Any] = {"intrinsics_sigma": known, "intrinsics_mean": self.mean}
+        ties = [*self._one_body(known, used), *self._one_lens(known, used)]
+        return terms | {"priors": tuple(ties)} if ties else terms
+
+    def _one_body(self, known: dict[str, Float[Tensor, "g"]], used: Bool[Tensor, "g"]) -> Iterator["_Alike"]:
+        """The principal points of one body: the first lies as principal points do, the others where the first does."""
+        first = self._first_of_body(used)
+        others = (first != torch.arange(len(used))).nonzero()[:, 0]
+        if "principal_point" in known and len(others):
+            width = known["principal_point"]
+            known["principal_point"] = width.index_fill(0, others, NOT_KNOWN * float(width.amax()))
+            columns = torch.tensor(free_columns(("principal_point",), type(self.mean.distortion)))
+            apart = (ONE_BODY / PRINCIPAL_POINT_SIGMA * width[others])[:, None].expand(-1, len(columns))
+            yield _Alike(first[others], others, columns, apart)
+
+    def _one_lens(self, known: dict[str, Float[Tensor, "g"]], used: Bool[Tensor, "g"]) -> Iterator["_Alike"]:
+        """All but the principal points, where all cameras are one."""
+        model, index = type(self.mean.distortion), used.nonzero()[:, 0]
         lens = [name for name in known if name != "principal_point"]
-        index = used.nonzero()[:, 0]
         if self.alike and lens and len(index) > 1:
-            columns = free_columns(lens, type(self.mean.distortion))
-            width = {c: self.sigma[name].amin() for name in lens for c in free_columns((name,), type(self.mean.distortion))}
+            columns = free_columns(lens, model)
+            width = {c: self.sigma[name].amin() for name in lens for c in free_columns((name,), model)}
             scale = [ALIKE * width[c] * (self.mean.K[index, 0, 0].mean() if c == FOCAL else 1.0) for c in columns]
-            terms["priors"] = (_Alike(index, torch.tensor(columns), torch.stack(scale)),)
-        return terms
+            first, others = index[:1].expand(len(index) - 1), index[1:]
+            yield _Alike(first, others, torch.tensor(columns), torch.stack(scale).expand(len(others), -1))
+
+    def _first_of_body(self, used: Bool[Tensor, "g"]) -> Int[Tensor, "g"]:
+        """For each camera in use the first one in use of its body; itself for others."""
+        own = torch.arange(len(used))
+        if self.body is None:
+            return own
+        first = torch.full_like(own, len(used)).scatter_reduce(0, self.body[used], own[used], "amin")
+        return torch.where(used, first[self.body], own)
 
     def against(self, excess: float) -> "CameraPrior":
         """The prior with more weight, for image points that say less than their noise lets them, by a variance ratio."""
@@ -92,11 +130,12 @@ class CameraPrior:
 
 @dataclass(frozen=True)
 class _Alike:
-    """Some numbers are the same in all of some cameras: each is held to the first."""
+    """Some numbers are about the same in pairs of cameras."""
 
+    first: Int[Tensor, "k"]
     index: Int[Tensor, "k"]
     columns: Int[Tensor, "c"]
-    sigma: Float[Tensor, "c"]
+    sigma: Float[Tensor, "k c"]
     block = "camera"
 
     def term(self) -> Term:
@@ -105,5 +144,4 @@ class _Alike:
         def residual(first: Tensor, other: Tensor, sigma: Tensor) -> Tensor:
             return (other[:, self.columns] - first[:, self.columns]) / sigma
 
-        first, others = self.index[:1].expand(len(self.index) - 1), self.index[1:]
-        return Term(residual, ("camera", "camera"), (first, others), (self.sigma.expand(len(others), -1),))
+        return Term(residual, ("camera", "camera"), (self.first, self.index), (self.sigma,))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera
 from torchsfm.reconstruction.adjust import adjust, adjust_all, adjust_by_tracks, neighbourhood, support
-from torchsfm.reconstruction.calibration import images_of_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.calibration import images_of_bodies, images_of_cameras, lone_cameras_plausible
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
 from torchsfm.reconstruction.mapping import Mapping
@@ -58,6 +58,7 @@ class MappingOptions:
         generator: Source of randomness.
         cropped: Whether images may have been cut out of larger ones, so that their principal points lie anywhere.
         alike: Whether one camera took them all; see `CameraPrior`.
+        body: Cameras that are one with a zoom lens; see `CameraPrior`.
     """
 
     free: tuple[str, ...]
@@ -69,10 +70,12 @@ class MappingOptions:
     generator: torch.Generator | None = None
     cropped: bool = False
     alike: bool = False
+    body: Int[Tensor, "g"] | None = None
 
     def prior(self, model: Mapping) -> CameraPrior:
         """What to expect of the cameras, as `adjust` takes it."""
-        return CameraPrior.of(model, self.expected, self.focal_sigma, cropped=self.cropped, alike=self.alike)
+        kind: dict[str, Any] = {"cropped": self.cropped, "alike": self.alike, "body": self.body}
+        return CameraPrior.of(model, self.expected, self.focal_sigma, **kind)
 
     def adjust(self, model: Mapping, *, last: bool = False, lone: bool = False, **limits: Any) -> Mapping:
         """Adjust all of a model, with those numbers of its cameras free that its images determine.
@@ -219,7 +222,7 @@ def _refine(model: Mapping, options: MappingOptions) -> Mapping:
         if settled:
             break
     model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
-    lone = not options.cropped and bool((images_of_cameras(model) == 1).any())
+    lone = not options.cropped and bool((images_of_bodies(images_of_cameras(model), options.prior(model)) == 1).any())
     if lone and "principal_point" in options.free:
         freed = model
         # Where that is not plausible soon, it is not worth the way to its minimum.
