@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.linalg.polynomial import attach_roots
+from torchsfm.linalg.portions import portions
 from torchsfm.linalg.root_cells import Cells, chords, root_cells
 from torchsfm.linalg.rows import take_columns
 
@@ -19,6 +20,8 @@ _STEPS = 4
 _SETTLED = 1e-9
 """The last of them at a root, at most; after it rounding is left."""
 _CAREFUL_STEPS = 12
+_CHUNK = 16384
+"""Roots at a time: what the steps take stays in the cache."""
 _DOUBLE = 1e-11
 """Half the square of the distance of two roots, in the units of `RootList`, below which they may be one."""
 
@@ -89,12 +92,12 @@ def real_root_list(c: Float[Tensor, "m batch"], *, in_order: bool = True) -> Roo
     single, pair = root_cells(c)
     both = torch.stack((c, c.flip(0)), 1).flatten(1)
     item, inverse, search = _for_one(both, single)
+    x, found = _newton(search)
     double = item[:0]
     if len(pair.item):
-        item2, inverse2, search2, double = _for_two(both, pair)
-        item, inverse = torch.cat((item, item2)), torch.cat((inverse, inverse2))
-        search = Search(*(torch.cat(two, -1) for two in zip(search, search2, strict=True)))
-    x, found = _newton(search)
+        item2, inverse2, search, double = _for_two(both, pair)
+        two = (item, item2), (inverse, inverse2), *zip((x, found), _newton(search), strict=True)
+        item, inverse, x, found = (torch.cat(parts) for parts in two)
     if not found.all():
         keep = found.nonzero()[:, 0]
         item, x, inverse = (t.index_select(0, keep) for t in (item, x, inverse))
@@ -175,15 +178,17 @@ def _horner_bend(c: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _newton(search: Search) -> tuple[Tensor, Tensor]:
     """The root of each, and whether there is one."""
-    k, x, low, high, _ = search
-    for _ in range(_STEPS):
-        p, d = _horner_slope(k, x)
-        step = p.div_(d)
-        x = torch.clamp(x - step, low, high)
-    found = step.abs_() <= _SETTLED
+    x, found = torch.empty_like(search.x), torch.empty_like(search.x, dtype=torch.bool)
+    for some in portions(len(x), _CHUNK, x.device):
+        k, own, low, high, _ = (t[..., some] for t in search)
+        for _ in range(_STEPS):
+            p, d = _horner_slope(k, own)
+            step = p.div_(d)
+            own = torch.clamp(own - step, low, high)
+        x[some], found[some] = own, step.abs_() <= _SETTLED
     if not found.all():
         (rest,) = (~found).nonzero(as_tuple=True)
-        x[rest], found[rest] = _bracketed(Search(*(t[..., rest] for t in search)))
+        x[rest], found[rest] = _bracketed(Search(*(t[..., rest] for t in search._replace(x=x))))
     return x, found
 
 

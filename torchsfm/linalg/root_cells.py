@@ -96,13 +96,13 @@ def _with_changes(b: Float[Tensor, "m k"]) -> Tensor:
 def _changes(b: Float[Tensor, "m k"]) -> Tensor:
     """The number of changes of sign of a column."""
     positive = b >= 0
-    return (positive[1:] ^ positive[:-1]).sum(0)
+    return (positive[1:] ^ positive[:-1]).sum(0, dtype=torch.int8)
 
 
 def _crossing(b: Float[Tensor, "m k"]) -> Float[Tensor, " k"]:
     """Where the polygon of the coefficients, from 0 to 1, first passes through zero."""
     positive, degree = b >= 0, len(b) - 1
-    before = (positive[1:] == positive[0]).sum(0)
+    before = (positive[1:] == positive[0]).sum(0, dtype=torch.int8).long()
     ends = b.gather(0, torch.stack((before, before + 1)).clamp_max_(degree))
     return (before + ends[0] / (ends[0] - ends[1])) / degree
 

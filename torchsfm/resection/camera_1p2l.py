@@ -13,7 +13,8 @@ from torch import Tensor
 from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.quartic import quartic_rows
 from torchsfm.linalg.rows import take_columns
-from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
+from torchsfm.resection.candidate_poses import Candidates, solve_poses
+from torchsfm.resection.points_and_lines import Sample
 from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, norm_rows, outer_rows
 
 _LEAST = 1e-6
@@ -58,7 +59,7 @@ def camera_1p2l(
     return solve_poses(_candidates, 4, batch, d, X, l, L)
 
 
-def _candidates(s: Sample) -> Candidates:
+def _candidates(s: Sample) -> list[Candidates]:
     # The point is the origin.
     l1, l2 = s.l.unbind(1)
     distance = norm_rows(s.A)
@@ -98,7 +99,7 @@ def _candidates(s: Sample) -> Candidates:
     world = frame_rows(a1 * w1 + b1 * u1, a2 * w2 + b2 * u2)
     R = outer_rows(take_columns(torch.stack(frame_rows(l1, l2)), item).unbind(0), world)
     one = s.of(item)
-    return Candidates(item, slot, R, depth / size * one.d[:, 0], one)
+    return [Candidates(item, slot, R, depth / size * one.d[:, 0], one)]
 
 
 def _not_zero(x: Tensor, size: Tensor | None = None) -> Tensor:

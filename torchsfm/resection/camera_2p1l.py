@@ -13,7 +13,8 @@ from torchsfm._types import Solutions, check_tensors
 from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.rows import add_rows
 from torchsfm.linalg.vectors import across
-from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
+from torchsfm.resection.candidate_poses import Candidates, solve_poses
+from torchsfm.resection.points_and_lines import Sample
 from torchsfm.resection.vector_rows import dot_rows, frame_rows, norm_rows, outer_rows
 
 
@@ -55,7 +56,7 @@ def camera_2p1l(
     return solve_poses(_candidates, 2, batch, d, X, l, L)
 
 
-def _candidates(s: Sample) -> Candidates:
+def _candidates(s: Sample) -> list[Candidates]:
     (x1, x2), l, V, A, D = s.d.unbind(1), s.l[:, 0], s.V[:, 0], s.A[:, 0], s.X[:, 0]  # noqa: E741
     # The first point is the origin; lengths in units of D.
     length = norm_rows(D)
@@ -94,7 +95,7 @@ def _candidates(s: Sample) -> Candidates:
     R = outer_rows(frame_rows(a2 * x2 - a1 * x1, l.expand(3, *g2.shape)), world)
     slot, item = torch.meshgrid(*(torch.arange(k, device=l.device) for k in g2.shape), indexing="ij")
     t = a1 * length * x1
-    return Candidates(item.flatten(), slot.flatten(), R.flatten(2), t.flatten(1), s.times(2), len(length))
+    return [Candidates(item.flatten(), slot.flatten(), R.flatten(2), t.flatten(1), s.times(2))]
 
 
 def _products(rows: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor]:

@@ -6,20 +6,26 @@ as a cross product; that it is a point of the unit circle is of degree four in c
 half.
 """
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
-from torchsfm.linalg.real_roots import number_among_equals, real_root_list
+from torchsfm.linalg.portions import portions
+from torchsfm.linalg.real_roots import RootList, real_root_list
 from torchsfm.linalg.rows import add_rows, take_columns
-from torchsfm.resection.points_and_lines import Candidates, Sample, solve_poses
+from torchsfm.resection.candidate_poses import Candidates, solve_poses
+from torchsfm.resection.points_and_lines import Sample
 from torchsfm.resection.vector_rows import cross_rows, dot_rows, frame_rows, outer_rows, turned
 
 CONCURRENT = 1e-7
 """Volume that the unit normals of three planes of sight span, at which they meet in a line but for rounding."""
 _VAGUE = 1e-6
 """Area that two rows span, below which they are one and the same."""
+_CHUNK = 16384
+"""Roots at a time: what follows of them stays in the cache."""
 _PARALLEL = 1e-3
 """Sine of the angle between lines that are parallel."""
 
@@ -58,56 +64,68 @@ def camera_3l(
     return solve_poses(_candidates, 8, batch, none, none, l, L)
 
 
-def _candidates(s: Sample) -> Candidates:
+def _candidates(s: Sample) -> Iterator[Candidates]:
     l, V = _ordered(s)  # noqa: E741
-    item, R, again = _rotations(l, V)
-    if len(again):
-        # Solutions that turn the first line alike are double roots, as in scenes that are their own mirror images.
-        l, V = (take_columns(v[:, [1, 0, 2]], again) for v in (l, V))  # noqa: E741
-        own, other, _ = _rotations(l, V)
-        keep = ~torch.isin(item, again)
-        item, order = torch.cat((item[keep], again[own])).sort(stable=True)
-        R = take_columns(torch.cat((R[..., keep], other), -1), order)
     # Concurrent image lines: three planes of sight through one line, along which nothing is told.
-    (l1, l2, l3), one = s.l.unbind(1), s.of(item)
+    l1, l2, l3 = s.l.unbind(1)
     e1 = cross_rows(l2, l3)
     volume = dot_rows(l1, e1)
     edges = torch.stack((e1, cross_rows(l3, l1), cross_rows(l1, l2)), 1)
     edges = edges / torch.where(volume.abs() > CONCURRENT, volume, torch.nan)
-    normals = turned(R.transpose(0, 1), one.l)
-    t = turned(take_columns(edges, item), dot_rows(normals, one.A).neg_()[:, None])[:, 0]
-    return Candidates(item, number_among_equals(item), R, t, one, normals=normals)
+    table, roots = _octic(l, V)
+    number, vague = roots.slot(), [roots.double]
+    for some in portions(max(len(number), 1), _CHUNK, number.device):
+        item = roots.item[some]
+        R, length = _rotations(take_columns(table, item), roots.s[some], roots.t[some])
+        vague.append(item[length < _VAGUE])
+        yield _placed(item, number[some], R, take_columns(edges, item), s.of(item))
+    again = torch.unique(torch.cat(vague))
+    across = cross_rows(*(take_columns(V[:, i], again) for i in (1, 2)))
+    again = again[dot_rows(across, across) > _PARALLEL**2]
+    if len(again):
+        # Solutions that turn the first line alike are double roots, as in scenes that are their own mirror images.
+        table, roots = _octic(*(take_columns(v[:, [1, 0, 2]], again) for v in (l, V)))
+        R, _ = _rotations(take_columns(table, roots.item), roots.s, roots.t)
+        item = again[roots.item]
+        yield _placed(item, roots.slot(), R, take_columns(edges, item), s.of(item))._replace(anew=True)
 
 
-def _rotations(l: Float[Tensor, "3 3 n"], V: Float[Tensor, "3 3 n"]) -> tuple[Tensor, Tensor, Tensor]:  # noqa: E741
-    """The problems that rotations belong to, these (3, 3, m), and problems that lines in another order may tell more of."""
+def _placed(item: Tensor, slot: Tensor, R: Tensor, edges: Tensor, s: Sample) -> Candidates:
+    """Cameras where the planes of sight pass through the lines; the edges, of these planes, are dual to their normals."""
+    normals = turned(R.transpose(0, 1), s.l)
+    t = turned(edges, dot_rows(normals, s.A).neg_()[:, None])[:, 0]
+    return Candidates(item, slot, R, t, s, normals)
+
+
+def _octic(l: Float[Tensor, "3 3 n"], V: Float[Tensor, "3 3 n"]) -> tuple[Float[Tensor, "29 n"], RootList]:  # noqa: E741
+    """What rotations follow from, and s / t = tan(alpha / 2) of each."""
     (l1, l2, l3), (V1, V2, V3) = l.unbind(1), V.unbind(1)
     # The world's frame has the columns 2, 3, 1 of this one, so that V1 is the third axis.
     camera, (f1, f2, f3) = frame_rows(l1, l2), frame_rows(V1, V2)
     p = [dot_rows(c, l2) for c in camera[:2]], [dot_rows(c, l3) for c in camera]
     q = [dot_rows(f2, V2), dot_rows(f1, V2)], [dot_rows(f, V3) for f in (f2, f3, f1)]
     rows = _two_rows(p, q)
-    roots = real_root_list(_on_circle(_circle_point(rows)))
-    item = roots.item
-    # tan(alpha / 2) = s / t.
-    size = 1 / (roots.s.square() + roots.t.square())
-    cos, sin = (roots.t - roots.s) * (roots.t + roots.s) * size, 2 * roots.s * roots.t * size
-    a0, a1, a2, zc, zs, u, uc, us, v, vc, vs = take_columns(torch.stack(rows), item).unbind(0)
-    second = torch.stack((a0 * sin, a1, a2 * cos))
-    third = torch.stack((zc * cos, u, v)).addcmul_(torch.stack((zs, us, vs)), sin)
-    third[1:].addcmul_(torch.stack((uc, vc)), cos)
-    length, cos_b, sin_b = cross_rows(second, third).unbind(0)
+    table = torch.cat((torch.stack(rows), *camera, f2, f3, f1))
+    return table, real_root_list(_on_circle(_circle_point(rows)))
+
+
+def _rotations(table: Float[Tensor, "29 m"], s: Float[Tensor, " m"], t: Float[Tensor, " m"]) -> tuple[Tensor, Tensor]:
+    """Rotations (3, 3, m), and how far the two lines are from leaving beta open."""
+    size = 1 / (s.square() + t.square())
+    cos, sin = (t - s) * (t + s) * size, 2 * s * t * size
+    a0, a1, a2, zc, zs, u, uc, us, v, vc, vs = table[:11]
+    second = a0 * sin, a1, a2 * cos
+    third = [torch.addcmul(c * cos, d, sin) for c, d in ((zc, zs), (uc, us), (vc, vs))]
+    third[1] += u
+    third[2] += v
+    length, cos_b, sin_b = cross_rows(torch.stack(second), torch.stack(third))
     length = torch.copysign((cos_b * cos_b).addcmul_(sin_b, sin_b).sqrt_(), length)
     cos_b, sin_b = cos_b / length, sin_b / length
     # Columns of Rx(alpha) Rz(beta) in the camera's frame.
-    x, y, z, *world = take_columns(torch.stack((*camera, f2, f3, f1)), item).unbind(0)
+    x, y, z, *world = table[11:].view(6, 3, -1)
     y, z = (cos * y).addcmul_(sin, z), (cos * z).addcmul_(sin, y, value=-1)
     x, y = (cos_b * x).addcmul_(sin_b, y), (cos_b * y).addcmul_(sin_b, x, value=-1)
-    again = torch.unique(torch.cat((roots.double, item[length.abs() < _VAGUE])))
-    if len(again):
-        across = cross_rows(*(take_columns(v, again) for v in (V2, V3)))
-        again = again[dot_rows(across, across) > _PARALLEL**2]
-    return item, outer_rows((x, y, z), world), again
+    return outer_rows((x, y, z), world), length.abs_()
 
 
 def _two_rows(p: tuple[list[Tensor], list[Tensor]], q: tuple[list[Tensor], list[Tensor]]) -> list[Tensor]:

@@ -1,40 +1,31 @@
-"""Poses from points and lines together: the data in a frame of their own, the equations, and Newton's method on them.
+"""Points and lines together: the data in a frame of their own, the equations of a pose, and how well poses satisfy them.
 
 A point says that `R X + t` lies on its ray, a line through A along V that `l'R V = 0` and `l'(R A + t) = 0` with the normal l
 of its plane of sight: two equations each, six for three of them.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm._types import Solutions, broadcast_shapes
+from torchsfm._types import broadcast_shapes
 from torchsfm.geometry.homogeneous import moderate_directions
 from torchsfm.linalg import cross, usable
-from torchsfm.linalg.portions import portions
 from torchsfm.linalg.rows import add_rows, take_columns
 from torchsfm.linalg.vectors import across
-from torchsfm.optim import attach_implicit, for_slots, rotation_exponential, wants_derivative
+from torchsfm.optim import rotation_exponential
 from torchsfm.resection.vector_rows import cross_rows, dot_rows, length_rows, norm_rows, turned, unit_rows
 
-_STEPS = 3
-_MET = 1e-9
-"""What may be left of an equation between unit vectors."""
+ROUNDING = 1e-14
+"""What is left of the equations at best."""
 _LEFT = 1e-6
 """What may be left of an equation over the size of what it is about."""
-_ROUNDING = 1e-14
-"""What is left of them at best."""
-_TWICE = 1e-8
-"""Distance of poses that are one."""
 _FLAT = 1e-10
 """Sine of an angle, or length over the unit, below which it is 0."""
 _RIDGE = 1e-6
 """How much the middle of all lines counts where they leave the point nearest to them open."""
-_CHUNK = 16384
-"""Problems at a time."""
 
 
 class Sample(NamedTuple):
@@ -66,22 +57,7 @@ class Sample(NamedTuple):
         return self._replace(**{name: v.repeat(1, 1, slots) for name, v in self._asdict().items() if v.ndim == 3})
 
 
-class Candidates(NamedTuple):
-    """Poses that may be solutions, one after the other; not finite where there is none."""
-
-    item: Int[Tensor, " m"]
-    slot: Int[Tensor, " m"]
-    R: Float[Tensor, "3 3 m"]
-    t: Float[Tensor, "3 m"]
-    problem: Sample
-    """`Sample.of(item)`."""
-    apart: int = 1
-    """How far apart in the list the candidates of a problem are."""
-    normals: Float[Tensor, "3 k m"] | None = None
-    """Of the planes of sight, turned into the world, where they are known."""
-
-
-class _Fit(NamedTuple):
+class Fit(NamedTuple):
     """How well poses satisfy the equations: first those of points, then those of lines."""
 
     left: Float[Tensor, "e m"]
@@ -119,44 +95,7 @@ def equations(
     return torch.cat([p.expand(*shape, p.shape[-1]) for p in parts], -1)
 
 
-def solve_poses(
-    candidates: Callable[[Sample], Candidates],
-    slots: int,
-    batch: torch.Size,
-    d: Tensor,
-    X: Tensor,
-    l: Tensor,  # noqa: E741
-    L: Tensor,
-) -> Solutions[Tensor]:
-    """The poses that a solver's candidates lead to: (*batch, slots, 3, 4), and which of them are real."""
-    dtype, number, data = L.dtype, batch.numel(), [t.expand(*batch, *t.shape[-2:]) for t in (d, X, l, L)]
-    with torch.no_grad():
-        flat = [t.detach().double().reshape(number, *t.shape[-2:]) for t in data]
-        # One column more, for what is no solution.
-        none = slots * number
-        rows = torch.zeros(3, 4, none + 1, dtype=dtype, device=L.device)
-        rows.diagonal(dim1=0, dim2=1).fill_(1)
-        real = torch.zeros(none + 1, dtype=torch.bool, device=L.device)
-        for some in portions(number, _CHUNK, L.device):
-            sample = _prepare([t[some].permute(2, 1, 0).contiguous() for t in flat], torch.finfo(dtype).eps)
-            found = candidates(sample)
-            R, t, good = _finish(sample, found, slots)
-            if dtype != R.dtype:
-                # What passes for a number in float64 may be none here.
-                R, t = R.to(dtype), t.to(dtype)
-                good &= R.isfinite().flatten(0, 1).all(0) & t.isfinite().all(0)
-            place = torch.where(good, (found.slot * number).add_(found.item).add_(some.start), none)
-            rows[:, :3].scatter_(2, place.expand(3, 3, -1), R)
-            rows[:, 3].scatter_(1, place.expand(3, -1), t)
-            real.index_fill_(0, place, True)
-        model = rows[..., :none].view(3, 4, slots, *batch).movedim((2, 0, 1), (-3, -2, -1))
-        valid = real[:none].view(slots, *batch).movedim(0, -1)
-    if wants_derivative(*data):
-        model = attach_implicit(equations, model, *(for_slots(t, batch) for t in data), dims=2, valid=valid)
-    return Solutions(model, valid)
-
-
-def _prepare(data: list[Tensor], eps: float) -> Sample:
+def prepare(data: list[Tensor], eps: float) -> Sample:
     """Lay the problems out; what is not sound gets harmless numbers."""
     largest = torch.stack([t.flatten(0, 1).abs().amax(0) for t in data if t.numel()]).amax(0)
     sound = usable(largest)
@@ -178,7 +117,7 @@ def _prepare(data: list[Tensor], eps: float) -> Sample:
     # A moment that is not across the direction is none, but for rounding.
     off = dot_rows(V, m).abs()
     sound = sound & (off <= eps**0.5 * (unit + length_rows(origin))).all(0)
-    return Sample(d, X / unit, l, V, A / unit, origin, unit, _ROUNDING * far / unit, sound)
+    return Sample(d, X / unit, l, V, A / unit, origin, unit, ROUNDING * far / unit, sound)
 
 
 def _nearest_to_all(V: Tensor, A: Tensor) -> Tensor:
@@ -198,44 +137,27 @@ def _nearest_to_all(V: Tensor, A: Tensor) -> Tensor:
     return middle + torch.stack((m11 * x + m12 * y + m13 * z, m12 * x + m22 * y + m23 * z, m13 * x + m23 * y + m33 * z)) / det
 
 
-def _finish(s: Sample, found: Candidates, slots: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The candidates in the world, and which of them are solutions, each once."""
-    R, t, fit = _polished(found)
-    far = length_rows(t).clamp_min_(1.0)
-    table = torch.cat((s.origin, torch.stack((s.unit, s.rounding, s.sound.to(t.dtype)))))
-    x, y, z, unit, rounding, sound = take_columns(table, found.item).unbind(0)
-    # No comparison holds where anything is not finite.
-    good = fit.left.amax(0) <= _MET * far
-    good &= (sound > 0) & (found.slot < slots)
-    good &= _sure(found.problem, R, fit, far, rounding)
-    good[_repeated(found, R, t, good, slots)] = False
-    shift = unit * t
-    for column, v in zip(R.unbind(1), (x, y, z), strict=True):
-        shift.addcmul_(column, v, value=-1)
-    return R, shift, good
+def fit_of(s: Sample, R: Tensor, t: Tensor, normals: Tensor | None = None) -> Fit:
+    """What is left of the equations, in the frame of the camera for points and that of the world for lines."""
+    left: list[Tensor] = []
+    reach: list[Tensor] = []
+    if s.d.shape[1]:
+        Y = t[:, None]
+        if s.X.shape[1]:
+            Y = torch.cat((Y, turned(R, s.X) + Y), 1)
+        left.append(cross_rows(s.d, Y).flatten(0, 1))
+        reach.append(dot_rows(s.d, Y))
+    if s.V.shape[1]:
+        back = R.transpose(0, 1)
+        normals = turned(back, s.l) if normals is None else normals
+        A = turned(back, t[:, None]) + s.A
+        left += [dot_rows(normals, s.V), dot_rows(normals, A)]
+        # From the camera to the whole of the line: a point far along it would say little of how it passes.
+        reach.append(norm_rows(A.addcmul_(dot_rows(A, s.V), s.V, value=-1)))
+    return Fit(torch.cat(left).abs_(), torch.cat(reach))
 
 
-def _repeated(found: Candidates, R: Tensor, t: Tensor, good: Tensor, slots: int) -> Tensor:
-    """Of good poses of a problem that are one all but the first: numbers in the list."""
-    # Equal poses have equal sums of some of their numbers; few others do.
-    total = torch.where(good, R[0, 0] + 0.7 * R[1, 1] + 0.4 * R[1, 2] + 0.3 * t[2], torch.nan)
-    pairs = [torch.zeros(2, 0, dtype=torch.long, device=t.device)]
-    for apart in range(found.apart, min(slots * found.apart, len(total)), found.apart):
-        (first,) = ((total[apart:] - total[:-apart]).abs_() < 4 * _TWICE).nonzero(as_tuple=True)
-        pairs.append(torch.stack((first, first + apart)))
-    first, second = torch.cat(pairs, 1)
-    same = found.item[first] == found.item[second]
-    for v in (R.flatten(0, 1), t):
-        same &= (v[:, first] - v[:, second]).abs().amax(0) < _TWICE
-    first, second = first[same], second[same]
-    alive = torch.ones_like(good)
-    for k in range(1, slots if len(first) else 1):
-        own = (found.slot[second] == k) & alive[first]
-        alive[second[own]] = False
-    return (~alive).nonzero()[:, 0]
-
-
-def _sure(s: Sample, R: Tensor, fit: _Fit, far: Tensor, rounding: Tensor) -> Tensor:
+def sure(s: Sample, R: Tensor, fit: Fit, far: Tensor, rounding: Tensor) -> Tensor:
     """Which poses are rotations that satisfy the equations of each point and line, also in the world, with points in front.
 
     What is small against far points need not be so against a near line.
@@ -254,49 +176,12 @@ def _sure(s: Sample, R: Tensor, fit: _Fit, far: Tensor, rounding: Tensor) -> Ten
     return good
 
 
-def _polished(found: Candidates) -> tuple[Tensor, Tensor, _Fit]:
-    """Newton's method where rounding has left something: poses, and how well they fit."""
-    s, R, t = found.problem, found.R, found.t
-    fit = _fit(s, R, t, found.normals)
-    (rough,) = (fit.left.amax(0) > _ROUNDING).nonzero(as_tuple=True)
-    for _ in range(_STEPS):
-        if not len(rough):
-            break
-        part, old_R, old_t = s.of(rough), take_columns(R, rough), take_columns(t, rough)
-        J, r = _linearized(part, old_R, old_t)
-        step = torch.linalg.solve_ex(J, r)[0][..., 0]
-        step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
-        new_R = (rotation_exponential(step[:, :3]) @ old_R.permute(2, 0, 1)).permute(1, 2, 0)
-        new_t = old_t + step[:, 3:].mT
-        new = _fit(part, new_R, new_t)
-        worst = new.left.amax(0)
-        better = worst < fit.left[:, rough].amax(0)
-        place = rough[better]
-        R[..., place], t[..., place] = new_R[..., better], new_t[..., better]
-        for old_rows, rows in zip(fit, new, strict=True):
-            old_rows[:, place] = rows[:, better]
-        rough = rough[better & (worst > _ROUNDING)]
-    return R, t, fit
-
-
-def _fit(s: Sample, R: Tensor, t: Tensor, normals: Tensor | None = None) -> _Fit:
-    """What is left of the equations, in the frame of the camera for points and that of the world for lines."""
-    left: list[Tensor] = []
-    reach: list[Tensor] = []
-    if s.d.shape[1]:
-        Y = t[:, None]
-        if s.X.shape[1]:
-            Y = torch.cat((Y, turned(R, s.X) + Y), 1)
-        left.append(cross_rows(s.d, Y).flatten(0, 1))
-        reach.append(dot_rows(s.d, Y))
-    if s.V.shape[1]:
-        back = R.transpose(0, 1)
-        normals = turned(back, s.l) if normals is None else normals
-        A = s.A + turned(back, t[:, None])
-        left += [dot_rows(normals, s.V), dot_rows(normals, A)]
-        # From the camera to the whole of the line: a point far along it would say little of how it passes.
-        reach.append(norm_rows(A - dot_rows(A, s.V) * s.V))
-    return _Fit(torch.cat(left).abs_(), torch.cat(reach))
+def newton_step(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses after a step of Newton's method."""
+    J, r = _linearized(s, R, t)
+    step = torch.linalg.solve_ex(J, r)[0][..., 0]
+    step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
+    return (rotation_exponential(step[:, :3]) @ R.permute(2, 0, 1)).permute(1, 2, 0), t + step[:, 3:].mT
 
 
 def _linearized(s: Sample, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
