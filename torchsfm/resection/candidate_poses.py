@@ -107,7 +107,7 @@ class _Solved:
         self.rough = []
         item, slot, R, t = (torch.cat(v, -1) for v in zip(*(c[:4] for c in found), strict=True))
         fit = Fit(*(torch.cat(v, -1) for v in zip(*fits, strict=True)))
-        problem, worst = self.sample.of(item), fit.left.amax(0)
+        problem, worst, enough = self.sample.of(item), fit.left.amax(0), ROUNDING * length_rows(t).clamp_min_(1.0)
         left = torch.arange(len(worst), device=worst.device)
         for _ in range(_STEPS):
             part = problem.of(left)
@@ -119,7 +119,7 @@ class _Solved:
             R[..., place], t[..., place], worst[place] = new_R[..., better], new_t[..., better], after[better]
             for old_rows, rows in zip(fit, new, strict=True):
                 old_rows[:, place] = rows[:, better]
-            left = left[better & (after > ROUNDING)]
+            left = left[better & (after > enough[left])]
             if not len(left):
                 break
         self._write(Candidates(item, slot, R, t, problem), fit, worst, length_rows(t).clamp_min_(1.0))

@@ -16,6 +16,9 @@ from torchsfm.resection.reprojection_step import camera_step, moved_pose, retrac
 from torchsfm.robust import RansacOptions, RobustResult, Weigh, check_counts, check_door, estimate_robustly
 from torchsfm.robust.moderation import moderate, moved_and_scaled, present
 
+_SAMPLES = 192
+"""Of points and lines in the first round: the four solvers of such samples take little less time for fewer."""
+
 
 @dataclass(frozen=True)
 class CameraEstimator:
@@ -179,6 +182,7 @@ def estimate_camera(
     x, X, K = x.double(), X.double(), K.double()
     intrinsics, middle, focal = _in_focal_lengths(K)
     estimator: CameraEstimator | PointLineCameraEstimator
+    every: Any = options
     if l is None or L is None:
         world, centre, size = moderate(X, present(options.get("mask"), x, X))
         estimator, rows = CameraEstimator(intrinsics.expand(*batch, 3, 3)), [moved_and_scaled(x, middle, focal), world]
@@ -189,6 +193,7 @@ def estimate_camera(
             PointLineCameraEstimator(intrinsics.expand(*batch, 3, 3)),
             [image_rows(x, l.double(), middle, focal), world, kind],
         )
+        every = options | {"min_iterations": _SAMPLES}
 
     def back(model: Tensor) -> Tensor:
         return world_pose(model, centre, size)
@@ -196,7 +201,7 @@ def estimate_camera(
     # [R | t] <- exp(w) [R | t] + [0 | v] in the scaled world is the same in the world, with v scaled back.
     unit = torch.cat((torch.ones_like(centre), size[..., None].expand_as(centre)), -1)
     return estimate_robustly(
-        estimator, *rows, threshold=threshold, dtype=dtype, scale=1 / focal, back=back, step_unit=unit, **options
+        estimator, *rows, threshold=threshold, dtype=dtype, scale=1 / focal, back=back, step_unit=unit, **every
     )  # fmt: skip
 
 

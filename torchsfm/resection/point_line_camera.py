@@ -155,7 +155,7 @@ class PointLineCameraEstimator:
         """Whether what the inliers show of points and lines may be in a plane, or leave a motion of the camera unseen."""
         points, twice = self._structure(model, x, X, kind, inliers)
         flat = flatness_suspected(model, points, self._focal(), twice, threshold, 2 * (2 + chance))
-        return flat | self._unseen(model, x, X, kind, inliers, threshold, 2 + chance)
+        return flat if flat.all() else flat | self._unseen(model, x, X, kind, inliers, threshold, 2 + chance)
 
     def degeneracy(
         self,
