@@ -163,7 +163,7 @@ def alike(there: Any, here: Any) -> None:
 INDIFFERENT = (
     "images.retrieve_pairs", "images.track_points", "images.track_sequence", "motion.essential_5pt",
     "reconstruction.reconstruct_tracks", "resection.camera_p35pf", "simulation.random_intrinsics", "simulation.random_points",
-    "simulation.random_poses", "simulation.simulate_images",
+    "simulation.random_poses", "simulation.simulate_images", "simulation.simulate_segments",
 )  # fmt: skip
 
 

@@ -557,6 +557,9 @@ FUNCTIONS: dict[str, Function] = {
     "geometry.enu_from_geodetic": Function({"place": _place, "origin": _place}),
     "geometry.geodetic_from_enu": Function({"X": _place, "origin": _place}),
     "tensors.reordered_trifocal": Function({"views": (1, 0, 2)}),
+    "simulation.simulate_segments": Function(
+        {"X": lambda s: s.points(16).reshape(*s.batch, 8, 2, 3), "poses": _poses, "cameras": _lenses, "generator": _generator}
+    ),
     "simulation.simulate_conics": Function({"shape": (2,), "generator": _generator}),
     "triangulation.triangulate_curves": Function({"curves": _image_curves, "P": lambda s: s.cameras(4), "samples": 12}),
     "triangulation.triangulate_conics": Function(sizes={"n": 2, "k": 12}, together=(("x", "weights"),)),

@@ -5,6 +5,7 @@ from torchsfm.simulation.bundle_problems import SimulatedBundle, random_bundle_p
 from torchsfm.simulation.conic_scenes import SimulatedConics, simulate_conics
 from torchsfm.simulation.observations import SimulatedImages, random_intrinsics, random_points, simulate_images
 from torchsfm.simulation.rendering import RenderedSequence, render_sequence
+from torchsfm.simulation.segments import SimulatedSegments, simulate_segments
 from torchsfm.simulation.shapes import RenderedShapes, paint_shapes, render_shapes
 from torchsfm.simulation.textured_scene import TexturedScene, courtyard_scene
 from torchsfm.simulation.viewpoints import look_at, orbit_poses, random_poses
@@ -15,6 +16,7 @@ __all__ = [
     "SimulatedBundle",
     "SimulatedConics",
     "SimulatedImages",
+    "SimulatedSegments",
     "TexturedScene",
     "courtyard_scene",
     "look_at",
@@ -29,4 +31,5 @@ __all__ = [
     "render_shapes",
     "simulate_conics",
     "simulate_images",
+    "simulate_segments",
 ]
