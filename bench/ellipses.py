@@ -2,22 +2,29 @@
 
 `python -m bench.ellipses [--scenes N]`. The peers, `cv2.ximgproc.findEllipses` and `EdgeDrawing.detectEllipses`, are in
 opencv-contrib-python. A detection is right where its area and that of a true ellipse have 0.8 of their union in common; an
-ellipse counts where a third of its outline is seen, and what is found of others is neither right nor wrong.
+ellipse counts where a third of its outline is seen, and what is found of others is neither right nor wrong. Photographs of a
+grid of circles are in the folder that TORCHSFM_DATA names: there the calibration from the grid says where the circles are, and
+whatever else is found is wrong.
 """
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import torch
 from torch import Tensor
 
-from torchsfm import Ellipse, detect_ellipses, render_shapes
+from torchsfm import Ellipse, calibrate_planes, detect_ellipses, fit_ellipse, render_shapes
 from torchsfm.geometry import conic_from_ellipse
+from torchsfm.images import detect_circles_grid, read_image
 
 F64 = torch.float64
+CIRCLES = 4, 3, 0.09, 0.035
+"""Circles in a row and in a column of the real board, metres from one to the next, and their radius."""
 KINDS = {
     "apart": {"ellipses": 8, "rings": 0, "polygons": 0},
     "in front of each other": {"ellipses": 24, "rings": 0, "polygons": 6},
@@ -27,9 +34,9 @@ KINDS = {
 }
 
 
-def ours(image: Tensor) -> Ellipse:
+def ours(image: Tensor, min_coverage: float = 0.25) -> Ellipse:
     """Ours."""
-    found = detect_ellipses(image)
+    found = detect_ellipses(image, min_coverage=min_coverage)
     e = found.ellipse
     return Ellipse(e.centre[found.valid], e.semi_axes[found.valid], e.angle[found.valid])
 
@@ -104,6 +111,45 @@ def score(found: Ellipse, true: Ellipse, seen: Tensor) -> tuple[int, int, int, l
     return right, int((~used).sum()), int(wanted.sum()) - right, errors
 
 
+def photographs(folder: Path) -> list[tuple[Tensor, Ellipse]]:
+    """Photographs of a grid of circles, and where the calibration from it has their images."""
+    columns, rows, pitch, radius = CIRCLES
+    images = [read_image(path).pixels.double().mean(0, keepdim=True) for path in sorted(folder.glob("*.jpg"))]
+    boards = [detect_circles_grid(image, columns, rows) for image in images]
+    X = pitch * torch.stack(torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), -1).reshape(-1, 2).to(F64)
+    height, width = images[0].shape[-2:]
+    outlines = torch.stack([board.outlines for board in boards if board.outlines is not None])
+    start = calibrate_planes(outlines, X, image_size=(width, height), radius=radius)
+    turn = torch.arange(120, dtype=F64) * (2 * math.pi / 120)
+    rings = X[:, None] + radius * torch.stack((turn.cos(), turn.sin()), -1)
+    points = torch.nn.functional.pad(rings, (0, 1)).flatten(0, 1)
+    seen = start.camera.project(start.poses.transform(points)).reshape(len(images), columns * rows, 120, 2)
+    return list(zip(images, (fit_ellipse(x).model for x in seen), strict=True))
+
+
+def compare(
+    name: str, noise: str, scenes: list[tuple[Tensor, Ellipse, Tensor]], methods: dict[str, Callable[[Tensor], Ellipse]]
+) -> None:
+    """Rows of the table: images, what is in them, and which share of its outline is seen."""
+    for method, detect in methods.items():
+        right = wrong = missed = 0
+        errors: list[float] = []
+        seconds = 0.0
+        for image, true, seen in scenes:
+            start = time.process_time()
+            found = detect(image)
+            seconds += time.process_time() - start
+            r, w, m, e = score(found, true, seen)
+            right, wrong, missed, errors = right + r, wrong + w, missed + m, errors + e
+        F = 2 * right / max(1, 2 * right + wrong + missed)
+        q = torch.tensor(errors or [math.nan], dtype=F64).quantile(torch.tensor([0.5, 0.9], dtype=F64)).tolist()
+        print(
+            f"{name:24s} {noise:5}  {method:20s} {F:5.3f}  {right / max(1, right + wrong):8.3f} "
+            f"{right / max(1, right + missed):7.3f}  {q[0]:21.3f} {q[1]:5.2f}  {seconds / len(scenes):9.3f}",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -113,26 +159,16 @@ def main() -> None:
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(options.seed)
     methods = {"detect_ellipses": ours, **peers()}
-    print(f"{'scenes':24s} noise  {'':16s}     F  precision recall  axis error px: median  90 %   s / image")
+    print(f"{'scenes':24s} noise  {'':20s}     F  precision recall  axis error px: median  90 %   s / image")
+    folder = os.environ.get("TORCHSFM_DATA")
+    if folder:
+        real = photographs(Path(folder) / "calibration" / "circles")
+        whole = {"detect_ellipses, 0.9": lambda image: ours(image, 0.9)}
+        compare("photographs of circles", "", [(image, e, torch.ones_like(e.angle)) for image, e in real], methods | whole)
     for name, kind in KINDS.items():
         for noise in (0.005, 0.03):
-            scenes = [render_shapes((), noise=noise, generator=generator, **kind) for _ in range(options.scenes)]
-            for method, detect in methods.items():
-                right = wrong = missed = 0
-                errors: list[float] = []
-                seconds = 0.0
-                for scene in scenes:
-                    start = time.process_time()
-                    found = detect(scene.images)
-                    seconds += time.process_time() - start
-                    r, w, m, e = score(found, scene.ellipses, scene.ellipses_seen)
-                    right, wrong, missed, errors = right + r, wrong + w, missed + m, errors + e
-                F = 2 * right / max(1, 2 * right + wrong + missed)
-                q = torch.tensor(errors or [math.nan], dtype=F64).quantile(torch.tensor([0.5, 0.9], dtype=F64)).tolist()
-                print(
-                    f"{name:24s} {noise:5.3f}  {method:16s} {F:5.3f}  {right / max(1, right + wrong):8.3f} "
-                    f"{right / max(1, right + missed):7.3f}  {q[0]:21.3f} {q[1]:5.2f}  {seconds / len(scenes):9.3f}"
-                )
+            drawn = [render_shapes((), noise=noise, generator=generator, **kind) for _ in range(options.scenes)]
+            compare(name, f"{noise:5.3f}", [(d.images, d.ellipses, d.ellipses_seen) for d in drawn], methods)
 
 
 if __name__ == "__main__":
