@@ -185,6 +185,17 @@ def test_shapes(kind, sample, batch):
         torch.testing.assert_close(alone.model, found.model[index], rtol=1e-10, atol=1e-10)
 
 
+def test_many_problems_are_solved_in_parts_as_few_are(kind, sample):
+    *data, _ = sample(kind, 20_000)
+    found = kind.solve(*data)
+    # Parts of problems and of candidates end at 16,384: about these places, and at the end.
+    for first in (0, 3700, 16_300, 19_900):
+        few = kind.solve(*(d[first : first + 100] for d in data))
+        own = found.valid[first : first + 100]
+        assert torch.equal(few.valid, own)
+        torch.testing.assert_close(few.model[own], found.model[first : first + 100][own], rtol=1e-6, atol=1e-6)
+
+
 def test_bad_values_have_no_solution_and_spoil_none(kind, sample):
     data = list(sample(kind, 40)[:4])
     good = kind.solve(*data)

@@ -104,8 +104,8 @@ def detect_ellipses(
     Args:
         image: Grey (c = 1) or red, green, blue images.
         max_ellipses: The number of slots for each image, for those with the most edge points.
-        min_coverage: Smallest share of the outline that edge points cover. Folds of cloth and other smooth curves look like parts of
-            ellipses: where whole ones are wanted, ask for 0.9.
+        min_coverage: Smallest share of the outline that edge points cover. Folds of cloth and other smooth curves look like
+            parts of ellipses: where whole ones are wanted, ask for 0.9.
         min_radius: Smallest semi-axis, in pixels.
         max_scatter: Root-mean-square distance of the edge points from the ellipse, in pixels, that is not noise but does no
             harm either.
