@@ -92,6 +92,10 @@ def test_recall_of_what_is_its_own_mirror_image(kind, generator, make_scene):
     found = kind.solve(a[:, :k], X[:, :k], torch.linalg.cross(a, b)[:, k:], pluecker_from_points(X, Z)[:, k:])
     # Measured: 13 of 20,000 are missed by three lines.
     assert_share(distance(found, P) < 1e-6, 0.998)
+    # None twice, also where another order of the lines was tried.
+    gap = (found.model[:, :, None] - found.model[:, None]).norm(dim=(-1, -2))
+    both = found.valid[:, :, None] & found.valid[:, None] & ~torch.eye(kind.slots, dtype=torch.bool)
+    assert (gap[both] > 1e-9).all()
 
 
 @pytest.mark.parametrize("far", [1e8, 1e14, 1e30])
