@@ -37,7 +37,8 @@ def fit(views: LineViews, chart: Chart, used: Tensor, loss: Loss | None, max_ite
     zero = torch.zeros_like(chart.unit)
     problem = LineProblem(chart.cameras(views), views.ends, views.w, used, loss)
     # The start is so near that damping is for the few where it is not.
-    options = Options(max_iterations, function_tolerance=1e-10, step_tolerance=1e-10, initial_damping=1e-6)
+    # What is left of the cost then is 1e-5 of a standard deviation of the lines at most.
+    options = Options(max_iterations, function_tolerance=1e-8, step_tolerance=1e-10, initial_damping=1e-6)
     found = descend(problem, (zero, zero, zero, zero), options, enough=views.used.sum(0) >= 2)
     x, status = found.x, found.status
     (at,) = (combine_rows(x, x) > _FAR**2).nonzero(as_tuple=True)
