@@ -7,10 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm._types import check_options, check_tensors
+from torchsfm._types import Status, check_options, check_tensors
+from torchsfm.bundle import bundle_adjust
 from torchsfm.bundle.curves import edge_distances
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.linalg.devices import on_the_cpu
+from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_fusion import fuse_pieces
 from torchsfm.reconstruction.curve_noise import measured_weights
 from torchsfm.reconstruction.curve_pieces import Pieces, image_pieces
@@ -18,6 +20,7 @@ from torchsfm.reconstruction.curve_tracks import track_samples
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
+from torchsfm.reconstruction.similarities import DEVIATION
 
 _ANGLE = 15.0
 """Angle, in degrees, at which the images around an image see the scene best: edges still look alike, and depths are told."""
@@ -27,6 +30,10 @@ _SHORTEST = 4
 """Samples of the shortest piece: ten pixels or so."""
 _AGREE = 4
 """Images, the followed one included, that must see a sample."""
+_SETTLED, _STEPS = 2, 5
+"""Rounds in which samples come to the least squares of all edges that show them, and the most steps of each."""
+_TRUSTED = 3.0
+"""Standard deviations of a distance beyond which an edge shows something else."""
 
 
 @on_the_cpu
@@ -154,8 +161,43 @@ def curves_of_edges(
         no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
-    tracked = track_samples(curves, curves.tangents(), kept, lines, P, size, threshold)
-    return measured_weights(tracked, edge_distances(poses, cameras, tracked.bundle()))
+    curves = track_samples(curves, curves.tangents(), kept, lines, P, size, threshold)
+    curves = settle_samples(curves, cameras, poses, threshold)
+    # What edges no longer run along is left behind.
+    curves = track_samples(curves, curves.tangents(), kept, lines, P, size, threshold)
+    return measured_weights(curves, edge_distances(poses, cameras, curves.bundle()))
+
+
+def settle_samples(curves: Curves, cameras: Camera, poses: Pose, most: float) -> Curves:
+    """The curves with samples at the robust least squares of their distances from all edges that show them; cameras are held.
+
+    What is fused of pieces lies between them, off what images show by more than noise and alike along whole pieces: edges
+    would be taken for that much worse.
+
+    Args:
+        curves: The curves, near there.
+        cameras: Of each image (v).
+        poses: Of each image (v).
+        most: Pixels in the images a sample was found in by which it may move: what edges hardly hold stays.
+    """
+    moved, none = curves, curves.sample[:0]
+    problem = BundleProblem(
+        poses, cameras, torch.arange(len(poses.R), device=none.device), poses.t[:0], curves.x[:0], none, none
+    )
+    for _ in range(_SETTLED):
+        r = edge_distances(poses, cameras, moved.bundle()).abs()
+        scale = DEVIATION * float(r[r.isfinite()].median()) if bool(r.isfinite().any()) else 0.0
+        if not scale > 0:
+            return curves
+        found = bundle_adjust(
+            problem, structure=(moved.bundle(loss=GemanMcClure(_TRUSTED * scale)),), free=(), max_iterations=_STEPS,
+            fixed_poses=torch.ones(len(poses.R), dtype=torch.bool, device=none.device),
+        )  # fmt: skip
+        if found.status == Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        moved = moved.adjusted(found.structure[0])  # type: ignore[arg-type]
+    near = torch.linalg.vector_norm(moved.X - curves.X, dim=-1) <= most * curves.sigma
+    return replace(curves, X=torch.where(near[:, None], moved.X, curves.X))
 
 
 def no_curves(like: Tensor) -> Curves:
