@@ -1,5 +1,6 @@
 """At which depths may the edge points of an image be? Where their images pass edges of many other images as the depth runs."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -27,6 +28,8 @@ _TURNED = 0.9
 """Least cosine of the angle between an edge and the image of the tangent that it agrees with."""
 _EXCHANGED = 0.5
 """What an image counts in which the light and the dark side are exchanged."""
+_TINY = 1e-30
+"""Depth, over that of the ray, below which points are behind."""
 _STEEP = 0.15
 """Sine of the angle between edge and epipolar line below which an edge says nothing of the depth."""
 
@@ -88,14 +91,38 @@ def _tops(closeness: Tensor, P: Tensor, rays: Rays, kept: int) -> tuple[Float[Te
     depths = int(number.nan_to_num(nan=0, posinf=_DEPTHS[1]).clamp(*_DEPTHS))
     share = torch.linspace(0, 1, depths, dtype=low.dtype, device=low.device)
     grid = low[:, None] + (high - low)[:, None] * share
-    total = torch.zeros_like(grid)
-    for j in range(len(P)):
-        y = divide_safely(*_image(A[j : j + 1], B[j : j + 1], grid))
-        total += EdgeMaps.look_up(closeness[j : j + 1], y, 0.0)[0]
+    total = _felt(closeness, A, B, grid)
     padded = torch.nn.functional.pad(total, (1, 1), value=-1.0)
     top = (total >= _LEAST) & (total > padded[:, :-2]) & (total >= padded[:, 2:]) & (high > low)[:, None]
     value, index = torch.where(top, total, 0).topk(min(kept, depths), dim=-1)
     return torch.where(value > 0, grid.gather(-1, index), 0).to(P.dtype), ((high - low) / (depths - 1)).to(P.dtype)
+
+
+def _felt(
+    closeness: Float[Tensor, "v h w"], A: Float[Tensor, "v 3"], B: Float[Tensor, "v s 3"], grid: Float[Tensor, "s d"]
+) -> Float[Tensor, "s d"]:
+    """What the maps hold at the pixels nearest to the images of points, all maps together; 0 outside and behind.
+
+    Most of the time goes here: what is done to each number counts.
+    """
+    h, w = closeness.shape[1:]
+    # Centres of the pixels of an image go from -1 to 1.
+    scale = A.new_tensor([[2 / (w - 1), 0, -1], [0, 2 / (h - 1), -1], [0, 0, 1]])
+    a, b = (A @ scale.mT).tolist(), B @ scale.mT
+    place, total = grid.new_empty(1, *grid.shape, 2), torch.zeros_like(grid)
+    for j, own in enumerate(a):
+        if not all(map(math.isfinite, own)):
+            continue
+        x, y, depth = (torch.add(b[j, :, k, None], grid, alpha=own[k]) for k in range(3))
+        # What is behind goes far outside.
+        depth.clamp_(min=_TINY)
+        torch.div(x, depth, out=place[0, ..., 0])
+        torch.div(y, depth, out=place[0, ..., 1])
+        place.clamp_(-2, 2)
+        total += torch.nn.functional.grid_sample(
+            closeness[None, j : j + 1], place, mode="nearest", padding_mode="zeros", align_corners=True
+        )[0, 0]
+    return total
 
 
 def _lines(P: Tensor, rays: Rays) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v s 3"]]:
@@ -154,7 +181,7 @@ def agreement(shown: Float[Tensor, "*batch 2"], edge: Float[Tensor, "*batch 2"],
 
     The darker side of an edge may be the brighter one in another image: what is behind an outline changes.
     """
-    along, enough = inner(shown, edge), least * torch.linalg.vector_norm(shown, dim=-1)
+    along, enough = inner(shown, edge), least * inner(shown, shown).sqrt()
     return torch.where(along > enough, 1.0, torch.where(along < -enough, _EXCHANGED, 0.0)).to(shown.dtype)
 
 
@@ -172,8 +199,8 @@ def _space_tangents(
     """
     # Where a line of sight along each of both axes takes the image, across the edge.
     normal = torch.stack((-edge[..., 1], edge[..., 0]), -1)
-    axes = torch.stack([a[:, None].expand(*y.shape[1:3], 3) for a in (rays.along, rays.direction)])
-    image = torch.einsum("vij,ascj->avsci", M, axes)
+    axes = torch.stack((rays.along, rays.direction))[:, :, None]
+    image = torch.stack((rays.along @ M.mT, rays.direction @ M.mT))[..., None, :]
     motion = (image[..., :2] - y * image[..., 2:]) / depth[..., None]
     a, b = inner(motion, normal)
     size = torch.linalg.vector_norm(motion, dim=-1).sum(0).clamp_min(1e-300)
