@@ -1,11 +1,11 @@
 """The main job, photographs to model, against COLMAP on the same photographs with the same threads.
 
-    TORCHSFM_DATA=/path/to/data python -m bench.reconstruction [--sets fountain sceaux ...] [--threads 2] [--lines]
+    TORCHSFM_DATA=/path/to/data python -m bench.reconstruction [--sets fountain sceaux ...] [--threads 2] [--lines] [--curves]
 
-prints one markdown table; with `--lines` also of points and lines together. Each run is a process of its own, so that its peak
-memory is its own; both programs start from the same knowledge: one shared camera, its focal length from the EXIF header where
-there is one, else unknown, or K where the set gives it. `pytest bench/reconstruction.py` times the whole job with
-pytest-benchmark instead.
+prints one markdown table; with `--lines` also of points and lines together, with `--curves` of points and curves. Each run
+is a process of its own, so that its peak memory is its own; both programs start from the same knowledge: one shared camera,
+its focal length from the EXIF header where there is one, else unknown, or K where the set gives it.
+`pytest bench/reconstruction.py` times the whole job with pytest-benchmark instead.
 """
 
 import argparse
@@ -32,7 +32,7 @@ Result = dict[str, Any]
 STAGES = ("start", "extract", "match", "verify", "map")
 
 
-def run_torchsfm(photographs: PhotographSet, threads: int, seed: int, lines: bool = False) -> Result:
+def run_torchsfm(photographs: PhotographSet, threads: int, seed: int, **more: bool) -> Result:
     """Reconstruct with this library; the seconds of its stages are those of its own report."""
     clock = time.perf_counter()
     torch.set_num_threads(threads)
@@ -44,13 +44,14 @@ def run_torchsfm(photographs: PhotographSet, threads: int, seed: int, lines: boo
     K = None if photographs.K is None else torch.from_numpy(photographs.K)
     start = time.perf_counter() - clock
     clock = time.perf_counter()
-    result = reconstruct(photographs.paths, sequence=photographs.sequence, shared_camera=True, K=K, seed=seed, lines=lines)
+    result = reconstruct(photographs.paths, sequence=photographs.sequence, shared_camera=True, K=K, seed=seed, **more)
     total = time.perf_counter() - clock
     model = result.models[0]
     group = {
         "read": "extract",
         "features": "extract",
         "segments": "extract",
+        "edges": "extract",
         "look": "match",
         "match": "match",
         "track": "match",
@@ -137,6 +138,7 @@ def run_colmap(photographs: PhotographSet, threads: int, seed: int) -> Result:
 PROGRAMS: dict[str, Callable[[PhotographSet, int, int], Result]] = {
     "torchsfm": run_torchsfm,
     "torchsfm with lines": partial(run_torchsfm, lines=True),
+    "torchsfm with curves": partial(run_torchsfm, curves=True),
     "colmap": run_colmap,
 }
 
@@ -210,6 +212,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--lines", action="store_true", help="also reconstruct with lines")
+    parser.add_argument("--curves", action="store_true", help="also reconstruct with curves")
     parser.add_argument("--no-colmap", action="store_true")
     parser.add_argument("--no-torchsfm", action="store_true")
     parser.add_argument("--worker", nargs=2, metavar=("PROGRAM", "SET"), help=argparse.SUPPRESS)
@@ -224,7 +227,7 @@ def main(arguments: list[str] | None = None) -> None:
         result["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
         print(json.dumps(result))
         return
-    wanted = {"torchsfm": not options.no_torchsfm, "torchsfm with lines": options.lines, "colmap": not options.no_colmap}
+    wanted = dict(zip(PROGRAMS, (not options.no_torchsfm, options.lines, options.curves, not options.no_colmap), strict=True))
     chosen = [program for program in PROGRAMS if wanted[program]]
     print(HEADER, "|---" * 12 + "|", sep="\n", flush=True)
     remarks = []

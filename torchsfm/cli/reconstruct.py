@@ -107,7 +107,7 @@ def reconstruct(
         bool, typer.Option("--lines", help="Find straight lines too, and adjust cameras by points and lines together.")
     ] = False,
     curves: Annotated[
-        bool, typer.Option("--curves", help="Find curves in space too, with the cameras found: from edges of the images.")
+        bool, typer.Option("--curves", help="Find curves in space too, from edges of the images, and adjust cameras by both.")
     ] = False,
     max_features: Annotated[int, typer.Option(min=100, help="Most features per image.")] = 8192,
     max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,

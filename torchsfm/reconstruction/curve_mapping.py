@@ -14,10 +14,9 @@ from torchsfm.bundle import BundleCovariance, bundle_adjust, bundle_covariance
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import BundleProblem, Camera, Pose, rotation_from_rotvec, rotvec_from_rotation
 from torchsfm.images.edge_field import EdgeField, edge_field
-from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_directions import across_own_curves, own_directions
 from torchsfm.reconstruction.curve_fusion import near_pairs
-from torchsfm.reconstruction.curve_noise import measured_weights, sample_weights
+from torchsfm.reconstruction.curve_noise import TRUSTED, edge_loss, usual_distance, weights_in_a_bundle
 from torchsfm.reconstruction.curve_pieces import image_pieces
 from torchsfm.reconstruction.curve_resection import Resection, pose_from_edges
 from torchsfm.reconstruction.curve_tracks import track_samples
@@ -37,10 +36,6 @@ _SHORTEST = 6
 """Samples of the shortest piece."""
 _SAMPLES = 350
 """Samples of a frame, the most."""
-_TRUSTED = 3.0
-"""Standard deviations of a distance beyond which edges show something else: outlines of surfaces, highlights."""
-_FINEST = 0.05
-"""Least standard deviation of distances that is believed, in pixels."""
 _STEPS = 3
 """Of an adjustment to the same edge points: images that go on along their curves leave these behind."""
 _BESIDE = 8.0
@@ -162,9 +157,9 @@ def add_pieces(mapping: CurveMapping, view: int, near: float = NEAR) -> CurveMap
 
 def directions(mapping: CurveMapping) -> Float[Tensor, "n 3"]:
     """Which way curves run at samples: by the edges that show them, as of their neighbours' places each is known poorly."""
-    loss = _loss(mapping)
     r, _ = distances(mapping)
-    return own_directions(mapping.curves.bundle(), mapping.poses, mapping.one_camera, loss.slope(r.square()))
+    trust = edge_loss(r).slope(r.square())
+    return own_directions(mapping.curves.bundle(), mapping.poses, mapping.one_camera, trust)
 
 
 def track(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
@@ -179,12 +174,7 @@ def track(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
 def distances(mapping: CurveMapping) -> tuple[Float[Tensor, "k"], float]:
     """Signed distances of samples from the edges that show them, and the standard deviation of most."""
     r = edge_distances(mapping.poses, mapping.one_camera, mapping.curves.bundle())
-    return r, max(_FINEST, 1.4826 * float(r.abs().median())) if len(r) else _FINEST
-
-
-def _loss(mapping: CurveMapping) -> GemanMcClure:
-    """Lets go of edges much farther away than most."""
-    return GemanMcClure(_TRUSTED * distances(mapping)[1])
+    return r, usual_distance(r)
 
 
 def terms(mapping: CurveMapping) -> dict[str, Any]:
@@ -193,9 +183,8 @@ def terms(mapping: CurveMapping) -> dict[str, Any]:
     Samples that fit badly as a whole have less.
     """
     r, _ = distances(mapping)
-    loss = _loss(mapping)
-    weighed = measured_weights(mapping.curves, r)
-    curves = replace(weighed, weight=weighed.weight * sample_weights(mapping.curves, r)).bundle(loss=loss)
+    loss = edge_loss(r)
+    curves = weights_in_a_bundle(mapping.curves, r).bundle(loss=loss)
     return {"structure": (across_own_curves(curves, mapping.poses, mapping.one_camera, loss.slope(r.square())),)}
 
 
@@ -241,7 +230,7 @@ def prune(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
     n = len(old.X)
     number = torch.bincount(old.sample, minlength=n)
     square = torch.zeros_like(old.X[:, 0]).index_add(0, old.sample, r.square())
-    keep = (square < (_TRUSTED * scale) ** 2 * (number - 2)) & (number >= _AGREE) & _confirmed(mapping, near)
+    keep = (square < (TRUSTED * scale) ** 2 * (number - 2)) & (number >= _AGREE) & _confirmed(mapping, near)
     seen = old.seen_where(keep[old.sample])
     left, curve = torch.unique(old.curve[keep], return_inverse=True)
     curves = replace(

@@ -8,7 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.bundle.track_weights import student_weights
+from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.similarities import DEVIATION
 
 LEAST_SCALE = 0.2
 """Distances smaller than this part of what edges' own variances say are no reason to weigh them more."""
@@ -16,8 +18,32 @@ LAGS = 64
 """Samples along a curve, the most, whose distances from edges may still be alike."""
 ALIKE = 0.05
 """Correlation, the least, that is told from none."""
+FINEST = 0.05
+"""Least standard deviation of distances that is believed, in pixels."""
+TRUSTED = 3.0
+"""Standard deviations of a distance beyond which edges show something else: outlines of surfaces, highlights."""
 _DOF = 4.0
 """Degrees of freedom of the distribution of all distances of a sample: the fewer, the faster weights of samples fall."""
+
+
+def usual_distance(apart: Float[Tensor, "k"]) -> float:
+    """The standard deviation of most distances, pixels."""
+    known = apart[apart.isfinite()].abs()
+    return max(FINEST, DEVIATION * float(known.median())) if len(known) else FINEST
+
+
+def edge_loss(apart: Float[Tensor, "k"]) -> GemanMcClure:
+    """Lets go of edges much farther away than most."""
+    return GemanMcClure(TRUSTED * usual_distance(apart))
+
+
+def weights_in_a_bundle(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
+    """The curves with edge points weighed by what is measured, and less where a sample fits badly as a whole.
+
+    Arguments are those of `measured_weights`.
+    """
+    weighed = measured_weights(curves, apart)
+    return replace(weighed, weight=weighed.weight * sample_weights(curves, apart))
 
 
 def measured_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:

@@ -14,9 +14,10 @@ from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curve_fusion import fuse_pieces
-from torchsfm.reconstruction.curve_noise import measured_weights
+from torchsfm.reconstruction.curve_noise import TRUSTED, measured_weights
 from torchsfm.reconstruction.curve_pieces import Pieces, image_pieces
 from torchsfm.reconstruction.curve_tracks import track_samples
+from torchsfm.reconstruction.edge_maps import EdgePoints
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
@@ -32,8 +33,6 @@ _AGREE = 4
 """Images, the followed one included, that must see a sample."""
 _SETTLED, _STEPS = 2, 5
 """Rounds in which samples come to the least squares of all edges that show them, and the most steps of each."""
-_TRUSTED = 3.0
-"""Standard deviations of a distance beyond which an edge shows something else."""
 
 
 @on_the_cpu
@@ -161,10 +160,32 @@ def curves_of_edges(
         no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
-    curves = track_samples(curves, curves.tangents(), kept, lines, P, size, threshold)
+    return _shown_by(curves, seen, size, cameras, poses, threshold)
+
+
+def curves_of_other_cameras(
+    curves: Curves, edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera, poses: Pose, *, threshold: float = 2.0
+) -> Curves:
+    """What `curves_of_edges` found, where cameras have changed a little since: shown by the edges that are near now."""
+    seen = [own.seen_by(cameras[i]) for i, own in enumerate(edges)]
+    return _shown_by(curves, seen, size, cameras, poses, threshold)
+
+
+def _shown_by(
+    curves: Curves,
+    seen: Sequence[tuple[ImageEdges, EdgePoints]],
+    size: tuple[int, int],
+    cameras: Camera,
+    poses: Pose,
+    threshold: float,
+) -> Curves:
+    """The curves at the least squares of all edges that run along them, with these edges."""
+    kept, straight = zip(*seen, strict=True)
+    P = cameras.K.double() @ poses.matrix().double()
+    curves = track_samples(curves, curves.tangents(), kept, straight, P, size, threshold)
     curves = settle_samples(curves, cameras, poses, threshold)
     # What edges no longer run along is left behind.
-    curves = track_samples(curves, curves.tangents(), kept, lines, P, size, threshold)
+    curves = track_samples(curves, curves.tangents(), kept, straight, P, size, threshold)
     return measured_weights(curves, edge_distances(poses, cameras, curves.bundle()))
 
 
@@ -190,7 +211,7 @@ def settle_samples(curves: Curves, cameras: Camera, poses: Pose, most: float) ->
         if not scale > 0:
             return curves
         found = bundle_adjust(
-            problem, structure=(moved.bundle(loss=GemanMcClure(_TRUSTED * scale)),), free=(), max_iterations=_STEPS,
+            problem, structure=(moved.bundle(loss=GemanMcClure(TRUSTED * scale)),), free=(), max_iterations=_STEPS,
             fixed_poses=torch.ones(len(poses.R), dtype=torch.bool, device=none.device),
         )  # fmt: skip
         if found.status == Status.INTERRUPTED:

@@ -1,4 +1,4 @@
-"""Curves after points: the edges of photographs are followed through the placed views."""
+"""Curves after points: edges of photographs are followed through the placed views, then all is adjusted together."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,13 +10,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.geometry import Camera
+from torchsfm.geometry import Camera, Pose
 from torchsfm.images import ImageError, read_image
-from torchsfm.reconstruction.curves import curves_of_edges
+from torchsfm.reconstruction.camera_prior import CameraPrior
+from torchsfm.reconstruction.curve_adjustment import WithCurves, adjust_with_curves
+from torchsfm.reconstruction.curves import curves_of_edges, curves_of_other_cameras
 from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.masks import Masks
-from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
 from torchsfm.reconstruction.stages import Arrays
 
@@ -89,25 +91,38 @@ def detect_all_edges(
     return joined | numbers
 
 
-def find_curves(mapping: Mapping, found: FoundEdges, progress: Progress) -> Curves:
-    """Find the curves in space of a finished model.
+def find_curves(
+    mapping: Mapping, found: FoundEdges, prior: CameraPrior | None, progress: Progress, *, lines: Lines | None = None
+) -> WithCurves:
+    """Find the curves in space of a finished model, and adjust cameras, points, lines and curves together.
 
     Args:
         mapping: The model.
         found: Edges of all its images.
+        prior: What is expected of its cameras, where something of them is estimated.
         progress: Called as the work goes on.
+        lines: Lines of the model, if it has any.
 
     Returns:
-        The curves, and the edge points that show them in pixels of the images.
+        The model after the adjustment, its lines, and the curves with the edge points that show them in pixels of the images.
+        The model and its lines are as they were where there are no curves, or these contradict the points.
     """
     known = mapping.registered.nonzero()[:, 0]
     zoom, size = found.zoom[known], found.size[known]
-    cameras = scaled(mapping.cameras[mapping.camera_index[known]], 1 / zoom)
-    points = mapping.X[_seen(mapping)]
     height_width = (int(size[:, 1].amax()), int(size[:, 0].amax())) if len(known) else (8, 8)
     edges = [found.edges[i] for i in known.tolist()]
-    curves = curves_of_edges(edges, height_width, cameras, mapping.poses[known], points=points, progress=progress)
-    return curves.in_images(known, zoom)
+
+    def placed(model: Mapping) -> tuple[Camera, Pose]:
+        return scaled(model.cameras[model.camera_index[known]], 1 / zoom), model.poses[known]
+
+    points = mapping.X[_seen(mapping)]
+    curves = curves_of_edges(edges, height_width, *placed(mapping), points=points, progress=progress)
+    whole = curves.in_images(known, zoom)
+    better = adjust_with_curves(mapping, whole, prior, lines)
+    if better is None:
+        return WithCurves(mapping, lines, whole)
+    curves = curves_of_other_cameras(better.curves, edges, height_width, *placed(better.mapping))
+    return WithCurves(better.mapping, better.lines, curves.in_images(known, zoom))
 
 
 def scaled(cameras: Camera, share: Float[Tensor, "v 2"]) -> Camera:

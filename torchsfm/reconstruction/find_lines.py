@@ -88,17 +88,11 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
     these say.
     """
     free = None if mapping.adjustment is None else mapping.adjustment.free
-    problem = mapping.problem()
     weights = observation_weights(mapping, LOSS)
-    noise = measure_noise(mapping, LOSS, weights)
-    apart = segment_distances(mapping.poses, mapping.cameras[mapping.camera_index], lines.bundle())
-    # Of robust mean size: two distances a segment, less the four numbers of each line.
-    redundancy = max(0.1, 1 - 4 * len(lines) / max(apart.numel(), 1))
-    scale = float((apart.abs() * lines.weight.sqrt()[:, None]).median()) / 0.6745 / redundancy**0.5
     known = about_cameras(mapping, free, prior, weights)
     result = bundle_adjust(
-        problem,
-        structure=[lines.bundle(unit=noise / max(scale, LEAST_SCALE), loss=LINE_LOSS)],
+        mapping.problem(),
+        structure=[lines_in_a_bundle(mapping, lines, measure_noise(mapping, LOSS, weights))],
         weights=weights,
         loss=LOSS,
         **({"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE} | known | limits),
@@ -108,6 +102,15 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
     (moved,) = result.structure
     assert isinstance(moved, BundleLines), "given"
     return as_adjusted(mapping, result, free, prior), lines.moved_to(moved.L)
+
+
+def lines_in_a_bundle(mapping: Mapping, lines: Lines, noise: float) -> BundleLines:
+    """Lines beside the points of a model, whose observations have that noise, pixels; see `adjust_with_lines`."""
+    apart = segment_distances(mapping.poses, mapping.cameras[mapping.camera_index], lines.bundle())
+    # Of robust mean size: two distances a segment, less the four numbers of each line.
+    redundancy = max(0.1, 1 - 4 * len(lines) / max(apart.numel(), 1))
+    scale = float((apart.abs() * lines.weight.sqrt()[:, None]).median()) / 0.6745 / redundancy**0.5
+    return lines.bundle(unit=noise / max(scale, LEAST_SCALE), loss=LINE_LOSS)
 
 
 def _without_lenses(mapping: Mapping, found: FoundSegments) -> tuple[ViewSegments, Tensor]:

@@ -76,14 +76,14 @@ def _with_lines_and_curves(
     stages: Stages,
     progress: Progress,
 ) -> tuple[Component, Reconstruction]:
-    """The model with its lines, which move the cameras, and its curves, where they are wanted."""
+    """The model with its lines and curves, where they are wanted; both move the cameras."""
     model, lines, curves = component.model, None, None
     if segments is not None:
         with stages.timed("lines"):
             model, lines = find_lines(model, segments(), component.options.prior(model))
     if edges is not None:
         with stages.timed("curves"):
-            curves = find_curves(model, edges(), progress)
+            model, lines, curves = find_curves(model, edges(), component.options.prior(model), progress, lines=lines)
     return component.moved(model), replace(model.reconstruction(), lines=lines, curves=curves)
 
 

@@ -91,9 +91,9 @@ def reconstruct(
             `report.refusal` says why where there is no model.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
             points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
-        curves: Find curves in space, too, with the cameras that have been found: edges of the photographs, scaled down to a
-            thousand pixels, followed through the images around (`reconstruct_curves`). They are in `Reconstruction.curves`, and
-            `bundle_adjust_model` adjusts cameras, points and curves together.
+        curves: Find curves in space, too: edges of the photographs, scaled down to a thousand pixels, followed through the
+            images around with the cameras that have been found (`reconstruct_curves`); then cameras, points, lines and curves
+            are adjusted together, unless curves contradict the points. They are in `Reconstruction.curves`.
         masks: Folder of masks, in which nothing counts that is black: see `Masks` for their names. The mask of `view.jpg` is
             `view.jpg.png` or `view.png`.
         max_features: Features per image.

@@ -1,0 +1,126 @@
+"""Cameras by points and curves together: few points and the edges of photographs of a box, and edges that contradict points."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from painted_box import HALF, SIZE, camera, orbit, photograph
+from torch import Tensor
+
+from torchsfm.bundle import bundle_adjust
+from torchsfm.bundle.curves import edge_distances
+from torchsfm.geometry import Pose
+from torchsfm.reconstruction import curve_noise
+from torchsfm.reconstruction.adjust import LOSS, adjust
+from torchsfm.reconstruction.curve_adjustment import adjust_with_curves, points_agree
+from torchsfm.reconstruction.curves import reconstruct_curves
+from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
+from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.track_graph import graph_from_tracks
+
+F64 = torch.float64
+VIEWS = 12
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is the same in all tests, as it takes a while."""
+
+    images: Tensor
+    edges: tuple[ImageEdges, ...]
+    curves: Curves
+    """By the true cameras."""
+
+    def found(self) -> FoundEdges:
+        """All edges, of images as they were read."""
+        sizes = torch.full((VIEWS, 2), SIZE)
+        return FoundEdges(self.edges, sizes, torch.ones(VIEWS, 2, dtype=F64), torch.zeros(VIEWS, dtype=F64))
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    images = photograph(orbit(VIEWS))
+    edges = tuple(ImageEdges.of(image) for image in images)
+    return Seen(images, edges, reconstruct_curves(images, camera(VIEWS), orbit(VIEWS)))
+
+
+def with_points(number: int, noise: float, generator: torch.Generator) -> Mapping:
+    """The true cameras, adjusted to noisy image points of so many points about the box."""
+    X = 2 * HALF * (torch.rand(number, 3, generator=generator, dtype=F64) - 0.5)
+    view, point = torch.cartesian_prod(torch.arange(VIEWS), torch.arange(number)).unbind(1)
+    x = camera(VIEWS)[view].project(orbit(VIEWS)[view].transform(X[point, None]))[:, 0]
+    x = x + noise * torch.randn(x.shape, generator=generator, dtype=F64)
+    names, sizes = tuple(f"{i}.png" for i in range(VIEWS)), torch.full((VIEWS, 2), SIZE)
+    graph, track = graph_from_tracks(names, sizes, x, view, point, torch.ones(len(x), 3, dtype=F64), generator=generator)
+    start = Mapping.start(graph, track, camera(1), torch.zeros(VIEWS, dtype=torch.long))
+    start = replace(start, poses=orbit(VIEWS), registered=torch.ones(VIEWS, dtype=torch.bool), X=X, point=track)
+    return adjust(start, max_iterations=50, tolerance=1e-9)
+
+
+def turned(poses: Pose) -> Tensor:
+    """Angles of relative rotations to the next view, off the true ones, degrees."""
+    true = orbit(VIEWS)
+
+    def steps(own: Pose) -> Tensor:
+        return own.R[1:] @ own.R[:-1].mT
+
+    trace = (steps(poses) @ steps(true).mT).diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Says nothing."""
+
+
+def test_curves_place_cameras_that_few_points_place_badly(seen: Seen, generator: torch.Generator) -> None:
+    model = with_points(12, 0.5, generator)
+    better = find_curves(model, seen.found(), None, silent)
+    assert better.mapping is not model
+    assert turned(better.mapping.poses).mean() < 0.9 * turned(model.poses).mean()
+    # The curves are those of the new cameras.
+    by_these = edge_distances(better.mapping.poses, camera(VIEWS), better.curves.bundle()).abs()
+    by_those = edge_distances(model.poses, camera(VIEWS), better.curves.bundle()).abs()
+    assert by_these.median() < 0.5 * by_those.median()
+
+
+def test_edges_that_lie_aside_leave_cameras_where_many_points_have_them(
+    seen: Seen, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In each image all of them by the same, as those of what is round do more or less: that is one error, not hundreds.
+
+    Where they count as hundreds, points contradict the cameras.
+    """
+    model = with_points(40, 0.1, generator)
+    aside = torch.randn(VIEWS, 2, generator=generator, dtype=F64)
+    aside = 0.3 * aside / aside.norm(dim=-1, keepdim=True)
+    wrong = replace(seen.curves, x=seen.curves.x + aside[seen.curves.view])
+    for curves, most in ((seen.curves, 0.95), (wrong, 1.2)):
+        moved = adjust_with_curves(model, curves, None)
+        assert moved is not None
+        assert turned(moved.mapping.poses).mean() < most * turned(model.poses).mean()
+    monkeypatch.setattr(curve_noise, "alike", lambda *_: 1.0)
+    assert adjust_with_curves(model, wrong, None) is None
+
+
+def test_cameras_are_refused_that_points_contradict(generator: torch.Generator) -> None:
+    """Those that are true are not, whatever the noise of points."""
+    model = with_points(30, 0.3, generator)
+
+    def at(poses: Pose) -> Mapping:
+        other, held = replace(model, poses=poses), torch.ones(VIEWS, dtype=torch.bool)
+        return replace(other, X=bundle_adjust(other.problem(), fixed_poses=held, free=(), loss=LOSS).X)
+
+    assert points_agree(model, at(orbit(VIEWS)))
+    off = (0.004 * torch.randn(VIEWS, 6, generator=generator, dtype=F64)) * torch.tensor([1, 1, 1, 5, 5, 5], dtype=F64)
+    assert not points_agree(model, at(orbit(VIEWS).retract(off)))
+
+
+def test_no_edges_change_nothing(generator: torch.Generator) -> None:
+    model = with_points(30, 0.3, generator)
+    none = (ImageEdges.none(),) * VIEWS
+    found = FoundEdges(none, torch.full((VIEWS, 2), SIZE), torch.ones(VIEWS, 2, dtype=F64), torch.zeros(VIEWS, dtype=F64))
+    same = find_curves(model, found, None, silent)
+    assert same.mapping is model
+    assert len(same.curves) == 0

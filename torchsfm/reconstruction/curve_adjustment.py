@@ -1,0 +1,107 @@
+"""Cameras by points, lines and curves together: edge points count by what is measured of them, and only where points agree."""
+
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor
+
+from torchsfm._types import Status
+from torchsfm.bundle import BundleCurves, bundle_adjust
+from torchsfm.bundle.curves import edge_distances
+from torchsfm.reconstruction.adjust import LOSS, ROUGHLY, about_cameras, as_adjusted
+from torchsfm.reconstruction.calibration import measure_noise, observation_weights
+from torchsfm.reconstruction.camera_prior import CameraPrior
+from torchsfm.reconstruction.curve_noise import edge_loss, weights_in_a_bundle
+from torchsfm.reconstruction.find_lines import lines_in_a_bundle
+from torchsfm.reconstruction.lines import Lines
+from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.model_curves import Curves
+
+TOLERANCE = 1e-5
+"""Relative decrease of the cost at which the last adjustment ends; samples slide on for long, and gain nothing."""
+MOST_STEPS = 50
+"""Of each adjustment."""
+UNLIKELY = 3.0
+"""Standard deviations beyond which what points lose by curves is not by chance."""
+
+
+class WithCurves(NamedTuple):
+    """A model, its lines and its curves, adjusted together."""
+
+    mapping: Mapping
+    lines: Lines | None
+    curves: Curves
+
+
+def adjust_with_curves(
+    mapping: Mapping, curves: Curves, prior: CameraPrior | None, lines: Lines | None = None
+) -> WithCurves | None:
+    """Adjust cameras, points, lines and curves together; of the cameras what the last adjustment of points did.
+
+    Edge points count by how far they are from the curves, and by how many along a curve are off alike: along a straight edge of
+    a building an image has one error, not one a pixel. So curves say little beside thousands of points, and much
+    beside few. Both are measured again after a first adjustment, as what cameras are off passes for noise of edges before.
+
+    Args:
+        mapping: The model, at the minimum of its points.
+        curves: Its curves, with edge points in pixels of its images.
+        prior: What is expected of its cameras, where something of them is estimated.
+        lines: Its lines, if it has any.
+
+    Returns:
+        All of them after the adjustment; None where no edge shows a curve, or where points fit worse than the cameras' own
+        uncertainty lets them: the squared distances of points, over their noise, may grow by one for each number of a camera
+        that curves say better, and as much more as chance makes likely. Then curves are off in a way that their own
+        noise does not tell, as outlines of what is round are.
+    """
+    if not len(curves.x):
+        return None
+    moved = WithCurves(mapping, lines, curves)
+    for tolerance in (ROUGHLY, TOLERANCE):
+        moved = _adjusted(moved, prior, tolerance)
+    return moved if points_agree(mapping, moved.mapping) else None
+
+
+def points_agree(mapping: Mapping, moved: Mapping) -> bool:
+    """Whether the points of a model lose no more by other cameras than their own noise makes likely; see `adjust_with_curves`.
+
+    Args:
+        mapping: The model, at the minimum of its points.
+        moved: The same with other cameras, and its points where these want them.
+    """
+    weights = observation_weights(mapping, LOSS)
+    lost = _cost(moved, weights) - _cost(mapping, weights)
+    free = {} if mapping.adjustment is None else mapping.adjustment.free
+    number = 6 * int(mapping.registered.sum()) + sum(int(mask.sum()) for mask in free.values())
+    most = number + UNLIKELY * (2 * number) ** 0.5
+    return bool(2 * lost <= most * measure_noise(mapping, LOSS, weights) ** 2)
+
+
+def _adjusted(model: WithCurves, prior: CameraPrior | None, tolerance: float) -> WithCurves:
+    mapping, lines, curves = model
+    free = None if mapping.adjustment is None else mapping.adjustment.free
+    weights = observation_weights(mapping, LOSS)
+    noise = measure_noise(mapping, LOSS, weights)
+    apart = edge_distances(mapping.poses, mapping.cameras[mapping.camera_index], curves.bundle())
+    edges = weights_in_a_bundle(curves, apart).bundle(unit=noise, loss=edge_loss(apart))
+    result = bundle_adjust(
+        mapping.problem(),
+        structure=[edges] if lines is None or not len(lines) else [edges, lines_in_a_bundle(mapping, lines, noise)],
+        weights=weights,
+        loss=LOSS,
+        max_iterations=MOST_STEPS,
+        tolerance=tolerance,
+        **about_cameras(mapping, free, prior, weights),
+    )
+    if result.status == Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    samples, *others = result.structure
+    assert isinstance(samples, BundleCurves), "given"
+    if lines is not None and others:
+        lines = lines.adjusted(others[0])  # type: ignore[arg-type]
+    return WithCurves(as_adjusted(mapping, result, free, prior), lines, curves.adjusted(samples))
+
+
+def _cost(mapping: Mapping, weights: Float[Tensor, "m"]) -> float:
+    """Half the sum of the losses of observations, square pixels."""
+    return 0.5 * float((weights * LOSS(mapping.problem().residuals().square())).nan_to_num(nan=0.0, posinf=0.0).sum())
