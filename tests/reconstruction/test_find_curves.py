@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_adjust
 from torchsfm.bundle.curves import edge_distances
+from torchsfm.bundle.lines import segment_distances
 from torchsfm.geometry import Pose
 from torchsfm.reconstruction import curve_noise
 from torchsfm.reconstruction.adjust import LOSS, adjust
@@ -16,6 +17,7 @@ from torchsfm.reconstruction.curve_adjustment import adjust_with_curves, points_
 from torchsfm.reconstruction.curves import reconstruct_curves
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.track_graph import graph_from_tracks
@@ -107,6 +109,23 @@ def test_edges_that_lie_aside_leave_cameras_where_many_points_have_them(
         assert turned(moved.mapping.poses).mean() < most * turned(model.poses).mean()
     monkeypatch.setattr(curve_noise, "alike", lambda *_: 1.0)
     assert adjust_with_curves(model, wrong, None) is None
+
+
+def test_lines_are_adjusted_with_points_and_curves(seen: Seen, generator: torch.Generator) -> None:
+    """The upright edges of the box, which fit the cameras of few points worse than those of all together."""
+    model = with_points(12, 0.2, generator)
+    x, y, z = HALF.tolist()
+    ends = torch.tensor([[(a * x, b * y, c * z) for c in (-1, 1)] for a in (-1, 1) for b in (-1, 1)], dtype=F64)
+    line, view = torch.cartesian_prod(torch.arange(4), torch.arange(VIEWS)).unbind(1)
+    shown = camera(VIEWS)[view].project(orbit(VIEWS)[view].transform(ends[line]))
+    shown = shown + 0.02 * torch.randn(shown.shape, generator=generator, dtype=F64)
+    lines = Lines(ends, torch.ones(4, 3, dtype=F64), shown, torch.full((len(line),), 0.02**-2, dtype=F64), view, line)
+    moved = adjust_with_curves(model, seen.curves, None, lines)
+    assert moved is not None
+    assert moved.lines is not None
+    before = segment_distances(model.poses, camera(VIEWS), lines.bundle()).abs().mean()
+    after = segment_distances(moved.mapping.poses, camera(VIEWS), moved.lines.bundle()).abs().mean()
+    assert after < 0.5 * before
 
 
 def test_cameras_are_refused_that_points_contradict(generator: torch.Generator) -> None:
