@@ -51,6 +51,16 @@ def group_cameras(image_size: Int[Tensor, "v 2"], labels: Sequence[str], shared:
     return torch.tensor([order[key] for key in keys], dtype=torch.long)
 
 
+def group_bodies(image_size: Int[Tensor, "v 2"], labels: Sequence[str]) -> Int[Tensor, "v"]:
+    """Which images one camera may have taken with all focal lengths of its zoom lens.
+
+    Args:
+        image_size: Width and height; cameras are not looked for among images of different size.
+        labels: What the files say of the camera (maker, model, and last, after a bar, the focal length).
+    """
+    return group_cameras(image_size, [label.rpartition("|")[0] for label in labels], None)
+
+
 def guess_cameras(
     graph: ViewGraph,
     camera_index: Int[Tensor, "v"],

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.reconstruction.beginning import Beginning, Grown, grow_by
-from torchsfm.reconstruction.cameras import group_cameras
+from torchsfm.reconstruction.cameras import group_bodies, group_cameras
 from torchsfm.reconstruction.choose_mapper import choose_mapper
 from torchsfm.reconstruction.consistency import PairAgreement
 from torchsfm.reconstruction.cropped import map_cropped, may_be_off_centre
@@ -166,15 +166,17 @@ class Growth:
             generator=generator,
         )  # fmt: skip
         together = group_cameras(graph.image_size, given.labels, wanted.shared_camera)
-        begun = begin(together)
+        unsaid = wanted.shared_camera is None and not given.known_cameras
+        body = group_bodies(graph.image_size, given.labels) if unsaid else None
+        begun = begin(together, body=body)
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, begun.options.focal_sigma[together])
         first: Grown | None = None
-        if wanted.shared_camera is None and wanted.K is None and not given.known_cameras and method != "projective":
+        if unsaid and wanted.K is None and method != "projective":
             apart = part_zoomed(graph, together, torch.tensor([focal is not None for focal in given.exif_focal]))
             if apart is not None:
                 own, more = apart
-                begun, first = better_beginning(begun, begin(own, body=together), more, partial(_settled, method, progress))
+                begun, first = better_beginning(begun, begin(own, body=body), more, partial(_settled, method, progress))
         # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
         family = group_cameras(torch.zeros_like(graph.image_size), given.labels, wanted.shared_camera)
         return cls(begun, method, family, given.track is None, progress, first)
