@@ -95,7 +95,7 @@ def graph_of_a_zoom_lens(generator: torch.Generator) -> ViewGraph:
 
 
 def test_one_body_with_a_zoom_lens_that_files_tell_of(generator: torch.Generator) -> None:
-    """Its principal points, off the middle by 21 pixels, are found together; those of seven cameras are held in the middle or wander."""
+    """Its principal points, 21 pixels off the middle, are found together; those of seven cameras are held there, or wander."""
     f, centre = 800 * torch.logspace(0, 0.25, 7, dtype=torch.float64), (516.5, 361.5)
     x, view, track = see(f, centre, -0.05, generator)
     names, size = [str(i) for i in range(7)], torch.tensor([SIZE] * 7)
