@@ -17,10 +17,10 @@ from torchsfm.reconstruction.mapping import Mapping
 
 PRINCIPAL_POINT_SIGMA = 0.01
 """How far principal points lie from the middle of the image, as a fraction of its longer side."""
-ONE_BODY = 0.002
-"""By how much the principal points of one camera differ as its lens zooms, in the same unit."""
 CROPPED_SIGMA = 0.1
 """The same where images may have been cut out of larger ones."""
+ONE_BODY = 0.002
+"""How far apart, in the same unit, those of one camera lie as its lens zooms."""
 RADIAL_SIGMA = 0.3
 TANGENTIAL_SIGMA = 0.01
 """How large the distortion parameters of lenses are."""
@@ -81,19 +81,16 @@ class CameraPrior:
         """
         known = {name: self.sigma[name] / noise for name in names}
         terms: dict[str, Any] = {"intrinsics_sigma": known, "intrinsics_mean": self.mean}
-        ties = [*self._one_body(known, used), *self._one_lens(known, used)]
-        return terms | {"priors": tuple(ties)} if ties else terms
-
-    def _one_body(self, known: dict[str, Float[Tensor, "g"]], used: Bool[Tensor, "g"]) -> Iterator["_Alike"]:
-        """The principal points of one body: the first lies as principal points do, the others where the first does."""
+        ties = list(self._one_lens(known, used))
         first = self._first_of_body(used)
         others = (first != torch.arange(len(used))).nonzero()[:, 0]
         if "principal_point" in known and len(others):
-            width = known["principal_point"]
+            # The first of a body lies as principal points do, the others where the first does.
+            width, columns = known["principal_point"], free_columns(("principal_point",), type(self.mean.distortion))
             known["principal_point"] = width.index_fill(0, others, NOT_KNOWN * float(width.amax()))
-            columns = torch.tensor(free_columns(("principal_point",), type(self.mean.distortion)))
-            apart = (ONE_BODY / PRINCIPAL_POINT_SIGMA * width[others])[:, None].expand(-1, len(columns))
-            yield _Alike(first[others], others, columns, apart)
+            apart = ONE_BODY / PRINCIPAL_POINT_SIGMA * width[others]
+            ties.append(_Alike(first[others], others, torch.tensor(columns), apart[:, None].expand(-1, len(columns))))
+        return terms | {"priors": tuple(ties)} if ties else terms
 
     def _one_lens(self, known: dict[str, Float[Tensor, "g"]], used: Bool[Tensor, "g"]) -> Iterator["_Alike"]:
         """All but the principal points, where all cameras are one."""
