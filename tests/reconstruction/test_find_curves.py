@@ -12,8 +12,8 @@ from torchsfm.bundle.curves import edge_distances
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.geometry import Pose
 from torchsfm.reconstruction import curve_noise
-from torchsfm.reconstruction.adjust import LOSS, adjust
-from torchsfm.reconstruction.curve_adjustment import adjust_with_curves, points_agree
+from torchsfm.reconstruction.adjust import LOSS, adjust, points_agree
+from torchsfm.reconstruction.curve_adjustment import adjust_with_curves
 from torchsfm.reconstruction.curves import reconstruct_curves
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.image_edges import ImageEdges

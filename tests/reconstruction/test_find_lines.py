@@ -134,6 +134,20 @@ def test_lines_hold_what_few_points_leave_open(generator: torch.Generator) -> No
     assert model.line_residuals().max() < 1e-4
 
 
+def test_lines_that_points_contradict_move_no_cameras(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = make_scene(generator)
+    model = adjust(scene.mapping)
+    free, _ = find_lines(model, scene.found, None)
+    assert free is not model
+    monkeypatch.setattr("torchsfm.reconstruction.find_lines.points_agree", lambda mapping, moved: False)
+    held, lines = find_lines(model, scene.found, None)
+    assert held is model
+    # The lines are where these cameras want them.
+    poses, points = torch.ones(VIEWS, dtype=torch.bool), torch.ones(len(model.X), dtype=torch.bool)
+    _, again = adjust_with_lines(model, lines, None, fixed_poses=poses, fixed_points=points)
+    assert point_to_line_distance(again.ends.flatten(0, 1), lines.L.repeat_interleave(2, 0)).max() < 1e-4
+
+
 def tracks(scene: Scene) -> Lines:
     """The true ones."""
     order = scene.line.argsort(stable=True)

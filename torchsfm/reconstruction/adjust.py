@@ -30,6 +30,8 @@ NEIGHBOURS = 8
 
 LOSS = Cauchy(1.0)
 """The loss of reprojection errors in pixels."""
+UNLIKELY = 3.0
+"""Standard deviations beyond which what points lose by curves is not by chance."""
 REWEIGHTED, WITHOUT, ROUGHLY = 4, 2, 1e-4
 """How often observations are weighed by what the adjustment before says of their tracks, and how often of these nearly without
 tracks of two views; the tolerance of all but the last."""
@@ -182,3 +184,26 @@ def support(mapping: Mapping, threshold: float) -> float:
     node = mapping.observations()
     square = mapping.errors(mapping.point[node], node).clamp(max=threshold).square()
     return float((LOSS(square.new_tensor(threshold**2)) - LOSS(square)).sum())
+
+
+def points_agree(mapping: Mapping, moved: Mapping) -> bool:
+    """Whether points lose no more than their own noise makes likely where lines or curves have moved the cameras.
+
+    Their squared distances, over their noise, may grow by one for each number of a camera that lines or curves say better, and
+    by as much more as chance makes likely.
+
+    Args:
+        mapping: The model, at the minimum of its points.
+        moved: The same with other cameras, and its points where these want them.
+    """
+    weights = observation_weights(mapping, LOSS)
+    lost = _cost(moved, weights) - _cost(mapping, weights)
+    free = {} if mapping.adjustment is None else mapping.adjustment.free
+    number = 6 * int(mapping.registered.sum()) + sum(int(mask.sum()) for mask in free.values())
+    most = number + UNLIKELY * (2 * number) ** 0.5
+    return bool(2 * lost <= most * measure_noise(mapping, LOSS, weights) ** 2)
+
+
+def _cost(mapping: Mapping, weights: Float[Tensor, "m"]) -> float:
+    """Half the sum of the losses of observations, square pixels."""
+    return 0.5 * float((weights * LOSS(mapping.problem().residuals().square())).nan_to_num(nan=0.0, posinf=0.0).sum())

@@ -2,13 +2,10 @@
 
 from typing import NamedTuple
 
-from jaxtyping import Float
-from torch import Tensor
-
 from torchsfm._types import Status
 from torchsfm.bundle import BundleCurves, bundle_adjust
 from torchsfm.bundle.curves import edge_distances
-from torchsfm.reconstruction.adjust import LOSS, ROUGHLY, about_cameras, as_adjusted
+from torchsfm.reconstruction.adjust import LOSS, ROUGHLY, about_cameras, as_adjusted, points_agree
 from torchsfm.reconstruction.calibration import measure_noise, observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.curve_noise import edge_loss, weights_in_a_bundle
@@ -21,8 +18,6 @@ TOLERANCE = 1e-5
 """Relative decrease of the cost at which the last adjustment ends; samples slide on for long, and gain nothing."""
 MOST_STEPS = 50
 """Of each adjustment."""
-UNLIKELY = 3.0
-"""Standard deviations beyond which what points lose by curves is not by chance."""
 
 
 class WithCurves(NamedTuple):
@@ -62,21 +57,6 @@ def adjust_with_curves(
     return moved if points_agree(mapping, moved.mapping) else None
 
 
-def points_agree(mapping: Mapping, moved: Mapping) -> bool:
-    """Whether the points of a model lose no more by other cameras than their own noise makes likely; see `adjust_with_curves`.
-
-    Args:
-        mapping: The model, at the minimum of its points.
-        moved: The same with other cameras, and its points where these want them.
-    """
-    weights = observation_weights(mapping, LOSS)
-    lost = _cost(moved, weights) - _cost(mapping, weights)
-    free = {} if mapping.adjustment is None else mapping.adjustment.free
-    number = 6 * int(mapping.registered.sum()) + sum(int(mask.sum()) for mask in free.values())
-    most = number + UNLIKELY * (2 * number) ** 0.5
-    return bool(2 * lost <= most * measure_noise(mapping, LOSS, weights) ** 2)
-
-
 def _adjusted(model: WithCurves, prior: CameraPrior | None, tolerance: float) -> WithCurves:
     mapping, lines, curves = model
     free = None if mapping.adjustment is None else mapping.adjustment.free
@@ -100,8 +80,3 @@ def _adjusted(model: WithCurves, prior: CameraPrior | None, tolerance: float) ->
     if lines is not None and others:
         lines = lines.adjusted(others[0])  # type: ignore[arg-type]
     return WithCurves(as_adjusted(mapping, result, free, prior), lines, curves.adjusted(samples))
-
-
-def _cost(mapping: Mapping, weights: Float[Tensor, "m"]) -> float:
-    """Half the sum of the losses of observations, square pixels."""
-    return 0.5 * float((weights * LOSS(mapping.problem().residuals().square())).nan_to_num(nan=0.0, posinf=0.0).sum())

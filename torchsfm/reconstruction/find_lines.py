@@ -11,7 +11,7 @@ from torchsfm._types import Status
 from torchsfm.bundle import BundleLines, bundle_adjust
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.optim import Cauchy
-from torchsfm.reconstruction.adjust import LOSS, about_cameras, as_adjusted
+from torchsfm.reconstruction.adjust import LOSS, about_cameras, as_adjusted, points_agree
 from torchsfm.reconstruction.calibration import measure_noise, observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE
@@ -62,7 +62,8 @@ def find_lines(mapping: Mapping, found: FoundSegments, prior: CameraPrior | None
         prior: What is expected of its cameras, where something of them is estimated.
 
     Returns:
-        The model after the adjustment, and its lines. Without any lines the model is as it was.
+        The model after the adjustment, and its lines. Without any, or where points contradict them (`points_agree`), the model
+        is as it was, and lines are where its cameras want them.
     """
     segments, sound = _without_lenses(mapping, found)
     cameras = _placed(mapping)
@@ -78,7 +79,14 @@ def find_lines(mapping: Mapping, found: FoundSegments, prior: CameraPrior | None
     color = total / torch.bincount(tracks.line, minlength=len(tracks.ends))[:, None].clamp_min(1)
     view = segments.view[tracks.segment]
     lines = Lines(tracks.ends, color, found.ends[number], found.weight[number], view, tracks.line)
-    return adjust_with_lines(mapping, lines, prior) if len(lines) else (mapping, lines)
+    if not len(lines):
+        return mapping, lines
+    moved = adjust_with_lines(mapping, lines, prior)
+    if points_agree(mapping, moved[0]):
+        return moved
+    poses, points = (torch.ones(len(some), dtype=torch.bool) for some in (mapping.registered, mapping.X))
+    _, lines = adjust_with_lines(mapping, lines, None, fixed_poses=poses, fixed_points=points)
+    return mapping, lines
 
 
 def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None, **limits: Any) -> tuple[Mapping, Lines]:
