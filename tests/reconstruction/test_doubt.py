@@ -433,6 +433,9 @@ def test_few_images_that_do_not_tell_the_focal_length(generator: torch.Generator
         mapping = mapping_of(cameras_on_an_arc(3, sweep), X, sees, generator)
         assert [("hardly determine" in reason) for reason in judged(mapping)] == [doubtful] * 3
         assert not any("hardly determine" in reason for reason in stand(mapping, 1e-3).doubt)
+    # Many such images are told of by their deviations alone.
+    X, sees = cloud(120, generator, (-3, -2, -0.5), (3, 2, 0.5)), torch.ones(8, 120, dtype=torch.bool)
+    assert not any("hardly determine" in reason for reason in judged(mapping_of(cameras_on_an_arc(8, 0.1), X, sees, generator)))
 
 
 def test_deviations_do_not_rest_on_tracks_of_two_views(generator: torch.Generator) -> None:

@@ -80,9 +80,6 @@ def adjust(
         initial_damping=initial_damping,
         **about_cameras(mapping, free, prior, weights),
     )
-    if result.status == Status.INTERRUPTED:
-        # There is more to do than this: let the interrupt through.
-        raise KeyboardInterrupt
     adjusted = as_adjusted(mapping, result, free, prior)
     return adjusted if moving is None else replace(adjusted, adjustment=mapping.adjustment)
 
@@ -142,7 +139,13 @@ def adjust_by_tracks(mapping: Mapping, prior: CameraPrior, *, tolerance: float, 
 
 
 def as_adjusted(mapping: Mapping, result: BundleResult, free: Free | None, prior: CameraPrior | None) -> Mapping:
-    """The model as `bundle_adjust` has left it, with one lens where all cameras are one."""
+    """The model as `bundle_adjust` has left it, with one lens where all cameras are one.
+
+    Raises:
+        KeyboardInterrupt: The adjustment was interrupted: there is more to do than this.
+    """
+    if result.status == Status.INTERRUPTED:
+        raise KeyboardInterrupt
     cameras = result.cameras
     if free and prior is not None:
         cameras = prior.made_alike(cameras, images_of_cameras(mapping) > 0)

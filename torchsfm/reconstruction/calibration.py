@@ -254,6 +254,7 @@ def choose_free(
         faultless: Cameras that took up to so many photographs are taken to be without such faults.
     """
     images = images_of_cameras(mapping)
+    taken = prior.sum_of_body(images)
     candidates = [name for name in ("focal", *mapping.cameras.distortion.parameter_names, "principal_point") if name in names]
     if not candidates:
         return {}
@@ -270,12 +271,12 @@ def choose_free(
         before = known.prior[:, own].amax(-1)
         # The prior is counted in the variance; without it, the noise alone is left.
         noise = 1 / (1 / variance - 1 / before).clamp_min(1e-12 / before)
-        taken = images_of_bodies(images, prior)
-        faults = FAULTS * before / taken.clamp(min=1) if name == "principal_point" else torch.zeros_like(before)
-        faults = torch.where(taken <= faultless, 0.0, faults)
+        sensor = name == "principal_point"
+        faults = torch.where(sensor & (taken > faultless), FAULTS * before / taken.clamp(min=1), 0.0)
         free[name] = (images > 0) & ((noise + faults < before) | (name == "focal"))
-        if name == "principal_point":
-            free[name] = (images > 0) & (images_of_bodies(free[name].long(), prior) > 0)
+        if sensor:
+            # Those of one body are tied: one that is held would hold the others.
+            free[name] = (images > 0) & (prior.sum_of_body(free[name].long()) > 0)
         chosen[:, own] |= free[name][:, None]
     return free
 
@@ -295,11 +296,6 @@ def images_of_cameras(mapping: Mapping) -> Int[Tensor, "g"]:
     return torch.bincount(mapping.camera_index[mapping.registered], minlength=len(mapping.cameras.K))
 
 
-def images_of_bodies(images: Int[Tensor, "g"], prior: CameraPrior) -> Int[Tensor, "g"]:
-    """How many images of those that each camera took, it took with all focal lengths of its zoom lens."""
-    return images if prior.body is None else torch.zeros_like(images).index_add(0, prior.body, images)[prior.body]
-
-
 def lone_cameras_plausible(mapping: Mapping, prior: CameraPrior) -> bool:
     """Whether the principal points of cameras that took one photograph each lie as principal points do.
 
@@ -307,7 +303,7 @@ def lone_cameras_plausible(mapping: Mapping, prior: CameraPrior) -> bool:
     Where they do, the points found scatter wider than those of cameras: beyond three standard deviations of the mean square.
     """
     shift = (mapping.cameras.K - prior.mean.K)[:, :2, 2] / prior.sigma["principal_point"][:, None]
-    shift = shift[(images_of_bodies(images_of_cameras(mapping), prior) == 1) & (shift != 0).any(-1)]
+    shift = shift[(prior.sum_of_body(images_of_cameras(mapping)) == 1) & (shift != 0).any(-1)]
     count = shift.numel()
     return count == 0 or float(shift.square().mean()) < 1 + 3 * (2 / count) ** 0.5
 

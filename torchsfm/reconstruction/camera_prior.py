@@ -103,6 +103,10 @@ class CameraPrior:
             first, others = index[:1].expand(len(index) - 1), index[1:]
             yield _Alike(first, others, torch.tensor(columns), torch.stack(scale).expand(len(others), -1))
 
+    def sum_of_body(self, count: Int[Tensor, "g"]) -> Int[Tensor, "g"]:
+        """For each camera, what all cameras of its body have of something: images, say."""
+        return count if self.body is None else torch.zeros_like(count).index_add(0, self.body, count)[self.body]
+
     def _first_of_body(self, used: Bool[Tensor, "g"]) -> Int[Tensor, "g"]:
         """For each camera in use the first one in use of its body; itself for others."""
         own = torch.arange(len(used))

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-from torchsfm._types import Status
 from torchsfm.bundle import BundleCurves, bundle_adjust
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.reconstruction.adjust import LOSS, ROUGHLY, about_cameras, as_adjusted, points_agree
@@ -44,10 +43,8 @@ def adjust_with_curves(
         lines: Its lines, if it has any.
 
     Returns:
-        All of them after the adjustment; None where no edge shows a curve, or where points fit worse than the cameras' own
-        uncertainty lets them: the squared distances of points, over their noise, may grow by one for each number of a camera
-        that curves say better, and as much more as chance makes likely. Then curves are off in a way that their own
-        noise does not tell, as outlines of what is round are.
+        All of them after the adjustment; None where no edge shows a curve, or where points contradict the cameras
+        (`points_agree`): curves are off then in a way that their own noise does not tell, as outlines of what is round are.
     """
     if not len(curves.x):
         return None
@@ -73,8 +70,6 @@ def _adjusted(model: WithCurves, prior: CameraPrior | None, tolerance: float) ->
         tolerance=tolerance,
         **about_cameras(mapping, free, prior, weights),
     )
-    if result.status == Status.INTERRUPTED:
-        raise KeyboardInterrupt
     samples, *others = result.structure
     assert isinstance(samples, BundleCurves), "given"
     if lines is not None and others:

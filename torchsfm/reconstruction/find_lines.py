@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status
 from torchsfm.bundle import BundleLines, bundle_adjust
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.optim import Cauchy
@@ -105,8 +104,6 @@ def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None,
         loss=LOSS,
         **({"max_iterations": LAST_ITERATIONS, "tolerance": LAST_TOLERANCE} | known | limits),
     )
-    if result.status == Status.INTERRUPTED:
-        raise KeyboardInterrupt
     (moved,) = result.structure
     assert isinstance(moved, BundleLines), "given"
     return as_adjusted(mapping, result, free, prior), lines.moved_to(moved.L)

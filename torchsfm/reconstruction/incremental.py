@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera
 from torchsfm.reconstruction.adjust import adjust, adjust_all, adjust_by_tracks, neighbourhood, support
-from torchsfm.reconstruction.calibration import images_of_bodies, images_of_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.calibration import images_of_cameras, lone_cameras_plausible
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.initialize import MIN_POINTS, place_start, starting_pairs
 from torchsfm.reconstruction.mapping import Mapping
@@ -222,7 +222,7 @@ def _refine(model: Mapping, options: MappingOptions) -> Mapping:
         if settled:
             break
     model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
-    lone = not options.cropped and bool((images_of_bodies(images_of_cameras(model), options.prior(model)) == 1).any())
+    lone = not options.cropped and bool((options.prior(model).sum_of_body(images_of_cameras(model)) == 1).any())
     if lone and "principal_point" in options.free:
         freed = model
         # Where that is not plausible soon, it is not worth the way to its minimum.

@@ -90,7 +90,8 @@ def reconstruct(
             nothing joins them there are several models. There are no points then: the curves are in `Reconstruction.curves`.
             `report.refusal` says why where there is no model.
         lines: Find straight lines, too: segments of the photographs, linked over three views or more with the cameras that
-            points have given; then cameras, points and lines are adjusted together. They are in `Reconstruction.lines`.
+            points have given; then cameras, points and lines are adjusted together, unless lines contradict the points.
+            They are in `Reconstruction.lines`.
         curves: Find curves in space, too: edges of the photographs, scaled down to a thousand pixels, followed through the
             images around with the cameras that have been found (`reconstruct_curves`); then cameras, points, lines and curves
             are adjusted together, unless curves contradict the points. They are in `Reconstruction.curves`.
