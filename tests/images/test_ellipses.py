@@ -61,6 +61,19 @@ def test_what_is_said_of_the_noise_is_so(generator: torch.Generator) -> None:
     assert bool((found.covariance[:, 1] == 0).all())
 
 
+def test_smooth_outlines_that_ellipses_only_touch_have_none(generator: torch.Generator) -> None:
+    """Half of an outline of two or three lobes may fit an ellipse to a twentieth of a pixel, and goes smoothly on, off it."""
+    t = torch.arange(120, dtype=torch.float64) * (2 * math.pi / 120)
+    found = 0
+    for lobes, bent in ((2, 0.3), (2, 0.32), (3, 0.13), (3, 0.15), (3, 0.17)):
+        r = 40 * (1 + bent * (lobes * t).cos())
+        outline = torch.stack((90 + 1.2 * r * t.cos(), 70 + r * t.sin()), -1)
+        image = paint_shapes([outline], torch.tensor([0.2, 0.8], dtype=torch.float64), width=200, height=140, fine=2)
+        image = image + 0.005 * torch.randn(image.shape, generator=generator, dtype=image.dtype)
+        found += int(detect_ellipses(image).valid.sum())
+    assert found == 0
+
+
 @pytest.mark.parametrize("degrees", [130, 180, 240])
 def test_hidden_ellipses_are_found_by_what_is_seen(degrees: int) -> None:
     rng = numpy_seeded(degrees)

@@ -133,6 +133,19 @@ def order_chains(preceding: Int[Tensor, " n"], image: Int[Tensor, " n"]) -> Chai
     return Chains(order, number, start, each, closed)
 
 
+def chains_of(chain: Int[Tensor, " n"], closed: Bool[Tensor, " n"]) -> Chains:
+    """The chains of a list that is in their order already.
+
+    Args:
+        chain: Number of each edge point's chain, the same for no two chains next to each other.
+        closed: Whether the last one of its chain is next to the first.
+    """
+    own = torch.arange(len(chain), device=chain.device)
+    number, length = torch.unique_consecutive(chain, return_inverse=True, return_counts=True)[1:]
+    start = (length.cumsum(0) - length)[number]
+    return Chains(own, number, start, length[number], closed)
+
+
 def _walk_back(preceding: Tensor, rank: Tensor, first: Tensor, least: Tensor, active: Tensor) -> Tensor:
     """Let `first`, which is `rank` steps back, become the start of each one's chain; those in rings, who have none.
 

@@ -10,6 +10,8 @@ from torch import Tensor
 from torchsfm._types import Status, check_options
 from torchsfm.geometry import Ellipse, ellipse_distance
 from torchsfm.geometry.conics import ellipse_of_shape
+from torchsfm.images.arc_ends import arc_ends
+from torchsfm.images.edge_chains import chains_of
 from torchsfm.images.edges import detect_edges
 from torchsfm.images.ellipse_moments import conic_moments, ellipse_of_moments, residual
 from torchsfm.images.ellipse_support import Support, crowded, edge_map, find_support, keep_the_best
@@ -42,6 +44,10 @@ _FEW = 3
 """each with so many steps."""
 _FIRST = 0.5
 """The part of the coverage wanted in the end that arcs, and first ellipses, must have."""
+_END = 8
+"""Decimal digits of false alarms that each end of an arc costs, times the share of the outline that is not seen,"""
+_SMOOTH_END = 20
+"""and each more where the edge goes smoothly on."""
 _SHARED = 0.5
 """The share of an ellipse's edge points from which on it is another one, seen again."""
 
@@ -98,17 +104,18 @@ def detect_ellipses(
 
     Chains are cut into arcs that bend to one side. Arcs, and pairs of arcs that may be of one convex curve, give ellipses, all
     in one batch; each takes up the edge points next to it, is fitted again, and is kept where that many gradients along its
-    normals are not to be expected in noise and where the edge points are not those of a better one. What is left is fitted by
-    orthogonal distances.
+    normals are not to be expected in noise and where the edge points are not those of a better one. Where an ellipse is seen in
+    part, ends of its arcs count against it, and more so those where the edge goes on without a corner, as a smooth curve does
+    that an ellipse only touches. What is left is fitted by orthogonal distances.
 
     Args:
         image: Grey (c = 1) or red, green, blue images.
         max_ellipses: The number of slots for each image, for those with the most edge points.
         min_coverage: Smallest share of the outline that edge points cover. Folds of cloth and other smooth curves look like
-            parts of ellipses: where whole ones are wanted, ask for 0.9.
+            parts of ellipses, and some still are taken for them: where whole ones are wanted, ask for 0.9.
         min_radius: Smallest semi-axis, in pixels.
         max_scatter: Root-mean-square distance of the edge points from the ellipse, in pixels, that is not noise but does no
-            harm either.
+            harm either; as much less as less of the outline is seen.
         tolerance: Root-mean-square deviation from straightness of the straight runs that arcs are made of, in pixels.
         blur: As in `detect_edges`.
         low: As in `detect_edges`.
@@ -154,12 +161,16 @@ def detect_ellipses(
     support = find_support(ellipse, of, edgels, _REACHES[-1])
     found = _judge(support, len(of), math.log10(size[1] * size[2]))
     good = (found["coverage"] >= min_coverage) & (found["log_nfa"] <= 0) & (found["count"] > 5)
+    ends = arc_ends(support.chosen(good[support.ellipse]), edgels, chains_of(chain, closed))
+    good &= found["log_nfa"] + (1 - found["coverage"]) * (_END * ends.all + _SMOOTH_END * ends.smooth) <= 0
     rank = torch.argsort(torch.where(good, -found["coverage"] * found["count"], 1.0), stable=True).argsort()
     support = support.chosen(good[support.ellipse] & support.aligned)
     kept = keep_the_best(rank, support, len(x), _SHARED)
     found = {name: values[kept] for name, values in found.items()}
     moved = crowded(edgels, of_image, edges.width.flatten()[place].double())
-    more, good = _refined(x, variance, support, moved, kept, 2 * math.sqrt(math.pi) * blur, max_scatter)
+    # The shorter an arc is, the better an ellipse fits it whatever it is of.
+    most = max_scatter * found["coverage"]
+    more, good = _refined(x, variance, support, moved, kept, 2 * math.sqrt(math.pi) * blur, most)
     good &= more["semi_axes"][:, 1] >= min_radius
     found |= more
     laid = lay_in_slots(found, good, found["count"].double(), of[kept], batch, max_ellipses, image.dtype)
@@ -226,7 +237,7 @@ def _judge(support: Support, n: int, log_pixels: float) -> dict[str, Tensor]:
 
 
 def _refined(
-    x: Tensor, variance: Tensor, support: Support, moved: Tensor, kept: Tensor, tied: float, scatter: float
+    x: Tensor, variance: Tensor, support: Support, moved: Tensor, kept: Tensor, tied: float, scatter: Tensor
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Ellipses of least orthogonal distances to edge points that other edges have not `moved`, and which are determined."""
     rows = kept[support.ellipse]
@@ -259,7 +270,7 @@ def _refined(
     model = fit.model
     sure = (covariance.diagonal(dim1=-2, dim2=-1)[:, 2:4].sqrt() <= _UNSURE * model.semi_axes).all(-1)
     noise = count / weights.sum(-1)
-    sure &= fit.error.square() <= scatter**2 + 4 * noise
+    sure &= fit.error.square() <= scatter.square() + 4 * noise
     return {
         "centre": model.centre, "semi_axes": model.semi_axes, "angle": model.angle, "covariance": covariance,
         "scatter": fit.error,

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.images.edge_chains import order_chains
+from torchsfm.images.edge_chains import chains_of, order_chains
 from torchsfm.images.straight_runs import Runs, axis, straight_runs
 
 _SHARPEST = 0.6 * math.pi
@@ -116,13 +116,7 @@ def compatible_pairs(arcs: Arcs, least_turn: float, most: int) -> Int[Tensor, "p
 
 def _chords(x: Tensor, chain: Tensor, closed: Tensor, runs: Runs) -> Tensor:
     """From the first edge point of each run to its last."""
-    own = torch.arange(len(x), device=x.device)
-    begins = torch.ones_like(closed)
-    begins[1:] = chain[1:] != chain[:-1]
-    start = torch.where(begins, own, 0).cummax(0).values
-    following = own + 1
-    last = begins.roll(-1)
-    following = torch.where(last, torch.where(closed, start, own), following)
+    following = chains_of(chain, closed).neighbour(1)
     inside = runs.number[following] == runs.number
     step = torch.where(inside[:, None], x[following] - x, 0.0)
     return x.new_zeros(len(runs.sums), 2).index_add(0, runs.number, step)
