@@ -172,7 +172,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(options.seed)
-    methods = {"detect_ellipses": ours, **peers()}
+    methods: dict[str, Callable[[Tensor], Ellipse]] = {"detect_ellipses": ours, **peers()}
     print(f"{'scenes':24s} noise  {'':20s}     F  precision recall  axis error px: median  90 %   s / image")
     folder = os.environ.get("TORCHSFM_DATA")
     if folder:

@@ -60,7 +60,9 @@ def arc_ends(support: Support, edges: EdgeMap, chains: Chains) -> ArcEnds:
         before, after = edges.x[here] - edges.x[behind], edges.x[last] - edges.x[first]
         cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
         turn = torch.atan2(cross, (before * after).sum(-1)).abs()
-        goes_on = _exists(chains, side * _BEYOND[1])[here] & (turn < _SMOOTH)
+        # An edge that crosses the ellipse goes on, too, but has not been on it.
+        stays = on(chains.neighbour(-side * _BEHIND)[edgel])[end]
+        goes_on = stays & _exists(chains, side * _BEYOND[1])[here] & (turn < _SMOOTH)
         everything = everything + ellipse[end].bincount(minlength=n)
         smooth = smooth + ellipse[end][goes_on].bincount(minlength=n)
     return ArcEnds(everything, smooth)
