@@ -4,7 +4,7 @@ The order of work follows Schönberger & Frahm, Structure-from-Motion Revisited,
 triangulated, many at a time.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,11 +24,13 @@ from torchsfm.reconstruction.structure import complete_tracks, filter_points, me
 MAX_STARTS = 5
 """Starting pairs tried before a set of images is given up."""
 FEW = 6
-"""Of so few images a model is made from each of these, as what a start got wrong the others do not put right: a plane seen from
-the wrong side, another focal length."""
-SAME = 0.01
-"""Models of two starts are one where what they explain differs by this part. Starts from focal lengths that are known a little
-for each image alone are tried until two come to the same, or all."""
+"""Of so few images a model is made from several of these, as what a start got wrong the others do not put right: a plane seen
+from the wrong side, another focal length."""
+SAME, AGREED, AGREED_OF_FEW = 0.01, 2, 3
+"""Models of starts are one where what they explain differs by this part. Starts from focal lengths that are known a little for
+each image alone are tried until two come to the best there is, of few images until three do, or all."""
+OTHER_FOCAL = 1.0, 0.7, 1.4
+"""Where these do not come to the same, few images are begun with focal lengths of so much times those that were guessed too."""
 GLOBAL_GROWTH = 1.1
 """A model this much larger than at its last global adjustment gets another."""
 SMALL = 20
@@ -102,28 +104,43 @@ def grow_model(
         A mapping of this component alone, and for each image that was tried and did not fit the reason; None if no pair of
         images was a start.
     """
-    empty = Mapping.start(mapping.graph, mapping.track, mapping.cameras, mapping.camera_index)
     best: tuple[Mapping, dict[int, str]] | None = None
-    most = -1.0  # Explained by it.
+    explained: list[float] = []
     available = int((~mapping.registered).sum())
-    unknown_focal = (options.focal_sigma >= UNKNOWN_FOCAL)[mapping.camera_index]
-    alone = (options.focal_sigma > SEARCHED) & (torch.bincount(mapping.camera_index, minlength=len(options.focal_sigma)) == 1)
-    uncertain = alone[mapping.camera_index]
-    starts = starting_pairs(mapping, unknown_focal, threshold=options.reprojection, generator=options.generator)
-    for start in starts[:MAX_STARTS]:
-        model = place_start(empty, start, threshold=options.reprojection)
-        model = adjust(model, tolerance=1e-4)
-        model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
-        if len(model.X) < MIN_POINTS:
-            continue
+    alone = torch.bincount(mapping.camera_index, minlength=len(options.focal_sigma)) == 1
+    uncertain = (alone & (options.focal_sigma > SEARCHED))[mapping.camera_index]
+    for model, pair in _starts(mapping, options, available <= FEW):
         grown = extend_model(model, mapping.registered, options, progress)
-        explained = support(grown[0], options.reprojection)
-        enough = not bool(uncertain[start.pair].any()) or abs(explained - most) < SAME * most
-        if explained > most:
-            best, most = grown, explained
-        if available > FEW and enough and int(grown[0].registered.sum()) > 0.5 * available:
+        explained.append(support(grown[0], options.reprojection))
+        most = max(explained)
+        best = grown if explained[-1] == most else best
+        same = sum(value > (1 - SAME) * most for value in explained)
+        if available <= FEW:
+            settled = same >= AGREED_OF_FEW
+        else:
+            enough = same >= AGREED or not bool(uncertain[pair].any())
+            settled = enough and int(grown[0].registered.sum()) > 0.5 * available
+        if settled:
             break
     return best
+
+
+def _starts(mapping: Mapping, options: MappingOptions, few: bool) -> Iterator[tuple[Mapping, Int[Tensor, "2"]]]:
+    """Models of two images, and these."""
+    unknown = options.focal_sigma >= UNKNOWN_FOCAL
+    for times in OTHER_FOCAL if few and bool(unknown.any()) else OTHER_FOCAL[:1]:
+        K = mapping.cameras.K.clone()
+        K[unknown, :2, :2] *= times
+        begun = replace(mapping, cameras=replace(mapping.cameras, K=K))
+        empty = Mapping.start(begun.graph, begun.track, begun.cameras, begun.camera_index)
+        unknown_focal = unknown[mapping.camera_index]
+        starts = starting_pairs(begun, unknown_focal, threshold=options.reprojection, generator=options.generator)
+        for start in starts[:MAX_STARTS]:
+            model = place_start(empty, start, threshold=options.reprojection)
+            model = adjust(model, tolerance=1e-4)
+            model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+            if len(model.X) >= MIN_POINTS:
+                yield model, start.pair
 
 
 def extend_model(
