@@ -14,7 +14,7 @@ from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction.adjust import LOSS, adjust
-from torchsfm.reconstruction.calibration import calibration_of, observation_weights
+from torchsfm.reconstruction.calibration import TO_JUDGE, calibration_of, observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.doubt import Standing, examine
@@ -415,7 +415,7 @@ def test_tracks_of_two_views_wait_for_cameras_that_longer_ones_place(generator: 
     sees[:5, :200] = True
     sees[0:2, 200:240] = sees[4:, 240:280] = sees[3:, 280:] = True
     mapping = mapping_of(poses, X, sees, generator)
-    first, then = (observation_weights(mapping, LOSS, by_long_tracks=early) for early in (True, False))
+    first, then = (observation_weights(mapping, LOSS, enough=enough) for enough in (100, None))
     problem = mapping.problem()
     length = torch.bincount(problem.point)
     placed, open_end = ((length == 2) & (torch.bincount(problem.point, problem.view == v) > 0) for v in (1, 5))
@@ -425,6 +425,9 @@ def test_tracks_of_two_views_wait_for_cameras_that_longer_ones_place(generator: 
     assert float(first[open_end[problem.point]].median()) > 0.4
     assert first[long].equal(then[long])
     assert float(then[~long].median()) > 0.6
+    # It is judged by these alone.
+    judged_by = observation_weights(mapping, LOSS, enough=TO_JUDGE)
+    assert float(judged_by[open_end[problem.point]].max()) <= 0.01
 
 
 def test_few_images_that_do_not_tell_the_focal_length(generator: torch.Generator) -> None:

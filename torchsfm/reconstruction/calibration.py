@@ -24,8 +24,9 @@ from torchsfm.reconstruction.mapping import Adjustment, Mapping
 
 LEAST_NOISE = 0.05
 """Image points are never better than this, in pixels."""
-ENOUGH, NEARLY_NONE = 100, 0.01
-"""Observations of long tracks that determine an image by themselves; what tracks of two views count beside them at first."""
+TO_PLACE, TO_JUDGE, NEARLY_NONE = 100, 30, 0.01
+"""Observations of long tracks by which images are placed first, and by which they are judged; what tracks of two views count
+beside so many."""
 MIN_IMAGES = 3
 """Two images leave the cameras as they were expected."""
 FAULTS = 3.0
@@ -129,19 +130,19 @@ def calibration_of(
     return replace(found, cropped=prior.cropped, alike=prior.alike)
 
 
-def observation_weights(mapping: Mapping, loss: Cauchy, *, by_long_tracks: bool = False) -> Float[Tensor, "m"]:
+def observation_weights(mapping: Mapping, loss: Cauchy, *, enough: int | None = None) -> Float[Tensor, "m"]:
     """What the observations of a finished model count, in their order: less where the track as a whole fits badly.
 
-    Tracks of two views count by how likely they are right. Wrong ones hide in cameras that had to fit them: `by_long_tracks`,
-    those of cameras that longer tracks determine count next to nothing.
+    Tracks of two views count by how likely they are right. Wrong ones hide in cameras that had to fit them: if it is said how
+    many observations of longer tracks are `enough`, those of cameras that have so many count next to nothing.
     """
     problem = mapping.problem()
     weights = track_weights(problem, loss=loss, least_noise=LEAST_NOISE)
-    if not by_long_tracks:
+    if enough is None:
         return weights * match_weights(problem, least_noise=LEAST_NOISE)
     length = torch.bincount(problem.point, minlength=len(problem.X))
     long = torch.bincount(problem.view[length[problem.point] > 2], minlength=len(problem.poses.R))
-    need = (1 - long.to(weights.dtype) / ENOUGH).clamp(min=NEARLY_NONE)[problem.view]
+    need = (1 - long.to(weights.dtype) / enough).clamp(min=NEARLY_NONE)[problem.view]
     need = need.new_zeros(len(problem.X)).scatter_reduce(0, problem.point, need, "amax")
     return weights * torch.where(length == 2, need, 1.0)[problem.point]
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchsfm.reconstruction.adjust import LOSS
-from torchsfm.reconstruction.calibration import Calibration, calibration_of, observation_weights
+from torchsfm.reconstruction.calibration import TO_JUDGE, Calibration, calibration_of, observation_weights
 from torchsfm.reconstruction.cropped import crops_of_one_plane
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
@@ -97,7 +97,7 @@ def _judged(component: Component, growth: Growth, graph: ViewGraph, wanted: Want
     # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
     widest = replace(options, cropped=options.cropped or component.off_centre).prior(model)
     # What few wrong matches of two views hold fast is not known: deviations are those that longer tracks leave.
-    weights = observation_weights(model, LOSS, by_long_tracks=True)
+    weights = observation_weights(model, LOSS, enough=TO_JUDGE)
     standing = examine(
         model, open_numbers=wanted.free, prior=widest, threshold=threshold, weights=weights, uncertain=uncertain,
         conflicts=component.conflicts, agreement=component.agreement,
