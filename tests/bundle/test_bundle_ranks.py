@@ -187,6 +187,29 @@ def test_problems_of_ones_own(eliminate: str | None, generator: torch.Generator,
                 torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
 
 
+def chain(blocks: dict[str, Block], terms: list[Term]) -> Any:
+    """The minimum of a problem so large that it is asked how to solve it."""
+    group = torch.distributed.group.WORLD if torch.distributed.is_initialized() else None
+    return sparse_levenberg_marquardt(blocks, terms, eliminate="mark", group=group).x
+
+
+def test_a_rank_that_has_nothing_to_eliminate(generator: torch.Generator, tmp_path: Path) -> None:
+    """A long chain and a single mark: all ranks ask the same questions all the same."""
+    many = torch.arange(1000)
+    blocks = {
+        "station": Block(torch.zeros(len(many), 2, dtype=F64), fixed=many == 0),
+        "mark": Block(torch.zeros(1, 2, dtype=F64)),
+    }
+    ways = torch.randn(len(many) - 1, 2, generator=generator, dtype=F64)
+    terms = [
+        Term(difference, ("station", "station"), (many[:-1], many[1:]), (ways,)),
+        Term(difference, ("station", "mark"), (many[:3], torch.zeros(3).long()), (ways[:3],)),
+    ]
+    alone = chain(blocks, terms)
+    for rank in processes.run_ranks(2, tmp_path, chain, blocks, terms):
+        torch.testing.assert_close(rank, alone, rtol=1e-9, atol=1e-9)
+
+
 @dataclass(frozen=True)
 class Member:
     """One of several processes that have nothing to say to each other."""

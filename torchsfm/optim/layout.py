@@ -73,6 +73,8 @@ class Layout:
     """Residuals that depend on nothing free."""
     ranks: Ranks
     """The processes that share the problem; families and pieces are those of this one."""
+    eliminates: bool
+    """Whether there may be families on any of them."""
 
     @property
     def device(self) -> torch.device:
@@ -146,7 +148,7 @@ def lay_out(
     for name in numbers:
         own = [piece if piece.family == name else replace(piece, family=None, point=None) for piece in pieces]
         families.append(Family(name, size, blocks[name].tangent, free[name].numel(), own))
-    return Layout(free, first, size, _kinds(blocks, free, first), families, pieces, still, ranks)
+    return Layout(free, first, size, _kinds(blocks, free, first), families, pieces, still, ranks, bool(gone))
 
 
 def _kinds(blocks: dict[str, Block], free: dict[str, Tensor], first: dict[str, int]) -> Tensor:

@@ -55,17 +55,24 @@ class PairGraph:
     """and those in which a variable meets itself."""
     ranks: Ranks
 
+    @staticmethod
+    def fits(layout: Layout) -> bool:
+        """Whether a problem is such a graph."""
+        if len(layout.first) != 1:
+            return False
+        (name,) = layout.first
+        width = layout.size // layout.free[name].numel()
+        fits = not layout.families and all(piece.columns.shape[1] <= 2 * width for piece in layout.pieces)
+        return bool(layout.ranks.all(torch.tensor(fits, device=layout.device)))
+
     @classmethod
     def of(cls, layout: Layout) -> "PairGraph | None":
         """The graph of a problem; None if it is none."""
-        if len(layout.first) != 1 or layout.families:
+        if not cls.fits(layout):
             return None
         (name,) = layout.first
         count = layout.free[name].numel()
         width = layout.size // count
-        fits = torch.tensor([piece.columns.shape[1] <= 2 * width for piece in layout.pieces], device=layout.device)
-        if not bool(layout.ranks.all(fits.all())):
-            return None
         none = torch.zeros(0, dtype=torch.long, device=layout.device)
         ends, rows, loops, pairs = [], [], [], [none[:, None].expand(0, 2)]
         for piece in layout.pieces:
@@ -158,36 +165,10 @@ class _Level:
         No two centres are partners (Luby, "A simple parallel algorithm for the maximal independent set problem", 1986), so
         stars are small whatever the strengths are.
         """
-        n, device = len(self.D), self.B.device
-        strength = torch.linalg.matrix_norm(self.B)
-        best = strength.new_zeros(n)
-        best.scatter_reduce_(0, self.i, strength, "amax").scatter_reduce_(0, self.j, strength, "amax")
-        best = self.ranks.largest(best)
-        strong = strength >= STRONG * torch.minimum(best[self.i], best[self.j])
-        i, j = self.i[strong], self.j[strong]
-        own = torch.arange(n, device=device)
-        rank = torch.randperm(n, generator=torch.Generator().manual_seed(0), device="cpu").to(device)
-        member = torch.empty_like(rank).index_copy_(0, rank, own)
-        centre = torch.full_like(own, -1)
-        while True:
-            left = centre < 0
-            both = left[i] & left[j]
-            i, j = i[both], j[both]
-            above = torch.where(left, rank, n)
-            above.scatter_reduce_(0, i, rank[j], "amax").scatter_reduce_(0, j, rank[i], "amax")
-            above = self.ranks.largest(above)
-            chosen = left & (above == rank)
-            centre = torch.where(chosen, own, centre)
-            # Without an edge between those that were left all are chosen.
-            if torch.equal(chosen, left):
-                star: Tensor = torch.unique(centre, return_inverse=True)[1]
-                return star
-            # The others go to the neighbouring centre that was drawn highest.
-            found = torch.full_like(own, -1)
-            for a, b in ((i, j), (j, i)):
-                found.scatter_reduce_(0, a, torch.where(chosen[b], rank[b], -1), "amax")
-            found = self.ranks.largest(found)
-            centre = torch.where((centre < 0) & (found >= 0), member[found.clamp(min=0)], centre)
+        # The first rank does it alone: rounds in which all take part are many messages.
+        i, j, strength = _on_first(self.i, self.j, torch.linalg.matrix_norm(self.B), self.ranks)
+        none = torch.zeros(len(self.D), dtype=torch.long, device=self.B.device)
+        return self.ranks.spread(none if self.ranks.rank else _stars(i, j, strength, len(none)))
 
     def coarser(self, star: Tensor) -> "_Level":
         """The matrix over stars whose members move alike; the first rank has it, the others know how large it is."""
@@ -201,14 +182,51 @@ class _Level:
         D = self.ranks.sum_first(D.index_add_(0, i[inside], self.B[inside] + self.B[inside].mT))
         i, j, B = _merged(i[~inside], j[~inside], self.B[~inside], n)
         if self.ranks.size > 1:
-            first = self.ranks.gather_first
-            i, j, B = _merged(first(i), first(j), first(B), n)
+            i, j, B = _merged(*_on_first(i, j, B, self.ranks), n)
         return _level(i, j, B, D, scale, Ranks())
+
+
+def _stars(i: Tensor, j: Tensor, strength: Tensor, n: int) -> Tensor:
+    """The number of the star of each of n variables, given all edges once."""
+    best = strength.new_zeros(n)
+    best.scatter_reduce_(0, i, strength, "amax").scatter_reduce_(0, j, strength, "amax")
+    strong = strength >= STRONG * torch.minimum(best[i], best[j])
+    i, j = i[strong], j[strong]
+    own = torch.arange(n, device=i.device)
+    rank = torch.randperm(n, generator=torch.Generator().manual_seed(0), device="cpu").to(i.device)
+    member = torch.empty_like(rank).index_copy_(0, rank, own)
+    centre = torch.full_like(own, -1)
+    while True:
+        left = centre < 0
+        both = left[i] & left[j]
+        i, j = i[both], j[both]
+        above = torch.where(left, rank, n)
+        above.scatter_reduce_(0, i, rank[j], "amax").scatter_reduce_(0, j, rank[i], "amax")
+        chosen = left & (above == rank)
+        centre = torch.where(chosen, own, centre)
+        # Without an edge between those that were left all are chosen.
+        if torch.equal(chosen, left):
+            star: Tensor = torch.unique(centre, return_inverse=True)[1]
+            return star
+        # The others go to the neighbouring centre that was drawn highest.
+        found = torch.full_like(own, -1)
+        for a, b in ((i, j), (j, i)):
+            found.scatter_reduce_(0, a, torch.where(chosen[b], rank[b], -1), "amax")
+        centre = torch.where((centre < 0) & (found >= 0), member[found.clamp(min=0)], centre)
 
 
 def _level(i: Tensor, j: Tensor, B: Tensor, D: Tensor, scale: Tensor, ranks: Ranks) -> _Level:
     """A level, its diagonal safe from rounding."""
     return _Level(i, j, B, D + torch.diag_embed(RIDGE * scale), scale, ranks)
+
+
+def _on_first(i: Tensor, j: Tensor, values: Tensor, ranks: Ranks) -> tuple[Tensor, Tensor, Tensor]:
+    """The edges of all ranks with what belongs to each, on the first rank; none on the others."""
+    if ranks.size == 1:
+        return i, j, values
+    # One message instead of three: integers of this size are exact.
+    rows = ranks.gather_first(torch.cat((torch.stack((i, j), 1), values.view(len(i), -1)), 1))
+    return rows[:, 0].long(), rows[:, 1].long(), rows[:, 2:].reshape(-1, *values.shape[1:])
 
 
 def _gathered(i: Tensor, j: Tensor, B: Tensor, n: int, ranks: Ranks) -> tuple[Tensor, Tensor, Tensor]:

@@ -104,7 +104,8 @@ class NormalEquations:
             own = own + (point * (product(metric, point) - part.gradient())).sum()
             failed = failed + (~positive).any() * self.curved
             points.append(point)
-        own, failed = self.layout.ranks.sum(torch.stack((own, failed)))
+        if self.layout.eliminates:
+            own, failed = self.layout.ranks.sum(torch.stack((own, failed)))
         promise, solved = promise + own, solved & (failed == 0)
         return Step(
             self.split(kept, points),
@@ -220,7 +221,8 @@ class NormalEquations:
         scaled = [kept * self.precision.rsqrt()]
         for part in self.eliminated:
             scaled.append((part.gradient() * floor(diagonal(part.metric, part.q)).rsqrt()).flatten())
-        return self.layout.ranks.largest(torch.cat(scaled).abs().amax())
+        steepest = torch.cat(scaled).abs().amax()
+        return self.layout.ranks.largest(steepest) if self.layout.eliminates else steepest
 
     def along(self, step: dict[str, Tensor]) -> Tensor:
         """The derivative of the cost along a step."""

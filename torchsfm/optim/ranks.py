@@ -17,6 +17,8 @@ from torchsfm.optim.terms import Block, Term, block_names, eliminated_block
 
 P = ParamSpec("P")
 T = TypeVar("T")
+LARGEST_KEY = 2**62
+"""Of the numbers that several indices are written as."""
 
 
 @runtime_checkable
@@ -188,7 +190,7 @@ def share(blocks: Mapping[str, Block], terms: Sequence[Term], eliminate: str | S
         own = term.select((where == ranks.rank).nonzero()[:, 0])
         index = tuple(number[n][i] if n == eliminated else i for n, i in zip(term.blocks, own.index, strict=True))
         own_terms.append(replace(own, index=index))
-        orders.append(torch.argsort(where, stable=True))
+        orders.append(torch.cat([(where == rank).nonzero()[:, 0] for rank in range(ranks.size)]))
     return Share(own_blocks, own_terms, names, ranks, orders, places)
 
 
@@ -234,7 +236,11 @@ def _alike(term: Term) -> Tensor:
     index = torch.stack(term.index)
     if len(set(term.blocks)) == 1:
         index = index.sort(0).values
-    key = torch.zeros_like(index[0])
+    key, most = torch.zeros_like(index[0]), 1
     for row in index if index.numel() else []:
-        key = torch.unique(key * (row.max() + 1) + row, return_inverse=True)[1]
-    return key
+        count = int(row.max()) + 1
+        if most * count > LARGEST_KEY:
+            key = torch.unique(key, return_inverse=True)[1]
+            most = len(key)
+        key, most = key * count + row, most * count
+    return torch.unique(key, return_inverse=True)[1]

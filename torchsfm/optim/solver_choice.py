@@ -57,7 +57,7 @@ def plan_fronts(layout: Layout, solver: Solver, *, last: Tensor | None = None, e
         return None
     dense, forming = layout.size**3 * FLOP, 0.0
     if solver == "auto":
-        if dense < WORTH or (not exact and PairGraph.of(layout) is not None):
+        if dense < WORTH or (not exact and PairGraph.fits(layout)):
             return None
         pairs = torch.tensor(sum(map(estimate_pairs, layout.families)), dtype=torch.float64, device=layout.device)
         forming = float(layout.ranks.largest(pairs))

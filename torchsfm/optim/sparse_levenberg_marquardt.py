@@ -167,15 +167,16 @@ def sparse_levenberg_marquardt(
         size = sum(_size(term) for term in counted)
         there, count, pieces = sum(u.numel() for u in used), sum(int(u.sum()) for u in used), len(layout.pieces)
         some = next(iter(double.values())).x if double else torch.empty(0, dtype=torch.float64)
-        constant, size, there, count, pieces = ranks.sum(some.new_tensor([still, size, there, count, pieces])).tolist()
+        points = sum(family.points for family in layout.families)
+        told = ranks.sum(some.new_tensor([still, size, there, count, pieces, points, progress is not None]))
+        constant, size, there, count, pieces, points, listens = told.tolist()
         cost, initial, iterations, status = constant, constant, 0, Status.TOO_FEW
         if not math.isfinite(constant) or (there and not count):
             status = Status.NOT_FINITE
         elif pieces:
-            points = ranks.sum(some.new_tensor(sum(family.points for family in layout.families)))
-            problem = _SparseProblem(Elimination(double, layout, linear_solver), size, points)
+            problem = _SparseProblem(Elimination(double, layout, linear_solver), size, some.new_tensor(points))
             limits = (max_iterations, function_tolerance, step_tolerance, gradient_tolerance, initial_damping)
-            tell = None if progress is None and ranks.size == 1 else _shared(progress, constant, ranks)
+            tell = _shared(progress, constant, ranks) if listens else None
             found = descend(problem, x, Options(*limits, progress=tell, interruptible=ranks.size == 1))
             x, iterations, status = found.x, int(found.iterations), Status(int(found.status))
             cost, initial = float(found.cost) + constant, float(found.initial_cost) + constant
