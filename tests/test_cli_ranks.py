@@ -1,5 +1,6 @@
 """The command started several times at once."""
 
+import json
 import os
 import random
 import signal
@@ -14,6 +15,8 @@ import torch.distributed
 from chance import stream_seed
 from command_line import copies, same_model, torchsfm
 
+from bench import kills
+from bench.kills import shards, workers
 from torchsfm.cli import ranks
 from torchsfm.cli.ranks import Started
 from torchsfm.reconstruction.stages import saved_stages
@@ -88,18 +91,6 @@ def launch(count: int, *words: object) -> "subprocess.Popen[bytes]":
     return subprocess.Popen([str(word) for word in (*command, *words)], stdout=quiet, stderr=quiet, env=environment)
 
 
-def workers(process: "subprocess.Popen[bytes]") -> list[int]:
-    """The processes that torchrun has started."""
-    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True)
-    return [int(line) for line in listed.stdout.split()]
-
-
-def shards(out: Path) -> dict[str, tuple[int, int]]:
-    """What is saved, and when it was made."""
-    found = {path: path.stat() for path in out.glob("stages/*/*.npz")}
-    return {path.relative_to(out).as_posix(): (stat.st_ino, stat.st_mtime_ns) for path, stat in found.items()}
-
-
 @pytest.mark.slow
 def test_ranks_killed_at_any_moment(courtyard: Path, tmp_path: Path) -> None:
     """In whatever stage a rank is killed the run ends with the same model, and what was saved is not made again."""
@@ -113,7 +104,7 @@ def test_ranks_killed_at_any_moment(courtyard: Path, tmp_path: Path) -> None:
                 time.sleep(0.01)
             time.sleep(chance.uniform(0, 0.3))
             before = shards(out)
-            alive = workers(process)
+            alive = workers(process.pid)
             if alive:
                 os.kill(chance.choice(alive), signal.SIGKILL)
             assert process.wait() == 0
@@ -134,10 +125,10 @@ def test_begun_with_two_and_finished_with_three(stage: str, courtyard: Path, tmp
         process.terminate()
     first = shards(tmp_path / "out")
     with launch(3, *words, "--resume") as process:
-        while not (alive := workers(process)) and process.poll() is None:
+        while not (alive := workers(process.pid)) and process.poll() is None:
             time.sleep(0.01)
         time.sleep(chance.uniform(0, 8))
-        before, alive = shards(tmp_path / "out"), workers(process)
+        before, alive = shards(tmp_path / "out"), workers(process.pid)
         if alive:
             os.kill(chance.choice(alive), signal.SIGKILL)
         assert process.wait() == 0
@@ -146,3 +137,16 @@ def test_begun_with_two_and_finished_with_three(stage: str, courtyard: Path, tmp
     assert first.items() <= before.items()
     assert torchsfm(*words[:-1], tmp_path / "alone")[0] == 0
     assert same_model(tmp_path / "alone/model.npz", tmp_path / "out/model.npz")
+
+
+@pytest.mark.slow
+def test_the_bench_kills_in_every_stage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Once each; what is on the record is not done again."""
+    words = ["--times", "1", "--grow", "0", "--record", str(tmp_path / "record")]
+    kills.main(words)
+    record = (tmp_path / "record").read_text()
+    assert {json.loads(line)["stage"] for line in record.splitlines()} >= {*kills.STAGES, "track"}
+    capsys.readouterr()
+    kills.main(words)
+    assert (tmp_path / "record").read_text() == record
+    assert "Kill(" not in capsys.readouterr().out

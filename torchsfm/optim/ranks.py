@@ -243,4 +243,5 @@ def _alike(term: Term) -> Tensor:
             key = torch.unique(key, return_inverse=True)[1]
             most = len(key)
         key, most = key * count + row, most * count
-    return torch.unique(key, return_inverse=True)[1]
+    found: Tensor = torch.unique(key, return_inverse=True)[1]
+    return found
