@@ -150,14 +150,14 @@ def held(out: Path, pids: Sequence[int]) -> dict[int, int]:
     return count
 
 
-def wait_for(stage: str, out: Path, process: BaseProcess, stages: Sequence[str]) -> list[int]:
-    """Return the ranks as soon as a stage, or a later one, has begun."""
+def wait_for(stage: str, out: Path, process: BaseProcess, stages: Sequence[str], count: int = 2) -> list[int]:
+    """Return the ranks as soon as all have been started and a stage, or a later one, has begun."""
     ranks: list[int] = []
     while process.is_alive():
-        ranks = ranks or workers(process.pid)
-        if ranks and stages.index(under_way(out, stages)) >= stages.index(stage):
+        ranks = ranks if len(ranks) >= count else workers(process.pid)
+        if len(ranks) >= count and stages.index(under_way(out, stages)) >= stages.index(stage):
             break
-        time.sleep(0.0005 if ranks else 0.02)
+        time.sleep(0.0005 if len(ranks) >= count else 0.02)
     return ranks
 
 
@@ -166,7 +166,7 @@ def lengths(out: Path, words: Sequence[object], stages: Sequence[str]) -> dict[s
     begun: list[float] = []
     with launched(2, *words, "--out", out) as process:
         for stage in stages:
-            wait_for(stage, out, process, stages)
+            wait_for(stage, out, process, stages, 1)
             begun.append(time.monotonic())
     return {stage: b - a for stage, a, b in zip(stages, begun, [*begun[1:], time.monotonic()], strict=True)}
 
@@ -217,7 +217,7 @@ def disturbed(
     if grow:
         before = saved
         with launched(3, *words, "--out", out, "--resume") as process:
-            ranks = wait_for("start", out, process, stages)
+            ranks = wait_for("start", out, process, stages, 3)
             time.sleep(chance.uniform(0, time.monotonic() - began))
             alive = list(filter(runs, ranks))
             rank = chance.randrange(max(len(alive), 1))
