@@ -1,6 +1,7 @@
 """Cameras by points and curves together: few points and the edges of photographs of a box, and edges that contradict points."""
 
 from dataclasses import dataclass, replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -11,15 +12,19 @@ from torchsfm.bundle import bundle_adjust
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.geometry import Pose
-from torchsfm.reconstruction import curve_noise
+from torchsfm.reconstruction import curve_noise, models
 from torchsfm.reconstruction.adjust import LOSS, adjust, points_agree
-from torchsfm.reconstruction.curve_adjustment import adjust_with_curves
-from torchsfm.reconstruction.curves import reconstruct_curves
+from torchsfm.reconstruction.curve_adjustment import WithCurves, adjust_with_curves
+from torchsfm.reconstruction.curves import no_curves, reconstruct_curves
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
+from torchsfm.reconstruction.find_lines import FoundSegments, lines_of_cameras
+from torchsfm.reconstruction.growth import Component
 from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.incremental import MappingOptions
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.stages import Stages
 from torchsfm.reconstruction.track_graph import graph_from_tracks
 
 F64 = torch.float64
@@ -111,21 +116,58 @@ def test_edges_that_lie_aside_leave_cameras_where_many_points_have_them(
     assert adjust_with_curves(model, wrong, None) is None
 
 
-def test_lines_are_adjusted_with_points_and_curves(seen: Seen, generator: torch.Generator) -> None:
-    """The upright edges of the box, which fit the cameras of few points worse than those of all together."""
-    model = with_points(12, 0.2, generator)
+def upright_edges(noise: float, generator: torch.Generator) -> Lines:
+    """Those of the box, and where the true cameras see their ends."""
     x, y, z = HALF.tolist()
     ends = torch.tensor([[(a * x, b * y, c * z) for c in (-1, 1)] for a in (-1, 1) for b in (-1, 1)], dtype=F64)
     line, view = torch.cartesian_prod(torch.arange(4), torch.arange(VIEWS)).unbind(1)
     shown = camera(VIEWS)[view].project(orbit(VIEWS)[view].transform(ends[line]))
-    shown = shown + 0.02 * torch.randn(shown.shape, generator=generator, dtype=F64)
-    lines = Lines(ends, torch.ones(4, 3, dtype=F64), shown, torch.full((len(line),), 0.02**-2, dtype=F64), view, line)
+    shown = shown + noise * torch.randn(shown.shape, generator=generator, dtype=F64)
+    return Lines(ends, torch.ones(4, 3, dtype=F64), shown, torch.full((len(line),), noise**-2, dtype=F64), view, line)
+
+
+def test_lines_are_adjusted_with_points_and_curves(seen: Seen, generator: torch.Generator) -> None:
+    """The upright edges of the box, which fit the cameras of few points worse than those of all together."""
+    model = with_points(12, 0.2, generator)
+    lines = upright_edges(0.02, generator)
     moved = adjust_with_curves(model, seen.curves, None, lines)
     assert moved is not None
     assert moved.lines is not None
     before = segment_distances(model.poses, camera(VIEWS), lines.bundle()).abs().mean()
     after = segment_distances(moved.mapping.poses, camera(VIEWS), moved.lines.bundle()).abs().mean()
     assert after < 0.5 * before
+
+
+def test_lines_that_points_contradict_move_no_cameras_beside_curves(seen: Seen, generator: torch.Generator) -> None:
+    """Segments of cameras that are elsewhere; the lines come to rest where the cameras of points and curves want them."""
+    model = with_points(40, 0.1, generator)
+    lines = upright_edges(0.02, generator)
+    aside = torch.randn(VIEWS, 2, generator=generator, dtype=F64)
+    wrong = replace(lines, x=lines.x + (1.5 * aside / aside.norm(dim=-1, keepdim=True))[lines.view, None])
+    alone = find_curves(model, seen.found(), None, silent)
+    beside = find_curves(model, seen.found(), None, silent, lines=wrong, lines_agree=False)
+    assert torch.equal(beside.mapping.poses.t, alone.mapping.poses.t)
+    assert beside.mapping is not model
+    assert beside.lines is not None
+    held = lines_of_cameras(alone.mapping, wrong)
+    torch.testing.assert_close(beside.lines.ends, held.ends)
+    assert (beside.lines.ends - wrong.ends).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("agree", [False, True])
+def test_lines_that_have_moved_no_camera_are_such(
+    agree: bool, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = with_points(12, 0.2, generator)
+    options = MappingOptions((), model.cameras, torch.tensor([0.1], dtype=F64))
+    told = Mock(return_value=WithCurves(model, None, no_curves(model.X)))
+    monkeypatch.setattr(models, "find_lines", lambda *_: (replace(model) if agree else model, upright_edges(0.02, generator)))
+    monkeypatch.setattr(models, "find_curves", told)
+    component = Component(model, options, off_centre=False)
+    models._with_lines_and_curves(
+        component, lambda: Mock(FoundSegments), lambda: Mock(FoundEdges), Stages(None, False, ""), silent
+    )
+    assert told.call_args.kwargs["lines_agree"] is agree
 
 
 def test_cameras_are_refused_that_points_contradict(generator: torch.Generator) -> None:

@@ -15,6 +15,7 @@ from torchsfm.images import ImageError, read_image
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.curve_adjustment import WithCurves, adjust_with_curves
 from torchsfm.reconstruction.curves import curves_of_edges, curves_of_other_cameras
+from torchsfm.reconstruction.find_lines import lines_of_cameras
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.lines import Lines
 from torchsfm.reconstruction.mapping import Mapping
@@ -92,7 +93,13 @@ def detect_all_edges(
 
 
 def find_curves(
-    mapping: Mapping, found: FoundEdges, prior: CameraPrior | None, progress: Progress, *, lines: Lines | None = None
+    mapping: Mapping,
+    found: FoundEdges,
+    prior: CameraPrior | None,
+    progress: Progress,
+    *,
+    lines: Lines | None = None,
+    lines_agree: bool = True,
 ) -> WithCurves:
     """Find the curves in space of a finished model, and adjust cameras, points, lines and curves together.
 
@@ -102,6 +109,7 @@ def find_curves(
         prior: What is expected of its cameras, where something of them is estimated.
         progress: Called as the work goes on.
         lines: Lines of the model, if it has any.
+        lines_agree: Whether they move the cameras, too. Those that points contradict go with the cameras.
 
     Returns:
         The model after the adjustment, its lines, and the curves with the edge points that show them in pixels of the images.
@@ -118,9 +126,11 @@ def find_curves(
     points = mapping.X[_seen(mapping)]
     curves = curves_of_edges(edges, height_width, *placed(mapping), points=points, progress=progress)
     whole = curves.in_images(known, zoom)
-    better = adjust_with_curves(mapping, whole, prior, lines)
+    better = adjust_with_curves(mapping, whole, prior, lines if lines_agree else None)
     if better is None:
         return WithCurves(mapping, lines, whole)
+    if lines is not None and not lines_agree:
+        better = better._replace(lines=lines_of_cameras(better.mapping, lines))
     curves = curves_of_other_cameras(better.curves, edges, height_width, *placed(better.mapping))
     return WithCurves(better.mapping, better.lines, curves.in_images(known, zoom))
 

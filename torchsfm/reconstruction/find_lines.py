@@ -81,11 +81,15 @@ def find_lines(mapping: Mapping, found: FoundSegments, prior: CameraPrior | None
     if not len(lines):
         return mapping, lines
     moved = adjust_with_lines(mapping, lines, prior)
-    if points_agree(mapping, moved[0]):
-        return moved
+    return moved if points_agree(mapping, moved[0]) else (mapping, lines_of_cameras(mapping, lines))
+
+
+def lines_of_cameras(mapping: Mapping, lines: Lines) -> Lines:
+    """The lines where the cameras of a model want them, which stay where they are."""
+    if not len(lines):
+        return lines
     poses, points = (torch.ones(len(some), dtype=torch.bool) for some in (mapping.registered, mapping.X))
-    _, lines = adjust_with_lines(mapping, lines, None, fixed_poses=poses, fixed_points=points)
-    return mapping, lines
+    return adjust_with_lines(mapping, lines, None, fixed_poses=poses, fixed_points=points)[1]
 
 
 def adjust_with_lines(mapping: Mapping, lines: Lines, prior: CameraPrior | None, **limits: Any) -> tuple[Mapping, Lines]:

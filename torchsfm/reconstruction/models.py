@@ -83,7 +83,9 @@ def _with_lines_and_curves(
             model, lines = find_lines(model, segments(), component.options.prior(model))
     if edges is not None:
         with stages.timed("curves"):
-            model, lines, curves = find_curves(model, edges(), component.options.prior(model), progress, lines=lines)
+            # Lines that have moved no camera are contradicted by points.
+            agree, prior = model is not component.model, component.options.prior(model)
+            model, lines, curves = find_curves(model, edges(), prior, progress, lines=lines, lines_agree=agree)
     return component.moved(model), replace(model.reconstruction(), lines=lines, curves=curves)
 
 
