@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from torchsfm.reconstruction.curve_fusion import fuse_pieces, near_pairs
+from torchsfm.reconstruction.curve_fusion import count_different, fuse_pieces, near_pairs
 from torchsfm.reconstruction.curve_pieces import Pieces
 
 F64 = torch.float64
@@ -75,3 +75,10 @@ def test_pieces_end_to_end_are_linked_in_order(generator: torch.Generator) -> No
         x = fused.X[fused.curve == curve]
         step = x.diff(dim=0).sum(-1)
         assert (step > 0).all() or (step < 0).all()
+
+
+def test_different_numbers_beside_each_are_counted(generator: torch.Generator) -> None:
+    a, b = (torch.randint(6, (40,), generator=generator) for _ in range(2))
+    wanted = [len(set(b[a == i].tolist())) for i in range(8)]
+    assert count_different(a, b, 8).tolist() == wanted
+    assert count_different(a[:0], b[:0], 3).tolist() == [0, 0, 0]

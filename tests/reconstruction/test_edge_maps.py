@@ -2,7 +2,7 @@
 
 import torch
 
-from torchsfm.reconstruction.edge_maps import EdgePoints, edge_maps
+from torchsfm.reconstruction.edge_maps import EdgeMap, EdgeMaps, EdgePoints
 
 F64 = torch.float64
 
@@ -14,12 +14,11 @@ def test_a_pixel_knows_its_nearest_edge_point(generator: torch.Generator) -> Non
         x = torch.rand(n, 2, **kind) * torch.tensor([50.0, 40.0], dtype=F64)
         tangent = torch.nn.functional.normalize(torch.randn(n, 2, **kind), dim=-1)
         points.append(EdgePoints(x, tangent, torch.arange(n)))
-    maps = edge_maps(points, 40, 50)
+    of_each = [EdgeMap.of(own, 40, 50) for own in points]
+    maps = EdgeMaps.of(of_each)
     y = torch.rand(3, 200, 2, **kind) * 60 - 5
     near = maps.near(y)
-    close = maps.closeness(2.0)
-    assert close.shape == (3, 40, 50)
-    assert (close[1] == 0).all()
+    assert (of_each[1].closeness == 0).all()
     for i, own in enumerate(points):
         pixel = y[i].round()
         inside = ((pixel >= 0) & (pixel < torch.tensor([50, 40]))).all(-1)

@@ -59,9 +59,8 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
     for _ in range(_ROUNDS):
         moved = torch.zeros_like(X).index_add(0, a, weight[:, None] * across(X))
         X = X + moved / total[:, None]
-    pairs = torch.unique(torch.stack((a, pieces.image[b]), -1), dim=0)
-    other = pairs[:, 1] != pieces.image[pairs[:, 0]]
-    images = 1 + torch.bincount(pairs[other, 0], minlength=n)
+    other = pieces.image[a] != pieces.image[b]
+    images = 1 + count_different(a[other], pieces.image[b[other]], n)
     order = a.argsort(stable=True)
     b = b[order]
     first = torch.searchsorted(a[order], torch.arange(n + 1, device=X.device))
@@ -98,6 +97,13 @@ def nearest_fused(pieces: Pieces, fused: FusedCurves) -> Int[Tensor, "n"]:
     order = torch.linalg.vector_norm(pieces.X[b] - pieces.X[a], dim=-1).argsort(stable=True)
     order = order[first_of_each(a[order])]
     return found.index_copy(0, a[order], found[b[order]])
+
+
+def count_different(a: Int[Tensor, "k"], b: Int[Tensor, "k"], number: int) -> Int[Tensor, "n"]:
+    """How many different `b`, which are not negative, stand beside each of so many `a`."""
+    most = int(b.amax()) + 1 if len(b) else 1
+    # One number for each pair: rows are told apart far more slowly.
+    return torch.bincount(torch.unique(a * most + b) // most, minlength=number)
 
 
 def _scale(pieces: Pieces) -> float:

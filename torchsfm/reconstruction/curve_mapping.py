@@ -15,13 +15,13 @@ from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import BundleProblem, Camera, Pose, rotation_from_rotvec, rotvec_from_rotation
 from torchsfm.images.edge_field import EdgeField, edge_field
 from torchsfm.reconstruction.curve_directions import across_own_curves, own_directions
-from torchsfm.reconstruction.curve_fusion import near_pairs
+from torchsfm.reconstruction.curve_fusion import count_different, near_pairs
 from torchsfm.reconstruction.curve_noise import TRUSTED, edge_loss, usual_distance, weights_in_a_bundle
 from torchsfm.reconstruction.curve_pieces import image_pieces
 from torchsfm.reconstruction.curve_resection import Resection, pose_from_edges
 from torchsfm.reconstruction.curve_tracks import track_samples
 from torchsfm.reconstruction.curves import no_curves
-from torchsfm.reconstruction.edge_maps import EdgePoints
+from torchsfm.reconstruction.edge_maps import EdgePoints, MapsOfImages
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
@@ -32,6 +32,8 @@ _AROUND = 5
 """Frames, besides its own, by which the depths of a frame's edges are found."""
 _AGREE = 4
 """Frames, its own included, that must see a sample."""
+_EVERY = 4
+"""Of so many edge points of a frame one is followed."""
 _SHORTEST = 6
 """Samples of the shortest piece."""
 _SAMPLES = 350
@@ -119,6 +121,10 @@ class CurveMapping:
         """With other curves."""
         return replace(self, curves=curves, home=torch.zeros_like(curves.curve) if home is None else home)
 
+    def maps(self) -> MapsOfImages:
+        """What frames show, to be looked up; it is of this camera."""
+        return MapsOfImages([sight.points for sight in self.sights], self.size)
+
     def problem(self) -> BundleProblem:
         """The cameras, without any points."""
         x = self.poses.t.new_zeros(0, 2)
@@ -127,19 +133,18 @@ class CurveMapping:
         return BundleProblem(self.poses, self.camera[(None,)], one, self.poses.t[:0], x, index, index)
 
 
-def add_pieces(mapping: CurveMapping, view: int, near: float = NEAR) -> CurveMapping:
+def add_pieces(mapping: CurveMapping, view: int, near: float = NEAR, maps: MapsOfImages | None = None) -> CurveMapping:
     """Samples of what the edges of a frame are images of, by the frames around; edges so many pixels away still show them."""
     known = mapping.known
     around = known[(known - view).abs().argsort(stable=True)]
     views = [view, *around[around != view][:_AROUND].tolist()]
-    points = [mapping.sights[j].points for j in views]
-    # Every other edge point will do here.
-    points[0] = EdgePoints(*(t[::2].contiguous() for t in points[0]))
-    if len(views) < 3 or not len(points[0].x):
+    if len(views) < 3 or not len(mapping.sights[view].points.x):
         return mapping
+    maps = maps or mapping.maps()
     found = image_pieces(
-        view, points, mapping.P[views], mapping.size, threshold=near, least_views=min(_AGREE, len(views)), shortest=_SHORTEST
-    )
+        view, [maps[j] for j in views], mapping.P[views], every=_EVERY, threshold=near,
+        least_views=min(_AGREE, len(views)), shortest=_SHORTEST,
+    )  # fmt: skip
     rank = torch.arange(len(found.X)) - torch.searchsorted(found.piece, found.piece)
     keep = rank % max(1, -(-len(found.X) // _SAMPLES)) == 0
     number, piece = torch.unique(found.piece[keep], return_inverse=True)
@@ -166,8 +171,8 @@ def track(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
     """Which edges of all placed frames show the samples."""
     known = mapping.known
     seen = [mapping.sights[i] for i in known.tolist()]
-    edges, points = [s.edges for s in seen], [s.points for s in seen]
-    curves = track_samples(mapping.curves, directions(mapping), edges, points, mapping.P[known], mapping.size, near)
+    edges, maps = [s.edges for s in seen], MapsOfImages([s.points for s in seen], mapping.size)
+    curves = track_samples(mapping.curves, directions(mapping), edges, maps, mapping.P[known], near)
     return replace(mapping, curves=replace(curves, view=known[curves.view]))
 
 
@@ -248,10 +253,10 @@ def settle(mapping: CurveMapping, cameras: Named[str, Any], *, rounds: int) -> C
 def sampled(mapping: CurveMapping, progress: Progress, near: float = NEAR) -> CurveMapping:
     """All samples found anew, from the edges of all placed frames."""
     mapping = mapping.with_curves(no_curves(mapping.poses.R))
-    known = mapping.known.tolist()
+    known, maps = mapping.known.tolist(), mapping.maps()
     for done, view in enumerate(known):
         progress("curves", done, len(known))
-        mapping = add_pieces(mapping, view, near)
+        mapping = add_pieces(mapping, view, near, maps)
     progress("curves", len(known), len(known))
     return mapping
 
@@ -265,8 +270,7 @@ def _confirmed(mapping: CurveMapping, near: float) -> Bool[Tensor, "n"]:
     d = X[b] - X[a]
     across = torch.linalg.vector_norm(d - (d * tangent[a]).sum(-1, keepdim=True) * tangent[a], dim=-1)
     same = (across < near * pixel[a]) & ((tangent[a] * tangent[b]).sum(-1) > _PARALLEL) & (home[a] != home[b])
-    pairs = torch.unique(torch.stack((a[same], home[b[same]])), dim=1)
-    return torch.bincount(pairs[0], minlength=len(X)) >= _CONFIRM
+    return count_different(a[same], home[b[same]], len(X)) >= _CONFIRM
 
 
 def register(mapping: CurveMapping, view: int, guesses: Sequence[Pose | None] = ()) -> CurveMapping | None:

@@ -1,5 +1,6 @@
 """Pieces of space curves that the edges of one image are images of, by what the images around it see."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -8,17 +9,15 @@ from torch import Tensor
 
 from torchsfm.linalg import inverse
 from torchsfm.reconstruction.curve_sweep import Candidates, Rays, agreement, sweep_depths
-from torchsfm.reconstruction.edge_maps import EdgeMaps, EdgePoints, edge_maps
+from torchsfm.reconstruction.edge_maps import EdgeMap, EdgeMaps, EdgePoints
 from torchsfm.triangulation.curve_path import best_path
 from torchsfm.triangulation.curve_refinement import covariance_across, refine_samples
 from torchsfm.triangulation.curve_views import CurveDistances, biweight, project_all
 
 _EVERY = 2
-"""Of so many edge points one is followed: neighbours are correlated."""
+"""Of so many edge points one is followed, as neighbours are correlated."""
 _KEPT = 12
 """Candidates of a sample."""
-_REACH = 2.5
-"""Distance of an edge, in pixels, that a pixel of the maps still feels."""
 _FULL = 4.0
 """Votes of a sample that all images agree on, as far as the path is concerned: a leap is as dear among few as among many."""
 _LEAP = 10.0
@@ -68,10 +67,10 @@ class _Sight(NamedTuple):
 
 def image_pieces(
     image: int,
-    points: list[EdgePoints],
+    sights: Sequence[EdgeMap],
     P: Float[Tensor, "v 3 4"],
-    size: tuple[int, int],
     *,
+    every: int = _EVERY,
     threshold: float,
     least_views: int,
     shortest: int,
@@ -80,19 +79,19 @@ def image_pieces(
 
     Args:
         image: Its number among all.
-        points: The edges of the images.
+        sights: The edges of the images.
         P: Their cameras, scaled so that depths are those in the world.
-        size: Height and width of the images.
+        every: Of so many edge points one is followed.
         threshold: Distance in pixels of an edge that an image still agrees with.
         least_views: Images that must agree, the first one included.
         shortest: Samples of the shortest piece.
     """
-    maps = edge_maps(points, *size)
+    maps = EdgeMaps.of(sights)
     others = EdgeMaps(maps.table[1:], maps.x, maps.tangent)
-    closeness = others.closeness(_REACH)
-    own = points[0]
+    closeness = torch.stack([sight.closeness for sight in sights[1:]])
+    own = sights[0].points
     rank = torch.arange(len(own.x), device=own.x.device)
-    taken = (rank - torch.searchsorted(own.chain, own.chain)) % _EVERY == 0
+    taken = (rank - torch.searchsorted(own.chain, own.chain)) % every == 0
     own, edge = EdgePoints(own.x[taken], own.tangent[taken], own.chain[taken]), rank[taken]
     groups, offset = [], 0
     for part in _groups(own.chain):

@@ -109,18 +109,17 @@ def _felt(
     # Centres of the pixels of an image go from -1 to 1.
     scale = A.new_tensor([[2 / (w - 1), 0, -1], [0, 2 / (h - 1), -1], [0, 0, 1]])
     a, b = (A @ scale.mT).tolist(), B @ scale.mT
-    place, total = grid.new_empty(1, *grid.shape, 2), torch.zeros_like(grid)
+    # Coordinates by themselves: arithmetic on every other number is slow.
+    place, depth, total = grid.new_empty(2, *grid.shape), torch.empty_like(grid), torch.zeros_like(grid)
     for j, own in enumerate(a):
         if not all(map(math.isfinite, own)):
             continue
-        x, y, depth = (torch.add(b[j, :, k, None], grid, alpha=own[k]) for k in range(3))
+        for k, out in enumerate((*place, depth)):
+            torch.add(b[j, :, k, None], grid, alpha=own[k], out=out)
         # What is behind goes far outside.
-        depth.clamp_(min=_TINY)
-        torch.div(x, depth, out=place[0, ..., 0])
-        torch.div(y, depth, out=place[0, ..., 1])
-        place.clamp_(-2, 2)
+        place.div_(depth.clamp_(min=_TINY)).clamp_(-2, 2)
         total += torch.nn.functional.grid_sample(
-            closeness[None, j : j + 1], place, mode="nearest", padding_mode="zeros", align_corners=True
+            closeness[None, j : j + 1], place.permute(1, 2, 0)[None], mode="nearest", padding_mode="zeros", align_corners=True
         )[0, 0]
     return total
 
@@ -132,9 +131,10 @@ def _lines(P: Tensor, rays: Rays) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "
 
 def _image(A: Tensor, B: Tensor, q: Float[Tensor, "s c"]) -> tuple[Float[Tensor, "v s c 2"], Float[Tensor, "v s c"]]:
     """Image points, homogeneous, and what they are divided by; points behind a camera are far outside."""
-    y = A[:, None, None] * q[..., None] + B[:, :, None]
-    front = y[..., 2] > 0
-    return torch.where(front[..., None], y[..., :2], -1e9), torch.where(front, y[..., 2], 1)
+    # Coordinates by themselves: arithmetic on every other number is slow.
+    y = A.T[:, :, None, None] * q + B.movedim(-1, 0)[..., None]
+    front = y[2] > 0
+    return torch.where(front, y[:2], -1e9).movedim(0, -1), torch.where(front, y[2], 1)
 
 
 def _range(A: Tensor, B: Tensor, baseline: Tensor, width: int, height: int) -> tuple[Float[Tensor, "s"], Float[Tensor, "s"]]:
@@ -163,7 +163,7 @@ def _polished(maps: EdgeMaps, P: Tensor, rays: Rays, q: Float[Tensor, "s c"], st
         # The images move by so much as the inverse depth grows.
         motion = (A[:, None, None, :2] - y * A[:, None, None, 2:]) / depth[..., None]
         speed = motion[..., 1] * near.tangent[..., 0] - motion[..., 0] * near.tangent[..., 1]
-        length = torch.linalg.vector_norm(motion, dim=-1)
+        length = inner(motion, motion).sqrt()
         weight = (1 - (near.r / threshold).square()).clamp(min=0).square() * (speed.abs() > _STEEP * length)
         tangent, agrees = _space_tangents(P[..., :3], near.tangent, y, depth, rays, weight)
         weight = weight * agrees * there
@@ -203,7 +203,7 @@ def _space_tangents(
     image = torch.stack((rays.along @ M.mT, rays.direction @ M.mT))[..., None, :]
     motion = (image[..., :2] - y * image[..., 2:]) / depth[..., None]
     a, b = inner(motion, normal)
-    size = torch.linalg.vector_norm(motion, dim=-1).sum(0).clamp_min(1e-300)
+    size = inner(motion, motion).sqrt().sum(0).clamp_min(1e-300)
     a, b = a / size, b / size
     # The least of the sum of squares of a cos + b sin.
     aa, ab, bb = ((weight * t).sum(0) for t in (a * a, a * b, b * b))

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.reconstruction.edge_maps import EdgePoints, edge_maps
+from torchsfm.reconstruction.edge_maps import EdgeMap, EdgeMaps, MapsOfImages
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
 
@@ -23,9 +23,8 @@ def track_samples(
     curves: Curves,
     tangent: Float[Tensor, "n 3"],
     edges: Sequence[ImageEdges],
-    points: Sequence[EdgePoints],
+    maps: MapsOfImages,
     P: Float[Tensor, "v 3 4"],
-    size: tuple[int, int],
     threshold: float,
 ) -> Curves:
     """The curves with the edge points that show them.
@@ -34,16 +33,15 @@ def track_samples(
         curves: The curves.
         tangent: Which way they run.
         edges: Edge points of the images.
-        points: The same as cameras without distortion see them.
+        maps: The same as cameras without distortion see them.
         P: These cameras.
-        size: Height and width of the images.
         threshold: Largest distance of the image of a sample from its edge point across the edge, pixels.
     """
     X, tangent = curves.X.double(), tangent.double()
     count = [len(own) for own in edges]
     found = [
-        _shown(X, tangent, curves.curve, straight, P[v], size, threshold) if count[v] else (curves.sample, curves.sample)
-        for v, straight in enumerate(points)
+        _shown(X, tangent, curves.curve, maps[v], P[v], threshold) if count[v] else (curves.sample[:0], curves.sample[:0])
+        for v in range(len(edges))
     ]
     view = torch.cat([torch.full_like(sample, v) for v, (sample, _) in enumerate(found)])
     sample = torch.cat([sample for sample, _ in found])
@@ -61,13 +59,12 @@ def _shown(
     X: Float[Tensor, "n 3"],
     tangent: Float[Tensor, "n 3"],
     curve: Int[Tensor, "n"],
-    points: EdgePoints,
+    own: EdgeMap,
     P: Float[Tensor, "3 4"],
-    size: tuple[int, int],
     threshold: float,
 ) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Samples that an image shows, and its edge points next to them."""
-    maps = edge_maps([points], *size)
+    maps, points = EdgeMaps.of([own]), own.points
     y = X @ P[:, :3].mT + P[:, 3]
     depth = y[:, 2:]
     y = y[:, :2] / torch.where(depth > 0, depth, torch.nan)

@@ -17,7 +17,7 @@ from torchsfm.reconstruction.curve_fusion import fuse_pieces
 from torchsfm.reconstruction.curve_noise import TRUSTED, measured_weights
 from torchsfm.reconstruction.curve_pieces import Pieces, image_pieces
 from torchsfm.reconstruction.curve_tracks import track_samples
-from torchsfm.reconstruction.edge_maps import EdgePoints
+from torchsfm.reconstruction.edge_maps import MapsOfImages
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
 from torchsfm.reconstruction.report import Progress
@@ -122,22 +122,17 @@ def curves_of_edges(
 ) -> Curves:
     """`reconstruct_curves` from the edges of images, of which `size` is the largest height and width."""
     v = len(edges)
-    seen = [own.seen_by(cameras[i]) for i, own in enumerate(edges)]
-    kept, lines = [own for own, _ in seen], [straight for _, straight in seen]
+    kept, maps = _seen_by(edges, size, cameras)
     P = cameras.K.double() @ poses.matrix().double()
     around = neighbouring_views(P, size, None if points is None else points.double(), neighbours)
     pieces = []
     for i, near in enumerate(around):
         progress("follow", i, v)
-        near = [j for j in near if len(lines[j].x)]
-        if near and len(lines[i].x):
+        near = [j for j in near if len(kept[j])]
+        if near and len(kept[i]):
             views = [i, *near]
-            agree = min(_AGREE, len(views))
-            pieces.append(
-                image_pieces(
-                    i, [lines[j] for j in views], P[views], size, threshold=threshold, least_views=agree, shortest=_SHORTEST
-                )
-            )
+            sights, agree = [maps[j] for j in views], min(_AGREE, len(views))
+            pieces.append(image_pieces(i, sights, P[views], threshold=threshold, least_views=agree, shortest=_SHORTEST))
     progress("follow", v, v)
     if not sum(len(p.piece) for p in pieces):
         return no_curves(poses.R)
@@ -160,32 +155,31 @@ def curves_of_edges(
         no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
-    return _shown_by(curves, seen, size, cameras, poses, threshold)
+    return _shown_by(curves, kept, maps, cameras, poses, threshold)
 
 
 def curves_of_other_cameras(
     curves: Curves, edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera, poses: Pose, *, threshold: float = 2.0
 ) -> Curves:
     """What `curves_of_edges` found, where cameras have changed a little since: shown by the edges that are near now."""
+    return _shown_by(curves, *_seen_by(edges, size, cameras), cameras, poses, threshold)
+
+
+def _seen_by(edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera) -> tuple[list[ImageEdges], MapsOfImages]:
+    """The edges that lenses show, and where they are without distortion."""
     seen = [own.seen_by(cameras[i]) for i, own in enumerate(edges)]
-    return _shown_by(curves, seen, size, cameras, poses, threshold)
+    return [own for own, _ in seen], MapsOfImages([straight for _, straight in seen], size)
 
 
 def _shown_by(
-    curves: Curves,
-    seen: Sequence[tuple[ImageEdges, EdgePoints]],
-    size: tuple[int, int],
-    cameras: Camera,
-    poses: Pose,
-    threshold: float,
+    curves: Curves, edges: Sequence[ImageEdges], maps: MapsOfImages, cameras: Camera, poses: Pose, threshold: float
 ) -> Curves:
     """The curves at the least squares of all edges that run along them, with these edges."""
-    kept, straight = zip(*seen, strict=True)
     P = cameras.K.double() @ poses.matrix().double()
-    curves = track_samples(curves, curves.tangents(), kept, straight, P, size, threshold)
+    curves = track_samples(curves, curves.tangents(), edges, maps, P, threshold)
     curves = settle_samples(curves, cameras, poses, threshold)
     # What edges no longer run along is left behind.
-    curves = track_samples(curves, curves.tangents(), kept, straight, P, size, threshold)
+    curves = track_samples(curves, curves.tangents(), edges, maps, P, threshold)
     return measured_weights(curves, edge_distances(poses, cameras, curves.bundle()))
 
 
