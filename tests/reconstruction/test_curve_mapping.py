@@ -10,8 +10,11 @@ from torch import Tensor
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
+from torchsfm.linalg import nearest_rotation
+from torchsfm.reconstruction.curve_deviations import deviations
 from torchsfm.reconstruction.curve_fusion import piece_tangents
 from torchsfm.reconstruction.curve_mapping import CurveMapping, adjust, covariance, distances, register, terms, track
+from torchsfm.reconstruction.curve_sequence import OPTIMISM, Expected
 from torchsfm.reconstruction.curves import no_curves
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
@@ -39,12 +42,12 @@ def wavy(generator: torch.Generator) -> Tensor:
     return torch.stack((x, height.expand_as(x), z), -1)
 
 
-def seen(X: Tensor, poses: Pose) -> list[ImageEdges]:
+def seen(X: Tensor, poses: Pose, K: Tensor = CAMERA.K) -> list[ImageEdges]:
     """The edges that frames show, each of which has the brighter side to the left of its curve."""
     chain = torch.arange(CURVES).repeat_interleave(SAMPLES)
     none = torch.zeros(len(chain), dtype=F64)
     edges = []
-    for x in project_points(CAMERA.K @ poses.matrix(), X.flatten(0, 1)):
+    for x in project_points(K @ poses.matrix(), X.flatten(0, 1)):
         tangent = piece_tangents(x, chain)
         normal = torch.stack((-tangent[:, 1], tangent[:, 0]), -1)
         edges.append(ImageEdges(x, normal, none, none + 0.1, none[:, None].expand(-1, 3), chain))
@@ -94,6 +97,36 @@ def test_edges_that_are_wrong_alike_along_curves_do_not_count_one_by_one(generat
     assert count[1] < 0.1 * count[0]
     # And so much less do they tell.
     assert sigma[1] > 3 * sigma[0]
+
+
+def test_cameras_are_off_as_far_as_the_numbers_of_the_camera_turn_them(generator: torch.Generator) -> None:
+    """Frames of which nothing is wrong but what is wrong in all of them: so much more than by edges deviations are."""
+    X, poses = wavy(generator), frames()
+    known = Expected(CAMERA, ("focal",), {"focal": 0.02, "principal_point": 4.0}, held=("principal_point",))
+    mapping = track(model(X, noisy(seen(X, poses), generator), torch.arange(FRAMES)))
+    told = deviations(mapping, known)
+    size = []
+    for _ in range(12):
+        K, part = CAMERA.K.clone(), 0.1  # So near that samples still see their edges.
+        K[:2, :2] *= 1 + part * told.numbers["focal"] * torch.randn((), generator=generator, dtype=F64)
+        K[:2, 2] += part * told.numbers["principal_point"] * torch.randn(2, generator=generator, dtype=F64)
+        begun = model(X, seen(X, poses, K), torch.arange(FRAMES))
+        found = adjust(begun, known.terms() | {"free": (), "intrinsics_sigma": {}}, rounds=4)
+        turn = nearest_rotation((poses.R.mT @ found.poses.R).mean(0))
+        size.append(rotation_angle(found.poses.R @ (poses.R @ turn).mT).rad2deg() / part)
+    edges = covariance(mapping, known.terms() | {"free": (), "intrinsics_sigma": {}})
+    alone = edges.poses.diagonal(dim1=-2, dim2=-1)[:, :3].sum(-1).sqrt().rad2deg()
+    stated = (told.rotation.square() - alone.square()).mean().sqrt()
+    assert float(torch.stack(size).square().mean().sqrt() / stated) == pytest.approx(1.0, rel=0.5)
+
+
+def test_numbers_of_the_camera_are_known_as_before_or_by_edges(generator: torch.Generator) -> None:
+    X = wavy(generator)
+    mapping = track(model(X, noisy(seen(X, frames()), generator), torch.arange(FRAMES)))
+    edges = float(covariance(mapping, {"free": ("focal",)}).cameras[0, 0, 0].sqrt()) / 500
+    for before, wanted in ((1e-3 * edges, 1e-3 * edges), (1e3 * edges, OPTIMISM * edges)):
+        known = Expected(CAMERA, ("focal",), {"focal": before})
+        assert deviations(mapping, known).numbers["focal"] == pytest.approx(wanted, rel=1e-3)
 
 
 def noisy(exact: list[ImageEdges], generator: torch.Generator) -> list[ImageEdges]:

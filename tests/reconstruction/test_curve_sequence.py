@@ -127,6 +127,11 @@ def test_cameras_and_curves_without_points(tmp_path: Path, generator: torch.Gene
     assert rotation_angle(model.poses.R @ (poses.R @ turn).mT).rad2deg().max() < 1.0
     assert abs(float(model.cameras.K[0, 0, 0]) / FOCAL - 1) < 0.05
     assert {image.doubt for image in found.report.images} == {""}
+    (known,) = found.report.calibrations
+    assert known.names == ("focal", "cx", "cy")
+    assert known.estimated.tolist() == [[True, False, False]]
+    assert 0.002 * FOCAL < float(known.deviation[0, 0]) < 0.05 * FOCAL
+    assert known.deviation[0, 1:].tolist() == known.prior[0, 1:].tolist()
     assert model.curves is not None
     assert len(model.curves) >= 6
     assert model.curve_residuals().median() < 0.3

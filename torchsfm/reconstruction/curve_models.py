@@ -6,11 +6,16 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
+from torchsfm.geometry.intrinsic_parameters import intrinsic_labels, row_from_camera
+from torchsfm.reconstruction.calibration import Calibration
+from torchsfm.reconstruction.camera_prior import PRINCIPAL_POINT_SIGMA
 from torchsfm.reconstruction.cameras import DEFAULT_FOCAL, FOCAL_SIGMA
+from torchsfm.reconstruction.curve_deviations import Deviations, deviations
 from torchsfm.reconstruction.curve_frames import Frames, as_motion, detect_all_motion
-from torchsfm.reconstruction.curve_mapping import CurveMapping, covariance
-from torchsfm.reconstruction.curve_sequence import Expected, Settled, all_curves, map_sequence
+from torchsfm.reconstruction.curve_mapping import CurveMapping, distances
+from torchsfm.reconstruction.curve_sequence import FINE, Expected, Settled, all_curves, map_sequence
 from torchsfm.reconstruction.doubt import DEVIATIONS, GUESSED_FOCAL, WRONG_ANGLE, Standing
 from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges, scaled
 from torchsfm.reconstruction.masks import Masks
@@ -78,10 +83,15 @@ def reconstruct_from_curves(
     names = [sources.names[i] for i in readable.tolist()]
     with stages.timed("curves"):
         models = tuple(_model(one.mapping, names, size, zoom, progress) for one in settled)
-    images = _reports(sources.names, readable, found, [(one, _standing(one, expected)) for one in settled], reason)
+    known = [deviations(one.mapping, one.told) for one in settled]
+    standing = [_standing(one, own) for one, own in zip(settled, known, strict=True)]
+    images = _reports(sources.names, readable, found, list(zip(settled, standing, strict=True)), reason)
+    calibrations = tuple(_calibration(one, own, expected, zoom) for one, own in zip(settled, known, strict=True))
     none = torch.zeros(0, dtype=torch.long)
     pairs = pair_report(none.reshape(0, 2), none, none, none, none)
-    return SfmResult(models, Report(images, pairs, dict(stages.seconds), (source,), method="curves", refusal=reason))
+    seconds = dict(stages.seconds)
+    report = Report(images, pairs, seconds, (source,), calibrations=calibrations, method="curves", refusal=reason)
+    return SfmResult(models, report)
 
 
 def _expected(
@@ -97,7 +107,10 @@ def _expected(
     seen = scaled(Camera(matrix, none)[(None,)], 1 / zoom[None])[0]
     names = distortion.parameter_names
     sigma = dict.fromkeys(names, _MORE_BENT) | dict.fromkeys(names[:1], _BENT) | {"focal": FOCAL_SIGMA[source]}
-    return Expected(seen, (() if K is not None else ("focal",)) + tuple(names), sigma), source
+    if K is not None:
+        return Expected(seen, tuple(names), sigma), source
+    sigma["principal_point"] = PRINCIPAL_POINT_SIGMA * float((whole / zoom).max())
+    return Expected(seen, ("focal", *names), sigma, held=("principal_point",)), source
 
 
 def _model(
@@ -115,22 +128,38 @@ def _model(
     )  # fmt: skip
 
 
-def _standing(settled: Settled, expected: Expected) -> Standing:
+def _calibration(settled: Settled, known: Deviations, expected: Expected, zoom: Float[Tensor, "2"]) -> Calibration:
+    """How the camera was found, in pixels of the whole frames."""
+    mapping, told = settled.mapping, settled.told
+    camera = scaled(mapping.camera[(None,)], zoom[None])
+    labels = intrinsic_labels(type(camera.distortion))
+    values, names = row_from_camera(camera), tuple(name for name in labels if name not in ("aspect", "skew"))
+    f = float(camera.K[0, 0, 0])
+    unit = {"focal": f, "cx": float(zoom[0]), "cy": float(zoom[1])}
+    point = dict.fromkeys(("cx", "cy"), "principal_point")
+
+    def row(numbers: dict[str, float]) -> Tensor:
+        return values.new_tensor([[unit.get(name, 1.0) * numbers.get(point.get(name, name), 0.0) for name in names]])
+
+    before = {name: expected.sigma[name] for name in (*expected.free, *expected.held)}
+    estimated = torch.tensor([[name in told.free for name in names]])
+    values = values[:, [labels.index(name) for name in names]]
+    noise = distances(mapping)[1]
+    return Calibration(Status.OK, FINE, noise, names, values, estimated, row(known.numbers), row(before))
+
+
+def _standing(settled: Settled, known: Deviations) -> Standing:
     """How well the cameras are known, by the curves."""
     mapping = settled.mapping
     curves = mapping.curves
-    known = covariance(mapping, expected.terms())
-    variance = known.poses.diagonal(dim1=-2, dim2=-1)
     seen = torch.bincount(curves.view, minlength=len(mapping.edges))
     depth = (mapping.poses.transform(curves.X)[..., 2]).median(-1).values
     there = mapping.registered
-    rotation = torch.where(there, variance[:, :3].sum(-1).sqrt().rad2deg(), torch.inf)
-    position = torch.where(there, variance[:, 3:].sum(-1).sqrt() / depth.abs(), torch.inf)
+    rotation = torch.where(there, known.rotation, torch.inf)
+    position = torch.where(there, known.position / depth.abs(), torch.inf)
     told = settled.apart[settled.apart.isfinite()]
     contradicted = float(told.amax()) if len(told) else 0.0
-    focal, zoomed = 0.0, settled.zoomed()
-    if "focal" in expected.free:
-        focal = float(known.cameras[0, 0, 0].sqrt() / mapping.camera.K[0, 0])
+    focal, zoomed = known.numbers.get("focal", 0.0), settled.zoomed()
 
     def doubt(i: int) -> str:
         if int(seen[i]) < _FEWEST:

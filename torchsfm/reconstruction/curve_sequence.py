@@ -55,9 +55,9 @@ _NEIGHBOURS = 6
 """Frames in which curves are sought in the end."""
 _ROUGH = 5
 """Rounds of an adjustment on the way,"""
-_FINE = 10
+FINE = 10
 """and in the end."""
-_OPTIMISM = 4.0
+OPTIMISM = 4.0
 """Focal lengths by the edges of all frames are about so many times farther off than these say, in rendered sequences: what is
 wrong alike in all frames, as by shades beside edges and outlines that hardly move, none of them tells."""
 _LAST = 3
@@ -97,6 +97,8 @@ class Expected:
     """Standard deviations of these, the focal length's as a part of it."""
     turns: RelativePosePrior | None = None
     """What is known of how cameras are turned from frame to frame."""
+    held: tuple[str, ...] = ()
+    """Numbers that are not known either, but which no edges tell."""
 
     def told(self, focal: Float[Tensor, ""], sigma: float) -> "Expected":
         """The same when the focal length is found to such a part of it."""
@@ -112,7 +114,7 @@ class Expected:
 
     def beside_edges(self) -> "Expected":
         """The same with the focal length as sure, beside the edges of all frames, as it is worth."""
-        return replace(self, sigma={**self.sigma, "focal": self.sigma["focal"] / _OPTIMISM}) if "focal" in self.free else self
+        return replace(self, sigma={**self.sigma, "focal": self.sigma["focal"] / OPTIMISM}) if "focal" in self.free else self
 
     def terms(self, placed: Bool[Tensor, "v"] | None = None) -> dict[str, Any]:
         """What a bundle adjusts of the camera, and what is known of it and of frames that are placed."""
@@ -233,7 +235,7 @@ def _together(mapping: CurveMapping, frames: Frames, told: Expected, progress: P
     views, known = mapping.known, told.beside_edges()
     mapping = _anew(mapping, known, progress, rounds=_ROUGH)
     for _ in range(_LAST):
-        before, mapping = mapping, _anew(mapping, known, progress, rounds=_FINE)
+        before, mapping = mapping, _anew(mapping, known, progress, rounds=FINE)
         turned = before.poses.R[views].mT @ mapping.poses.R[views]
         moved = float(rotation_angle(turned @ turned[len(views) // 2].mT).rad2deg().amax())
         if moved < _STILL:
