@@ -131,7 +131,8 @@ def test_cameras_and_curves_without_points(tmp_path: Path, generator: torch.Gene
     assert known.names == ("focal", "cx", "cy")
     assert known.estimated.tolist() == [[True, False, False]]
     assert 0.002 * FOCAL < float(known.deviation[0, 0]) < 0.05 * FOCAL
-    assert known.deviation[0, 1:].tolist() == known.prior[0, 1:].tolist()
+    assert bool((known.deviation[0, 1:] <= known.prior[0, 1:]).all())
+    assert bool((known.deviation[0, 1:] > 0.3 * known.prior[0, 1:]).all())
     assert model.curves is not None
     assert len(model.curves) >= 6
     assert model.curve_residuals().median() < 0.3
