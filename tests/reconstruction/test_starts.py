@@ -1,6 +1,7 @@
 """From which pairs of images, and from which focal lengths, few images are begun."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,33 +16,33 @@ from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at
 
-VIEWS, POINTS, FOCAL = 4, 200, 700.0
+POINTS, FOCAL = 200, 700.0
 
 
 def quiet(done: int, total: int) -> None:
     """No progress is shown."""
 
 
-def seen(generator: torch.Generator) -> Mapping:
-    """Four images that all see all points, and a camera whose focal length is the true one."""
+def seen(generator: torch.Generator, views: int = 4) -> Mapping:
+    """Images that all see all points, and a camera whose focal length is the true one."""
     X = 2 * torch.rand(POINTS, 3, generator=generator, dtype=torch.float64) - 1
-    angle = torch.linspace(-0.5, 0.5, VIEWS, dtype=torch.float64)
+    angle = torch.linspace(-0.5, 0.5, views, dtype=torch.float64)
     centre = 5 * torch.stack((angle.sin(), 0.2 * angle.square(), -angle.cos()), -1)
     zero = torch.zeros(1, dtype=torch.float64)
     camera = Camera(intrinsics(zero + FOCAL, torch.full((1, 2), 250.0, dtype=torch.float64)), Radial(zero, zero))
-    x = camera[torch.zeros(VIEWS, dtype=torch.long)].project(
-        look_at(centre, torch.zeros_like(centre)).transform(X.expand(VIEWS, -1, -1))
+    x = camera[torch.zeros(views, dtype=torch.long)].project(
+        look_at(centre, torch.zeros_like(centre)).transform(X.expand(views, -1, -1))
     )
-    pairs = torch.combinations(torch.arange(VIEWS))
-    node = torch.arange(VIEWS * POINTS).reshape(VIEWS, POINTS)
+    pairs = torch.combinations(torch.arange(views))
+    node = torch.arange(views * POINTS).reshape(views, POINTS)
     count = torch.full((len(pairs),), POINTS)
     eye = torch.eye(3, dtype=torch.float64).repeat(len(pairs), 1, 1)
     graph = ViewGraph(
-        names=tuple(f"{i}.png" for i in range(VIEWS)),
-        image_size=torch.tensor([(501, 501)] * VIEWS),
-        x=x.flatten(0, 1) + 0.3 * torch.randn(VIEWS * POINTS, 2, generator=generator, dtype=torch.float64),
-        view=torch.arange(VIEWS).repeat_interleave(POINTS),
-        color=torch.zeros(VIEWS * POINTS, 3, dtype=torch.float64),
+        names=tuple(f"{i}.png" for i in range(views)),
+        image_size=torch.tensor([(501, 501)] * views),
+        x=x.flatten(0, 1) + 0.3 * torch.randn(views * POINTS, 2, generator=generator, dtype=torch.float64),
+        view=torch.arange(views).repeat_interleave(POINTS),
+        color=torch.zeros(views * POINTS, 3, dtype=torch.float64),
         pairs=pairs,
         num_matches=count,
         F=eye,
@@ -52,7 +53,7 @@ def seen(generator: torch.Generator) -> Mapping:
         match_pair=torch.arange(len(pairs)).repeat_interleave(POINTS),
     )
     track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
-    return Mapping.start(graph, track, camera, torch.zeros(VIEWS, dtype=torch.long))
+    return Mapping.start(graph, track, camera, torch.zeros(views, dtype=torch.long))
 
 
 @pytest.fixture
@@ -63,8 +64,8 @@ def begun(monkeypatch: pytest.MonkeyPatch) -> Callable[[Mapping, float, list[flo
         models: list[Mapping] = []
 
         def extend(model: Mapping, *_: object) -> tuple[Mapping, dict[int, str]]:
-            models.append(model)
-            return model, {}
+            models.append(replace(model, registered=torch.ones_like(model.registered)))
+            return models[-1], {}
 
         def support(model: Mapping, _: float) -> float:
             return explained[next(k for k, one in enumerate(models) if one is model)]
@@ -101,6 +102,15 @@ def test_where_starts_disagree_other_focal_lengths_are_tried(
     chosen, focal = begun(mapping, 0.05, [80.0, 81.0, 85.0, 80.5, 79.0])
     assert chosen == 85.0
     assert focal == [1.0] * 5
+
+
+def test_several_images_are_begun_until_two_models_come_to_the_best(
+    generator: torch.Generator, begun: Callable[[Mapping, float, list[float]], tuple[float, list[float]]]
+) -> None:
+    # Not of many images, and not where the focal length is known.
+    for views, sigma, best, tried in ((8, 0.6, 100.0, 4), (13, 0.6, 80.0, 1), (8, 0.05, 80.0, 1)):
+        chosen, focal = begun(seen(generator, views), sigma, [80.0, 100.0, 85.0, 99.5, 0.0])
+        assert (chosen, focal) == (best, [1.0] * tried)
 
 
 def test_few_images_come_to_one_model_whatever_was_guessed(generator: torch.Generator) -> None:

@@ -26,9 +26,11 @@ MAX_STARTS = 5
 FEW = 6
 """Of so few images a model is made from several of these, as what a start got wrong the others do not put right: a plane seen
 from the wrong side, another focal length."""
+SEVERAL = 12
+"""So it is of so many where the focal length is guessed."""
 SAME, AGREED, AGREED_OF_FEW = 0.01, 2, 3
-"""Models of starts are one where what they explain differs by this part. Starts from focal lengths that are known a little for
-each image alone are tried until two come to the best there is, of few images until three do, or all."""
+"""Models of starts are one where what they explain differs by this part. Starts of several images, and those from focal lengths
+that are known a little for each image alone, are tried until two come to the best there is, of few images until three do."""
 OTHER_FOCAL = 1.0, 0.7, 1.4
 """Where these do not come to the same, few images are begun with focal lengths of so much times those that were guessed too."""
 GLOBAL_GROWTH = 1.1
@@ -108,26 +110,25 @@ def grow_model(
     explained: list[float] = []
     available = int((~mapping.registered).sum())
     alone = torch.bincount(mapping.camera_index, minlength=len(options.focal_sigma)) == 1
-    uncertain = (alone & (options.focal_sigma > SEARCHED))[mapping.camera_index]
-    for model, pair in _starts(mapping, options, available <= FEW):
+    guessed = options.focal_sigma >= UNKNOWN_FOCAL
+    uncertain = (alone & (options.focal_sigma > SEARCHED)) | (guessed & (available <= SEVERAL))
+    few = available <= FEW
+    for model, pair in _starts(mapping, guessed, options, few):
         grown = extend_model(model, mapping.registered, options, progress)
         explained.append(support(grown[0], options.reprojection))
         most = max(explained)
         best = grown if explained[-1] == most else best
         same = sum(value > (1 - SAME) * most for value in explained)
-        if available <= FEW:
-            settled = same >= AGREED_OF_FEW
-        else:
-            enough = same >= AGREED or not bool(uncertain[pair].any())
-            settled = enough and int(grown[0].registered.sum()) > 0.5 * available
-        if settled:
+        enough = AGREED_OF_FEW if few else AGREED if bool(uncertain[mapping.camera_index[pair]].any()) else 1
+        if same >= enough and (few or int(grown[0].registered.sum()) > 0.5 * available):
             break
     return best
 
 
-def _starts(mapping: Mapping, options: MappingOptions, few: bool) -> Iterator[tuple[Mapping, Int[Tensor, "2"]]]:
-    """Models of two images, and these."""
-    unknown = options.focal_sigma >= UNKNOWN_FOCAL
+def _starts(
+    mapping: Mapping, unknown: Bool[Tensor, "g"], options: MappingOptions, few: bool
+) -> Iterator[tuple[Mapping, Int[Tensor, "2"]]]:
+    """Models of two images, and these; of few images from more than one focal length where cameras have an `unknown` one."""
     for times in OTHER_FOCAL if few and bool(unknown.any()) else OTHER_FOCAL[:1]:
         K = mapping.cameras.K.clone()
         K[unknown, :2, :2] *= times
