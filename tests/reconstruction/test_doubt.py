@@ -14,7 +14,7 @@ from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction.adjust import LOSS, adjust
-from torchsfm.reconstruction.calibration import TO_JUDGE, calibration_of, observation_weights
+from torchsfm.reconstruction.calibration import ENOUGH_OF_FEW, calibration_of, observation_weights
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.doubt import Standing, examine
@@ -425,8 +425,8 @@ def test_tracks_of_two_views_wait_for_cameras_that_longer_ones_place(generator: 
     assert float(first[open_end[problem.point]].median()) > 0.4
     assert first[long].equal(then[long])
     assert float(then[~long].median()) > 0.6
-    # It is judged by these alone.
-    judged_by = observation_weights(mapping, LOSS, enough=TO_JUDGE)
+    # Of few images it would be judged by these alone.
+    judged_by = observation_weights(mapping, LOSS, enough=ENOUGH_OF_FEW)
     assert float(judged_by[open_end[problem.point]].max()) <= 0.01
 
 

@@ -13,7 +13,7 @@ from torchsfm.bundle import bundle_adjust
 from torchsfm.bundle.bundle_adjust import BundleResult
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction.calibration import (
-    TO_PLACE,
+    ENOUGH,
     Free,
     as_expected,
     cameras_free,
@@ -134,7 +134,7 @@ def adjust_by_tracks(mapping: Mapping, prior: CameraPrior, *, tolerance: float, 
     """
     free = None if mapping.adjustment is None else mapping.adjustment.free
     for number, until in enumerate((ROUGHLY,) * (REWEIGHTED - 1) + (tolerance,)):
-        weights = observation_weights(mapping, LOSS, enough=TO_PLACE if number < WITHOUT else None)
+        weights = observation_weights(mapping, LOSS, enough=ENOUGH if number < WITHOUT else None)
         mapping = adjust(mapping, free=free, prior=prior, weights=weights, tolerance=until, **limits)
     return mapping
 

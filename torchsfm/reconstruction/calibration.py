@@ -24,9 +24,9 @@ from torchsfm.reconstruction.mapping import Adjustment, Mapping
 
 LEAST_NOISE = 0.05
 """Image points are never better than this, in pixels."""
-TO_PLACE, TO_JUDGE, NEARLY_NONE = 100, 30, 0.01
-"""Observations of long tracks by which images are placed first, and by which they are judged; what tracks of two views count
-beside so many."""
+ENOUGH, ENOUGH_OF_FEW, NEARLY_NONE = 100, 30, 0.01
+"""Observations of long tracks that determine an image by themselves, and by which few images are judged, as little else
+contradicts what is wrong there; what tracks of two views count beside so many."""
 MIN_IMAGES = 3
 """Two images leave the cameras as they were expected."""
 FAULTS = 3.0

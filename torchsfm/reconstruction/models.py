@@ -10,14 +10,14 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchsfm.reconstruction.adjust import LOSS
-from torchsfm.reconstruction.calibration import TO_JUDGE, Calibration, calibration_of, observation_weights
+from torchsfm.reconstruction.calibration import ENOUGH, ENOUGH_OF_FEW, Calibration, calibration_of, observation_weights
 from torchsfm.reconstruction.cropped import crops_of_one_plane
 from torchsfm.reconstruction.doubt import Standing, examine
 from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
 from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
 from torchsfm.reconstruction.growth import Component, Given, Growth, Wanted
 from torchsfm.reconstruction.image_reports import image_reports
-from torchsfm.reconstruction.incremental import UNKNOWN_FOCAL
+from torchsfm.reconstruction.incremental import FEW, UNKNOWN_FOCAL
 from torchsfm.reconstruction.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Progress, Report, SfmResult, pair_report
 from torchsfm.reconstruction.stages import Stages, one_thread
@@ -99,7 +99,7 @@ def _judged(component: Component, growth: Growth, graph: ViewGraph, wanted: Want
     # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
     widest = replace(options, cropped=options.cropped or component.off_centre).prior(model)
     # What few wrong matches of two views hold fast is not known: deviations are those that longer tracks leave.
-    weights = observation_weights(model, LOSS, enough=TO_JUDGE)
+    weights = observation_weights(model, LOSS, enough=ENOUGH_OF_FEW if int(model.registered.sum()) <= FEW else ENOUGH)
     standing = examine(
         model, open_numbers=wanted.free, prior=widest, threshold=threshold, weights=weights, uncertain=uncertain,
         conflicts=component.conflicts, agreement=component.agreement,
