@@ -7,14 +7,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.linalg import nearest_rotation
-from torchsfm.reconstruction.curve_deviations import deviations
+from torchsfm.reconstruction.curve_deviations import calibration, deviations
 from torchsfm.reconstruction.curve_fusion import piece_tangents
 from torchsfm.reconstruction.curve_mapping import CurveMapping, adjust, covariance, distances, register, terms, track
-from torchsfm.reconstruction.curve_sequence import OPTIMISM, Expected
+from torchsfm.reconstruction.curve_sequence import OPTIMISM, Expected, Settled
 from torchsfm.reconstruction.curves import no_curves
 from torchsfm.reconstruction.image_edges import ImageEdges
 from torchsfm.reconstruction.model_curves import Curves
@@ -118,6 +119,18 @@ def test_cameras_are_off_as_far_as_the_numbers_of_the_camera_turn_them(generator
     alone = edges.poses.diagonal(dim1=-2, dim2=-1)[:, :3].sum(-1).sqrt().rad2deg()
     stated = (told.rotation.square() - alone.square()).mean().sqrt()
     assert float(torch.stack(size).square().mean().sqrt() / stated) == pytest.approx(1.0, rel=0.5)
+
+
+def test_the_report_says_whether_cameras_stood(generator: torch.Generator) -> None:
+    X = wavy(generator)
+    mapping = track(model(X, seen(X, frames()), torch.arange(FRAMES)))
+    expected = Expected(CAMERA, ("focal",), {"focal": 0.02})
+    own, zoom = deviations(mapping, expected), torch.full((2,), 2.0, dtype=F64)
+    for moved, status in ((0.01, Status.OK), (1.0, Status.NOT_CONVERGED)):
+        found = calibration(Settled(mapping, moved, torch.zeros(FRAMES), expected), own, expected, zoom)
+        assert found.status == status
+    assert dict(zip(found.names, found.values[0].tolist(), strict=True))["focal"] == pytest.approx(1000.0)
+    assert float(found.deviation[0, 0]) == pytest.approx(1000 * own.numbers["focal"])
 
 
 def test_numbers_of_the_camera_are_known_as_before_or_by_edges(generator: torch.Generator) -> None:

@@ -6,10 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.bundle.intrinsics import free_columns
+from torchsfm.geometry.intrinsic_parameters import intrinsic_labels, row_from_camera
 from torchsfm.linalg import inverse
-from torchsfm.reconstruction.curve_mapping import CurveMapping, covariance
-from torchsfm.reconstruction.curve_sequence import OPTIMISM, Expected
+from torchsfm.reconstruction.calibration import Calibration
+from torchsfm.reconstruction.curve_mapping import CurveMapping, covariance, distances
+from torchsfm.reconstruction.curve_sequence import FINE, OPTIMISM, Expected, Settled
+from torchsfm.reconstruction.find_curves import scaled
 
 
 class Deviations(NamedTuple):
@@ -57,3 +61,30 @@ def deviations(mapping: CurveMapping, known: Expected) -> Deviations:
             along = (slope[place].square() * square[:, None]).sum(0).view_as(rest)
             rest = rest + torch.where(rest.isfinite(), along, 0)
     return Deviations(rest[:, :3].sum(-1).sqrt().rad2deg(), rest[:, 3:].sum(-1).sqrt(), numbers)
+
+
+def calibration(settled: Settled, known: Deviations, expected: Expected, zoom: Float[Tensor, "2"]) -> Calibration:
+    """How the camera was found, in pixels of the whole frames.
+
+    Args:
+        settled: The model.
+        known: How well its cameras are known.
+        expected: What was known of the camera before any frame was seen.
+        zoom: Pixels of the whole frames to one of those that were looked at.
+    """
+    mapping, told = settled.mapping, settled.told
+    camera = scaled(mapping.camera[(None,)], zoom[None])
+    labels = intrinsic_labels(type(camera.distortion))
+    values, names = row_from_camera(camera), tuple(name for name in labels if name not in ("aspect", "skew"))
+    f = float(camera.K[0, 0, 0])
+    unit = {"focal": f, "cx": float(zoom[0]), "cy": float(zoom[1])}
+    point = dict.fromkeys(("cx", "cy"), "principal_point")
+
+    def row(numbers: dict[str, float]) -> Tensor:
+        return values.new_tensor([[unit.get(name, 1.0) * numbers.get(point.get(name, name), 0.0) for name in names]])
+
+    before = {name: expected.sigma[name] for name in (*expected.free, *expected.held)}
+    estimated = torch.tensor([[name in told.free for name in names]])
+    values = values[:, [labels.index(name) for name in names]]
+    status, noise = Status.OK if settled.still else Status.NOT_CONVERGED, distances(mapping)[1]
+    return Calibration(status, FINE, noise, names, values, estimated, row(known.numbers), row(before))

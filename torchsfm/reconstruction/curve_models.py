@@ -6,16 +6,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm._types import Status
 from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
-from torchsfm.geometry.intrinsic_parameters import intrinsic_labels, row_from_camera
-from torchsfm.reconstruction.calibration import Calibration
 from torchsfm.reconstruction.camera_prior import PRINCIPAL_POINT_SIGMA
 from torchsfm.reconstruction.cameras import DEFAULT_FOCAL, FOCAL_SIGMA
-from torchsfm.reconstruction.curve_deviations import Deviations, deviations
+from torchsfm.reconstruction.curve_deviations import Deviations, calibration, deviations
 from torchsfm.reconstruction.curve_frames import Frames, as_motion, detect_all_motion
-from torchsfm.reconstruction.curve_mapping import CurveMapping, distances
-from torchsfm.reconstruction.curve_sequence import FINE, Expected, Settled, all_curves, map_sequence
+from torchsfm.reconstruction.curve_mapping import CurveMapping
+from torchsfm.reconstruction.curve_sequence import Expected, Settled, all_curves, map_sequence
 from torchsfm.reconstruction.doubt import DEVIATIONS, GUESSED_FOCAL, WRONG_ANGLE, Standing
 from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges, scaled
 from torchsfm.reconstruction.masks import Masks
@@ -86,7 +83,7 @@ def reconstruct_from_curves(
     known = [deviations(one.mapping, one.told) for one in settled]
     standing = [_standing(one, own) for one, own in zip(settled, known, strict=True)]
     images = _reports(sources.names, readable, found, list(zip(settled, standing, strict=True)), reason)
-    calibrations = tuple(_calibration(one, own, expected, zoom) for one, own in zip(settled, known, strict=True))
+    calibrations = tuple(calibration(one, own, expected, zoom) for one, own in zip(settled, known, strict=True))
     none = torch.zeros(0, dtype=torch.long)
     pairs = pair_report(none.reshape(0, 2), none, none, none, none)
     seconds = dict(stages.seconds)
@@ -126,26 +123,6 @@ def _model(
         camera_index=torch.zeros(v, dtype=torch.long), poses=mapping.poses, registered=mapping.registered,
         X=X, color=X, x=x, view=none, point=none, curves=curves,
     )  # fmt: skip
-
-
-def _calibration(settled: Settled, known: Deviations, expected: Expected, zoom: Float[Tensor, "2"]) -> Calibration:
-    """How the camera was found, in pixels of the whole frames."""
-    mapping, told = settled.mapping, settled.told
-    camera = scaled(mapping.camera[(None,)], zoom[None])
-    labels = intrinsic_labels(type(camera.distortion))
-    values, names = row_from_camera(camera), tuple(name for name in labels if name not in ("aspect", "skew"))
-    f = float(camera.K[0, 0, 0])
-    unit = {"focal": f, "cx": float(zoom[0]), "cy": float(zoom[1])}
-    point = dict.fromkeys(("cx", "cy"), "principal_point")
-
-    def row(numbers: dict[str, float]) -> Tensor:
-        return values.new_tensor([[unit.get(name, 1.0) * numbers.get(point.get(name, name), 0.0) for name in names]])
-
-    before = {name: expected.sigma[name] for name in (*expected.free, *expected.held)}
-    estimated = torch.tensor([[name in told.free for name in names]])
-    values = values[:, [labels.index(name) for name in names]]
-    noise = distances(mapping)[1]
-    return Calibration(Status.OK, FINE, noise, names, values, estimated, row(known.numbers), row(before))
 
 
 def _standing(settled: Settled, known: Deviations) -> Standing:

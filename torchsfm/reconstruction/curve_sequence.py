@@ -77,6 +77,11 @@ class Settled(NamedTuple):
     told: "Expected"
     """The camera as few frames at a time say it is."""
 
+    @property
+    def still(self) -> bool:
+        """Whether cameras stood when samples were found anew for the last time."""
+        return self.moved < _STILL
+
     def zoomed(self) -> float | None:
         """The focal length over the one that few frames at a time say; None where these do not contradict it."""
         if "focal" not in self.told.free:
