@@ -12,8 +12,7 @@ from torchsfm.geometry.distortion import Radial
 from torchsfm.reconstruction import incremental
 from torchsfm.reconstruction.incremental import MappingOptions, grow_model
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.tracks import build_tracks
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.track_graph import graph_from_tracks
 from torchsfm.simulation import look_at
 
 POINTS, FOCAL = 200, 700.0
@@ -33,26 +32,12 @@ def seen(generator: torch.Generator, views: int = 4) -> Mapping:
     x = camera[torch.zeros(views, dtype=torch.long)].project(
         look_at(centre, torch.zeros_like(centre)).transform(X.expand(views, -1, -1))
     )
-    pairs = torch.combinations(torch.arange(views))
-    node = torch.arange(views * POINTS).reshape(views, POINTS)
-    count = torch.full((len(pairs),), POINTS)
-    eye = torch.eye(3, dtype=torch.float64).repeat(len(pairs), 1, 1)
-    graph = ViewGraph(
-        names=tuple(f"{i}.png" for i in range(views)),
-        image_size=torch.tensor([(501, 501)] * views),
-        x=x.flatten(0, 1) + 0.3 * torch.randn(views * POINTS, 2, generator=generator, dtype=torch.float64),
-        view=torch.arange(views).repeat_interleave(POINTS),
-        color=torch.zeros(views * POINTS, 3, dtype=torch.float64),
-        pairs=pairs,
-        num_matches=count,
-        F=eye,
-        H=eye,
-        fundamental_inliers=count,
-        homography_inliers=torch.zeros_like(count),
-        match=torch.stack((node[pairs[:, 0]], node[pairs[:, 1]]), -1).flatten(0, 1),
-        match_pair=torch.arange(len(pairs)).repeat_interleave(POINTS),
+    x = x.flatten(0, 1) + 0.3 * torch.randn(views * POINTS, 2, generator=generator, dtype=torch.float64)
+    view, track = torch.arange(views).repeat_interleave(POINTS), torch.arange(POINTS).repeat(views)
+    names, sizes = [f"{i}.png" for i in range(views)], torch.full((views, 2), 501)
+    graph, track = graph_from_tracks(
+        names, sizes, x, view, track, torch.zeros(len(x), 3, dtype=torch.float64), generator=generator
     )
-    track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
     return Mapping.start(graph, track, camera, torch.zeros(views, dtype=torch.long))
 
 
