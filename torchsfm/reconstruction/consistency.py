@@ -53,6 +53,11 @@ class PairAgreement:
         """Pairs that do not."""
         return self.deviation < -CONFIDENT
 
+    @property
+    def explained(self) -> int:
+        """Agreeing matches of the pairs that support the model."""
+        return int(self.agreeing[self.supports].sum())
+
     def balance(self, views: int) -> Int[Tensor, "v"]:
         """Matches of the pairs that support each image's place, less those of the pairs that contradict it."""
         return self.per_view(self.supports, self.matches, views) - self.per_view(self.contradicts, self.matches, views)

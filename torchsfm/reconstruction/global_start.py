@@ -27,6 +27,7 @@ from torchsfm.reconstruction.initialize import MIN_POINTS
 from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.pair_poses import relative_poses, strongest_pairs
 from torchsfm.reconstruction.structure import complete_tracks, filter_points, triangulate_tracks
+from torchsfm.reconstruction.torn import join_torn
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import MIN_INLIERS
 
@@ -75,7 +76,7 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
         if again is None or int(again.registered.sum()) < int(model.registered.sum()):
             break
         model = again
-    model = complete(fill(model, options), options) if model is not None else None
+    model = complete(close_tears(fill(model, options), options), options) if model is not None else None
     return model if model is not None and len(model.X) >= MIN_POINTS else None
 
 
@@ -171,6 +172,21 @@ def fill(model: Mapping, options: MappingOptions) -> Mapping:
     reach = 2 * options.reprojection
     model = replace(model, track=_tracks(model, reach), X=model.X[:0], point=torch.full_like(model.point, -1))
     return triangulate_tracks(model, threshold=reach, min_angle=options.min_angle)
+
+
+def close_tears(model: Mapping, options: MappingOptions) -> Mapping:
+    """The model with its tears closed, see `join_torn`, as long as that makes more matches agree."""
+    agreement = pair_agreement(model, threshold=options.reprojection, poses_alone=True)
+    for _ in range(RETURNS):
+        joined = join_torn(model, agreement)
+        if joined is None:
+            break
+        trial = fill(tighten(joined, WIDEST, options), options)
+        tried = pair_agreement(trial, threshold=options.reprojection, poses_alone=True)
+        if tried.explained <= agreement.explained:
+            break
+        model, agreement = trial, tried
+    return model
 
 
 def complete(model: Mapping, options: MappingOptions) -> Mapping:

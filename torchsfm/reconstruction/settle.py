@@ -43,7 +43,7 @@ def settle(
             break
         trial, _ = extend_model(_without_images(model, suspect), elsewhere, options, progress)
         tried = pair_agreement(trial, threshold=options.reprojection)
-        if _support(tried) <= _support(agreement):
+        if tried.explained <= agreement.explained:
             break
         model, agreement = trial, tried
     apart = _apart(model, agreement)
@@ -52,10 +52,6 @@ def settle(
     reason = "the pairs of images that agree with its place contradict the rest of the model"
     model, _ = extend_model(_without_images(model, apart), elsewhere | apart, options, progress)
     return model, dict.fromkeys(apart.nonzero()[:, 0].tolist(), reason), None
-
-
-def _support(agreement: PairAgreement) -> int:
-    return int(agreement.agreeing[agreement.supports].sum())
 
 
 def _without_images(model: Mapping, images: Bool[Tensor, "v"]) -> Mapping:

@@ -97,6 +97,13 @@ def robust_similarity(
     return similarity, used
 
 
+def four_places(X: Float[Tensor, "n 3"]) -> Float[Tensor, "4 3"]:
+    """Four places that stand for many: their mean, and along each axis as far off as they are."""
+    mean = X.mean(0)
+    spread = (X - mean).square().mean(0).sum().sqrt()
+    return mean + spread * torch.eye(4, 3, dtype=X.dtype).roll(1, 0)
+
+
 def certainty(similarity: Similarity, X: Float[Tensor, "n 3"], Y: Float[Tensor, "n 3"], used: Bool[Tensor, "n"]) -> Certainty:
     """How well the pairs that are used determine the similarity which fits them best."""
     apart, around = (similarity.transform(X) - Y)[used], similarity.transform(X)[used]

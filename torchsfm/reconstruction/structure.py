@@ -237,3 +237,12 @@ def widest_angle(mapping: Mapping) -> Float[Tensor, "p"]:
         )
         reference = ray[farthest.clamp(max=max(len(node) - 1, 0))]
     return angle
+
+
+def point_uncertainty(mapping: Mapping) -> Float[Tensor, "p"]:
+    """How far off each point is per radian that its rays are off: the farther and the narrower the angle, the more."""
+    node = mapping.observations()
+    point = mapping.point[node]
+    depth = mapping.project(point, mapping.graph.view[node])[1]
+    total = torch.zeros_like(mapping.X[:, 0]).index_add(0, point, depth)
+    return total / torch.bincount(point, minlength=len(mapping.X)).clamp(min=1) / widest_angle(mapping).clamp(min=1e-6)

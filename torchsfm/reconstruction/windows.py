@@ -21,8 +21,8 @@ from torchsfm.reconstruction.global_start import WIDEST, complete, fill, largest
 from torchsfm.reconstruction.incremental import MappingOptions, grow_model
 from torchsfm.reconstruction.initialize import MIN_POINTS
 from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.similarities import robust_similarity
-from torchsfm.reconstruction.structure import widest_angle
+from torchsfm.reconstruction.similarities import four_places, robust_similarity
+from torchsfm.reconstruction.structure import point_uncertainty
 
 FRAMES, NEXT = 40, 25
 """Frames of a window, and from the first of one to the first of the next."""
@@ -83,17 +83,8 @@ def map_windows(mapping: Mapping, available: Bool[Tensor, "v"], options: Mapping
             Mapping.start(graph, track, mapping.cameras, mapping.camera_index[some]), options, lambda done, total: None
         )
         if grown is not None and len(grown[0].X) >= MIN_POINTS:
-            windows.append(Window(grown[0], some, nodes, _deviation(grown[0])))
+            windows.append(Window(grown[0], some, nodes, point_uncertainty(grown[0])))
     return windows
-
-
-def _deviation(model: Mapping) -> Float[Tensor, "p"]:
-    """How well points are known, up to a factor: the farther off and the narrower the angle, the worse."""
-    node = model.observations()
-    point = model.point[node]
-    depth = model.project(point, model.graph.view[node])[1]
-    total = torch.zeros_like(model.X[:, 0]).index_add(0, point, depth)
-    return total / torch.bincount(point, minlength=len(model.X)).clamp(min=1) / widest_angle(model).clamp(min=1e-6)
 
 
 def _common_cameras(windows: Sequence[Window]) -> Camera:
@@ -110,7 +101,7 @@ def _common_cameras(windows: Sequence[Window]) -> Camera:
 def _with_cameras(window: Window, cameras: Camera) -> Window:
     """The model with other cameras, which are held."""
     model = adjust(replace(window.model, cameras=cameras), tolerance=1e-5)
-    return replace(window, model=model, deviation=_deviation(model))
+    return replace(window, model=model, deviation=point_uncertainty(model))
 
 
 def join_windows(windows: Sequence[Window], nodes: int, match: Int[Tensor, "k 2"]) -> tuple[Similarity, Bool[Tensor, "w"]]:
@@ -142,7 +133,7 @@ def join_windows(windows: Sequence[Window], nodes: int, match: Int[Tensor, "k 2"
         apart = (similarity.transform(P) - Q)[used]
         edges.append(owner[some[0]])
         between.append(similarity)
-        middles.append(_places(P[used]))
+        middles.append(four_places(P[used]))
         deviations.append(apart.square().mean().sqrt() / len(apart) ** 0.5)
     if not edges:
         return _identities(len(windows), X), torch.arange(len(windows)) == int(first.diff().argmax())
@@ -155,13 +146,6 @@ def join_windows(windows: Sequence[Window], nodes: int, match: Int[Tensor, "k 2"
 
 def _identities(count: int, like: Tensor) -> Similarity:
     return Similarity(like.new_ones(count), torch.eye(3).to(like).expand(count, 3, 3), like.new_zeros(count, 3))
-
-
-def _places(X: Float[Tensor, "n 3"]) -> Float[Tensor, "4 3"]:
-    """Four places that stand for many: their mean, and along each axis as far off as they are."""
-    mean = X.mean(0)
-    spread = (X - mean).square().mean(0).sum().sqrt()
-    return mean + spread * torch.eye(4, 3, dtype=X.dtype).roll(1, 0)
 
 
 def _shared_points(
