@@ -1,6 +1,7 @@
 """Two places that look alike: which relations are distinctive, and how a folded model is put right."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction import unfold as unfolding
+from torchsfm.reconstruction.beginning import grow_by
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.distinctive import Backbone, Distinctiveness
 from torchsfm.reconstruction.doubt import examine
@@ -135,9 +137,10 @@ def test_the_backbone_passes_by_copies(generator: torch.Generator) -> None:
     assert fooled > 0
 
 
-def test_a_folded_model_is_put_right(folded: tuple[Mapping, Pose, Mapping]) -> None:
+@pytest.mark.parametrize("method", ["incremental", "global"])
+def test_a_folded_model_is_put_right(folded: tuple[Mapping, Pose, Mapping], method: str) -> None:
     empty, truth, model = folded
-    unfolded = unfold(empty, model, empty.registered, options(empty), quiet)
+    unfolded = unfold(empty, model, empty.registered, options(empty), quiet, partial(grow_by, method))
     assert unfolded.model.registered.all()
     assert wrong_cameras(unfolded.model, truth) == 0
     assert not unfolded.uncertain.any()

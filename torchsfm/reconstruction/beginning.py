@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.reconstruction.cameras import focal_uncertainty, guess_cameras
@@ -49,22 +49,19 @@ class Beginning:
         return cls(Mapping.start(graph, track, cameras, camera_index), options, source)
 
 
-def grow_by(
-    method: str, taken: Bool[Tensor, "v"], progress: Callable[[int, int], None], empty: Mapping, options: MappingOptions
-) -> Grown | None:
+def grow_by(method: str, mapping: Mapping, options: MappingOptions, progress: Callable[[int, int], None]) -> Grown | None:
     """A model as one of the mappers makes it that start from known or guessed cameras.
 
     Args:
         method: "global", "windows", or else one by one.
-        taken: Images that belong to other models and are left alone.
-        progress: Called with the number of registered images and of all.
-        empty: A mapping without images, with the cameras to start from.
+        mapping: The cameras to start from, and images that belong to other models and are left alone: those registered.
         options: How models are made.
+        progress: Called with the number of registered images and of all.
 
     Returns:
         The model, and for each image that was tried and did not fit the reason; None where there is no start.
     """
     if method not in ("global", "windows"):
-        return grow_model(replace(empty, registered=taken), options, progress)
-    placed = (global_start if method == "global" else window_start)(empty, ~taken, options)
-    return None if placed is None else extend_model(placed, taken, options, progress)
+        return grow_model(mapping, options, progress)
+    placed = (global_start if method == "global" else window_start)(mapping, ~mapping.registered, options)
+    return None if placed is None else extend_model(placed, mapping.registered, options, progress)

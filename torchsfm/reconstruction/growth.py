@@ -201,13 +201,14 @@ class Growth:
     def _from_cameras(self) -> tuple[Component, dict[int, str]] | None:
         """A model from first cameras, and why images that were tried do not fit."""
         options = self.begun.options
-        grow = partial(grow_by, self.method, self.taken, self.progress)
-        grown, self.first = self.first or grow(self.empty, options), None
+        grow = partial(grow_by, self.method, progress=self.progress)
+        empty = replace(self.empty, registered=self.taken)
+        grown, self.first = self.first or grow(empty, options), None
         if grown is None:
             return None
         off_centre = may_be_off_centre(grown[0], options)
         if off_centre:
-            cropped = map_cropped(self.empty, grown[0], self.taken, options, self.family, grow, self.progress)
+            cropped = map_cropped(empty, grown[0], self.taken, options, self.family, grow, self.progress)
             if cropped is not None:
                 (grown, options), off_centre = cropped, False
         return Component(grown[0], options, off_centre), grown[1]
@@ -233,7 +234,8 @@ class Growth:
     def _unfolded(self, component: Component) -> Component:
         """A model in which like things do not pass for the same one, as far as relations between images tell."""
         settled = component.model
-        unfolded = unfold(self.empty, settled, self.taken, component.options, self.progress)
+        grow = partial(grow_by, self.method)
+        unfolded = unfold(self.empty, settled, self.taken, component.options, self.progress, grow)
         model = unfolded.model
         self.given_up = self.given_up | (settled.registered & ~model.registered)
         # What is left is mapped without the relations that were given up.
@@ -245,5 +247,5 @@ def _settled(
     method: str, progress: Callable[[int, int], None], empty: Mapping, options: MappingOptions
 ) -> tuple[Grown, Mapping] | None:
     """The first model, and what is left of it without images that contradict it."""
-    grown = grow_by(method, empty.registered, progress, empty, options)
+    grown = grow_by(method, empty, options, progress)
     return None if grown is None else (grown, settle(grown[0], empty.registered, options, progress)[0])

@@ -15,6 +15,8 @@ from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.view_graph import ViewGraph
 
+Grow = Callable[[Mapping, MappingOptions, Callable[[int, int], None]], tuple[Mapping, dict[int, str]] | None]
+"""Makes a model of the images that are not registered, see `grow_model`."""
 ROUNDS = 3
 """Models that are made anew, each without the relations that the one before refuted."""
 
@@ -42,6 +44,7 @@ def unfold(
     elsewhere: Bool[Tensor, "v"],
     options: MappingOptions,
     progress: Callable[[int, int], None],
+    grow: Grow = grow_model,
 ) -> Unfolded:
     """Look for a better model where missing correspondences refute one, or it contradicts its most distinctive relations.
 
@@ -55,6 +58,7 @@ def unfold(
         elsewhere: Images that belong to other models and are left alone.
         options: How models are grown.
         progress: Called with the number of registered images and of all.
+        grow: Makes a model of the backbone, as the given one was made of all pairs.
 
     Returns:
         The best of the given model and the new ones: that which is refuted least and which the most distinctive pairs support.
@@ -68,7 +72,7 @@ def unfold(
     first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, distinct.weight))
     if not len(contradicted) and not first.conflicts.folded:
         return first
-    for trial in _trials(empty, distinct, elsewhere, options, progress):
+    for trial in _trials(empty, distinct, elsewhere, options, progress, grow):
         # Less than a fold is no reason to give images up.
         complete = int(trial.model.registered.sum()) >= int(best.model.registered.sum())
         better = (trial.conflicts.strength, -trial.support) < (best.conflicts.strength, -best.support)
@@ -133,13 +137,14 @@ def _trials(
     elsewhere: Bool[Tensor, "v"],
     options: MappingOptions,
     progress: Callable[[int, int], None],
+    grow: Grow,
 ) -> Iterator[Unfolded]:
     graph, weight, v = empty.graph, distinct.weight, len(empty.graph.names)
     refuted, suspected = (torch.zeros(len(graph.pairs), dtype=torch.bool) for _ in range(2))
     for _ in range(ROUNDS):
         usable = ~refuted & ~elsewhere[graph.pairs].any(1)
         backbone = Backbone.of(graph.pairs, torch.where(usable, weight, 0.0), v)
-        grown = _from_backbone(replace(empty, graph=graph.only(usable)), backbone, elsewhere, options, progress)
+        grown = _from_backbone(replace(empty, graph=graph.only(usable)), backbone, elsewhere, options, progress, grow)
         if grown is None:
             return
         conflicts = missing_correspondences(grown)
@@ -163,9 +168,10 @@ def _from_backbone(
     elsewhere: Bool[Tensor, "v"],
     options: MappingOptions,
     progress: Callable[[int, int], None],
+    grow: Grow,
 ) -> Mapping | None:
     """The model of the backbone, and then of all pairs that agree with it."""
-    grown = grow_model(replace(_with_pairs(empty, empty.graph, backbone.chosen), registered=elsewhere), options, progress)
+    grown = grow(replace(_with_pairs(empty, empty.graph, backbone.chosen), registered=elsewhere), options, progress)
     if grown is None:
         return None
     model = replace(grown[0], graph=empty.graph)
