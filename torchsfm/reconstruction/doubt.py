@@ -60,6 +60,7 @@ def examine(
     agreement: PairAgreement | None = None,
     elsewhere: Int[Tensor, "v"] | None = None,
     flat: bool = False,
+    rival: Float[Tensor, "v"] | None = None,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
@@ -74,6 +75,7 @@ def examine(
         agreement: How all pairs agree with this model where that is known; else it is found.
         elsewhere: How many verified matches each image has with images of other models.
         flat: Whether most pairs of images that seem to be cropped show little besides one plane, see `crops_of_one_plane`.
+        rival: The focal length that explains each of few images nearly as well, in pixels; not a number where none does.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -122,6 +124,8 @@ def examine(
             return "two images alone, with a guessed focal length"
         if count <= FEW and bool(guessed[i]) and not focal_sigma[i] < HARDLY:
             return "few images, which hardly determine the focal length"
+        if rival is not None and bool(rival[i].isfinite()):
+            return f"few images, which a focal length of {rival[i]:.0f} px explains nearly as well"
         if flat:
             return "the images seem to be cropped, and most pairs of them show little besides one plane"
         if not DEVIATIONS * rotation[i] < WRONG_ANGLE:

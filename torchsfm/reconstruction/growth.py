@@ -19,6 +19,7 @@ from torchsfm.reconstruction.mapping import Mapping
 from torchsfm.reconstruction.missing import Conflicts
 from torchsfm.reconstruction.projective import projective_start
 from torchsfm.reconstruction.report import ReconstructionError
+from torchsfm.reconstruction.rivals import rival_focal
 from torchsfm.reconstruction.settle import settle
 from torchsfm.reconstruction.tracks import build_tracks
 from torchsfm.reconstruction.unfold import unfold
@@ -100,6 +101,7 @@ class Component:
         uncertain: Images that hang on a relation which may be one of like things, see `unfold`.
         conflicts: What missing correspondences say of it, if that is known.
         agreement: How all pairs agree with it, if that is known.
+        rival: The focal length that explains each of few images nearly as well, see `rival_focal`.
     """
 
     model: Mapping
@@ -108,6 +110,7 @@ class Component:
     uncertain: Bool[Tensor, "v"] | None = None
     conflicts: Conflicts | None = None
     agreement: PairAgreement | None = None
+    rival: Float[Tensor, "v"] | None = None
 
     def moved(self, model: Mapping) -> "Component":
         """With a model whose cameras are elsewhere, for which what pairs and missing correspondences said does not hold."""
@@ -195,6 +198,7 @@ class Growth:
             component = replace(grown, model=model, agreement=agreement)
             if self.copies and self.method != "projective":
                 component = self._unfolded(component)
+                component = replace(component, rival=rival_focal(self.empty, component.model, component.options))
             self.taken, number = self.taken | component.model.registered, number + 1
             yield component.finished()
 

@@ -6,6 +6,7 @@ triangulated, many at a time.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import torch
@@ -113,7 +114,8 @@ def grow_model(
     guessed = options.focal_sigma >= UNKNOWN_FOCAL
     uncertain = (alone & (options.focal_sigma > SEARCHED)) | (guessed & (available <= SEVERAL))
     few = available <= FEW
-    for model, pair in _starts(mapping, guessed, options, few):
+    focals = OTHER_FOCAL if few and bool(guessed.any()) else OTHER_FOCAL[:1]
+    for model, pair in chain.from_iterable(starts(mapping, guessed, options, times) for times in focals):
         grown = extend_model(model, mapping.registered, options, progress)
         explained.append(support(grown[0], options.reprojection))
         most = max(explained)
@@ -125,23 +127,21 @@ def grow_model(
     return best
 
 
-def _starts(
-    mapping: Mapping, unknown: Bool[Tensor, "g"], options: MappingOptions, few: bool
+def starts(
+    mapping: Mapping, unknown: Bool[Tensor, "g"], options: MappingOptions, times: float = 1.0
 ) -> Iterator[tuple[Mapping, Int[Tensor, "2"]]]:
-    """Models of two images, and these; of few images from more than one focal length where cameras have an `unknown` one."""
-    for times in OTHER_FOCAL if few and bool(unknown.any()) else OTHER_FOCAL[:1]:
-        K = mapping.cameras.K.clone()
-        K[unknown, :2, :2] *= times
-        begun = replace(mapping, cameras=replace(mapping.cameras, K=K))
-        empty = Mapping.start(begun.graph, begun.track, begun.cameras, begun.camera_index)
-        unknown_focal = unknown[mapping.camera_index]
-        starts = starting_pairs(begun, unknown_focal, threshold=options.reprojection, generator=options.generator)
-        for start in starts[:MAX_STARTS]:
-            model = place_start(empty, start, threshold=options.reprojection)
-            model = adjust(model, tolerance=1e-4)
-            model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
-            if len(model.X) >= MIN_POINTS:
-                yield model, start.pair
+    """Models of two images, and these, the best first, from so many `times` the focal length where that is `unknown`."""
+    K = mapping.cameras.K.clone()
+    K[unknown, :2, :2] *= times
+    begun = replace(mapping, cameras=replace(mapping.cameras, K=K))
+    empty = Mapping.start(begun.graph, begun.track, begun.cameras, begun.camera_index)
+    pairs = starting_pairs(begun, unknown[mapping.camera_index], threshold=options.reprojection, generator=options.generator)
+    for start in pairs[:MAX_STARTS]:
+        model = place_start(empty, start, threshold=options.reprojection)
+        model = adjust(model, tolerance=1e-4)
+        model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
+        if len(model.X) >= MIN_POINTS:
+            yield model, start.pair
 
 
 def extend_model(

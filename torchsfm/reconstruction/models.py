@@ -104,6 +104,7 @@ def _judged(component: Component, growth: Growth, graph: ViewGraph, wanted: Want
         model, open_numbers=wanted.free, prior=widest, threshold=threshold, weights=weights, uncertain=uncertain,
         conflicts=component.conflicts, agreement=component.agreement,
         elsewhere=matches_across(graph, model.registered, others), flat=crops_of_one_plane(model, options),
+        rival=component.rival,
     )  # fmt: skip
     covariance = None if standing.intrinsics is None or component.off_centre else (wanted.free, standing.intrinsics)
     return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
