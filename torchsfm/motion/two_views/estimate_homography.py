@@ -15,6 +15,7 @@ from torchsfm.motion.two_views.epipolar_fit import matrices, product
 from torchsfm.motion.two_views.homography_4pt import homography_4pt
 from torchsfm.motion.two_views.normalization import common_scale, largest_positive
 from torchsfm.motion.two_views.plane_and_parallax import more_than_chance
+from torchsfm.motion.two_views.sampson_transfer import constraint, squared_distance
 from torchsfm.optim import UnitSphere
 from torchsfm.robust import Degeneracy, RansacOptions, RobustResult, Weigh, check_door, estimate_robustly
 
@@ -59,12 +60,7 @@ class HomographyEstimator:
         self, H: Float[Tensor, "*#batch 3 3"], x1: Float[Tensor, "*#batch n 2"], x2: Float[Tensor, "*#batch n 2"]
     ) -> Float[Tensor, "*batch n"]:
         """Squared Sampson distance."""
-        c0, c1, _, (s00, s01, s11), _ = _constraint(H, *x1.unbind(-1), *x2.unbind(-1))
-        # The determinant and the numerator are positive but for rounding.
-        det = (s00 * s11).addcmul_(s01, s01, value=-1).clamp_(min=1e-30)
-        first = (s11 * c0).addcmul_(s01, c1, value=-1)
-        second = (s00 * c1).addcmul_(s01, c0, value=-1)
-        return first.mul_(c0).addcmul_(second, c1).div_(det).abs_()
+        return squared_distance(H, x1, x2)
 
     def degenerate(self, x1: Float[Tensor, "*#batch 4 2"], x2: Float[Tensor, "*#batch 4 2"]) -> Bool[Tensor, "*batch"]:
         """Whether three of the points are collinear in an image, or turn the other way round in the other.
@@ -101,7 +97,7 @@ class HomographyEstimator:
         matrices.
         """
         (x, y), (u, v) = x1.unbind(-1), x2.unbind(-1)
-        c0, c1, w, (s00, s01, s11), (b00, b01, b10, b11) = _constraint(H, x, y, u, v)
+        c0, c1, w, (s00, s01, s11), (b00, b01, b10, b11) = constraint(H, x, y, u, v)
         # So large that nothing overflows, and what has no weight adds nothing.
         least = torch.finfo(c0.dtype).tiny ** (1 / 3)
         inverse = (s00 * s11).addcmul_(s01, s01, value=-1).clamp_(min=least).reciprocal_()
@@ -159,22 +155,6 @@ class HomographyEstimator:
         off, _ = line_and_plane_distances(x1, inliers)
         bad = ~more_than_chance((inliers & (off > 2 * threshold[..., None])).sum(-1), chance, -1)
         return torch.where(bad, int(Degeneracy.COLLINEAR), int(Degeneracy.NONE)).to(torch.int8)
-
-
-def _constraint(
-    H: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor
-) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """The constraint c, the depth w, S, and B row by row."""
-    h00, h01, h02, h10, h11, h12, h20, h21, h22 = H.flatten(-2).unsqueeze(-1).unbind(-2)
-    w = torch.addcmul(h22, h20, x).addcmul_(h21, y)
-    b00, b01 = torch.addcmul(h00, h20, u, value=-1), torch.addcmul(h01, h21, u, value=-1)
-    b10, b11 = torch.addcmul(h10, h20, v, value=-1), torch.addcmul(h11, h21, v, value=-1)
-    c0 = torch.addcmul(h02, h22, u, value=-1).addcmul_(b00, x).addcmul_(b01, y)
-    c1 = torch.addcmul(h12, h22, v, value=-1).addcmul_(b10, x).addcmul_(b11, y)
-    ww = w * w
-    s00, s01 = torch.addcmul(ww, b00, b00).addcmul_(b01, b01), (b00 * b10).addcmul_(b01, b11)
-    s11 = ww.addcmul_(b10, b10).addcmul_(b11, b11)
-    return c0, c1, w, (s00, s01, s11), (b00, b01, b10, b11)
 
 
 @cache

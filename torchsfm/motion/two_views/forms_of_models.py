@@ -61,6 +61,11 @@ class Forms:
         return values.reshape(*values.shape[:-2], self.count, rows.shape[-1], values.shape[-1]).unbind(-3)
 
 
+def coordinates_of_pairs(x1: Float[Tensor, "*batch 1 n 2"], x2: Float[Tensor, "*batch 1 n 2"]) -> Float[Tensor, "*batch 5 n"]:
+    """The coordinates x1, y1, x2, y2, 1 of pairs of points, once for all models."""
+    return torch.nn.functional.pad(torch.cat((x1.mT, x2.mT), -2), (0, 0, 0, 1), value=1.0)[..., 0, :, :]
+
+
 @lru_cache
 def _tables(forms: Forms, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The coordinates of the monomials; the numbers, by side, term, monomial and form; the factors of the terms."""

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.motion.two_views.epipolar_fit import apply_rows, one_data_set_for_many, product
-from torchsfm.motion.two_views.forms_of_models import ONE, Forms, Term
+from torchsfm.motion.two_views.forms_of_models import ONE, Forms, Term, coordinates_of_pairs
 from torchsfm.robust import Weigh
 
 _TINY = 1e-30
@@ -77,8 +77,7 @@ def _squared_distances(model: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
 
     In float32 the square of the gradient's length is off by about 1e-7 of the squares of the entries of F and the coordinates.
     """
-    h = torch.nn.functional.pad(torch.cat((x1.mT, x2.mT), -2), (0, 0, 0, 1), value=1.0)[..., 0, :, :]
-    e, side, size = SCORING.of(model.flatten(-2), h)
+    e, side, size = SCORING.of(model.flatten(-2), coordinates_of_pairs(x1, x2))
     return infinite_where_positive(e * e / size.clamp(min=_TINY), side)
 
 
