@@ -15,6 +15,7 @@ from torchsfm.linalg import damped_solve, determinant_3x3
 from torchsfm.motion import (
     FundamentalEstimator,
     HomographyEstimator,
+    RelativePoseEstimator,
     estimate_essential,
     estimate_fundamental,
     estimate_homography,
@@ -82,6 +83,22 @@ def test_steps_are_bounded_where_all_curvatures_vanish(kind: type, generator: to
     final, settled = optimise_fully(estimator, start, one, data, reach, counts)
     assert torch.isfinite(final).all()
     assert (loss(final)[settled] <= loss(one)[settled] * (1 + 1e-4) + 1e-9).all()
+
+
+@pytest.mark.parametrize("kind", [FundamentalEstimator, RelativePoseEstimator])
+def test_what_has_settled_is_a_minimum(kind: type, generator: torch.Generator) -> None:
+    """The next step leads nowhere, also where the Hessian was indefinite on the way, as with so many data beyond the reach."""
+    scene = make_scene(kind, (200,), 40, generator, 1e-3)
+    data, estimator = scene.data, scene.estimator
+    start = estimator.retract(scene.model, 1e-2 * torch.randn(200, kind.dimension, generator=generator, dtype=F64))  # type: ignore[attr-defined]
+    reach = squared_residual(estimator, start, *data).median(-1).values
+    counts = torch.ones(200, 40, dtype=torch.bool)
+    one, _ = step_within(estimator, start, data, reach, counts)
+    final, settled = optimise_fully(estimator, start, one, data, reach, counts)
+    again, _ = step_within(estimator, final, data, reach, counts)
+    left, first = ((b - a).flatten(1).norm(dim=-1) for a, b in ((final, again), (start, one)))
+    assert settled.sum() > 100
+    assert (left < 1e-4 * first)[settled].all()
 
 
 def test_steps_of_any_length_end_next_to_a_determinant_of_zero(generator: torch.Generator) -> None:

@@ -14,7 +14,7 @@ from torchsfm.robust.estimator import Located, is_located
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import hash_integers
 
-_GLANCE, _MANY, _MOST = 64, 25, 0.75
+_GLANCE, _MANY, _MOST = 256, 25, 0.75
 """How many data a glance looks at; how many inliers that it tells apart, or which part of all, are evidence enough."""
 _REACH = 2.0
 """How far from each other data are evidence twice, in thresholds."""

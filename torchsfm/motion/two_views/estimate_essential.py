@@ -150,7 +150,8 @@ class RelativePoseEstimator:
     ) -> Bool[Tensor, "p"]:
         """Whether the inliers agree with another pose as well: one near to a member of rank 2 in the pencil of solutions."""
         E = _unit_essential(model[..., :3], model[..., 3])
-        found = rank_two_members(E, unit_rows(d1), unit_rows(d2), inliers, 4 * threshold * threshold, sphere=True)
+        limit, spare = 4 * threshold * threshold, most_by_chance(chance, 2)
+        found, near = rank_two_members(E, unit_rows(d1), unit_rows(d2), inliers, limit, spare, sphere=True)
         rivals = poses_from_essential(found).model
 
         def rise(model: Tensor, others: Tensor, weights: Tensor) -> Tensor:
@@ -159,7 +160,8 @@ class RelativePoseEstimator:
             d = torch.cat((turn, others[..., 3] - model[..., 3]), -1)[..., None]
             return (d.mT @ A @ d)[..., 0, 0]
 
-        return rival_explains(replace(self, slack=slack), model, rivals, (d1, d2), inliers, threshold, chance, rise)
+        own = replace(self, slack=slack)
+        return rival_explains(own, model, rivals, near, (d1, d2), inliers, threshold, chance, rise)
 
 
 def estimate_essential(

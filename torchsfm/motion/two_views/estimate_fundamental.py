@@ -177,7 +177,8 @@ class FundamentalEstimator:
         """Whether the inliers agree with another F as well: one of rank 2 in the pencil of solutions."""
         F = model[..., :3]
         h1, h2 = homogeneous_rows(x1), homogeneous_rows(x2)
-        found = rank_two_members(F, h1, h2, inliers, 4 * threshold * threshold, sphere=False)
+        limit, spare = 4 * threshold * threshold, most_by_chance(chance, 2)
+        found, near = rank_two_members(F, h1, h2, inliers, limit, spare, sphere=False)
         e = with_left_epipole(found, torch.ones_like(found[..., 0]))[..., 3:]
         rivals = torch.stack([torch.cat((found, side * e), -1) for side in (1, -1)], 2)
 
@@ -191,7 +192,7 @@ class FundamentalEstimator:
             d = d[..., None] - basis @ (basis.mT @ d[..., None])
             return (d.mT @ A @ d)[..., 0, 0]
 
-        return rival_explains(self, model, rivals, (x1, x2), inliers, threshold, chance, rise)
+        return rival_explains(self, model, rivals, near, (x1, x2), inliers, threshold, chance, rise)
 
 
 def _cofactors(f: Tensor) -> Tensor:

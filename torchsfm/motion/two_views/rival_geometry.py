@@ -24,6 +24,9 @@ _PARTS, _ROUNDS, _GLANCE_ROUNDS = 8, 3, 1
 _STEPS, _SETTLED, _SHORTEST = 40, 0.01, 2.0**12
 """Most steps from a rank-2 member of the pencil to the rival; by what share of the loss one must be better, or be shortened by
 how much in vain, to be one of the last."""
+_OFF = 0.2
+"""What share of the inliers, besides those by chance, may be far from the second solution if a rival is near it: up to 5 % of
+them were in scenes on critical surfaces, in others more than this nearly always."""
 _DEVIATIONS = 3.0
 """By how many standard deviations of the difference the points must prefer the one to the other."""
 _EXACT = 1e-4
@@ -143,10 +146,15 @@ def rank_two_members(
     h2: Float[Tensor, "p 3 n"],
     inliers: Bool[Tensor, "p n"],
     limit: Float[Tensor, "p"],
+    spare: Float[Tensor, "p"],
     sphere: bool,
-) -> Float[Tensor, "p 2 3 3"]:
-    """The other two of rank 2 in the pencil of F and the second solution; where these are not real, what is nearest to them."""
-    g, _ = _second_solution(F, h1, h2, inliers, limit, sphere)
+) -> tuple[Float[Tensor, "p 2 3 3"], Bool[Tensor, "p"]]:
+    """The other two of rank 2 in the pencil of F and the second solution; where these are not real, what is nearest to them.
+
+    And whether so many points are near to the second solution that one of the two may be a rival. See `rival_suspected`.
+    """
+    g, square = _second_solution(F, h1, h2, inliers, limit, sphere)
+    near = (square > limit[:, None]).sum(-1) <= torch.add(spare, inliers.sum(-1), alpha=_OFF)
     G = g.reshape(-1, 3, 3)
     # det(a G + b F) = a (a^2 det G + a b cof(G).F + b^2 cof(F).G), as det F = 0.
     C = cofactors(G)
@@ -157,13 +165,14 @@ def rank_two_members(
     a, b = torch.stack((c2, q), -1)[..., None, None], torch.stack((q, c0), -1)[..., None, None]
     both = a * G[:, None] + b * F[:, None]
     size: Tensor = torch.linalg.matrix_norm(both, dim=(-2, -1), keepdim=True)
-    return both / size.clamp(min=_TINY)
+    return both / size.clamp(min=_TINY), near
 
 
 def rival_explains(
     estimator: Any,
     model: Float[Tensor, "p 3 4"],
     rivals: Float[Tensor, "p k sides 3 4"],
+    near: Bool[Tensor, "p"],
     data: tuple[Tensor, Tensor],
     inliers: Bool[Tensor, "p n"],
     threshold: Float[Tensor, "p"],
@@ -180,19 +189,22 @@ def rival_explains(
         estimator: Measures and refines models, its fields one of each problem.
         model: The best model.
         rivals: Where to begin: models that differ by where points are in front alone, of which the best side is meant.
+        near: Where there may be a rival: nowhere else it is looked for.
         data: The points.
         inliers: Which of them agree with the model.
         threshold: Largest distance of an inlier.
         chance: How many inliers chance explains.
         rise: By how much the quadratic model of the sum of weighted squares is larger at others: rise(model, others, weights).
     """
+    if not bool(near.any()):
+        return near
     p, k, sides = rivals.shape[:3]
     x1, x2 = (x[:, None] for x in data)
     wide, limit, inside = tensor_map(lambda t: t[:, None], estimator), (threshold * threshold)[:, None, None], inliers[:, None]
     squared = wide.squared_residual(rivals.flatten(1, 2), x1, x2)
     side = (inside & (squared < limit)).sum(-1).view(p, k, sides).argmax(-1)
     rivals = rivals.flatten(0, 1)[torch.arange(p * k, device=side.device), side.flatten()]
-    rivals = _refined(estimator, rivals, data, inliers, limit[:, 0]).view(p, k, 3, 4)
+    rivals = _refined(estimator, rivals, data, inliers, limit[:, 0], near).view(p, k, 3, 4)
     own = torch.where(inliers, wide.squared_residual(model[:, None], x1, x2)[:, 0], 0.0)
     squared = wide.squared_residual(rivals, x1, x2)
     agree = inside & (squared < limit)
@@ -206,7 +218,7 @@ def rival_explains(
     rounding = (_EXACT * threshold).square() * inliers.sum(-1)
     as_well = more.sum(-1) < _DEVIATIONS * more.square().sum(-1).sqrt() + rounding[:, None]
     other = rise(model[:, None], rivals, agree.to(squared.dtype)) > _APART**2 * variance[:, None]
-    found: Tensor = (enough & as_well & other).any(-1)
+    found: Tensor = near & (enough & as_well & other).any(-1)
     return found
 
 
@@ -216,13 +228,16 @@ def _refined(
     data: tuple[Tensor, Tensor],
     inliers: Bool[Tensor, "p n"],
     limit: Float[Tensor, "p 1"],
+    near: Bool[Tensor, "p"],
 ) -> Float[Tensor, "r 3 4"]:
     """Robust Gauss-Newton steps, shorter ones where whole ones lead uphill: rivals that nearly are one are hardly determined.
 
     Each goes on until it settles, whatever becomes of the others; those of a problem stand together.
     """
-    found, row = models.clone(), torch.arange(len(models), device=models.device)
-    some = tensor_map(lambda t: t[row // (len(models) // len(inliers))], (estimator, *data, inliers, limit))
+    each = len(models) // len(inliers)
+    found, row = models.clone(), near.repeat_interleave(each).nonzero()[:, 0]
+    some = tensor_map(lambda t: t[row // each], (estimator, *data, inliers, limit))
+    models = models[row]
     one = torch.ones_like(models[:, 0, 0])
     state = models, models, one * torch.inf, one, one > 0
     for _ in range(_STEPS):
