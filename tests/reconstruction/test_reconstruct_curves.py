@@ -6,12 +6,17 @@ import pytest
 import torch
 from painted_box import FOCAL, SIZE, camera, orbit, photograph, true_curves
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchsfm.bundle import bundle_adjust_model
 from torchsfm.geometry import Camera, Similarity, project_points, random_rotation
+from torchsfm.geometry.cameras import intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction import Curves, Reconstruction, reconstruct_curves
+from torchsfm.simulation import look_at, render_sequence
+from torchsfm.simulation.surfaces import Sphere
+from torchsfm.simulation.textured_scene import TexturedScene, texture_surface
 
 VIEWS = 12
 PIXEL = 6.5 / FOCAL
@@ -142,3 +147,22 @@ def test_wrong_arguments(unchecked: None, images: list[Tensor]) -> None:
         reconstruct_curves(images, Camera(camera(1).K), orbit(VIEWS))
     with pytest.raises(ValueError, match="threshold"):
         reconstruct_curves(images, camera(VIEWS), orbit(VIEWS), threshold=0.0)
+
+
+def test_edges_are_not_those_of_what_hides_a_curve_nor_of_the_rim(generator: torch.Generator) -> None:
+    """A painted ball from all around: on its rim every curve runs along the outline, and lies a little inside of it."""
+    views, size, radius, middle = 16, 200, 6.0, torch.zeros(3, dtype=torch.float64)
+    ball = texture_surface(Sphere(middle, radius), "curves", texel=0.06, generator=generator)
+    around = torch.arange(views, dtype=torch.float64) * (2 * torch.pi / views)
+    out = torch.stack((around.cos(), around.sin(), 0.6 * (3 * around).sin()), -1)
+    poses = look_at(4 * radius * normalize(out, dim=-1), middle)
+    K = intrinsics(torch.tensor(325.0, dtype=torch.float64), torch.full((2,), (size - 1) / 2, dtype=torch.float64))
+    scene = TexturedScene((ball,), torch.tensor([0.0, 0.0, 1.0]), ambient=1.0)
+    shown = render_sequence(
+        scene, poses=poses, camera=Camera(K), width=size, height=size, noise=0.01, points=1, generator=generator
+    )
+    found = reconstruct_curves(list(shown.images), Camera(K.repeat(views, 1, 1)), poses)
+    X = found.X[found.sample]
+    facing = (normalize(poses.centre[found.view] - X, dim=-1) * normalize(X, dim=-1)).sum(-1)
+    assert len(found.X) > 150
+    assert (facing < 0).double().mean() < 0.15

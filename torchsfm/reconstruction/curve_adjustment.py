@@ -28,7 +28,7 @@ class WithCurves(NamedTuple):
 
 
 def adjust_with_curves(
-    mapping: Mapping, curves: Curves, prior: CameraPrior | None, lines: Lines | None = None
+    mapping: Mapping, curves: Curves, prior: CameraPrior | None, lines: Lines | None = None, *, alone: Mapping | None = None
 ) -> WithCurves | None:
     """Adjust cameras, points, lines and curves together; of the cameras what the last adjustment of points did.
 
@@ -37,10 +37,11 @@ def adjust_with_curves(
     beside few. Both are measured again after a first adjustment, as what cameras are off passes for noise of edges before.
 
     Args:
-        mapping: The model, at the minimum of its points.
+        mapping: The model.
         curves: Its curves, with edge points in pixels of its images.
         prior: What is expected of its cameras, where something of them is estimated.
         lines: Its lines, if it has any.
+        alone: The model at the minimum of its points, without curves; `mapping` if not given.
 
     Returns:
         All of them after the adjustment; None where no edge shows a curve, or where points contradict the cameras
@@ -51,7 +52,7 @@ def adjust_with_curves(
     moved = WithCurves(mapping, lines, curves)
     for tolerance in (ROUGHLY, TOLERANCE):
         moved = _adjusted(moved, prior, tolerance)
-    return moved if points_agree(mapping, moved.mapping) else None
+    return moved if points_agree(alone or mapping, moved.mapping) else None
 
 
 def _adjusted(model: WithCurves, prior: CameraPrior | None, tolerance: float) -> WithCurves:

@@ -34,6 +34,8 @@ class FusedCurves(NamedTuple):
     """Of which sample of the pieces it is the mean with those near."""
     sigma: Float[Tensor, "n"]
     closed: Bool[Tensor, "c"]
+    finders: Int[Tensor, "f 2"]
+    """Samples, and images in which they were found; one more than once where more of its samples are near."""
 
 
 def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCurves:
@@ -62,8 +64,8 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
     other = pieces.image[a] != pieces.image[b]
     images = 1 + count_different(a[other], pieces.image[b[other]], n)
     order = a.argsort(stable=True)
-    b = b[order]
-    first = torch.searchsorted(a[order], torch.arange(n + 1, device=X.device))
+    a, b = a[order], b[order]
+    first = torch.searchsorted(a, torch.arange(n + 1, device=X.device))
     runs = list(_once(pieces.piece, images >= least_images, first, b, shortest))
     links = _links([X[r] for r in runs], _GAP * scale)
     parts, closed = [], []
@@ -71,6 +73,8 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
         parts.append(torch.cat([runs[i] if forwards else runs[i].flip(0) for i, forwards in chain]))
         closed.append(around)
     index = torch.cat(parts) if parts else torch.zeros(0, dtype=torch.long, device=X.device)
+    place = torch.full((n,), -1, device=X.device).index_copy(0, index, torch.arange(len(index), device=X.device))
+    near = torch.cat((torch.stack((place[index], pieces.image[index]), -1), torch.stack((place[a], pieces.image[b]), -1)))
     curve = torch.repeat_interleave(torch.arange(len(parts)), torch.tensor([len(p) for p in parts], dtype=torch.long))
     return FusedCurves(
         X[index],
@@ -79,6 +83,7 @@ def fuse_pieces(pieces: Pieces, *, least_images: int, shortest: int) -> FusedCur
         index,
         pieces.sigma[index],
         torch.tensor(closed, dtype=torch.bool, device=X.device),
+        near[near[:, 0] >= 0],
     )
 
 

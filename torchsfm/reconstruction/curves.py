@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
@@ -155,14 +155,20 @@ def curves_of_edges(
         no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
-    return _shown_by(curves, kept, maps, cameras, poses, threshold)
+    place = torch.empty_like(moved).scatter_(0, moved, torch.arange(len(moved), device=like.device))
+    found = place[fused.finders[:, 0]] * v + fused.finders[:, 1]
+    return _shown_by(curves, found, kept, maps, cameras, poses, threshold)
 
 
 def curves_of_other_cameras(
     curves: Curves, edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera, poses: Pose, *, threshold: float = 2.0
 ) -> Curves:
-    """What `curves_of_edges` found, where cameras have changed a little since: shown by the edges that are near now."""
-    return _shown_by(curves, *_seen_by(edges, size, cameras), cameras, poses, threshold)
+    """What `curves_of_edges` found, where cameras have changed a little since: shown by the edges that are near now.
+
+    Arguments are those of `curves_of_edges`, and the curves with the edges that showed them before.
+    """
+    shown = curves.sample * len(edges) + curves.view
+    return _shown_by(curves, shown, *_seen_by(edges, size, cameras), cameras, poses, threshold)
 
 
 def _seen_by(edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera) -> tuple[list[ImageEdges], MapsOfImages]:
@@ -172,14 +178,28 @@ def _seen_by(edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera
 
 
 def _shown_by(
-    curves: Curves, edges: Sequence[ImageEdges], maps: MapsOfImages, cameras: Camera, poses: Pose, threshold: float
+    curves: Curves,
+    found: Int[Tensor, "f"],
+    edges: Sequence[ImageEdges],
+    maps: MapsOfImages,
+    cameras: Camera,
+    poses: Pose,
+    threshold: float,
 ) -> Curves:
-    """The curves at the least squares of all edges that run along them, with these edges."""
+    """The curves at the least squares of the edges that run along them, with these edges.
+
+    Only of images whose own edges led there, `found` (number of the sample times that of all images, and the image). Elsewhere
+    samples are behind something, next to its edges by chance, or on the rim of what is round, where every curve runs along the
+    outline and lies inside of it: a third of all edges of smooth objects, and off alike.
+    """
     P = cameras.K.double() @ poses.matrix().double()
-    curves = track_samples(curves, curves.tangents(), edges, maps, P, threshold)
-    curves = settle_samples(curves, cameras, poses, threshold)
-    # What edges no longer run along is left behind.
-    curves = track_samples(curves, curves.tangents(), edges, maps, P, threshold)
+
+    def tracked(curves: Curves) -> Curves:
+        near = track_samples(curves, curves.tangents(), edges, maps, P, threshold)
+        return near.seen_where(torch.isin(near.sample * len(edges) + near.view, found))
+
+    # After they have moved, what edges no longer run along is left behind.
+    curves = tracked(settle_samples(tracked(curves), cameras, poses, threshold))
     return measured_weights(curves, edge_distances(poses, cameras, curves.bundle()))
 
 

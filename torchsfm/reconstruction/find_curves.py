@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.geometry import Camera, Pose
+from torchsfm.geometry import Camera, Pose, rotation_angle
 from torchsfm.images import ImageError, read_image
 from torchsfm.reconstruction.camera_prior import CameraPrior
 from torchsfm.reconstruction.curve_adjustment import WithCurves, adjust_with_curves
@@ -27,6 +27,10 @@ EDGE_SIZE = 1000
 """Longer side, in pixels, to which larger images are scaled down: they have more edges, each with more depths to look at."""
 SHORTEST = 16
 """Edge points of the shortest chains."""
+_ROUNDS = 3
+"""Times, the most, that cameras are adjusted and samples then brought to the edges by these,"""
+_STILL = 0.1
+"""as images move by more pixels."""
 
 
 @dataclass(frozen=True)
@@ -125,14 +129,29 @@ def find_curves(
 
     points = mapping.X[_seen(mapping)]
     curves = curves_of_edges(edges, height_width, *placed(mapping), points=points, progress=progress)
-    whole = curves.in_images(known, zoom)
-    better = adjust_with_curves(mapping, whole, prior, lines if lines_agree else None)
-    if better is None:
-        return WithCurves(mapping, lines, whole)
-    if lines is not None and not lines_agree:
-        better = better._replace(lines=lines_of_cameras(better.mapping, lines))
-    curves = curves_of_other_cameras(better.curves, edges, height_width, *placed(better.mapping))
-    return WithCurves(better.mapping, better.lines, curves.in_images(known, zoom))
+    best = WithCurves(mapping, lines, curves.in_images(known, zoom))
+    for _ in range(_ROUNDS):
+        before = best.mapping
+        better = adjust_with_curves(before, best.curves, prior, best.lines if lines_agree else None, alone=mapping)
+        if better is None:
+            break
+        # Samples were brought to their edges with cameras that were off, which holds these where they were.
+        curves = curves_of_other_cameras(replace(curves, X=better.curves.X), edges, height_width, *placed(better.mapping))
+        best = WithCurves(better.mapping, better.lines if lines_agree else lines, curves.in_images(known, zoom))
+        if _shift(before, best.mapping) < _STILL:
+            break
+    if lines is not None and not lines_agree and best.mapping is not mapping:
+        best = best._replace(lines=lines_of_cameras(best.mapping, lines))
+    return best
+
+
+def _shift(before: Mapping, after: Mapping) -> float:
+    """By how many pixels images have moved, the most, as their cameras have turned to each other."""
+    own = after.registered
+    turn = before.poses.R[own].mT @ after.poses.R[own]
+    # What is alike in all is a turn of the world.
+    apart = rotation_angle(turn @ turn[:1].mT)
+    return float((apart * after.cameras.K[after.camera_index[own], 0, 0]).amax())
 
 
 def scaled(cameras: Camera, share: Float[Tensor, "v 2"]) -> Camera:
