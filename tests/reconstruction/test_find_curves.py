@@ -1,6 +1,7 @@
 """Cameras by points and curves together: few points and the edges of photographs of a box, and edges that contradict points."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -81,19 +82,34 @@ def silent(stage: str, done: int, total: int) -> None:
     """Says nothing."""
 
 
-def test_curves_place_cameras_that_few_points_place_badly(seen: Seen, generator: torch.Generator) -> None:
-    before, after, by_those, by_these = [], [], [], []
+def test_curves_place_cameras_that_few_points_place_badly(
+    seen: Seen, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Adjusted once, samples are still where cameras that were off had them: 0.6 of the errors are left, 0.2 to 0.7 later."""
+    steps: list[WithCurves] = []
+
+    def watched(*args: Any, **options: Any) -> WithCurves | None:
+        moved = adjust_with_curves(*args, **options)
+        assert moved is not None
+        steps.append(moved)
+        return moved
+
+    monkeypatch.setattr("torchsfm.reconstruction.find_curves.adjust_with_curves", watched)
+    before, once, after, by_those, by_these = [], [], [], [], []
     for _ in range(2):
         model = with_points(12, 0.2, generator)
+        steps.clear()
         better = find_curves(model, seen.found(), None, silent)
         assert better.mapping is not model
         before.append(turned(model.poses).mean())
+        once.append(turned(steps[0].mapping.poses).mean())
         after.append(turned(better.mapping.poses).mean())
         # The curves are those of the new cameras.
         curves = better.curves.bundle()
         by_those.append(edge_distances(model.poses, camera(VIEWS), curves).abs().median())
         by_these.append(edge_distances(better.mapping.poses, camera(VIEWS), curves).abs().median())
-    assert sum(after) < 0.95 * sum(before)
+    assert sum(once) < 0.95 * sum(before)
+    assert sum(after) < 0.85 * sum(once)
     assert sum(by_these) < 0.95 * sum(by_those)
 
 
