@@ -118,9 +118,16 @@ def curves_of_edges(
     neighbours: int = 10,
     threshold: float = 2.0,
     least_images: int = 3,
+    finders_alone: bool = False,
     progress: Progress,
 ) -> Curves:
-    """`reconstruct_curves` from the edges of images, of which `size` is the largest height and width."""
+    """`reconstruct_curves` from the edges of images, of which `size` is the largest height and width.
+
+    With `finders_alone` samples are shown by images alone whose own edges led there, for cameras that are to be adjusted by
+    them. Elsewhere samples are behind something, next to its edges by chance, or on the rim of what is round, where every curve
+    runs along the outline and lies inside of it: a third of all edges of smooth objects, and off alike. Where cameras are right
+    already, samples are somewhat better by all edges.
+    """
     v = len(edges)
     kept, maps = _seen_by(edges, size, cameras)
     P = cameras.K.double() @ poses.matrix().double()
@@ -155,8 +162,10 @@ def curves_of_edges(
         no_curves(like), X=X.to(like), curve=curve[moved], closed=fused.closed[order], color=color.to(like),
         sigma=fused.sigma[moved].to(like),
     )  # fmt: skip
-    place = torch.empty_like(moved).scatter_(0, moved, torch.arange(len(moved), device=like.device))
-    found = place[fused.finders[:, 0]] * v + fused.finders[:, 1]
+    found = None
+    if finders_alone:
+        place = torch.empty_like(moved).scatter_(0, moved, torch.arange(len(moved), device=like.device))
+        found = place[fused.finders[:, 0]] * v + fused.finders[:, 1]
     return _shown_by(curves, found, kept, maps, cameras, poses, threshold)
 
 
@@ -165,7 +174,7 @@ def curves_of_other_cameras(
 ) -> Curves:
     """What `curves_of_edges` found, where cameras have changed a little since: shown by the edges that are near now.
 
-    Arguments are those of `curves_of_edges`, and the curves with the edges that showed them before.
+    Images that did not show a sample before do not show it now.
     """
     shown = curves.sample * len(edges) + curves.view
     return _shown_by(curves, shown, *_seen_by(edges, size, cameras), cameras, poses, threshold)
@@ -179,7 +188,7 @@ def _seen_by(edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera
 
 def _shown_by(
     curves: Curves,
-    found: Int[Tensor, "f"],
+    found: Int[Tensor, "f"] | None,
     edges: Sequence[ImageEdges],
     maps: MapsOfImages,
     cameras: Camera,
@@ -188,15 +197,13 @@ def _shown_by(
 ) -> Curves:
     """The curves at the least squares of the edges that run along them, with these edges.
 
-    Only of images whose own edges led there, `found` (number of the sample times that of all images, and the image). Elsewhere
-    samples are behind something, next to its edges by chance, or on the rim of what is round, where every curve runs along the
-    outline and lies inside of it: a third of all edges of smooth objects, and off alike.
+    If given, those alone that `found` tells: number of the sample times that of all images, and the image.
     """
     P = cameras.K.double() @ poses.matrix().double()
 
     def tracked(curves: Curves) -> Curves:
         near = track_samples(curves, curves.tangents(), edges, maps, P, threshold)
-        return near.seen_where(torch.isin(near.sample * len(edges) + near.view, found))
+        return near if found is None else near.seen_where(torch.isin(near.sample * len(edges) + near.view, found))
 
     # After they have moved, what edges no longer run along is left behind.
     curves = tracked(settle_samples(tracked(curves), cameras, poses, threshold))

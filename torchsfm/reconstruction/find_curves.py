@@ -128,7 +128,7 @@ def find_curves(
         return scaled(model.cameras[model.camera_index[known]], 1 / zoom), model.poses[known]
 
     points = mapping.X[_seen(mapping)]
-    curves = curves_of_edges(edges, height_width, *placed(mapping), points=points, progress=progress)
+    curves = curves_of_edges(edges, height_width, *placed(mapping), points=points, finders_alone=True, progress=progress)
     best = WithCurves(mapping, lines, curves.in_images(known, zoom))
     for _ in range(_ROUNDS):
         before = best.mapping
