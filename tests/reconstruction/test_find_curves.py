@@ -206,3 +206,16 @@ def test_no_edges_change_nothing(generator: torch.Generator) -> None:
     same = find_curves(model, found, None, silent)
     assert same.mapping is model
     assert len(same.curves) == 0
+
+
+def test_samples_that_few_edges_hold_stay_beside_the_others(seen: Seen, generator: torch.Generator) -> None:
+    """Two images next to each other alone show every tenth sample, by edges a fifth of a pixel to either side."""
+    model, curves = with_points(40, 0.1, generator), seen.curves
+    number = curves.support()
+    rank = torch.arange(len(curves.x)) - (number.cumsum(0) - number)[curves.sample]
+    lone = curves.sample % 10 == 5
+    aside = torch.where(lone & (rank % 2 > 0), 0.2, torch.where(lone, -0.2, 0.0))
+    few = replace(curves, x=curves.x + aside[:, None] * curves.normal).seen_where(~lone | (rank < 2))
+    moved = adjust_with_curves(model, few, None)
+    assert moved is not None
+    assert ((moved.curves.X - curves.X).norm(dim=-1) / curves.sigma).max() < 2.5

@@ -1,6 +1,9 @@
 """Cameras by points, lines and curves together: edge points count by what is measured of them, and only where points agree."""
 
+from dataclasses import replace
 from typing import NamedTuple
+
+import torch
 
 from torchsfm.bundle import BundleCurves, bundle_adjust
 from torchsfm.bundle.curves import edge_distances
@@ -17,6 +20,10 @@ TOLERANCE = 1e-5
 """Relative decrease of the cost at which the last adjustment ends; samples slide on for long, and gain nothing."""
 MOST_STEPS = 50
 """Of each adjustment."""
+_AROUND = 4
+"""Samples on either side that tell how a sample moves where its edges hardly do,"""
+_ASIDE = 2.0
+"""that is, where it would move by more pixels otherwise."""
 
 
 class WithCurves(NamedTuple):
@@ -75,4 +82,18 @@ def _adjusted(model: WithCurves, prior: CameraPrior | None, tolerance: float) ->
     assert isinstance(samples, BundleCurves), "given"
     if lines is not None and others:
         lines = lines.adjusted(others[0])  # type: ignore[arg-type]
-    return WithCurves(as_adjusted(mapping, result, free, prior), lines, curves.adjusted(samples))
+    return WithCurves(as_adjusted(mapping, result, free, prior), lines, _together(curves, curves.adjusted(samples)))
+
+
+def _together(before: Curves, after: Curves) -> Curves:
+    """The curves after an adjustment, with samples that few edges hold moved as those beside them.
+
+    By themselves they fly off along what holds them in no image, and leave spikes.
+    """
+    own = torch.arange(len(before.X), device=before.X.device)
+    beside = (own[:, None] + torch.arange(-_AROUND, _AROUND + 1, device=own.device)).clamp(0, max(len(own) - 1, 0))
+    same = before.curve[beside] == before.curve[:, None]
+    move = after.X - before.X
+    around = torch.where(same[..., None], move[beside], torch.nan).nanmedian(1).values
+    aside = torch.linalg.vector_norm(move - around, dim=-1) > _ASIDE * before.sigma
+    return replace(after, X=torch.where(aside[:, None], before.X + around, after.X))
