@@ -35,7 +35,7 @@ from torchsfm.autocalibration import (
 from torchsfm.bundle import bundle_adjust
 from torchsfm.geometry import BrownConrady, BundleProblem, Camera, NoDistortion, Pose, Radial
 from torchsfm.reconstruction import reconstruct, reconstruct_tracks
-from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.tensors import bifocal_tensors
 
 IMAGE = (float(SIZE[0]), float(SIZE[1]))

@@ -21,7 +21,7 @@ from torchsfm.formats import write_curves
 from torchsfm.geometry import Camera, Pose, krt_from_camera
 from torchsfm.images import ImageError, read_image
 from torchsfm.reconstruction import Curves, reconstruct_curves
-from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
 
 Array = NDArray[np.float64]
 STEP, CELLS = 0.005, 256

@@ -35,7 +35,7 @@ from torchsfm.reconstruction import (
     saved_features,
     triangulate_photographs,
 )
-from torchsfm.reconstruction.evaluation import align_poses, pose_auc, pose_errors, position_rmse
+from torchsfm.reconstruction.model.evaluation import align_poses, pose_auc, pose_errors, position_rmse
 
 HEAD = """
 | model | images | points | error, px | AUC at 1 / 2 / 5 deg | position, RMS mm | rotation, mean deg |

@@ -15,7 +15,7 @@ import torch
 from bench.real_data import SETS, PhotographSet, data_folder
 from torchsfm import reconstruct
 from torchsfm.geometry import Pose
-from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.model.evaluation import pose_errors
 
 WRONG, RIGHT = 5.0, 2.0
 """Degrees from which on an image that is not doubted is silently wrong, and up to which one that is doubted is right."""

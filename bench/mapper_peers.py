@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph
+from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
 
 HALF = 0.5
 """COLMAP puts the centre of the first pixel at (0.5, 0.5)."""

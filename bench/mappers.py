@@ -37,14 +37,14 @@ from bench.real_data import SETS, PhotographSet, data_folder
 from bench.scale import FEATURES, render, ring
 from bench.view_graphs import FAMILIES, look_around
 from torchsfm.geometry import Pose
-from torchsfm.reconstruction.evaluation import pose_auc, pose_errors
-from torchsfm.reconstruction.growth import Given, Wanted
-from torchsfm.reconstruction.image_points import ImagePoints
+from torchsfm.reconstruction.mappers.growth import Given, Wanted
+from torchsfm.reconstruction.matching.image_points import ImagePoints
+from torchsfm.reconstruction.matching.stages import Stages
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.model.evaluation import pose_auc, pose_errors
 from torchsfm.reconstruction.models import build_models
 from torchsfm.reconstruction.photographs import NEIGHBOURS, match_photographs
-from torchsfm.reconstruction.stages import Stages
-from torchsfm.reconstruction.track_graph import graph_from_tracks
-from torchsfm.reconstruction.view_graph import ViewGraph
 
 Row = dict[str, Any]
 MAPPERS = ("incremental", "global")

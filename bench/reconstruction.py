@@ -160,7 +160,7 @@ def judge(result: Result, photographs: PhotographSet) -> Result:
     if not photographs.poses:
         return {}
     from torchsfm.geometry.poses import Pose
-    from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_rmse
+    from torchsfm.reconstruction.model.evaluation import pose_auc, pose_errors, position_rmse
 
     names = [path.name for path in photographs.paths]
     nothing = np.eye(3, 4)

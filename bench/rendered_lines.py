@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from torchsfm import orbit_poses, render_sequence
-from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
-from torchsfm.reconstruction.lines import Lines
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.segments import detect_all_segments
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.lines.find_lines import FoundSegments, find_lines
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.segments import detect_all_segments
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.model.lines import Lines
 from torchsfm.simulation import RenderedSequence
 
 VIEWS, WIDTH, HEIGHT, NOISE = 12, 960, 720, 0.2

@@ -109,7 +109,7 @@ def photographs(views: int, method: str) -> Row:
 def simulated(views: int) -> Row:
     """Retrieval among features of a long street, in which each image shares most with those near it."""
     from torchsfm.images import Features, retrieve_pairs
-    from torchsfm.reconstruction.match_all import PairShards
+    from torchsfm.reconstruction.matching.match_all import PairShards
 
     each = 100
     world = torch.randint(0, 100, (views * each // 10, 128), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
@@ -141,7 +141,7 @@ def simulated(views: int) -> Row:
 def recall(views: int) -> Row:
     """The share of the pairs that verification finds related among all, that are among the k most alike of either image."""
     from torchsfm.images import describe_images
-    from torchsfm.reconstruction import match_all
+    from torchsfm.reconstruction.matching import match_all
     from torchsfm.reconstruction.photographs import match_photographs
 
     with tempfile.TemporaryDirectory() as folder:

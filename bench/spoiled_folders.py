@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bench.real_data import SETS, data_folder
 from torchsfm.geometry.poses import Pose
 from torchsfm.reconstruction import reconstruct
-from torchsfm.reconstruction.evaluation import pose_auc, pose_errors
+from torchsfm.reconstruction.model.evaluation import pose_auc, pose_errors
 
 Image = NDArray[np.uint8]
 LARGE = 1000

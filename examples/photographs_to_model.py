@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from torchsfm.reconstruction import reconstruct
-from torchsfm.reconstruction.evaluation import align_reconstruction, pose_errors
+from torchsfm.reconstruction.model.evaluation import align_reconstruction, pose_errors
 from torchsfm.simulation import RenderedSequence, courtyard_scene, orbit_poses, render_sequence
 
 

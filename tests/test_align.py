@@ -11,7 +11,7 @@ from command_line import assert_one_line, torchsfm
 from torchsfm._types import Status
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, Similarity, intrinsics, random_rotation
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.alignment import ControlPoints, align_models, align_to_points
+from torchsfm.reconstruction.model.alignment import ControlPoints, align_models, align_to_points
 from torchsfm.simulation import look_at, random_points
 
 F64 = torch.float64

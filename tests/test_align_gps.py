@@ -13,10 +13,10 @@ from test_align import control, make
 from torchsfm.geometry import Camera, Pose, Similarity, geodetic_from_enu, random_rotation, rotation_from_rotvec
 from torchsfm.images import parse_exif
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.alignment import align_to_points, align_to_positions
-from torchsfm.reconstruction.control import adjust_to_points
-from torchsfm.reconstruction.gps import align_to_gps
-from torchsfm.reconstruction.upright import align_to_ground, align_upright
+from torchsfm.reconstruction.model.alignment import align_to_points, align_to_positions
+from torchsfm.reconstruction.model.control import adjust_to_points
+from torchsfm.reconstruction.model.gps import align_to_gps
+from torchsfm.reconstruction.model.upright import align_to_ground, align_upright
 from torchsfm.simulation import look_at
 
 F64 = torch.float64

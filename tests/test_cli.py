@@ -30,7 +30,7 @@ from torchsfm.cli.results import VERSION
 from torchsfm.formats import read_lines, read_ply
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.stages import saved_stages
+from torchsfm.reconstruction.matching.stages import saved_stages
 from torchsfm.simulation import look_at
 
 

@@ -14,7 +14,7 @@ from full_disk import full_disk
 from torchsfm.formats import read_colmap
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import printable
+from torchsfm.reconstruction.messages import printable
 
 NAMES = ("1 caf\udce9.png", "2 <img src=x onerror=alert(1)>|.png", "3 new\nline \x1b[31m.png")
 

@@ -19,7 +19,7 @@ from bench import kills
 from bench.kills import shards, workers
 from torchsfm.cli import ranks
 from torchsfm.cli.ranks import Started
-from torchsfm.reconstruction.stages import saved_stages
+from torchsfm.reconstruction.matching.stages import saved_stages
 
 KILLS = 20
 LAST = {"features": 1, "pairs": 5, "match": 6, "overlays": 7, "verify": 8, "map": 9}

@@ -29,6 +29,12 @@ ALLOWED: dict[str, set[str]] = {
     "formats": {"linalg", "geometry", "images", "reconstruction"},
     "plot": {"linalg", "geometry", "tensors", "images", "reconstruction"},
 }  # fmt: skip
+INSIDE = {
+    "reconstruction": (
+        "messages", "model", "matching", "mapping", "evidence", "mappers", "lines", "curves", "merging",
+    ),
+}  # fmt: skip
+"""Large rooms are divided: each part may import from those before it, and the doors, which stand beside the parts, from all."""
 FREE = {"__init__", "cli", "__main__"}
 LAZY = {"kornia", "cv2", "matplotlib"}
 """Slow or optional packages, imported inside the functions that use them, and only in the rooms named below."""
@@ -65,6 +71,20 @@ def imported_modules(tree: ast.AST) -> list[str]:
 
 
 SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("room", INSIDE)
+def test_imports_go_down_inside_a_room(room: str) -> None:
+    parts, climbing = INSIDE[room], []
+    folders = {path.name for path in (PACKAGE / room).iterdir() if path.is_dir() and (path / "__init__.py").exists()}
+    assert folders < set(parts), "every folder has its place in the order"
+    for path in sorted((PACKAGE / room).rglob("*.py")):
+        part = path.relative_to(PACKAGE / room).parts[0].removesuffix(".py")
+        if part in parts:
+            names = [name.split(".") for name in imported_modules(ast.parse(path.read_text()))]
+            used = {name[2] for name in names if name[:2] == ["torchsfm", room] and len(name) > 2} - {part}
+            climbing += [(str(path.relative_to(PACKAGE)), other) for other in used if other not in parts[: parts.index(part)]]
+    assert not climbing
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))

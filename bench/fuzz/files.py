@@ -53,8 +53,8 @@ from torchsfm.geometry import BundleProblem, Camera, Pose, Radial, intrinsics, r
 from torchsfm.images import Photograph, extract_frames, parse_exif, read_image, save_image
 from torchsfm.images.heif import heif_library
 from torchsfm.reconstruction import ControlPoints, KnownFeatures, MatchedImages, Reconstruction
-from torchsfm.reconstruction.files import load_arrays
-from torchsfm.reconstruction.sources import Sources
+from torchsfm.reconstruction.matching.sources import Sources
+from torchsfm.reconstruction.model.files import load_arrays
 
 FILES_PER_TRIAL = 10
 MAX_SECONDS = 5.0

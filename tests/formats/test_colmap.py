@@ -18,7 +18,7 @@ from torchsfm.geometry import (
     SimpleRadial,
     random_rotation,
 )
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 F64 = torch.float64
 KINDS = {

@@ -9,7 +9,7 @@ import torch
 
 from torchsfm.formats import read_lines, read_ply, write_lines
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.lines import Lines
+from torchsfm.reconstruction.model.lines import Lines
 
 F64 = torch.float64
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from torchsfm.formats import read_ply, write_ply
 from torchsfm.geometry import Camera, Pose, Radial, random_rotation
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 ASCII = """ply
 format ascii 1.0

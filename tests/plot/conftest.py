@@ -8,7 +8,7 @@ from chance import seeded
 
 from torchsfm.geometry import Camera, Radial
 from torchsfm.geometry.cameras import intrinsics
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.simulation import orbit_poses, random_points, simulate_images
 
 

@@ -24,7 +24,7 @@ from torchsfm.plot import (
     show_scaled,
 )
 from torchsfm.plot.flat import clip_lines
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.simulation import look_at
 from torchsfm.tensors import fundamental_from_pose
 

@@ -19,8 +19,8 @@ from torchsfm.geometry import Pose
 from torchsfm.images import read_image, save_image
 from torchsfm.plot import write_page
 from torchsfm.plot.framing import frame
-from torchsfm.reconstruction.lines import Lines
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.lines import Lines
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, Report
 
 

@@ -15,11 +15,11 @@ from browser import CHROMIUM, Browser
 from torchsfm.geometry import Pose
 from torchsfm.images import save_image
 from torchsfm.plot import write_page
-from torchsfm.reconstruction.lines import Lines
-from torchsfm.reconstruction.model_curves import Curves
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.matching.view_graph import Verdict
+from torchsfm.reconstruction.model.curves import Curves
+from torchsfm.reconstruction.model.lines import Lines
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport, PairReport, Report
-from torchsfm.reconstruction.view_graph import Verdict
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 WIDE, PHONE = (1400, 900), (390, 844)

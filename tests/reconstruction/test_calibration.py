@@ -14,13 +14,14 @@ from torchsfm.bundle import bundle_adjust_model, bundle_covariance, intrinsics_c
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_from_rotvec
 from torchsfm.optim import Cauchy
 from torchsfm.plot import write_page
-from torchsfm.reconstruction import SfmResult, incremental, reconstruct_tracks
-from torchsfm.reconstruction.adjust import LOSS, adjust
-from torchsfm.reconstruction.calibration import choose_free, folded_cameras, lone_cameras_plausible
-from torchsfm.reconstruction.camera_prior import CameraPrior
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.structure import triangulate_tracks
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction import SfmResult, reconstruct_tracks
+from torchsfm.reconstruction.mappers import incremental
+from torchsfm.reconstruction.mapping.adjust import LOSS, adjust
+from torchsfm.reconstruction.mapping.calibration import choose_free, folded_cameras, lone_cameras_plausible
+from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.mapping.structure import triangulate_tracks
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 from torchsfm.simulation import look_at, random_bundle_problem, random_points, simulate_images
 

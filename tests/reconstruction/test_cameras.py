@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, intrinsics
-from torchsfm.reconstruction.cameras import guess_cameras
-from torchsfm.reconstruction.track_graph import graph_from_tracks
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.mapping.cameras import guess_cameras
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
 from torchsfm.simulation import random_points, random_poses, simulate_images
 
 SIZE, FOCAL = (1000, 750), 1000.0

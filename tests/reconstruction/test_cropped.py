@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, growth, reconstruct_tracks
-from torchsfm.reconstruction.cropped import may_be_off_centre
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.incremental import MappingOptions
-from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction import SfmResult, reconstruct_tracks
+from torchsfm.reconstruction.mappers import growth
+from torchsfm.reconstruction.mappers.cropped import may_be_off_centre
+from torchsfm.reconstruction.mappers.incremental import MappingOptions
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 from torchsfm.simulation import look_at, random_points, simulate_images
 

@@ -11,12 +11,12 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.images import detect_motion
-from torchsfm.reconstruction.curve_frames import Frames, as_motion, turns_between
-from torchsfm.reconstruction.curve_guess import agrees_with_motion, guess_by_motion
-from torchsfm.reconstruction.curve_mapping import CurveMapping
-from torchsfm.reconstruction.curve_windows import window_at
-from torchsfm.reconstruction.image_edges import ImageEdges
-from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.curves.frames import Frames, as_motion, turns_between
+from torchsfm.reconstruction.curves.guess import agrees_with_motion, guess_by_motion
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
+from torchsfm.reconstruction.curves.mapping import CurveMapping
+from torchsfm.reconstruction.curves.windows import window_at
+from torchsfm.reconstruction.model.curves import Curves
 from torchsfm.simulation import paint_shapes
 
 F64 = torch.float64

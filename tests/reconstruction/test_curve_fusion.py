@@ -4,8 +4,8 @@ import math
 
 import torch
 
-from torchsfm.reconstruction.curve_fusion import count_different, fuse_pieces, near_pairs
-from torchsfm.reconstruction.curve_pieces import Pieces
+from torchsfm.reconstruction.curves.fusion import count_different, fuse_pieces, near_pairs
+from torchsfm.reconstruction.curves.pieces import Pieces
 
 F64 = torch.float64
 

@@ -12,13 +12,13 @@ from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.linalg import nearest_rotation
-from torchsfm.reconstruction.curve_deviations import calibration, deviations
-from torchsfm.reconstruction.curve_fusion import piece_tangents
-from torchsfm.reconstruction.curve_mapping import CurveMapping, adjust, covariance, distances, register, terms, track
-from torchsfm.reconstruction.curve_sequence import OPTIMISM, Expected, Settled
-from torchsfm.reconstruction.curves import no_curves
-from torchsfm.reconstruction.image_edges import ImageEdges
-from torchsfm.reconstruction.model_curves import Curves
+from torchsfm.reconstruction.curves.deviations import calibration, deviations
+from torchsfm.reconstruction.curves.from_edges import no_curves
+from torchsfm.reconstruction.curves.fusion import piece_tangents
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
+from torchsfm.reconstruction.curves.mapping import CurveMapping, adjust, covariance, distances, register, terms, track
+from torchsfm.reconstruction.curves.sequence import OPTIMISM, Expected, Settled
+from torchsfm.reconstruction.model.curves import Curves
 
 F64 = torch.float64
 FRAMES, CURVES, SAMPLES = 6, 12, 60

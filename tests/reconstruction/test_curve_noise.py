@@ -11,9 +11,9 @@ from torchsfm.bundle import bundle_adjust_model
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics, random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction import Curves
-from torchsfm.reconstruction.curve_noise import alike, measured_weights, sample_weights
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.curves.noise import alike, measured_weights, sample_weights
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 
 F64 = torch.float64
 VIEWS, POINTS, CURVES, SAMPLES = 6, 30, 15, 40

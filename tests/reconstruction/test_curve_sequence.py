@@ -16,13 +16,14 @@ from torchsfm.geometry import Camera, Pose, intrinsics, project_points, rotation
 from torchsfm.geometry.distortion import Radial
 from torchsfm.images import detect_edges, read_image, save_image
 from torchsfm.linalg import nearest_rotation
-from torchsfm.reconstruction import ReconstructionError, curve_sequence, reconstruct
-from torchsfm.reconstruction.curve_chains import Chain
-from torchsfm.reconstruction.curve_frames import Frames
-from torchsfm.reconstruction.curve_sequence import Expected, map_sequence
-from torchsfm.reconstruction.curve_start import FirstCameras
-from torchsfm.reconstruction.curve_windows import Window, as_edges, window_at
-from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction import ReconstructionError, reconstruct
+from torchsfm.reconstruction.curves import sequence as curve_sequence
+from torchsfm.reconstruction.curves.chains import Chain
+from torchsfm.reconstruction.curves.frames import Frames
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
+from torchsfm.reconstruction.curves.sequence import Expected, map_sequence
+from torchsfm.reconstruction.curves.start import FirstCameras
+from torchsfm.reconstruction.curves.windows import Window, as_edges, window_at
 from torchsfm.simulation import orbit_poses, paint_shapes
 
 F64 = torch.float64

@@ -19,8 +19,8 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
 )
 from torchsfm.images.edge_field import edge_field
-from torchsfm.reconstruction.curve_resection import pose_from_edges
-from torchsfm.reconstruction.curve_start import first_cameras
+from torchsfm.reconstruction.curves.resection import pose_from_edges
+from torchsfm.reconstruction.curves.start import first_cameras
 
 F64 = torch.float64
 WIDTH, HEIGHT, FOCAL, FRAMES = 480, 360, 500.0, 5

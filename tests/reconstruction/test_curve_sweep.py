@@ -2,7 +2,7 @@
 
 import torch
 
-from torchsfm.reconstruction.curve_sweep import _felt
+from torchsfm.reconstruction.curves.sweep import _felt
 
 
 def test_maps_are_looked_up_at_the_nearest_pixel(generator: torch.Generator) -> None:

@@ -11,13 +11,13 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, Similarity, intrinsics, rotation_angle, rotation_from_rotvec
 from torchsfm.geometry.distortion import Radial
 from torchsfm.images import read_image
-from torchsfm.reconstruction.curve_chains import chains
-from torchsfm.reconstruction.curve_frames import Frames
-from torchsfm.reconstruction.curve_mapping import CurveMapping
-from torchsfm.reconstruction.curve_sequence import Expected, Settled, apart
-from torchsfm.reconstruction.curve_start import FirstCameras
-from torchsfm.reconstruction.curve_windows import WIDTH, Window, contradictions, focal_of, telling, turns_of, window_at
-from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.curves.chains import chains
+from torchsfm.reconstruction.curves.frames import Frames
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
+from torchsfm.reconstruction.curves.mapping import CurveMapping
+from torchsfm.reconstruction.curves.sequence import Expected, Settled, apart
+from torchsfm.reconstruction.curves.start import FirstCameras
+from torchsfm.reconstruction.curves.windows import WIDTH, Window, contradictions, focal_of, telling, turns_of, window_at
 
 F64 = torch.float64
 FRAMES = 13

@@ -13,19 +13,19 @@ from torchsfm._types import Status
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
-from torchsfm.reconstruction.adjust import LOSS, adjust
-from torchsfm.reconstruction.calibration import ENOUGH_OF_FEW, calibration_of, observation_weights
-from torchsfm.reconstruction.camera_prior import CameraPrior
-from torchsfm.reconstruction.consistency import excess_scatter, pair_agreement
-from torchsfm.reconstruction.doubt import Standing, examine
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.growth import Component, Growth, Wanted
-from torchsfm.reconstruction.incremental import MappingOptions
-from torchsfm.reconstruction.mapping import Adjustment, Mapping
-from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
+from torchsfm.reconstruction.evidence.consistency import excess_scatter, pair_agreement
+from torchsfm.reconstruction.evidence.doubt import Standing, examine
+from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
+from torchsfm.reconstruction.mappers.growth import Component, Growth, Wanted
+from torchsfm.reconstruction.mappers.incremental import MappingOptions
+from torchsfm.reconstruction.mappers.settle import settle
+from torchsfm.reconstruction.mapping.adjust import LOSS, adjust
+from torchsfm.reconstruction.mapping.calibration import ENOUGH_OF_FEW, calibration_of, observation_weights
+from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
+from torchsfm.reconstruction.mapping.mapping import Adjustment, Mapping
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.reconstruction.models import _judged, matches_across
-from torchsfm.reconstruction.settle import settle
-from torchsfm.reconstruction.view_graph import ViewGraph
 from torchsfm.simulation import look_at
 
 SIZE = (640, 480)

@@ -2,7 +2,7 @@
 
 import torch
 
-from torchsfm.reconstruction.edge_maps import EdgeMap, EdgeMaps, EdgePoints
+from torchsfm.reconstruction.curves.edge_maps import EdgeMap, EdgeMaps, EdgePoints
 
 F64 = torch.float64
 

@@ -9,8 +9,8 @@ from chance import numpy_seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Similarity, random_rotation, rotation_from_rotvec
-from torchsfm.reconstruction.evaluation import align_poses, align_reconstruction, pose_auc, pose_errors, position_rmse
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.evaluation import align_poses, align_reconstruction, pose_auc, pose_errors, position_rmse
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 F64 = torch.float64
 

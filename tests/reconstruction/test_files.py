@@ -12,8 +12,8 @@ from full_disk import full_disk
 from small_model import make
 
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.files import load_arrays, whole_file, write_whole_files
-from torchsfm.reconstruction.stages import Stages
+from torchsfm.reconstruction.matching.stages import Stages
+from torchsfm.reconstruction.model.files import load_arrays, whole_file, write_whole_files
 
 
 def saved(path: Path, **changes: np.ndarray) -> Path:

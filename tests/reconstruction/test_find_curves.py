@@ -13,20 +13,21 @@ from torchsfm.bundle import bundle_adjust
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.bundle.lines import segment_distances
 from torchsfm.geometry import Pose
-from torchsfm.reconstruction import curve_noise, models
-from torchsfm.reconstruction.adjust import LOSS, adjust, points_agree
-from torchsfm.reconstruction.curve_adjustment import WithCurves, adjust_with_curves
-from torchsfm.reconstruction.curves import no_curves, reconstruct_curves
-from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
-from torchsfm.reconstruction.find_lines import FoundSegments, lines_of_cameras
-from torchsfm.reconstruction.growth import Component
-from torchsfm.reconstruction.image_edges import ImageEdges
-from torchsfm.reconstruction.incremental import MappingOptions
-from torchsfm.reconstruction.lines import Lines
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.model_curves import Curves
-from torchsfm.reconstruction.stages import Stages
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction import models
+from torchsfm.reconstruction.curves import noise as curve_noise
+from torchsfm.reconstruction.curves.adjustment import WithCurves, adjust_with_curves
+from torchsfm.reconstruction.curves.find_curves import FoundEdges, find_curves
+from torchsfm.reconstruction.curves.from_edges import no_curves, reconstruct_curves
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
+from torchsfm.reconstruction.lines.find_lines import FoundSegments, lines_of_cameras
+from torchsfm.reconstruction.mappers.growth import Component
+from torchsfm.reconstruction.mappers.incremental import MappingOptions
+from torchsfm.reconstruction.mapping.adjust import LOSS, adjust, points_agree
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.stages import Stages
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.model.curves import Curves
+from torchsfm.reconstruction.model.lines import Lines
 
 F64 = torch.float64
 VIEWS = 12
@@ -94,7 +95,7 @@ def test_curves_place_cameras_that_few_points_place_badly(
         steps.append(moved)
         return moved
 
-    monkeypatch.setattr("torchsfm.reconstruction.find_curves.adjust_with_curves", watched)
+    monkeypatch.setattr("torchsfm.reconstruction.curves.find_curves.adjust_with_curves", watched)
     before, once, after, by_those, by_these = [], [], [], [], []
     for _ in range(2):
         model = with_points(12, 0.2, generator)

@@ -22,11 +22,11 @@ from torchsfm.geometry import (
     rotation_from_rotvec,
 )
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.adjust import adjust
-from torchsfm.reconstruction.find_lines import FoundSegments, adjust_with_lines, find_lines
-from torchsfm.reconstruction.lines import Lines
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.lines.find_lines import FoundSegments, adjust_with_lines, find_lines
+from torchsfm.reconstruction.mapping.adjust import adjust
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.model.lines import Lines
 
 F64 = torch.float64
 VIEWS, POINTS, LINES = 6, 40, 25
@@ -139,7 +139,7 @@ def test_lines_that_points_contradict_move_no_cameras(generator: torch.Generator
     model = adjust(scene.mapping)
     free, _ = find_lines(model, scene.found, None)
     assert free is not model
-    monkeypatch.setattr("torchsfm.reconstruction.find_lines.points_agree", lambda mapping, moved: False)
+    monkeypatch.setattr("torchsfm.reconstruction.lines.find_lines.points_agree", lambda mapping, moved: False)
     held, lines = find_lines(model, scene.found, None)
     assert held is model
     # The lines are where these cameras want them.

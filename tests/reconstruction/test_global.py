@@ -11,9 +11,9 @@ from test_pair_poses import mapping_of
 from test_reconstruct_tracks import SIZE, Scene, make_scene, run, turning
 
 from torchsfm.geometry import Camera, Pose, intrinsics, rotation_from_rotvec
-from torchsfm.reconstruction import global_start
-from torchsfm.reconstruction.choose_mapper import choose_mapper
-from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction.mappers import global_start
+from torchsfm.reconstruction.mappers.choose_mapper import choose_mapper
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses, simulate_images
 
 

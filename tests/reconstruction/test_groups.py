@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from torchsfm.reconstruction.consistency import PairAgreement
-from torchsfm.reconstruction.groups import agreeing_groups, outvoted_groups
+from torchsfm.reconstruction.evidence.consistency import PairAgreement
+from torchsfm.reconstruction.evidence.groups import agreeing_groups, outvoted_groups
 
 
 def two_sides(sizes: tuple[int, int], agree_across: int, generator: torch.Generator) -> PairAgreement:

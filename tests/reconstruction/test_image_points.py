@@ -7,9 +7,9 @@ import torch
 from chance import seeded
 
 from torchsfm.images import detect_features, read_image, save_image
-from torchsfm.reconstruction import image_points
-from torchsfm.reconstruction.image_points import detect_all
-from torchsfm.reconstruction.stages import Stages
+from torchsfm.reconstruction.matching import image_points
+from torchsfm.reconstruction.matching.image_points import detect_all
+from torchsfm.reconstruction.matching.stages import Stages
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

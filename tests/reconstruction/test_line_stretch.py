@@ -5,7 +5,7 @@ from torch import Tensor
 
 from torchsfm import random_intrinsics, random_points, random_poses
 from torchsfm.geometry import project_points
-from torchsfm.reconstruction.line_stretch import places_on_lines, shared_stretch
+from torchsfm.reconstruction.lines.stretch import places_on_lines, shared_stretch
 
 F64 = torch.float64
 

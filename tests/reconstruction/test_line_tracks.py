@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Pose, intrinsics, project_points, rotation_from_rotvec
-from torchsfm.reconstruction.line_tracks import Cameras, LineTracks, ViewSegments, link_lines
+from torchsfm.reconstruction.lines.tracks import Cameras, LineTracks, ViewSegments, link_lines
 
 F64 = torch.float64
 VIEWS, LINES, NOISE = 5, 20, 0.1

@@ -8,7 +8,7 @@ from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, torchsfm
 
 from torchsfm.images import ImageError, save_image
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.matching.masks import Masks
 from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
 
 

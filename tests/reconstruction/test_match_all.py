@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import project_points
-from torchsfm.reconstruction import match_all
-from torchsfm.reconstruction.image_points import SavedFeatures
-from torchsfm.reconstruction.match_all import NEAR_IMAGES, VERIFIED_AT_ONCE, PairShards
+from torchsfm.reconstruction.matching import match_all
+from torchsfm.reconstruction.matching.image_points import SavedFeatures
+from torchsfm.reconstruction.matching.match_all import NEAR_IMAGES, VERIFIED_AT_ONCE, PairShards
+from torchsfm.reconstruction.matching.view_graph import ViewGraph, verify_pairs
 from torchsfm.reconstruction.photographs import MatchedPhotographs, match_photographs
-from torchsfm.reconstruction.view_graph import ViewGraph, verify_pairs
 from torchsfm.simulation import random_points, random_poses
 
 

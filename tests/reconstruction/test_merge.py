@@ -13,9 +13,9 @@ from torch import Tensor
 from torchsfm.geometry import Camera, NoDistortion, Pose, Similarity, intrinsics, random_rotation
 from torchsfm.images import fit_ellipse
 from torchsfm.reconstruction import Conics, Lines, Reconstruction
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.merge import merge_models
-from torchsfm.reconstruction.parts import part_of_model
+from torchsfm.reconstruction.merging.merge import merge_models
+from torchsfm.reconstruction.model.evaluation import pose_errors
+from torchsfm.reconstruction.model.parts import part_of_model
 from torchsfm.simulation import look_at, random_points
 
 F64 = torch.float64

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.missing import SIGNIFICANCE, Conflicts, _Looks, _Occupied, missing_correspondences
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.evidence.missing import SIGNIFICANCE, Conflicts, _Looks, _Occupied, missing_correspondences
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
 
 SIZE = (640, 480)
 GROUP = 6

@@ -14,9 +14,9 @@ from torchsfm.formats import undistorted_model
 from torchsfm.geometry import Similarity, rotation_from_rotvec
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Curves, Reconstruction
-from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges
-from torchsfm.reconstruction.image_edges import ImageEdges
-from torchsfm.reconstruction.masks import Masks
+from torchsfm.reconstruction.curves.find_curves import FoundEdges, detect_all_edges
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
+from torchsfm.reconstruction.matching.masks import Masks
 
 F64 = torch.float64
 WORLD = Similarity(

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchsfm.geometry import camera_from_krt, intrinsics, project_points, rotation_from_rotvec
 from torchsfm.reconstruction import reconstruct
-from torchsfm.reconstruction.overlays import Overlays, find_overlays
+from torchsfm.reconstruction.matching.overlays import Overlays, find_overlays
 
 SIZE = torch.tensor([1000, 750])
 K = intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()

@@ -13,11 +13,12 @@ from test_reconstruct_tracks import Scene, make_scene, run
 from torch import Tensor
 
 from torchsfm.geometry import BundleProblem, Camera, Radial, intrinsics
-from torchsfm.reconstruction import adjust, global_start, pair_poses
-from torchsfm.reconstruction.incremental import MappingOptions
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.pair_poses import FORESTS, relative_poses, strongest_pairs
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.mappers import global_start, pair_poses
+from torchsfm.reconstruction.mappers.incremental import MappingOptions
+from torchsfm.reconstruction.mappers.pair_poses import FORESTS, relative_poses, strongest_pairs
+from torchsfm.reconstruction.mapping import adjust
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 from torchsfm.simulation import orbit_poses
 
 

@@ -9,10 +9,10 @@ from test_reconstruct_tracks import SIZE, Scene, make_scene, run
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
 from torchsfm.reconstruction import ReconstructionError
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.projective import projective_start
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.mappers.projective import projective_start
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses
 
 

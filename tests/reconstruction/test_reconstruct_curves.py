@@ -14,8 +14,8 @@ from torchsfm.geometry.cameras import intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction import Curves, Reconstruction, reconstruct_curves
-from torchsfm.reconstruction.curves import curves_of_edges, curves_of_other_cameras
-from torchsfm.reconstruction.image_edges import ImageEdges
+from torchsfm.reconstruction.curves.from_edges import curves_of_edges, curves_of_other_cameras
+from torchsfm.reconstruction.curves.image_edges import ImageEdges
 from torchsfm.simulation import look_at, render_sequence
 from torchsfm.simulation.surfaces import Sphere
 from torchsfm.simulation.textured_scene import TexturedScene, texture_surface

@@ -7,8 +7,11 @@ import torch
 from chance import seeded
 from test_reconstruct_tracks import Scene, make_scene
 
-from torchsfm.reconstruction import MatchedImages, SfmResult, adjust, doubt, growth, incremental, reconstruct_matches, unfold
-from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction import MatchedImages, SfmResult, reconstruct_matches
+from torchsfm.reconstruction.evidence import doubt
+from torchsfm.reconstruction.mappers import growth, incremental, unfold
+from torchsfm.reconstruction.mapping import adjust
+from torchsfm.reconstruction.model.evaluation import pose_errors
 
 
 def matched(scene: Scene, *, wrong: float = 0.2, seed: int = 0) -> MatchedImages:

@@ -10,8 +10,9 @@ from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, Verdict, incremental, reconstruct_tracks
-from torchsfm.reconstruction.evaluation import pose_errors
+from torchsfm.reconstruction import SfmResult, Verdict, reconstruct_tracks
+from torchsfm.reconstruction.mappers import incremental
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses, random_points, simulate_images
 
 SIZE = (1000, 750)

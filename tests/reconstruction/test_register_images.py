@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.register import register_images
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.mapping.register import register_images
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 from torchsfm.simulation import look_at, simulate_images
 
 SIZE = (1000, 750)

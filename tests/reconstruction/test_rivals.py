@@ -8,10 +8,10 @@ from test_pair_poses import mapping_of
 from test_reconstruct_tracks import Scene, make_scene
 from torch import Tensor
 
-from torchsfm.reconstruction import rivals
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.incremental import grow_model
-from torchsfm.reconstruction.rivals import rival_focal
+from torchsfm.reconstruction.mappers import rivals
+from torchsfm.reconstruction.mappers.incremental import grow_model
+from torchsfm.reconstruction.mappers.rivals import rival_focal
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses
 
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from torchsfm.images import save_image
-from torchsfm.reconstruction.cameras import group_cameras
-from torchsfm.reconstruction.image_points import detect_all
-from torchsfm.reconstruction.report import ReconstructionError
-from torchsfm.reconstruction.sources import Sources
-from torchsfm.reconstruction.stages import Stages
+from torchsfm.reconstruction.mapping.cameras import group_cameras
+from torchsfm.reconstruction.matching.image_points import detect_all
+from torchsfm.reconstruction.matching.sources import Sources
+from torchsfm.reconstruction.matching.stages import Stages
+from torchsfm.reconstruction.messages import ReconstructionError
 
 
 def touch(folder: Path, *names: str) -> None:

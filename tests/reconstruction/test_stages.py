@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchsfm.reconstruction.files import held_file
-from torchsfm.reconstruction.stages import Arrays, Stages, clear_stages, fingerprint, saved_stages
+from torchsfm.reconstruction.matching.stages import Arrays, Stages, clear_stages, fingerprint, saved_stages
+from torchsfm.reconstruction.model.files import held_file
 
 
 class Counter:

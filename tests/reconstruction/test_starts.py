@@ -9,10 +9,10 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera, intrinsics
 from torchsfm.geometry.distortion import Radial
-from torchsfm.reconstruction import incremental
-from torchsfm.reconstruction.incremental import MappingOptions, grow_model
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.mappers import incremental
+from torchsfm.reconstruction.mappers.incremental import MappingOptions, grow_model
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 from torchsfm.simulation import look_at
 
 POINTS, FOCAL = 200, 700.0

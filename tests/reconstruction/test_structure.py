@@ -8,8 +8,8 @@ from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, NoDistortion, Pose, intrinsics
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.structure import (
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.mapping.structure import (
     complete_tracks,
     filter_points,
     merge_points,
@@ -17,7 +17,7 @@ from torchsfm.reconstruction.structure import (
     visible_points,
     widest_angle,
 )
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
 from torchsfm.simulation import orbit_poses, random_points, simulate_images
 
 SIZE = (1000, 800)

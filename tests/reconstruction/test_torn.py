@@ -10,12 +10,12 @@ from test_pair_poses import mapping_of
 from test_reconstruct_tracks import SIZE, Scene
 
 from torchsfm.geometry import Camera, Pose, intrinsics
-from torchsfm.reconstruction.consistency import PairAgreement, pair_agreement
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.global_start import close_tears, fill, tighten
-from torchsfm.reconstruction.incremental import MappingOptions
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.torn import join_torn
+from torchsfm.reconstruction.evidence.consistency import PairAgreement, pair_agreement
+from torchsfm.reconstruction.mappers.global_start import close_tears, fill, tighten
+from torchsfm.reconstruction.mappers.incremental import MappingOptions
+from torchsfm.reconstruction.mappers.torn import join_torn
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses, simulate_images
 
 VIEWS, FOCAL = 40, 700.0

@@ -6,8 +6,8 @@ from chance import seeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsfm.reconstruction import tracks
-from torchsfm.reconstruction.tracks import _by_priority, build_tracks
+from torchsfm.reconstruction.mapping import tracks
+from torchsfm.reconstruction.mapping.tracks import _by_priority, build_tracks
 
 
 def test_chains_become_tracks() -> None:

@@ -12,19 +12,19 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.motion.many_views.components import components
-from torchsfm.reconstruction import unfold as unfolding
-from torchsfm.reconstruction.beginning import grow_by
-from torchsfm.reconstruction.camera_prior import CameraPrior
-from torchsfm.reconstruction.distinctive import Backbone, Distinctiveness
-from torchsfm.reconstruction.doubt import examine
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.incremental import MappingOptions, grow_model
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.missing import Conflicts, missing_correspondences
-from torchsfm.reconstruction.settle import settle
-from torchsfm.reconstruction.tracks import build_tracks
-from torchsfm.reconstruction.unfold import Unfolded, hanging_on_copies, imitated, unfold
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.evidence.distinctive import Backbone, Distinctiveness
+from torchsfm.reconstruction.evidence.doubt import examine
+from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
+from torchsfm.reconstruction.mappers import unfold as unfolding
+from torchsfm.reconstruction.mappers.beginning import grow_by
+from torchsfm.reconstruction.mappers.incremental import MappingOptions, grow_model
+from torchsfm.reconstruction.mappers.settle import settle
+from torchsfm.reconstruction.mappers.unfold import Unfolded, hanging_on_copies, imitated, unfold
+from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.mapping.tracks import build_tracks
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import look_at
 
 SIZE = (640, 480)
@@ -166,7 +166,7 @@ def test_what_contradicts_the_most_distinctive_relations_is_doubted(
 ) -> None:
     empty, _, model = folded
     # Nothing better is found.
-    monkeypatch.setattr("torchsfm.reconstruction.unfold.ROUNDS", 0)
+    monkeypatch.setattr("torchsfm.reconstruction.mappers.unfold.ROUNDS", 0)
     unfolded = unfold(empty, model, empty.registered, options(empty), quiet)
     assert unfolded.model is model
     assert unfolded.uncertain.any()

@@ -9,13 +9,13 @@ from chance import seeded
 from test_reconstruct_tracks import Scene, make_scene, run
 
 from torchsfm.geometry import Camera, Pose, Similarity, intrinsics, random_rotation
-from torchsfm.reconstruction.evaluation import pose_errors
-from torchsfm.reconstruction.incremental import MappingOptions
-from torchsfm.reconstruction.mapping import Mapping
-from torchsfm.reconstruction.similarities import robust_similarity
-from torchsfm.reconstruction.track_graph import graph_from_tracks
-from torchsfm.reconstruction.view_graph import ViewGraph
-from torchsfm.reconstruction.windows import Window, join_windows, map_windows
+from torchsfm.reconstruction.mappers.incremental import MappingOptions
+from torchsfm.reconstruction.mappers.windows import Window, join_windows, map_windows
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.model.evaluation import pose_errors
+from torchsfm.reconstruction.model.similarities import robust_similarity
 from torchsfm.simulation import orbit_poses
 
 FRAMES, NEXT = 16, 10
@@ -42,8 +42,8 @@ def windows(graph: tuple[ViewGraph, torch.Tensor]) -> list[Window]:
     options = MappingOptions(free=("focal",), expected=camera, focal_sigma=torch.tensor([0.1]).double(), generator=seeded(1))
     mapping = Mapping.start(*graph, camera, torch.zeros(VIEWS, dtype=torch.long))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("torchsfm.reconstruction.windows.FRAMES", FRAMES)
-        patch.setattr("torchsfm.reconstruction.windows.NEXT", NEXT)
+        patch.setattr("torchsfm.reconstruction.mappers.windows.FRAMES", FRAMES)
+        patch.setattr("torchsfm.reconstruction.mappers.windows.NEXT", NEXT)
         return map_windows(mapping, torch.ones(VIEWS, dtype=torch.bool), options)
 
 

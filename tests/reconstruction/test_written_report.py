@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from small_model import make
 
 from torchsfm.reconstruction import ImageReport, Report, SfmResult
-from torchsfm.reconstruction.report import describe_skipped, pair_report, printable
+from torchsfm.reconstruction.messages import describe_skipped, printable
+from torchsfm.reconstruction.report import pair_report
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 
 NAMES = ("a|b.jpg", "<img src=x onerror=alert(1)>.jpg", "[link](http:evil).jpg", "caf\udce9\n\x1b[31m.jpg")

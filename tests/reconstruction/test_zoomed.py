@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, growth, reconstruct_tracks
-from torchsfm.reconstruction.growth import Given, Growth, Wanted
-from torchsfm.reconstruction.track_graph import graph_from_tracks
-from torchsfm.reconstruction.view_graph import ViewGraph
-from torchsfm.reconstruction.zoomed import part_zoomed
+from torchsfm.reconstruction import SfmResult, reconstruct_tracks
+from torchsfm.reconstruction.mappers import growth
+from torchsfm.reconstruction.mappers.growth import Given, Growth, Wanted
+from torchsfm.reconstruction.mappers.zoomed import part_zoomed
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
 from torchsfm.simulation import look_at, random_points, simulate_images
 
 SIZE = (1000, 750)

@@ -15,11 +15,11 @@ from torchsfm.formats import write_model
 from torchsfm.formats.registry import format_for
 from torchsfm.geometry import Similarity
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.alignment import Alignment, ControlPoints, align_models, align_to_points
-from torchsfm.reconstruction.control import adjust_to_points
-from torchsfm.reconstruction.gps import align_to_gps
-from torchsfm.reconstruction.report import printable
-from torchsfm.reconstruction.upright import align_to_ground, align_upright
+from torchsfm.reconstruction.messages import printable
+from torchsfm.reconstruction.model.alignment import Alignment, ControlPoints, align_models, align_to_points
+from torchsfm.reconstruction.model.control import adjust_to_points
+from torchsfm.reconstruction.model.gps import align_to_gps
+from torchsfm.reconstruction.model.upright import align_to_ground, align_upright
 
 
 def align(

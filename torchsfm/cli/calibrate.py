@@ -31,8 +31,8 @@ from torchsfm.images import (
     undistorted_cameras,
 )
 from torchsfm.optim import Huber
-from torchsfm.reconstruction.files import write_whole_files
-from torchsfm.reconstruction.report import printable
+from torchsfm.reconstruction.messages import printable
+from torchsfm.reconstruction.model.files import write_whole_files
 
 _FAR = 3.0
 """How many times the median error of photographs is an error worth a remark."""

@@ -13,8 +13,8 @@ from torchsfm.cli.export import load
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.geometry import Pose
 from torchsfm.reconstruction import Reconstruction
-from torchsfm.reconstruction.evaluation import pose_auc, pose_errors, position_rmse
-from torchsfm.reconstruction.report import printable
+from torchsfm.reconstruction.messages import printable
+from torchsfm.reconstruction.model.evaluation import pose_auc, pose_errors, position_rmse
 
 THRESHOLDS = (1.0, 2.0, 5.0)
 """Degrees up to which the area under the curve of errors is taken."""

@@ -18,8 +18,8 @@ from torchsfm.formats.registry import read_model_or_problem
 from torchsfm.images import MAX_PIXELS, ImageError, read_image
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import Curves, Reconstruction, reconstruct_curves
-from torchsfm.reconstruction.find_curves import scaled
-from torchsfm.reconstruction.report import printable
+from torchsfm.reconstruction.curves.find_curves import scaled
+from torchsfm.reconstruction.messages import printable
 
 
 def curves(

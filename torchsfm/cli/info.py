@@ -10,7 +10,7 @@ from torchsfm.cli.export import load
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.cli.output import finish_replacing, output_folder, unfinished
 from torchsfm.formats.registry import model_files
-from torchsfm.reconstruction.report import printable
+from torchsfm.reconstruction.messages import printable
 
 
 def info(

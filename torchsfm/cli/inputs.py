@@ -12,7 +12,7 @@ from torchsfm.formats import read_database, read_hloc
 from torchsfm.images import FILMS, extract_frames
 from torchsfm.images.film import FPS
 from torchsfm.reconstruction import MatchedImages, Reconstruction, ReconstructionError
-from torchsfm.reconstruction.sources import Sources
+from torchsfm.reconstruction.matching.sources import Sources
 
 FRAMES = "frames"
 """The folder of a film's frames, beside the results."""

@@ -17,9 +17,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from torchsfm.cli.ranks import Started
 from torchsfm.cli.voice import VOICE, Voice
 from torchsfm.reconstruction import MatchedImages, ReconstructionError, SfmResult, reconstruct, reconstruct_matches
+from torchsfm.reconstruction.matching.sources import Source
+from torchsfm.reconstruction.matching.stages import saved_stages
 from torchsfm.reconstruction.photographs import NEIGHBOURS, match_photographs
-from torchsfm.reconstruction.sources import Source
-from torchsfm.reconstruction.stages import saved_stages
 
 NOTHING, WRONG, INTERRUPTED = 1, 2, 130
 PAUSE = 30.0

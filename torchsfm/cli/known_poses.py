@@ -20,7 +20,7 @@ from torchsfm.reconstruction import (
     saved_features,
     triangulate_photographs,
 )
-from torchsfm.reconstruction.sources import Sources
+from torchsfm.reconstruction.matching.sources import Sources
 
 Images = Annotated[list[Path], typer.Argument(help="A folder of images, or image files.", show_default=False)]
 Masks = Annotated[

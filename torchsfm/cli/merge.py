@@ -9,7 +9,7 @@ from torchsfm.cli.export import load, model_record
 from torchsfm.cli.job import Job, UserError, told
 from torchsfm.formats import write_model
 from torchsfm.formats.registry import format_for
-from torchsfm.reconstruction.merge import merge_models
+from torchsfm.reconstruction.merging.merge import merge_models
 
 
 def merge(

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from torchsfm.cli.job import UserError
-from torchsfm.reconstruction.files import HELD, PARTIAL, lock_file
+from torchsfm.reconstruction.model.files import HELD, PARTIAL, lock_file
 
 LOCK, WRITING, WRITTEN, ARRIVING = ".lock", ".writing", ".written", ".arriving"
 RESULTS = re.compile(

@@ -1,7 +1,7 @@
 """A command started several times at once, as `torchrun` does: all work on the stages of a run, the first does the rest.
 
-Work is divided through the folder of the stages (see `torchsfm.reconstruction.stages`), so a process that is killed takes no
-more with it than the shard that it was working on.
+Work is divided through the folder of the stages (see `torchsfm.reconstruction.matching.stages`), so a process that is killed
+takes no more with it than the shard that it was working on.
 """
 
 import os
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from torch.distributed.rendezvous import rendezvous
 
-from torchsfm.reconstruction.stages import clear_stages
+from torchsfm.reconstruction.matching.stages import clear_stages
 
 LONGEST_START = timedelta(minutes=30)
 """What the first process may take until it has the folder; if it fails before, the others are ended from outside."""

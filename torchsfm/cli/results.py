@@ -17,7 +17,7 @@ from torchsfm.formats import write_colmap, write_curves, write_lines, write_ply
 from torchsfm.images import MAX_PIXELS
 from torchsfm.plot import write_page
 from torchsfm.reconstruction import Reconstruction, SfmResult
-from torchsfm.reconstruction.files import write_whole_files
+from torchsfm.reconstruction.model.files import write_whole_files
 from torchsfm.reconstruction.written_report import report_markdown, report_record
 
 VERSION = metadata.version("torchsfm")

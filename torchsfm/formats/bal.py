@@ -30,7 +30,7 @@ from torchsfm.geometry import (
     rotvec_from_rotation,
 )
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import FREE_BYTES, MAX_RATIO, whole_file
+from torchsfm.reconstruction.model.files import FREE_BYTES, MAX_RATIO, whole_file
 
 OPENERS: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
 

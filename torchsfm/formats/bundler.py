@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torchsfm.formats.joining import Lens, Rows, centred_cameras, picture_size, reading, symmetric_size, track_rows
 from torchsfm.geometry import Radial
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import write_whole_files
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import write_whole_files
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 HEADER = "# Bundle file v0.3"
 LIST = "list.txt"

@@ -27,8 +27,8 @@ from torchsfm.formats.colmap_model import (
 from torchsfm.formats.joining import Lens, join_cameras
 from torchsfm.geometry import DISTORTION_MODELS, Camera, quaternion_wxyz_from_rotation
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import write_whole_files
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import write_whole_files
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 HALF_PIXEL = 0.5
 TABLES = ("cameras", "images", "points3D", "rigs", "frames")

@@ -20,9 +20,9 @@ from torch import Tensor
 from torchsfm.formats.colmap_model import MAX_SIZE, PARAMETERS
 from torchsfm.formats.joining import reading
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.known_features import KnownFeatures
 from torchsfm.reconstruction.matched import MatchedImages
+from torchsfm.reconstruction.matching.known_features import KnownFeatures
+from torchsfm.reconstruction.model.files import whole_file
 
 HALF_PIXEL = 0.5
 MAX_IMAGES = 2147483647

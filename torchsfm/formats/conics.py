@@ -7,9 +7,9 @@ from torch import Tensor
 
 from torchsfm.formats.lines import pieces_as_obj, pieces_as_ply
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.conics import Conics
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.conics import Conics
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 HEAD = """# Ellipses in space and what images show of them, one ellipse of the model on each line of text:
 # centre X Y Z, semi-axes aX aY aZ bX bY bZ, red green blue, count, then for each measured ellipse:

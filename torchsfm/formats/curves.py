@@ -11,9 +11,9 @@ from torchsfm._types import check_options
 from torchsfm.formats.drawing import draw_curves, draw_model_curves
 from torchsfm.geometry import Curve
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.model_curves import Curves
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.curves import Curves
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 
 @on_the_cpu

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm.geometry import Curve
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import printable
+from torchsfm.reconstruction.messages import printable
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 SAME_RAY = 1e-4
 """Sine of the angle within which the ray that comes back from its image is the same: lenses fold over far outside of it."""

@@ -20,8 +20,8 @@ from torchsfm.formats.opensfm import write_opensfm
 from torchsfm.formats.pictures import picture_names, registered_only, undistorted_model, write_pictures
 from torchsfm.formats.ply import write_ply
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import PARTIAL
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import PARTIAL
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 PICTURES = "images"
 MARK = ".torchsfm-export"

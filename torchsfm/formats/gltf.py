@@ -15,8 +15,8 @@ import numpy as np
 from torchsfm.formats.joining import cameras_within
 from torchsfm.geometry import NoDistortion
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 BYTES, FLOATS, POINTS, ARRAY = 5121, 5126, 0, 34962
 """Numbers of glTF for types of values, for points as what is drawn, and for data of vertices."""

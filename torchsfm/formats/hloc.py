@@ -15,8 +15,8 @@ import torch
 
 from torchsfm.formats.joining import numbers, picture_size, reading
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import FREE_BYTES, MAX_RATIO
 from torchsfm.reconstruction.matched import MatchedImages
+from torchsfm.reconstruction.model.files import FREE_BYTES, MAX_RATIO
 
 
 @on_the_cpu

@@ -24,7 +24,7 @@ from torchsfm.geometry import (
 )
 from torchsfm.images.exif import parse_exif
 from torchsfm.images.headers import image_size
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 MAX_SIDE = 2**31
 GREY = 0.5

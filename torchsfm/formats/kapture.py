@@ -18,8 +18,8 @@ from torchsfm.formats.colmap_model import PARAMETERS, ColmapCamera
 from torchsfm.formats.joining import Rows, numbers, reading, running_numbers
 from torchsfm.geometry import quaternion_wxyz_from_rotation, rotation_from_quaternion_wxyz
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import write_whole_files
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import write_whole_files
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 VERSION = "# kapture format: 1.1"
 HALF_PIXEL = 0.5

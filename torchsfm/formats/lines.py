@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.lines import Lines
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.lines import Lines
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 HEAD = """# Lines in space and the image segments that show them, one line of the model on each line of text:
 # X1 Y1 Z1 X2 Y2 Z2 red green blue count, then for each segment: image x1 y1 x2 y2 weight

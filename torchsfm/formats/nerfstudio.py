@@ -16,8 +16,8 @@ from torchsfm.formats.joining import Lens, Rows, numbers, picture_size, reading
 from torchsfm.formats.ply import read_ply, write_ply
 from torchsfm.geometry import Camera, KannalaBrandt
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 HALF_PIXEL = 0.5
 PICTURES = "images"

@@ -25,8 +25,8 @@ from torchsfm.formats.joining import (
 from torchsfm.formats.pictures import registered_only
 from torchsfm.geometry import NoDistortion, quaternion_wxyz_from_rotation, rotation_from_quaternion_wxyz
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 HEADER = "NVM_V3"
 

@@ -13,8 +13,8 @@ import numpy as np
 from torchsfm.formats.joining import Lens, Rows, numbers, reading, running_numbers
 from torchsfm.geometry import BrownConrady, Camera, KannalaBrandt, Radial
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 FIRST = 2**31
 """Added to the number of an object, or of the name of a type, where it occurs for the first time (the way of cereal)."""

@@ -22,8 +22,8 @@ from torchsfm.geometry import (
     rotvec_from_rotation,
 )
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import write_whole_files
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import write_whole_files
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 TRACKS = "tracks.csv"
 VERSION = "OPENSFM_TRACKS_VERSION_v"

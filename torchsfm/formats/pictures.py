@@ -15,8 +15,8 @@ from torch import Tensor
 from torchsfm.geometry import Camera
 from torchsfm.images import ImageError, Photograph, parse_exif, read_image, save_image, undistort_images, undistorted_cameras
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.parts import with_images
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.parts import with_images
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 KEPT = frozenset((".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm"))
 """Endings under which new pictures are saved; the others become PNG."""

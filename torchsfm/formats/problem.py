@@ -3,7 +3,7 @@
 import torch
 
 from torchsfm.geometry import BundleProblem
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 
 def as_reconstruction(model: BundleProblem) -> Reconstruction:

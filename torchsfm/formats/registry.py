@@ -26,7 +26,7 @@ from torchsfm.formats.problem import as_reconstruction
 from torchsfm.formats.trajectory import write_kitti, write_tum
 from torchsfm.geometry import BundleProblem
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 HEAD = 2**20
 """The first bytes of a file, by which it is known."""

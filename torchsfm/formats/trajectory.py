@@ -10,8 +10,8 @@ import torch
 
 from torchsfm.geometry import quaternion_wxyz_from_rotation
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 
 @on_the_cpu

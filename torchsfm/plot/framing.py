@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.upright import up_direction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.upright import up_direction
 
 
 @dataclass(frozen=True)

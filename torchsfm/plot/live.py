@@ -15,7 +15,7 @@ from torchsfm.geometry.rotations import quaternion_wxyz_from_rotation
 from torchsfm.images import ImageError, read_image
 from torchsfm.plot.framing import frame
 from torchsfm.plot.strokes import model_strokes
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 MISSING = "the live viewer needs viser (pip install 'torchsfm[viser]')"
 POINT, CAMERA, STROKE = 0.003, 0.05, 0.001

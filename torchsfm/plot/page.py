@@ -12,8 +12,8 @@ from string import Template
 from torchsfm.images import MAX_PIXELS, read_image, save_image
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.plot.page_content import model_content, pairs_content
-from torchsfm.reconstruction.files import whole_file
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.files import whole_file
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Report
 
 SCRIPTS = ("vectors", "shaders", "model", "view", "overlay", "picking", "details", "pairs", "moving", "panel")

@@ -12,10 +12,10 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.plot.framing import Framing, frame
 from torchsfm.plot.strokes import model_strokes
-from torchsfm.reconstruction.calibration import Calibration
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.mapping.calibration import Calibration
+from torchsfm.reconstruction.matching.view_graph import Verdict
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import Report
-from torchsfm.reconstruction.view_graph import Verdict
 
 
 def _pack(tensor: Tensor, dtype: type[np.generic]) -> str:

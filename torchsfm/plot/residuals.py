@@ -5,7 +5,7 @@ from torch import Tensor
 
 from torchsfm.plot.axes import Axes, Figure, array, pyplot
 from torchsfm.plot.flat import show_image
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 
 def plot_residuals(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 
 @dataclass(frozen=True)

@@ -7,19 +7,20 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
-from torchsfm.reconstruction.camera_prior import PRINCIPAL_POINT_SIGMA
-from torchsfm.reconstruction.cameras import DEFAULT_FOCAL, FOCAL_SIGMA
-from torchsfm.reconstruction.curve_deviations import Deviations, calibration, deviations
-from torchsfm.reconstruction.curve_frames import Frames, as_motion, detect_all_motion
-from torchsfm.reconstruction.curve_mapping import CurveMapping
-from torchsfm.reconstruction.curve_sequence import Expected, Settled, all_curves, map_sequence
-from torchsfm.reconstruction.doubt import DEVIATIONS, GUESSED_FOCAL, WRONG_ANGLE, Standing
-from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges, scaled
-from torchsfm.reconstruction.masks import Masks
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import ImageReport, Progress, ReconstructionError, Report, SfmResult, pair_report
-from torchsfm.reconstruction.sources import Sources
-from torchsfm.reconstruction.stages import Stages, one_thread
+from torchsfm.reconstruction.curves.deviations import Deviations, calibration, deviations
+from torchsfm.reconstruction.curves.find_curves import FoundEdges, detect_all_edges, scaled
+from torchsfm.reconstruction.curves.frames import Frames, as_motion, detect_all_motion
+from torchsfm.reconstruction.curves.mapping import CurveMapping
+from torchsfm.reconstruction.curves.sequence import Expected, Settled, all_curves, map_sequence
+from torchsfm.reconstruction.evidence.doubt import DEVIATIONS, GUESSED_FOCAL, WRONG_ANGLE, Standing
+from torchsfm.reconstruction.mapping.camera_prior import PRINCIPAL_POINT_SIGMA
+from torchsfm.reconstruction.mapping.cameras import DEFAULT_FOCAL, FOCAL_SIGMA
+from torchsfm.reconstruction.matching.masks import Masks
+from torchsfm.reconstruction.matching.sources import Sources
+from torchsfm.reconstruction.matching.stages import Stages, one_thread
+from torchsfm.reconstruction.messages import Progress, ReconstructionError
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import ImageReport, Report, SfmResult, pair_report
 
 FRAME_SIZE = 640
 """Longer side, in pixels, to which larger frames are scaled down."""

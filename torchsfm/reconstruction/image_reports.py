@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import torch
 
-from torchsfm.reconstruction.doubt import Standing
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.evidence.doubt import Standing
+from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.report import ImageReport
-from torchsfm.reconstruction.view_graph import MIN_INLIERS, ViewGraph
 
 MIN_FEATURES = 30
 """An image with fewer features shows nothing to match."""

@@ -13,21 +13,22 @@ from torchsfm.bundle import bundle_adjust
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose, similarity_from_points
 from torchsfm.images import MAX_PIXELS
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.adjust import LOSS, about_cameras, adjust
-from torchsfm.reconstruction.calibration import choose_free
-from torchsfm.reconstruction.cameras import focal_uncertainty, group_cameras, guess_cameras
-from torchsfm.reconstruction.doubt import examine
+from torchsfm.reconstruction.evidence.doubt import examine
 from torchsfm.reconstruction.image_reports import image_reports
-from torchsfm.reconstruction.incremental import LAST_ITERATIONS, LAST_TOLERANCE, MappingOptions, next_images
-from torchsfm.reconstruction.mapping import Mapping
+from torchsfm.reconstruction.mappers.incremental import LAST_ITERATIONS, LAST_TOLERANCE, MappingOptions, next_images
+from torchsfm.reconstruction.mapping.adjust import LOSS, about_cameras, adjust
+from torchsfm.reconstruction.mapping.calibration import choose_free
+from torchsfm.reconstruction.mapping.cameras import focal_uncertainty, group_cameras, guess_cameras
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.mapping.register import register_images
+from torchsfm.reconstruction.mapping.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
+from torchsfm.reconstruction.mapping.tracks import build_tracks
+from torchsfm.reconstruction.matching.sources import Source
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.messages import Progress, ReconstructionError
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.photographs import NEIGHBOURS, MatchedPhotographs, match_photographs
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.register import register_images
-from torchsfm.reconstruction.report import Progress, ReconstructionError, Report, SfmResult, pair_report
-from torchsfm.reconstruction.sources import Source
-from torchsfm.reconstruction.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
-from torchsfm.reconstruction.tracks import build_tracks
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.report import Report, SfmResult, pair_report
 
 ROUNDS = 4
 """Of triangulation, completion and adjustment; little changes after the second."""

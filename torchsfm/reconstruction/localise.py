@@ -9,17 +9,18 @@ from torch import Tensor
 
 from torchsfm.images import MAX_PIXELS, Features, match_features, retrieve_pairs
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.image_points import detect_all
-from torchsfm.reconstruction.known_features import KnownFeatures, observed_features
 from torchsfm.reconstruction.known_poses import place_images, result_of, start_mapping
-from torchsfm.reconstruction.masks import Masks
-from torchsfm.reconstruction.match_all import MAX_IMAGES_ALL_PAIRS
+from torchsfm.reconstruction.matching.image_points import detect_all
+from torchsfm.reconstruction.matching.known_features import KnownFeatures, observed_features
+from torchsfm.reconstruction.matching.masks import Masks
+from torchsfm.reconstruction.matching.match_all import MAX_IMAGES_ALL_PAIRS
+from torchsfm.reconstruction.matching.sources import Source, Sources
+from torchsfm.reconstruction.matching.stages import Stages, fingerprint, one_thread
+from torchsfm.reconstruction.matching.view_graph import verify_pairs
+from torchsfm.reconstruction.messages import Progress, ReconstructionError
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.photographs import NEIGHBOURS
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
-from torchsfm.reconstruction.sources import Source, Sources
-from torchsfm.reconstruction.stages import Stages, fingerprint, one_thread
-from torchsfm.reconstruction.view_graph import verify_pairs
+from torchsfm.reconstruction.report import SfmResult
 
 
 @on_the_cpu

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.growth import Given, Wanted
+from torchsfm.reconstruction.mappers.growth import Given, Wanted
+from torchsfm.reconstruction.matching.stages import Stages, one_thread
+from torchsfm.reconstruction.matching.view_graph import verify_pairs
+from torchsfm.reconstruction.messages import Progress
 from torchsfm.reconstruction.models import build_models
-from torchsfm.reconstruction.report import Progress, SfmResult
-from torchsfm.reconstruction.stages import Stages, one_thread
-from torchsfm.reconstruction.view_graph import verify_pairs
+from torchsfm.reconstruction.report import SfmResult
 
 
 @dataclass(frozen=True)

@@ -9,20 +9,28 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchsfm.reconstruction.adjust import LOSS
-from torchsfm.reconstruction.calibration import ENOUGH, ENOUGH_OF_FEW, Calibration, calibration_of, observation_weights
-from torchsfm.reconstruction.cropped import crops_of_one_plane
-from torchsfm.reconstruction.doubt import Standing, examine
-from torchsfm.reconstruction.find_curves import FoundEdges, find_curves
-from torchsfm.reconstruction.find_lines import FoundSegments, find_lines
-from torchsfm.reconstruction.growth import Component, Given, Growth, Wanted
+from torchsfm.reconstruction.curves.find_curves import FoundEdges, find_curves
+from torchsfm.reconstruction.evidence.doubt import Standing, examine
 from torchsfm.reconstruction.image_reports import image_reports
-from torchsfm.reconstruction.incremental import FEW, UNKNOWN_FOCAL
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import Progress, Report, SfmResult, pair_report
-from torchsfm.reconstruction.stages import Stages, one_thread
-from torchsfm.reconstruction.unfold import hanging_on_copies
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.lines.find_lines import FoundSegments, find_lines
+from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
+from torchsfm.reconstruction.mappers.growth import Component, Given, Growth, Wanted
+from torchsfm.reconstruction.mappers.incremental import UNKNOWN_FOCAL
+from torchsfm.reconstruction.mappers.unfold import hanging_on_copies
+from torchsfm.reconstruction.mapping.adjust import LOSS
+from torchsfm.reconstruction.mapping.calibration import (
+    ENOUGH,
+    ENOUGH_OF_FEW,
+    FEW,
+    Calibration,
+    calibration_of,
+    observation_weights,
+)
+from torchsfm.reconstruction.matching.stages import Stages, one_thread
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.messages import Progress
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import Report, SfmResult, pair_report
 
 FEW_IMAGES = 60
 """Models of so few images have matrices too small to share between threads."""

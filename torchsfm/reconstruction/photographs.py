@@ -12,18 +12,19 @@ from torch import Tensor
 from torchsfm.images import MAX_PIXELS
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.reconstruction.curve_models import reconstruct_from_curves
-from torchsfm.reconstruction.find_curves import FoundEdges, detect_all_edges
-from torchsfm.reconstruction.find_lines import FoundSegments
-from torchsfm.reconstruction.growth import METHODS, Given, Wanted
-from torchsfm.reconstruction.image_points import ImagePoints, detect_all
-from torchsfm.reconstruction.masks import Masks
-from torchsfm.reconstruction.match_all import match_all
+from torchsfm.reconstruction.curves.find_curves import FoundEdges, detect_all_edges
+from torchsfm.reconstruction.lines.find_lines import FoundSegments
+from torchsfm.reconstruction.mappers.growth import METHODS, Given, Wanted
+from torchsfm.reconstruction.matching.image_points import ImagePoints, detect_all
+from torchsfm.reconstruction.matching.masks import Masks
+from torchsfm.reconstruction.matching.match_all import match_all
+from torchsfm.reconstruction.matching.segments import detect_all_segments
+from torchsfm.reconstruction.matching.sources import Source, Sources
+from torchsfm.reconstruction.matching.stages import Stages, fingerprint
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.messages import Progress, ReconstructionError
 from torchsfm.reconstruction.models import build_models
-from torchsfm.reconstruction.report import Progress, ReconstructionError, SfmResult
-from torchsfm.reconstruction.segments import detect_all_segments
-from torchsfm.reconstruction.sources import Source, Sources
-from torchsfm.reconstruction.stages import Stages, fingerprint
-from torchsfm.reconstruction.view_graph import ViewGraph
+from torchsfm.reconstruction.report import SfmResult
 
 FROM_CURVES = "curves"
 """The method that goes by edges alone."""

@@ -1,42 +1,18 @@
 """What happened to each image and each pair on the way to the models."""
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchsfm.reconstruction.calibration import Calibration
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.view_graph import Verdict
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage, the number of items done and the number of all."""
-
+from torchsfm.reconstruction.mapping.calibration import Calibration
+from torchsfm.reconstruction.matching.view_graph import Verdict
+from torchsfm.reconstruction.messages import ReconstructionError, describe_skipped, printable
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 STILL = "they stand still where the scene moves, as a watermark or a part of the vehicle does"
-
-
-class ReconstructionError(ValueError):
-    """The input cannot be used; the message is one line for people.
-
-    Example:
-        >>> import torchsfm
-        >>> torchsfm.reconstruct("no folder")
-        Traceback (most recent call last):
-            ...
-        torchsfm.reconstruction.report.ReconstructionError: no folder: no such folder
-    """
-
-
-def printable(text: str) -> str:
-    """Text in one line that every terminal and file can hold; what cannot be shown is spelt as in a Python string.
-
-    File names may hold line breaks, commands to the terminal, and bytes that are no characters.
-    """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @dataclass(frozen=True)
@@ -188,16 +164,6 @@ class Report:
         lines += [printable(f"doubtful: {image.name} ({image.doubt})") for image in self.images if image.doubt]
         lines.append("seconds: " + ", ".join(f"{stage} {time:.1f}" for stage, time in self.seconds.items()))
         return "\n".join(lines)
-
-
-def describe_skipped(skipped: Sequence[tuple[str, str]]) -> list[str]:
-    """One line for each reason: how many, the first names."""
-    lines = []
-    for reason in dict.fromkeys(reason for _, reason in skipped):
-        names = [name for name, why in skipped if why == reason]
-        listed = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-        lines.append(printable(f"{listed} ({reason})"))
-    return lines
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ from torch import Tensor
 
 from torchsfm._types import check_one_problem, check_options
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.growth import Given, Wanted
+from torchsfm.reconstruction.mappers.growth import Given, Wanted
+from torchsfm.reconstruction.matching.stages import Stages
+from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
+from torchsfm.reconstruction.messages import Progress
 from torchsfm.reconstruction.models import build_models
-from torchsfm.reconstruction.report import Progress, SfmResult
-from torchsfm.reconstruction.stages import Stages
-from torchsfm.reconstruction.track_graph import graph_from_tracks
+from torchsfm.reconstruction.report import SfmResult
 
 
 @on_the_cpu

@@ -10,10 +10,11 @@ import torch
 
 from torchsfm._types import Status
 from torchsfm.geometry import DISTORTION_MODELS
-from torchsfm.reconstruction.calibration import Calibration
-from torchsfm.reconstruction.reconstruction import Reconstruction
-from torchsfm.reconstruction.report import STILL, SfmResult, printable
-from torchsfm.reconstruction.view_graph import Verdict
+from torchsfm.reconstruction.mapping.calibration import Calibration
+from torchsfm.reconstruction.matching.view_graph import Verdict
+from torchsfm.reconstruction.messages import printable
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
+from torchsfm.reconstruction.report import STILL, SfmResult
 
 Record = dict[str, Any]
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from torchsfm.formats.colmap import read_colmap, write_colmap
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.reconstruction import Reconstruction
+from torchsfm.reconstruction.model.reconstruction import Reconstruction
 
 
 @on_the_cpu

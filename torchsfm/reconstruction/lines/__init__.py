@@ -1,0 +1,1 @@
+"""Lines of a model from the segments of its photographs."""

@@ -1,0 +1,131 @@
+"""Photographs of one size that were taken with different focal lengths: a zoom lens, or several cameras, and no file tells.
+
+Images of one size share a camera, which makes it well determined. Where that is wrong most images find no place. The
+fundamental matrices of the pairs tell before anything is placed: with a focal length for each image they are essential matrices
+by more than as many further numbers bring about by chance (Schwarz, "Estimating the dimension of a model", Annals of
+Statistics 1978). Lenses that distort and principal points off the middle make them look so as well, so that models decide.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.autocalibration import calibrate_view_graph
+from torchsfm.autocalibration.focal_from_fundamentals import SCALE, WIDE
+from torchsfm.linalg import svdvals
+from torchsfm.reconstruction.mappers.beginning import Beginning, Grown
+from torchsfm.reconstruction.mappers.incremental import MappingOptions
+from torchsfm.reconstruction.mapping.adjust import support
+from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs
+from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
+
+TRIED = 64
+"""Common focal lengths that are tried."""
+MORE, MUCH_MORE = 1.01, 1.05
+"""By how much more of what is seen must be explained, as numbers of their own make up for a little of all errors: where the
+pairs say that focal lengths differ, and where so few tell of them that they cannot say."""
+ENOUGH = 2.0
+"""Pairs for each image, of whatever kind, by which models tell focal lengths where pairs do not."""
+MOST = 60
+"""Images of one size that are asked: those of the most pairs."""
+
+
+def part_zoomed(
+    graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"]
+) -> tuple[Int[Tensor, "v"], float] | None:
+    """Give each image a camera of its own where the pairs say that those of one have several focal lengths, or cannot tell.
+
+    Args:
+        graph: Verified pairs.
+        camera_index: Which camera took each image, as far as sizes and files tell.
+        told: Images whose file states a focal length: those of one camera have the same.
+
+    Returns:
+        Which camera took each image, numbered from 0 in the order of the images, and how many times as much models with these
+        cameras must explain to be believed; None where it stays as it is.
+    """
+    differ: dict[int, bool | None] = {
+        k: _focal_lengths_differ(graph, camera_index == k)
+        for k in torch.unique(camera_index[~told]).tolist()
+        if not bool(told[camera_index == k].any())
+    }
+    sure = [k for k, answer in differ.items() if answer]
+    several = sure or [k for k, answer in differ.items() if answer is None]
+    if not several:
+        return None
+    own = torch.isin(camera_index, camera_index.new_tensor(several))
+    v = len(camera_index)
+    keys = torch.where(own, v + torch.arange(v), camera_index).tolist()
+    order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    return camera_index.new_tensor([order[key] for key in keys]), MORE if sure else MUCH_MORE
+
+
+def better_beginning(
+    together: Beginning,
+    apart: Beginning,
+    more: float,
+    make: Callable[[Mapping, MappingOptions], tuple[Grown, Mapping] | None],
+) -> tuple[Beginning, Grown | None]:
+    """Cameras of their own for some images, if these explain clearly more of what is seen, else those that images share.
+
+    Args:
+        together: With cameras that images share.
+        apart: With cameras of their own.
+        more: How many times as much these must explain.
+        make: Makes a model, and what is left of it without images that contradict it.
+
+    Returns:
+        The better one, and the model that came of it.
+    """
+    one, several = (make(begun.empty, begun.options) for begun in (together, apart))
+    threshold = together.options.reprojection
+    known = 0.0 if one is None else support(one[1], threshold)
+    if several is not None and support(several[1], threshold) > more * known:
+        return apart, several[0]
+    return together, None if one is None else one[0]
+
+
+def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"]) -> bool | None:
+    """Whether a focal length for each image explains the pairs of some images so much better than one for all.
+
+    None where too few pairs tell, but models of as many pairs as there are do.
+    """
+    telling = telling_pairs(graph) & member[graph.pairs].all(-1)
+    pairs = graph.pairs[telling]
+    number = torch.bincount(pairs.flatten(), minlength=len(member))
+    asked = torch.zeros_like(member)
+    asked[number.argsort(descending=True, stable=True)[:MOST]] = True
+    among = asked[pairs].all(-1)
+    images, ends = torch.unique(pairs[among], return_inverse=True)
+    # Fewer pairs than focal lengths always agree with some.
+    if len(ends) <= len(images):
+        within = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1)
+        return None if int(within.sum()) >= ENOUGH * int(member.sum()) else False
+    F = graph.F[telling][among].double()
+    size = graph.image_size[images].double()
+    c = (size - 1) / 2
+    tried = size.max() * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()
+    costs = _disagreement(_asymmetry(F, c[ends], tried[:, None, None]))
+    common = tried[costs.argmin()].expand(len(images))
+    sigma = torch.full_like(common, FOCAL_SIGMA["default"])
+    found = calibrate_view_graph(F, ends, c, common, sigma)
+    gain = float(costs.min() - _disagreement(found.asymmetry))
+    return gain > 0.5 * (len(images) - 1) * math.log(len(ends))
+
+
+def _disagreement(asymmetry: Float[Tensor, "*b p"]) -> Float[Tensor, "*b"]:
+    """Minus the logarithm of how probable asymmetries are, some of which belong to wrong pairs."""
+    return torch.log1p((asymmetry / SCALE).square()).sum(-1) / 2
+
+
+def _asymmetry(F: Float[Tensor, "p 3 3"], c: Float[Tensor, "p 2 2"], f: Float[Tensor, "k 1 1"]) -> Float[Tensor, "k p"]:
+    """`(s1 - s2) / (s1 + s2)` of the essential matrices that pairs have with k focal lengths."""
+    K = torch.diag_embed(torch.cat((f, f, torch.ones_like(f)), -1)).repeat(1, len(F), 1, 1)
+    first, second = K.clone(), K
+    first[..., :2, 2], second[..., :2, 2] = c[:, 0], c[:, 1]
+    s, _ = svdvals(second.mT @ F @ first)
+    return (s[..., 0] - s[..., 1]) / (s[..., 0] + s[..., 1]).clamp(min=1e-300)

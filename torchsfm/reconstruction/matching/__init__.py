@@ -1,0 +1,1 @@
+"""From photographs, or from what other programs found in them, to verified pairs of images."""

@@ -1,0 +1,1 @@
+"""Models joined to one."""
