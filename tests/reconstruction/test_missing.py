@@ -143,6 +143,18 @@ def with_a_copy(mapping: Mapping, image: int) -> Mapping:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize(("places", "refuted", "folded"), [(90, 1, True), (800, 1, False), (800, 7, False), (800, 8, True)])
+def test_one_place_of_many_hundred_folds_no_model(places: int, refuted: int, folded: bool) -> None:
+    """Each is compared with 40 others around, and those refuted with four of them in vain."""
+    first = torch.arange(places)
+    pairs = torch.stack((first.repeat_interleave(20), (first[:, None] + torch.arange(1, 21)).flatten() % places), 1)
+    score = torch.zeros(len(pairs), dtype=F64)
+    for number in range(refuted):
+        # Far enough from each other that no other place is refuted by two.
+        score[20 * 45 * number + torch.tensor([3, 8, 13, 18])] = 99.0
+    assert Conflicts(pairs, score, 18.0, torch.arange(places)).folded == folded
+
+
 @pytest.mark.parametrize("folded", [False, True])
 def test_copies_of_a_photograph_are_one_witness(folded: bool, generator: torch.Generator) -> None:
     """What two cameras miss of each other does not depend on whether one of them, or a third, is there twice."""

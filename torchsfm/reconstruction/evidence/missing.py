@@ -49,6 +49,8 @@ SIGNIFICANCE = 0.01
 PART = 1 / 12
 """Part of the places that a place is compared with by which one that is taken for another is refuted, at least: where there are
 many, chance refutes some, as points next to each other are missed together."""
+PLACES = 0.01
+"""Part of all places that are refuted so in a folded model, at least: of many hundred beside each other chance refutes one."""
 SPARSE = 8
 """Entries of a table of occupied pixels, at least, for each that is occupied."""
 ROWS = 2048
@@ -83,13 +85,14 @@ class Conflicts:
         """Whether two places pass for one.
 
         One pair may miss what something without features hides. A place taken for another is refuted from more than one other,
-        and from a `PART` of those it is compared with, and folds the whole model.
+        and from a `PART` of those it is compared with; one folds a whole model, or a part of all `PLACES` where there are many.
         """
         refuting, compared = (
             torch.bincount(torch.unique(self.place[pairs].sort(dim=1).values, dim=0).flatten(), minlength=len(self.place))
             for pairs in (self.refuted, self.pairs)
         )
-        return bool(((refuting >= 2) & (refuting >= PART * compared)).any())
+        taken_for_another = int(((refuting >= 2) & (refuting >= PART * compared)).sum())
+        return taken_for_another >= max(1.0, PLACES * int((compared > 0).sum()))
 
     @property
     def strength(self) -> float:
