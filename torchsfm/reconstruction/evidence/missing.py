@@ -85,7 +85,7 @@ class Conflicts:
         """Whether two places pass for one.
 
         One pair may miss what something without features hides. A place taken for another is refuted from more than one other,
-        and from a `PART` of those it is compared with; one folds a whole model, or a part of all `PLACES` where there are many.
+        and from a `PART` of those it is compared with; one folds a model, or a part of all `PLACES` where there are many.
         """
         refuting, compared = (
             torch.bincount(torch.unique(self.place[pairs].sort(dim=1).values, dim=0).flatten(), minlength=len(self.place))

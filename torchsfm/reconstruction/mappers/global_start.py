@@ -41,6 +41,8 @@ ROUGH = 1e-3
 """Part of the cost that is left to what comes after."""
 RETURNS, CHANGED = 3, 0.05
 """Times that all is done again, where a focal length has changed by more than this part."""
+TEARS = 3
+"""Times that a model is closed where it is torn, at most."""
 USABLE = (int(Status.OK), int(Status.NOT_CONVERGED))
 
 
@@ -177,7 +179,7 @@ def fill(model: Mapping, options: MappingOptions) -> Mapping:
 def close_tears(model: Mapping, options: MappingOptions) -> Mapping:
     """The model with its tears closed, see `join_torn`, as long as that makes more matches agree."""
     agreement = pair_agreement(model, threshold=options.reprojection, poses_alone=True)
-    for _ in range(RETURNS):
+    for _ in range(TEARS):
         joined = join_torn(model, agreement)
         if joined is None:
             break

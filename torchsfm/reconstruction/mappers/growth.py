@@ -196,8 +196,8 @@ class Growth:
             if number == 0:
                 self.reasons |= failed | parted
             component = replace(grown, model=model, agreement=agreement)
-            if self.copies and self.method != "projective":
-                component = self._unfolded(component)
+            if self.method != "projective":
+                component = self._unfolded(component) if self.copies else component
                 component = replace(component, rival=rival_focal(self.empty, component.model, component.options))
             self.taken, number = self.taken | component.model.registered, number + 1
             yield component.finished()

@@ -1,5 +1,6 @@
 """Few images that another focal length explains nearly as well as theirs: which one is right, they do not tell."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -40,11 +41,12 @@ def rival_focal(empty: Mapping, model: Mapping, options: MappingOptions) -> Floa
     focal = model.cameras.K[model.camera_index, 0, 0]
     rival, bar = torch.full_like(focal, torch.nan), NEARLY * support(model, options.reprojection)
     for times in OTHER_FOCAL[1:]:
-        for begun, _ in starts(replace(empty, registered=~model.registered), unknown, options, times):
-            other, _ = extend_model(begun, ~model.registered, options, lambda done, total: None)
-            found = other.cameras.K[other.camera_index, 0, 0]
-            if bool((other.registered == model.registered).all()) and support(other, options.reprojection) >= bar:
-                differs = guessed & ((found / focal).log().abs() > torch.tensor(APART).log())
-                rival = torch.where(differs, found, rival)
-            break
+        begun = next(starts(replace(empty, registered=~model.registered), unknown, options, times), None)
+        if begun is None:
+            continue
+        other, _ = extend_model(begun[0], ~model.registered, options, lambda done, total: None)
+        found = other.cameras.K[other.camera_index, 0, 0]
+        if bool((other.registered == model.registered).all()) and support(other, options.reprojection) >= bar:
+            differs = guessed & ((found / focal).log().abs() > math.log(APART))
+            rival = torch.where(differs, found, rival)
     return rival

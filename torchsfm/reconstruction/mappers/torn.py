@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchsfm._types import Status
 from torchsfm.geometry import rotvec_from_rotation
+from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import PairAgreement
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.mapping.structure import point_uncertainty
@@ -44,7 +45,8 @@ def join_torn(model: Mapping, agreement: PairAgreement) -> Mapping | None:
     match = contradicts[graph.match_pair].nonzero()[:, 0]
     node = graph.match[match]
     # Of a track that is whole, one side has the point, and the other is too far off for it.
-    point, whole = model.point[node], (model.track[node[:, 0]] == model.track[node[:, 1]])[:, None]
+    point, track = model.point[node], model.track[node]
+    whole = (track[:, :1] >= 0) & (track[:, :1] == track[:, 1:])
     point = torch.where(whole & (point < 0), point.flip(1), point)
     match, node, point = (t[(point >= 0).all(1)] for t in (match, node, point))
     order = torch.argsort(graph.match_pair[match], stable=True)
@@ -55,10 +57,10 @@ def join_torn(model: Mapping, agreement: PairAgreement) -> Mapping | None:
     if not one or not bool(torch.cat(one).any()):
         return None
     node, point = node[torch.cat(one)], point[torch.cat(one)]
-    target = torch.arange(len(model.X))
-    target[point[:, 1]] = point[:, 0]
+    # Which side comes first is not the same in all pairs, and three points may be one.
+    group = components(point, len(model.X))
     new = model.point.index_copy(0, node.flatten(), point.flatten())
-    return replace(model, point=torch.where(new >= 0, target[new.clamp(min=0)], -1)).compacted()
+    return replace(model, point=torch.where(new >= 0, group[new.clamp(min=0)], -1)).compacted()
 
 
 def _one(model: Mapping, points: Int[Tensor, "k 2"], known: Float[Tensor, "p"]) -> Bool[Tensor, "k"]:
