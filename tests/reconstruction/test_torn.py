@@ -89,3 +89,24 @@ def test_like_things_that_are_two_stay_two() -> None:
     assert bool(told(model).contradicts.any())
     assert join_torn(model, told(model)) is None
     assert close_tears(model, options) is model
+
+
+def test_points_are_joined_whichever_side_comes_first() -> None:
+    """Of each point there are two, one for images of even and one for those of odd numbers."""
+    right, _, _ = ring(0)
+    graph, odd = right.graph, right.graph.view % 2 == 1
+    node = right.observations()
+    split = torch.where(odd & (right.point >= 0), right.point + len(right.X), right.point)
+    track = torch.where(odd & (right.track >= 0), right.track + len(graph.view), right.track)
+    two = replace(right, X=right.X.repeat(2, 1), point=split, track=track).compacted()
+    across = (graph.pairs % 2).sum(1) == 1
+    matches = torch.bincount(graph.match_pair, minlength=len(graph.pairs))[across]
+    says = PairAgreement(graph.pairs[across], matches, torch.zeros_like(matches), across.nonzero()[:, 0])
+    one = join_torn(two, says)
+    assert one is not None
+    # Of a point that enough matches show, all image points are of one again.
+    both = (one.point[graph.match] >= 0).all(1) & (right.point[graph.match] >= 0).all(1)
+    good = both & (right.point[graph.match[:, 0]] == right.point[graph.match[:, 1]]) & (two.point[graph.match] >= 0).all(1)
+    same = one.point[graph.match[good]]
+    assert len(node) > 5000
+    assert float((same[:, 0] == same[:, 1]).double().mean()) > 0.95
