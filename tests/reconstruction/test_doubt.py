@@ -13,6 +13,7 @@ from torchsfm._types import Status
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.geometry.rotations import random_rotation, rotation_from_rotvec
+from torchsfm.reconstruction.attempts import Attempt, matches_across
 from torchsfm.reconstruction.evidence.consistency import excess_scatter, pair_agreement
 from torchsfm.reconstruction.evidence.doubt import Standing, examine
 from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
@@ -25,7 +26,6 @@ from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping.mapping import Adjustment, Mapping
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
 from torchsfm.reconstruction.model.evaluation import pose_errors
-from torchsfm.reconstruction.models import _judged, matches_across
 from torchsfm.simulation import look_at
 
 SIZE = (640, 480)
@@ -472,6 +472,6 @@ def test_deviations_do_not_rest_on_tracks_of_two_views(generator: torch.Generato
     begun = SimpleNamespace(options=options)
     growth = Mock(Growth, begun=begun, taken=mapping.registered, given_up=~mapping.registered)
     component = Component(mapping, options, off_centre=False)
-    _, told = _judged(component, growth, mapping.graph, Wanted(free_principal_point=False))
+    _, told = Attempt(mapping.graph, Wanted(free_principal_point=False), growth, (component,)).judge(component)
     assert off > 8 * float(rest)
     assert off < 3 * float(told.deviation[1, 0])

@@ -98,11 +98,12 @@ def reconstruct(
         typer.Option(
             "--method",
             "--mapper",
-            help="From two images on; all together without calibration and then autocalibration; rotations of all images, "
-            "then all places; the first or last of these, by the number of images and what holds them together; or a sequence "
-            "by its edges alone, where there is little else to see.",
+            help="incremental: from two images on; projective: all together without calibration, then autocalibration; global: "
+            "rotations of all images, then all places; windows: a film, some frames at a time; auto: incremental or global, by "
+            "the number of images, what holds them together and what comes of it; curves: a sequence by its edges alone, where "
+            "there is little else to see.",
         ),
-    ] = Method.incremental,
+    ] = Method.auto,
     lines: Annotated[
         bool, typer.Option("--lines", help="Find straight lines too, and adjust cameras by points and lines together.")
     ] = False,

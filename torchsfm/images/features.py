@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ _SCALE = 0.5 * 2 ** (1 / 6)
 """OpenCV gives twice the smaller of two Gaussians, of ratio 2^(1/3), whose difference answers most to what lies between."""
 
 _CELLS = 24
+
+_LOOSER = 3.0
+"""By so much both tests of points are looser in images that have too few."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ def detect_features(
     *,
     contrast: float = 0.01,
     edge: float = 10.0,
+    enough: int = 2048,
     max_size: int = 2400,
 ) -> Features:
     """SIFT points with RootSIFT descriptors (Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012).
@@ -77,6 +81,8 @@ def detect_features(
             as poses want them. A point's contrast counts divided by its rank among those of its cell, of 24 along the image.
         contrast: Smallest contrast, in the units of OpenCV's `contrastThreshold`.
         edge: Points whose principal curvatures have a larger ratio than this lie on an edge and are dropped.
+        enough: An image with fewer points is given up to so many, after the others those of a third of that contrast and three
+            times that ratio: bends of edges are most of what smooth things have.
         max_size: Larger images are scaled down to this longer side for the detection; positions are those of the image given.
 
     Returns:
@@ -106,12 +112,15 @@ def detect_features(
     if shrink < 1:
         gray = cv2.resize(gray, (max(1, round(width * shrink)), max(1, round(height * shrink))), interpolation=cv2.INTER_AREA)
     # Without the precise option OpenCV's first octave, and with it every point, is shifted by a quarter of a pixel.
-    sift = cv2.SIFT.create(0, 3, contrast, edge, 1.6, enable_precise_upscale=True)
-    keypoints = sift.detect(gray, None)
-    table = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
-    order = _spread(table, max(gray.shape) / _CELLS)[:max_features]
-    table = table[order]
-    raw = sift.compute(gray, [keypoints[i] for i in order])[1] if len(order) else np.zeros((0, 128), np.float32)
+    keypoints: list[Any] = []
+    for looser, most in ((1.0, max_features), (_LOOSER, min(enough, max_features))):
+        if len(keypoints) < most:
+            sift = cv2.SIFT.create(0, 3, contrast / looser, edge * looser, 1.6, enable_precise_upscale=True)
+            known = {(*k.pt, k.size, k.angle) for k in keypoints}
+            more = [k for k in sift.detect(gray, None) if (*k.pt, k.size, k.angle) not in known]
+            keypoints += [more[i] for i in _spread(_table(more), max(gray.shape) / _CELLS)[: most - len(keypoints)]]
+    table = _table(keypoints)
+    raw = sift.compute(gray, keypoints)[1] if keypoints else np.zeros((0, 128), np.float32)
     zoom = np.array([width / gray.shape[1], height / gray.shape[0]])
     return Features(
         x=torch.from_numpy((table[:, :2] + 0.5) * zoom - 0.5).float(),
@@ -120,6 +129,11 @@ def detect_features(
         response=torch.from_numpy(table[:, 4]).float(),
         descriptors=_root_sift(torch.from_numpy(raw)),
     )
+
+
+def _table(keypoints: Sequence[Any]) -> NDArray[np.float64]:
+    """Rows (x, y, size, angle, response)."""
+    return np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
 
 
 def _spread(table: NDArray[np.float64], cell: float) -> NDArray[np.int64]:

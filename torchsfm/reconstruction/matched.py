@@ -74,7 +74,7 @@ def reconstruct_matches(
     K: Float[Tensor, "3 3"] | None = None,
     focal: float | Sequence[float | None] | None = None,
     free_principal_point: bool = True,
-    method: str = "incremental",
+    method: str = "auto",
     threshold: float = 3.0,
     seed: int = 0,
     progress: Progress | None = None,

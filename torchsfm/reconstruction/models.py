@@ -6,26 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Int
-from torch import Tensor
 
+from torchsfm.reconstruction.attempts import best_attempt
 from torchsfm.reconstruction.curves.find_curves import FoundEdges, find_curves
-from torchsfm.reconstruction.evidence.doubt import Standing, examine
+from torchsfm.reconstruction.evidence.doubt import Standing
 from torchsfm.reconstruction.image_reports import image_reports
 from torchsfm.reconstruction.lines.find_lines import FoundSegments, find_lines
-from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
 from torchsfm.reconstruction.mappers.growth import Component, Given, Growth, Wanted
 from torchsfm.reconstruction.mappers.incremental import UNKNOWN_FOCAL
-from torchsfm.reconstruction.mappers.unfold import hanging_on_copies
-from torchsfm.reconstruction.mapping.adjust import LOSS
-from torchsfm.reconstruction.mapping.calibration import (
-    ENOUGH,
-    ENOUGH_OF_FEW,
-    FEW,
-    Calibration,
-    calibration_of,
-    observation_weights,
-)
+from torchsfm.reconstruction.mapping.calibration import Calibration
 from torchsfm.reconstruction.matching.stages import Stages, one_thread
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
 from torchsfm.reconstruction.messages import Progress
@@ -66,15 +55,18 @@ def build_models(
     number = len(given.graph.names)
     with stages.timed("map"), one_thread() if number <= FEW_IMAGES else nullcontext():
         growth = Growth.of(given, wanted, generator, lambda done, total: progress("map", done, total))
+        attempt = best_attempt(given.graph, wanted, growth)
         made: list[tuple[Component, Reconstruction]] = []
-        for component in growth.components():
+        for component in attempt.components:
             made.append(_with_lines_and_curves(component, segments, edges, stages, progress))
             if stages.folder is not None:
                 _save_model(made[-1][1], stages.folder, len(made) - 1)
-        found = [(finished, *_judged(component, growth, given.graph, wanted)) for component, finished in made]
+        found = [(finished, *attempt.judge(component)) for component, finished in made]
         found.sort(key=lambda entry: (-entry[0].num_registered, -entry[0].num_points))
     progress("map", number, number)
-    return SfmResult(tuple(model for model, _, _ in found), _report(growth, given.graph, found, order, failures or {}, stages))
+    return SfmResult(
+        tuple(model for model, _, _ in found), _report(attempt.growth, given.graph, found, order, failures or {}, stages)
+    )
 
 
 def _with_lines_and_curves(
@@ -95,27 +87,6 @@ def _with_lines_and_curves(
             agree, prior = model is not component.model, component.options.prior(model)
             model, lines, curves = find_curves(model, edges(), prior, progress, lines=lines, lines_agree=agree)
     return component.moved(model), replace(model.reconstruction(), lines=lines, curves=curves)
-
-
-def _judged(component: Component, growth: Growth, graph: ViewGraph, wanted: Wanted) -> tuple[Standing, Calibration]:
-    """What is thought of a model's camera poses and intrinsics, once all models are made."""
-    model, options, threshold = component.model, component.options, growth.begun.options.reprojection
-    others = growth.taken & ~model.registered
-    uncertain = component.uncertain
-    if uncertain is not None and bool(growth.given_up.any()):
-        uncertain = uncertain | hanging_on_copies(graph, model, others, threshold=threshold)
-    # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
-    widest = replace(options, cropped=options.cropped or component.off_centre).prior(model)
-    # What few wrong matches of two views hold fast is not known: deviations are those that longer tracks leave.
-    weights = observation_weights(model, LOSS, enough=ENOUGH_OF_FEW if int(model.registered.sum()) <= FEW else ENOUGH)
-    standing = examine(
-        model, open_numbers=wanted.free, prior=widest, threshold=threshold, weights=weights, uncertain=uncertain,
-        conflicts=component.conflicts, agreement=component.agreement,
-        elsewhere=matches_across(graph, model.registered, others), flat=crops_of_one_plane(model, options),
-        rival=component.rival,
-    )  # fmt: skip
-    covariance = None if standing.intrinsics is None or component.off_centre else (wanted.free, standing.intrinsics)
-    return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
 
 
 def _report(
@@ -145,12 +116,3 @@ def _report(
 def _save_model(model: Reconstruction, folder: Path, number: int) -> None:
     (folder / "stages").mkdir(parents=True, exist_ok=True)
     model.save(folder / "stages" / f"model-{number}.npz")
-
-
-def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:
-    """How many verified matches each image of a model has with images of others."""
-    total = torch.zeros(len(registered), dtype=torch.long)
-    for own, other in (graph.pairs.unbind(1), graph.pairs.flip(1).unbind(1)):
-        across = registered[own] & others[other]
-        total.index_add_(0, own[across], graph.fundamental_inliers[across])
-    return total

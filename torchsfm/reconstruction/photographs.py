@@ -41,7 +41,7 @@ def reconstruct(
     shared_camera: bool | None = None,
     K: Float[Tensor, "3 3"] | None = None,
     free_principal_point: bool = True,
-    method: str = "incremental",
+    method: str = "auto",
     lines: bool = False,
     curves: bool = False,
     masks: str | Path | None = None,
@@ -58,7 +58,7 @@ def reconstruct(
     The steps: SIFT features; matches between all pairs, of many images between those whose best features match (see
     `preview_matches`), less those of what is fixed to the images, as watermarks and parts of a vehicle are; epipolar geometry
     of these pairs in one batched call; focal length from Exif unless the fundamental matrices refute it, else from these, else
-    a default; incremental structure from motion with bundle adjustment over poses, points, focal length and distortion. Images
+    a default; structure from motion (`method`) with bundle adjustment over poses, points, focal length and distortion. Images
     that have nothing in common form several models.
 
     Args:
@@ -83,7 +83,8 @@ def reconstruct(
             "global" finds the rotations of all images from those of pairs, then all centres and points at once, with a first
             focal length; "windows" is for films: models of forty frames at a time, joined over what they share, also where the
             camera comes back, so that what each adds to the drift is spread over the loop; "auto" is "global" for 500 images or
-            more that many pairs hold together and whose focal lengths are roughly known, else "incremental"; "curves" goes by
+            more that many pairs hold together and whose focal lengths are roughly known, else "incremental", or "global" where
+            that leaves parts of what hangs together and more images are not doubtful then; "curves" goes by
             edges alone, where points do not suffice: smooth things with painted curves. The images are consecutive frames of
             one camera that is a little elsewhere each time, or farther where dense motion tells where what they show is in the
             next one; its principal point is held centred. Curves are followed through a few frames at a time, which tells their

@@ -30,7 +30,7 @@ def reconstruct_tracks(
     K: Float[Tensor, "3 3"] | None = None,
     focal: float | None = None,
     free_principal_point: bool = True,
-    method: str = "incremental",
+    method: str = "auto",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SfmResult:

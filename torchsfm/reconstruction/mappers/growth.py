@@ -59,14 +59,14 @@ class Wanted:
         shared_camera: Whether one camera took all images of the same size.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
-        method: "incremental", "projective", "global", "windows", or "auto" for what `choose_mapper` says.
+        method: "incremental", "projective", "global", "windows", or "auto" for what `choose_mapper` and `best_attempt` say.
     """
 
     camera: str | None = None
     shared_camera: bool | None = None
     K: Float[Tensor, "3 3"] | None = None
     free_principal_point: bool = True
-    method: str = "incremental"
+    method: str = "auto"
 
     def __post_init__(self) -> None:
         if self.camera is not None and self.camera not in DISTORTION_MODELS:
@@ -183,6 +183,10 @@ class Growth:
         # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
         family = group_cameras(torch.zeros_like(graph.image_size), given.labels, wanted.shared_camera)
         return cls(begun, method, family, given.track is None, progress, first)
+
+    def by(self, method: str) -> "Growth":
+        """From the same beginning, by another mapper."""
+        return replace(self, method=method, first=None)
 
     def components(self) -> Iterator[Component]:
         """The models, in the order in which they are made."""

@@ -25,6 +25,8 @@ NEAR_IMAGES = 16
 """Pairs of one block of so many by so many images are matched one after the other, and so need few images at a time."""
 MATCHED_AT_ONCE = 128
 """Pairs whose images are in the memory together."""
+FEW_FEATURES, RATIO_OF_FEW = 2048, 0.9
+"""Images with fewer features match by a looser ratio: there are fewer others to take one for, and each match is needed."""
 VERIFIED_AT_ONCE = 4096
 """Pairs of a shard of verification, which gains from large batches."""
 
@@ -199,7 +201,10 @@ def _promising(pairs: Int[Tensor, "q 2"], features: SavedFeatures, stages: Stage
 
 def _matches(features: list[Features], pairs: Int[Tensor, "k 2"]) -> Arrays:
     """The matches of pairs one after the other, and how many each has."""
-    rows = match_features(features, pairs)
+    few = (torch.tensor([len(f) for f in features]) < FEW_FEATURES)[pairs].any(1)
+    strict = iter(match_features(features, pairs[~few]))
+    loose = iter(match_features(features, pairs[few], ratio=RATIO_OF_FEW))
+    rows = [next(loose if of_few else strict) for of_few in few.tolist()]
     return {"count": torch.tensor([len(m) for m in rows]).long(), "match": torch.cat(rows)}
 
 

@@ -1,0 +1,103 @@
+"""The models of all images by one mapper, what is thought of them, and by which of two mappers they are better."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from torchsfm.motion.many_views.components import components
+from torchsfm.reconstruction.evidence.doubt import Standing, examine
+from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
+from torchsfm.reconstruction.mappers.growth import Component, Growth, Wanted
+from torchsfm.reconstruction.mappers.unfold import hanging_on_copies
+from torchsfm.reconstruction.mapping.adjust import LOSS
+from torchsfm.reconstruction.mapping.calibration import (
+    ENOUGH,
+    ENOUGH_OF_FEW,
+    FEW,
+    Calibration,
+    calibration_of,
+    observation_weights,
+)
+from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
+
+LEFT = 0.1
+"""Models have fallen apart where a larger part of the images that hang together with the largest one is not in it."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """All models that one mapper made."""
+
+    graph: ViewGraph
+    wanted: Wanted
+    growth: Growth
+    components: tuple[Component, ...]
+
+    @classmethod
+    def of(cls, graph: ViewGraph, wanted: Wanted, growth: Growth) -> "Attempt":
+        """Make them."""
+        return cls(graph, wanted, growth, tuple(growth.components()))
+
+    def judge(self, component: Component) -> tuple[Standing, Calibration]:
+        """What is thought of a model's camera poses and intrinsics."""
+        model, options, threshold = component.model, component.options, self.growth.begun.options.reprojection
+        others = self.growth.taken & ~model.registered
+        uncertain = component.uncertain
+        if uncertain is not None and bool(self.growth.given_up.any()):
+            uncertain = uncertain | hanging_on_copies(self.graph, model, others, threshold=threshold)
+        # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
+        widest = replace(options, cropped=options.cropped or component.off_centre).prior(model)
+        # What few wrong matches of two views hold fast is not known: deviations are those that longer tracks leave.
+        weights = observation_weights(model, LOSS, enough=ENOUGH_OF_FEW if int(model.registered.sum()) <= FEW else ENOUGH)
+        standing = examine(
+            model, open_numbers=self.wanted.free, prior=widest, threshold=threshold, weights=weights, uncertain=uncertain,
+            conflicts=component.conflicts, agreement=component.agreement,
+            elsewhere=matches_across(self.graph, model.registered, others), flat=crops_of_one_plane(model, options),
+            rival=component.rival,
+        )  # fmt: skip
+        covariance = None if standing.intrinsics is None or component.off_centre else (self.wanted.free, standing.intrinsics)
+        return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
+
+    @property
+    def undoubted(self) -> int:
+        """How many images are in a model and not doubtful."""
+        total = 0
+        for component in self.components:
+            doubt = self.judge(component)[0].doubt
+            total += sum(not doubt[i] for i in component.model.registered.nonzero()[:, 0].tolist())
+        return total
+
+    @property
+    def fell_apart(self) -> bool:
+        """Whether more than a few of the images that hang together with those of the largest model are not in it."""
+        if not self.components:
+            return False
+        largest = max((component.model.registered for component in self.components), key=lambda own: int(own.sum()))
+        found = torch.maximum(self.graph.fundamental_inliers, self.graph.homography_inliers)
+        label = components(self.graph.pairs[found >= MIN_INLIERS], len(largest))
+        together = label == label[largest].mode().values
+        return int((together & ~largest).sum()) > LEFT * int(together.sum())
+
+
+def best_attempt(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
+    """The models of all images; where the mapper is not prescribed, those by another one if these have fallen apart.
+
+    Images that are placed one by one need many points in common with those before. To place all at once takes less, and goes
+    wrong more often; so the models are kept in which more images are not doubtful.
+    """
+    attempt = Attempt.of(graph, wanted, growth)
+    if wanted.method != "auto" or growth.method != "incremental" or not attempt.fell_apart:
+        return attempt
+    other = Attempt.of(graph, wanted, growth.by("global"))
+    return other if other.undoubted > attempt.undoubted else attempt
+
+
+def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:
+    """How many verified matches each image of a model has with images of others."""
+    total = torch.zeros(len(registered), dtype=torch.long)
+    for own, other in (graph.pairs.unbind(1), graph.pairs.flip(1).unbind(1)):
+        across = registered[own] & others[other]
+        total.index_add_(0, own[across], graph.fundamental_inliers[across])
+    return total
