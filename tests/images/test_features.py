@@ -133,6 +133,29 @@ def test_strong_points_come_first_but_from_all_over() -> None:
         assert float(some.response[kept == c].max()) == float(strongest)
 
 
+def test_an_image_with_few_points_is_given_weaker_ones_after_them() -> None:
+    canvas = np.full((240, 320), 90, np.uint8)
+    t = np.linspace(0, 2 * np.pi, 400)
+    for k in range(48):  # thin loops, bent by three waves each
+        r = 8 + 5 * (k % 4) + 3 * np.sin(3 * t + k)
+        loop = np.stack((40 + 80 * (k // 4 % 4) + 1.4 * r * np.cos(t), 40 + 80 * (k // 16) + 1.2 * r * np.sin(t)), 1)
+        cv2.polylines(canvas, [np.round(16 * loop).astype(np.int32)], True, 140, 1, cv2.LINE_AA, 4)
+    image = torch.from_numpy(canvas)[None] / 255
+    few, every = (detect_features(image, enough=k) for k in (0, 5000))
+    assert 100 < len(few) < 0.8 * len(every)
+    some = detect_features(image, enough=len(few) + 20)
+    assert len(some) == len(few) + 20
+    assert torch.equal(every.x[: len(few)], few.x)
+    assert torch.equal(every.x[: len(some)], some.x)
+    assert len(
+        {(*x, s, a) for x, s, a in zip(every.x.tolist(), every.scale.tolist(), every.angle.tolist(), strict=True)}
+    ) == len(every)
+    assert len(detect_features(image, 60)) == 60
+    # One that has enough keeps to the strict tests.
+    rich = torch.from_numpy(texture(4))[None]
+    assert torch.equal(detect_features(rich, enough=200).x, detect_features(rich, enough=0).x)
+
+
 def test_the_answer_is_always_the_same() -> None:
     image = torch.from_numpy(texture(5))[None]
     before = image.clone()

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import project_points
+from torchsfm.images import Features
 from torchsfm.reconstruction.matching import match_all
 from torchsfm.reconstruction.matching.image_points import SavedFeatures
 from torchsfm.reconstruction.matching.match_all import NEAR_IMAGES, VERIFIED_AT_ONCE, PairShards
@@ -112,3 +113,25 @@ def test_a_pair_is_verified_by_its_own_matches(generator: torch.Generator) -> No
         assert alone.homography_inliers[0] == together.homography_inliers[q]
         torch.testing.assert_close(alone.F[0], together.F[q], rtol=1e-6, atol=1e-12)
         assert torch.equal(alone.match, together.match[together.match_pair == q])
+
+
+def test_images_of_few_features_match_by_a_looser_ratio(generator: torch.Generator) -> None:
+    """Each descriptor of the first image has a partner, and one 20 % farther in angle: 0.83 is between the two ratios."""
+    count = match_all.FEW_FEATURES
+    d = torch.nn.functional.normalize(torch.randn(count, 128, generator=generator), dim=1)
+    aside = torch.nn.functional.normalize(torch.randn(count, 128, generator=generator), dim=1)
+    aside = torch.nn.functional.normalize(aside - (aside * d).sum(1, keepdim=True) * d, dim=1)
+    near, far = (angle.cos() * d + angle.sin() * aside for angle in torch.tensor([0.2, 0.24]))
+    x = torch.zeros(count, 2)
+
+    def features(descriptors: Tensor) -> Features:
+        return Features(x[: len(descriptors)], x[: len(descriptors), 0], *([x[: len(descriptors), 0]] * 2), descriptors)
+
+    both = torch.stack((near[: count // 2], far[: count // 2]), 1).flatten(0, 1)
+    images = [features(d), features(both), features(d[:-1]), features(both[:-1])]
+    pairs = torch.tensor([[0, 3], [0, 1], [2, 1], [0, 1]])
+    found = match_all._matches(images, pairs)
+    assert len(found["match"]) == int(found["count"].sum())
+    second, strict, first, again = found["count"].tolist()
+    assert strict == again < 0.02 * count
+    assert min(second, first) > 0.45 * count

@@ -61,13 +61,14 @@ class Attempt:
         return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
 
     @property
+    def registered(self) -> int:
+        """How many images are in a model."""
+        return sum(int(component.model.registered.sum()) for component in self.components)
+
+    @property
     def undoubted(self) -> int:
-        """How many images are in a model and not doubtful."""
-        total = 0
-        for component in self.components:
-            doubt = self.judge(component)[0].doubt
-            total += sum(not doubt[i] for i in component.model.registered.nonzero()[:, 0].tolist())
-        return total
+        """How many of these are not doubtful."""
+        return self.registered - sum(bool(doubt) for one in self.components for doubt in self.judge(one)[0].doubt)
 
     @property
     def fell_apart(self) -> bool:
@@ -91,7 +92,7 @@ def best_attempt(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
     if wanted.method != "auto" or growth.method != "incremental" or not attempt.fell_apart:
         return attempt
     other = Attempt.of(graph, wanted, growth.by("global"))
-    return other if other.undoubted > attempt.undoubted else attempt
+    return max(attempt, other, key=lambda one: (one.undoubted, one.registered))
 
 
 def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.evidence.consistency import PairAgreement, excess_scatter, pair_agreement
-from torchsfm.reconstruction.evidence.groups import outvoted_groups
+from torchsfm.reconstruction.evidence.groups import hanging_groups, outvoted_groups
 from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
 from torchsfm.reconstruction.mapping.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.mapping.calibration import FEW, HARDLY, measure_noise
@@ -88,6 +88,7 @@ def examine(
     explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
     outvoted = agreement.balance(v) < 0
     hinged = outvoted_groups(agreement, mapping.registered)
+    hanging = hanging_groups(agreement, mapping.registered)
     conflicts = conflicts or missing_correspondences(mapping)
     refuted, folded = conflicts.refuted, conflicts.folded
     guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL
@@ -119,6 +120,8 @@ def examine(
             return f"{explained} of the {verified} matches of all pairs agree with the model, the others do not"
         if count >= 3 and int(supporting[i]) < 2:
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
+        if count >= 3 and int(hanging[i]) > 0:
+            return f"one pair of images alone holds it, with {int(hanging[i]) - 1} others, to the rest"
         if count < 3 and bool(guessed[i]):
             return "two images alone, with a guessed focal length"
         if count <= FEW and bool(guessed[i]) and not focal_sigma[i] < HARDLY:

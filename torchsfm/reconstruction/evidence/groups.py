@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchsfm.motion.many_views.blocks import blocks
+from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import PairAgreement
 
 
@@ -50,3 +52,17 @@ def outvoted_groups(agreement: PairAgreement, registered: Bool[Tensor, "v"]) -> 
     for own in (first, second):
         balance.index_add_(0, own[first != second], votes[first != second])
     return registered & (balance[group] < 0) & (group != sizes.argmax())
+
+
+def hanging_groups(agreement: PairAgreement, registered: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:
+    """How many images each one is in a group with, itself included, that a single pair holds to the largest of them; else 0.
+
+    Two images of a thing far away leave a hinge open, and the pair agrees with the model however it is turned. A group that
+    one pair alone holds may stand anywhere along it, though each of its images has several pairs that agree.
+    """
+    pairs = agreement.pairs[agreement.supports]
+    block = blocks(pairs, len(registered))
+    alone = torch.bincount(block, minlength=1)[block] == 1
+    group = components(pairs[~alone], len(registered))
+    sizes = torch.bincount(group[registered], minlength=len(group))
+    return torch.where(registered & (group != sizes.argmax()), sizes[group], 0)

@@ -1,0 +1,63 @@
+"""Two mappers: where models fall apart images are placed all at once, and what is less in doubt is kept."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from chance import seeded
+
+from bench.doubt import camera_errors
+from torchsfm.geometry import Camera, Pose, Radial, intrinsics
+from torchsfm.reconstruction import SfmResult, reconstruct_tracks
+from torchsfm.reconstruction.attempts import Attempt
+from torchsfm.simulation import orbit_poses, random_points, simulate_images
+
+SIZE, VIEWS, RADIUS = (1000, 750), 9, 5.0
+
+
+def chain(seed: int, three: int) -> tuple[Callable[..., SfmResult], Pose]:
+    """Each pair of neighbours sees 60 points that no other image does, and any three in a row see so many together."""
+    g, v, two = seeded(seed), VIEWS, 60
+    poses = orbit_poses(v, radius=RADIUS, sweep=1.8)
+    X = random_points((v - 1) * two + (v - 2) * three, kind="ball", size=1.6, generator=g)
+    first = torch.cat((torch.arange(v - 1).repeat_interleave(two), torch.arange(v - 2).repeat_interleave(three)))
+    length = torch.full_like(first, 3).index_fill_(0, torch.arange((v - 1) * two), 2)
+    view = torch.arange(v)[:, None]
+    zero = torch.zeros(v, dtype=torch.float64)
+    camera = Camera(intrinsics(torch.tensor(1100.0), torch.tensor([499.5, 374.5])).double().expand(v, 3, 3), Radial(zero, zero))
+    seen = simulate_images(X, poses, camera, image_size=SIZE, noise=0.3, generator=g)
+    i, track = (seen.visible & (view >= first) & (view < first + length)).nonzero(as_tuple=True)
+
+    def run(**options: object) -> SfmResult:
+        size = torch.tensor([SIZE] * v)
+        return reconstruct_tracks(seen.x[i, track], i, track, size, focal=1100.0, **options)  # type: ignore[arg-type]
+
+    return run, poses
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_images_with_few_points_in_common_are_placed_all_at_once(seed: int) -> None:
+    run, poses = chain(seed, 18)
+    assert run(method="incremental").model.num_registered == 2
+    found = run()
+    assert found.report.method == "global"
+    own = found.model.registered
+    assert int(own.sum()) >= 7
+    assert float(camera_errors(found.model.poses, poses, own, RADIUS)[own].max()) < 1.0
+    assert not any(image.doubt for image in found.report.images)
+
+
+def test_images_that_hang_together_are_placed_one_by_one() -> None:
+    run, _ = chain(1, 60)
+    found = run()
+    assert found.report.method == "incremental"
+    assert found.model.num_registered == VIEWS
+
+
+def test_models_in_doubt_do_not_replace_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, _ = chain(0, 18)
+    undoubted = {"incremental": 3}
+    monkeypatch.setattr(Attempt, "undoubted", property(lambda attempt: undoubted[attempt.growth.method]))
+    for number, kept in ((2, "incremental"), (4, "global")):
+        undoubted["global"] = number
+        assert run().report.method == kept
