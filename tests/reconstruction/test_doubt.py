@@ -392,6 +392,18 @@ def test_what_was_held_is_still_uncertain(generator: torch.Generator) -> None:
     assert (known.rotation_sigma < guessed.rotation_sigma).all()
 
 
+def test_a_group_on_a_hinge_is_doubted_unless_a_third_image_sees_it(generator: torch.Generator) -> None:
+    """Five images see one cloud, three another; two of them see 40 points between the clouds."""
+    X = torch.cat((cloud(300, generator, (-3, -2, -2.5), (3, 2, 2.5)), cloud(40, generator, (-3, -2, -2.5), (3, 2, 2.5))))
+    for third in (False, True):
+        sees = torch.zeros(8, 340, dtype=torch.bool)
+        sees[:5, :150] = sees[5:, 150:300] = sees[4:6, 300:] = True
+        sees[6, 300:] = third
+        doubt = judged(mapping_of(cameras_on_an_arc(8, 0.8), X, sees, generator))
+        hanging = ["holds it, with 2 others" in reason for reason in doubt]
+        assert hanging == [False] * 5 + [not third] * 3
+
+
 def test_a_model_of_images_that_have_more_in_common_with_another(generator: torch.Generator) -> None:
     mapping = scene(generator)
     own = torch.arange(8) < 4

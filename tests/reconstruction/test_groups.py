@@ -52,15 +52,12 @@ def test_images_of_which_nothing_is_known_are_no_group_that_is_outvoted(generato
     assert not outvoted_groups(PairAgreement(none.reshape(0, 2), none, none, none), registered).any()
 
 
-def test_what_one_pair_holds_may_stand_anywhere_along_it(generator: torch.Generator) -> None:
+def test_what_a_hinge_holds_is_told(generator: torch.Generator) -> None:
     registered = torch.arange(13) < 12
-    for across, expected in ((0, [0] * 7 + [4] * 4), (1, [0] * 7 + [4] * 4), (2, [0] * 11)):
+    for across, held in ((0, False), (1, False), (2, True)):
         agreement, place = shuffled(two_sides((7, 4), across, generator), 11, generator)
-        found = hanging_groups(agreement, registered)
-        assert found[place].tolist() == expected
+        far = (place.argsort() >= 7)[agreement.pairs]
+        hinge = agreement.supports & (far[:, 0] != far[:, 1]) & (across == 1)
+        found = hanging_groups(agreement, registered, hinge)
+        assert found[place].tolist() == ([0] * 11 if held else [0] * 7 + [4] * 4)
         assert found[11:].tolist() == [1, 0], "an image without pairs, and one that is not registered"
-    pairs = torch.tensor([[0, 1], [1, 2], [2, 3]])
-    row, ring = ((e, torch.full((len(e),), 50)) for e in (pairs, torch.cat((pairs, torch.tensor([[0, 3]])))))
-    for (edges, matches), held in ((row, 1), (ring, 4)):
-        agreement = PairAgreement(edges, matches, matches, torch.arange(len(edges)))
-        assert int((hanging_groups(agreement, torch.ones(4, dtype=torch.bool)) == 0).sum()) == held

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm.bundle import bundle_covariance
 from torchsfm.reconstruction.evidence.consistency import PairAgreement, excess_scatter, pair_agreement
-from torchsfm.reconstruction.evidence.groups import hanging_groups, outvoted_groups
+from torchsfm.reconstruction.evidence.groups import hanging_groups, hinges, outvoted_groups
 from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
 from torchsfm.reconstruction.mapping.adjust import LOSS, about_cameras
 from torchsfm.reconstruction.mapping.calibration import FEW, HARDLY, measure_noise
@@ -88,7 +88,7 @@ def examine(
     explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
     outvoted = agreement.balance(v) < 0
     hinged = outvoted_groups(agreement, mapping.registered)
-    hanging = hanging_groups(agreement, mapping.registered)
+    hanging = hanging_groups(agreement, mapping.registered, hinges(agreement, mapping))
     conflicts = conflicts or missing_correspondences(mapping)
     refuted, folded = conflicts.refuted, conflicts.folded
     guessed = prior.sigma["focal"][mapping.camera_index] >= GUESSED_FOCAL

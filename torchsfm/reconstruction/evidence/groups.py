@@ -14,6 +14,10 @@ from torch import Tensor
 from torchsfm.motion.many_views.blocks import blocks
 from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import PairAgreement
+from torchsfm.reconstruction.mapping.mapping import Mapping
+
+FIRM = 20
+"""Points that three images or more see hold the third to the other two: by so many an image is registered."""
 
 
 def agreeing_groups(agreement: PairAgreement, views: int) -> Int[Tensor, "v"]:
@@ -54,15 +58,34 @@ def outvoted_groups(agreement: PairAgreement, registered: Bool[Tensor, "v"]) -> 
     return registered & (balance[group] < 0) & (group != sizes.argmax())
 
 
-def hanging_groups(agreement: PairAgreement, registered: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:
-    """How many images each one is in a group with, itself included, that a single pair holds to the largest of them; else 0.
+def hanging_groups(agreement: PairAgreement, registered: Bool[Tensor, "v"], hinge: Bool[Tensor, "q"]) -> Int[Tensor, "v"]:
+    """How many images each one is in a group with, itself included, that a hinge holds to the largest of them; else 0.
 
-    Two images of a thing far away leave a hinge open, and the pair agrees with the model however it is turned. A group that
-    one pair alone holds may stand anywhere along it, though each of its images has several pairs that agree.
+    Args:
+        agreement: How pairs agree with the model.
+        registered: The images of the model.
+        hinge: What `hinges` are among these pairs.
     """
-    pairs = agreement.pairs[agreement.supports]
-    block = blocks(pairs, len(registered))
-    alone = torch.bincount(block, minlength=1)[block] == 1
-    group = components(pairs[~alone], len(registered))
+    group = components(agreement.pairs[agreement.supports & ~hinge], len(registered))
     sizes = torch.bincount(group[registered], minlength=len(group))
     return torch.where(registered & (group != sizes.argmax()), sizes[group], 0)
+
+
+def hinges(agreement: PairAgreement, mapping: Mapping) -> Bool[Tensor, "q"]:
+    """Pairs of images that alone hold what is on one side of them to what is on the other.
+
+    Two images of a thing far away leave open how it is turned, and the pair agrees with the model whatever that is. Each image
+    of a group that stands anywhere along such a pair has others that agree. What a third image sees of the pair's points holds
+    them, as it does an image that is registered, if these are `FIRM` or more.
+    """
+    supporting = agreement.supports.nonzero()[:, 0]
+    block = blocks(agreement.pairs[supporting], len(mapping.registered))
+    hinge = torch.zeros_like(agreement.supports)
+    hinge[supporting[torch.bincount(block, minlength=1)[block] == 1]] = True
+    node = mapping.observations()
+    node = node[(torch.bincount(mapping.point[node], minlength=len(mapping.X)) >= 3)[mapping.point[node]]]
+    view, point = mapping.graph.view[node], mapping.point[node]
+    for q in hinge.nonzero()[:, 0].tolist():
+        first, second = (point[view == i] for i in agreement.pairs[q].tolist())
+        hinge[q] = int(torch.isin(first, second).sum()) < FIRM
+    return hinge
