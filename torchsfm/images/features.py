@@ -68,7 +68,7 @@ def detect_features(
     *,
     contrast: float = 0.01,
     edge: float = 10.0,
-    enough: int = 2048,
+    enough: int = 0,
     max_size: int = 2400,
 ) -> Features:
     """SIFT points with RootSIFT descriptors (Lowe, IJCV 2004; Arandjelovic and Zisserman, CVPR 2012).
@@ -82,7 +82,7 @@ def detect_features(
         contrast: Smallest contrast, in the units of OpenCV's `contrastThreshold`.
         edge: Points whose principal curvatures have a larger ratio than this lie on an edge and are dropped.
         enough: An image with fewer points is given up to so many, after the others those of a third of that contrast and three
-            times that ratio: bends of edges are most of what smooth things have.
+            times that ratio: bends of edges are most of what smooth things have. Fewer of these are found again elsewhere.
         max_size: Larger images are scaled down to this longer side for the detection; positions are those of the image given.
 
     Returns:

@@ -15,7 +15,7 @@ from torchsfm.reconstruction.curve_models import reconstruct_from_curves
 from torchsfm.reconstruction.curves.find_curves import FoundEdges, detect_all_edges
 from torchsfm.reconstruction.lines.find_lines import FoundSegments
 from torchsfm.reconstruction.mappers.growth import METHODS, Given, Wanted
-from torchsfm.reconstruction.matching.image_points import ImagePoints, detect_all
+from torchsfm.reconstruction.matching.image_points import ENOUGH, ImagePoints, detect_all
 from torchsfm.reconstruction.matching.masks import Masks
 from torchsfm.reconstruction.matching.match_all import match_all
 from torchsfm.reconstruction.matching.segments import detect_all_segments
@@ -226,6 +226,7 @@ def match_photographs(
     files, names = sources.files, sources.names
     # What is saved depends on these alone; cameras and models are made from it each time.
     options: dict[str, Any] = {"sequence": sequence, "features": max_features, "pixels": max_pixels, "neighbours": neighbours}
+    options["enough"] = ENOUGH
     found = None if masks is None else Masks.of(masks, sources)
     stages = _stages(sources, found, options, out, resume, first)
     points = detect_all(files, names, stages, max_features, max_pixels, progress, found)

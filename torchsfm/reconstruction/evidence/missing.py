@@ -103,8 +103,8 @@ class Conflicts:
 def missing_correspondences(mapping: Mapping) -> Conflicts:
     """Compare every two cameras with like viewpoints, point by point, in each part of the image.
 
-    A point counts between two cameras if the one sees it, at least one camera at another place than these two does, and the
-    model says that it lies in the other's view, from nearly the same direction and distance. The share that the other sees is
+    A point counts between two cameras if the one sees it distinctly, at least one camera at another place than these two does,
+    and the model says that it lies in the other's view, from nearly the same direction and distance. The share that is seen is
     the pair's own; a part of the image where it is zero speaks against the pair with the likelihood of so many misses at that
     share, if it is zero both for the points of the one camera and for those of the other, or if both miss points, each
     anywhere, at places that they see. A point is found again where its track says so, or where the other image has a point that
@@ -119,6 +119,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     own, other, open_ = (torch.zeros(3, len(directed), cells, dtype=torch.float64) for _ in range(3))
     node = mapping.observations()
     point, view = mapping.point[node], mapping.graph.view[node]
+    strong = torch.ones_like(node, dtype=torch.bool) if mapping.graph.weak is None else ~mapping.graph.weak[node]
     sightings = torch.bincount(point, minlength=len(mapping.X))
     first_sighting = sightings.cumsum(0) - sightings
     site = _places(mapping)
@@ -131,7 +132,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     for a in torch.unique(directed[:, 0]).tolist():
         rows = (directed[:, 0] == a).nonzero()[:, 0]
         b = directed[rows, 1]
-        mine = node[view == a]
+        mine = node[strong & (view == a)]
         p = mapping.point[mine]
         near, ray = _looked_at(mapping, p, a, b)
         # Observations are sorted by point.

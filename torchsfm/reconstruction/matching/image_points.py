@@ -8,7 +8,7 @@ from threading import Lock
 from typing import overload
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import tensor_map
@@ -17,11 +17,13 @@ from torchsfm.reconstruction.matching.masks import Masks
 from torchsfm.reconstruction.matching.stages import Arrays, Shards, Stages
 from torchsfm.reconstruction.messages import Progress, ReconstructionError
 
-Found = tuple[Photograph, Features, Tensor]
+Found = tuple[Photograph, Features, Tensor, Tensor]
 SHARDS, MOST_IMAGES = 64, 64
 """The photographs are divided into about so many shards, but none of more images than this."""
 DETECTION_SIZE = 2400
 """Larger photographs are read and searched at this longer side; positions are those of the whole image."""
+ENOUGH = 1024
+"""Images with fewer features are given weaker ones too, up to so many."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class ImagePoints:
     x: tuple[Float[Tensor, "_ 2"], ...]
     """Where the features of each are, pixels."""
     color: tuple[Float[Tensor, "_ 3"], ...]
+    weak: tuple[Bool[Tensor, "_"], ...]
+    """Which of these are no more than what an image of few features has."""
     features: "SavedFeatures"
     """Their descriptors, read when they are asked for."""
 
@@ -102,18 +106,22 @@ def detect_all(
         except ImageError as error:
             return str(error)
         features = detect_features(photo, max_features, max_size=DETECTION_SIZE)
+        strong = len(features)
+        if strong < ENOUGH:
+            features = detect_features(photo, max_features, enough=ENOUGH, max_size=DETECTION_SIZE)
+        weak = torch.arange(len(features)) >= strong
         zoom = torch.tensor([photo.size[0] / photo.width, photo.size[1] / photo.height])
         if masks is not None:
             try:
                 admitted = masks.admit(path, (features.x + 0.5) * zoom - 0.5, photo.size)
             except ImageError as error:
                 return str(error)
-            features = tensor_map(lambda rows: rows[admitted], features)
+            features, weak = tensor_map(lambda rows: rows[admitted], features), weak[admitted]
         color = nearest_colors(photo.pixels, features.x)
         focal = None if photo.focal is None else photo.focal * max(photo.size) / max(photo.width, photo.height)
         # The pixels have served; only what the file says of the whole image is kept.
         whole = replace(photo, pixels=torch.zeros(1, 1, 1), focal=focal)
-        return whole, replace(features, x=(features.x + 0.5) * zoom - 0.5), color
+        return whole, replace(features, x=(features.x + 0.5) * zoom - 0.5), color, weak
 
     def shard(number: int) -> Arrays:
         found = []
@@ -144,13 +152,14 @@ def _pack(found: list[Found | str]) -> Arrays:
     return {
         "readable": torch.tensor([not isinstance(entry, str) for entry in found]),
         "records": torch.frombuffer(bytearray(text or b"\0"), dtype=torch.uint8),
-        "focal": torch.tensor([photo.focal or 0.0 for photo, _, _ in good], dtype=torch.float64),
-        "size": torch.tensor([photo.size for photo, _, _ in good], dtype=torch.long).reshape(-1, 2),
-        "count": torch.tensor([len(features) for _, features, _ in good], dtype=torch.long),
-        "x": torch.cat([features.x for _, features, _ in good]) if good else torch.zeros(0, 2),
-        "color": torch.cat([color for _, _, color in good]) if good else torch.zeros(0, 3),
+        "focal": torch.tensor([photo.focal or 0.0 for photo, _, _, _ in good], dtype=torch.float64),
+        "size": torch.tensor([photo.size for photo, _, _, _ in good], dtype=torch.long).reshape(-1, 2),
+        "count": torch.tensor([len(features) for _, features, _, _ in good], dtype=torch.long),
+        "x": torch.cat([features.x for _, features, _, _ in good]) if good else torch.zeros(0, 2),
+        "color": torch.cat([color for _, _, color, _ in good]) if good else torch.zeros(0, 3),
+        "weak": torch.cat([weak for _, _, _, weak in good]) if good else torch.zeros(0, dtype=torch.bool),
         # Each by itself, so that one can be read without the others.
-        **{f"descriptors-{k}": features.descriptors for k, (_, features, _) in enumerate(good)},
+        **{f"descriptors-{k}": features.descriptors for k, (_, features, _, _) in enumerate(good)},
     }
 
 
@@ -171,15 +180,16 @@ def _unpack(shards: Shards, files: Sequence[Path], names: Sequence[str], least: 
     Raises:
         ReconstructionError: Fewer files could be read than there must be.
     """
-    parts = [shards.only(k, "readable", "records", "focal", "size", "count", "x", "color") for k in range(len(shards))]
+    parts = [shards.only(k, "readable", "records", "focal", "size", "count", "x", "color", "weak") for k in range(len(shards))]
     records = [r for part in parts for r in bytes(part["records"].numpy()).decode("utf-8", "surrogateescape").split("\0")]
     readable = [bool(ok) for part in parts for ok in part["readable"]]
     failures = {name: record for name, record, ok in zip(names, records, readable, strict=True) if not ok}
     if sum(readable) < least:
         worst = next(iter(failures.values()))
         raise ReconstructionError(f"{sum(readable)} of {len(files)} files can be read as images; first failure: {worst}")
-    x, color = (
-        tuple(rows for part in parts for rows in torch.split(part[key], part["count"].tolist())) for key in ("x", "color")
+    x, color, weak = (
+        tuple(rows for part in parts for rows in torch.split(part[key], part["count"].tolist()))
+        for key in ("x", "color", "weak")
     )
     place = tuple((k, i) for k, part in enumerate(parts) for i in range(len(part["count"])))
     return ImagePoints(
@@ -191,5 +201,6 @@ def _unpack(shards: Shards, files: Sequence[Path], names: Sequence[str], least: 
         failures=failures,
         x=x,
         color=color,
+        weak=weak,
         features=SavedFeatures(shards, place, x),
     )

@@ -25,7 +25,7 @@ NEAR_IMAGES = 16
 """Pairs of one block of so many by so many images are matched one after the other, and so need few images at a time."""
 MATCHED_AT_ONCE = 128
 """Pairs whose images are in the memory together."""
-FEW_FEATURES, RATIO_OF_FEW = 2048, 0.9
+FEW_FEATURES, RATIO_OF_FEW = 4096, 0.9
 """Images with fewer features match by a looser ratio: there are fewer others to take one for, and each match is needed."""
 VERIFIED_AT_ONCE = 4096
 """Pairs of a shard of verification, which gains from large batches."""
@@ -146,12 +146,13 @@ def match_all(
         pairs = _promising(pairs, features, stages, progress)
     work = PairShards.of(pairs)
     matched = _compared("match", _matches, pairs, features, stages, progress)
-    x, color, corners = points.x, points.color, None
+    x, color, weak, corners = points.x, points.color, points.weak, None
     if sequence:
         tracked = stages.run("track", lambda: track_corners(points, max_pixels, progress, masks))
         corners = Corners.of(tracked, len(points.names))
         x = tuple(torch.cat(both) for both in zip(points.x, corners.x, strict=True))
         color = tuple(torch.cat(both) for both in zip(points.color, corners.color, strict=True))
+        weak = tuple(torch.cat((own, own.new_zeros(len(more)))) for own, more in zip(points.weak, corners.x, strict=True))
     x = tuple(a.double() for a in x)
 
     found = FoundMatches(work, pairs, matched, [len(a) for a in points.x], corners)
@@ -184,7 +185,8 @@ def match_all(
     parts = [dict(shard) for shard in shards]
     still = sum(int(part.pop("still")) for part in parts)
     verified = VerifiedPairs.join([VerifiedPairs(**part) for part in parts])
-    graph = replace(verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs), still=still)
+    graph = verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
+    graph = replace(graph, still=still, weak=torch.cat(weak))
     # Corners that were tracked through a sequence have no descriptors.
     return graph if sequence else replace(graph, descriptors=lambda: torch.cat([f.descriptors for f in features]))
 

@@ -76,6 +76,7 @@ class ViewGraph:
         match: Verified matches, as indices into `x`.
         match_pair: Pair of each verified match.
         descriptors: Reads what the image points look like; None where that is not known of all.
+        weak: Image points that are less distinct, so that it says nothing if another image misses them; None where none is.
         still: Matches left out because they stand still where the scene moves, see `find_overlays`.
     """
 
@@ -93,6 +94,7 @@ class ViewGraph:
     match: Int[Tensor, "k 2"]
     match_pair: Int[Tensor, "k"]
     descriptors: Callable[[], UInt8[Tensor, "n d"]] | None = None
+    weak: Bool[Tensor, "n"] | None = None
     still: int = 0
 
     def only(self, kept: Bool[Tensor, "q"]) -> "ViewGraph":
@@ -130,6 +132,7 @@ class ViewGraph:
             match=place[self.match[own]],
             match_pair=(kept.cumsum(0) - 1)[self.match_pair[own]],
             descriptors=None,
+            weak=None if self.weak is None else self.weak[node],
         )
         return part, node
 
