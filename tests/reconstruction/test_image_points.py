@@ -32,3 +32,25 @@ def test_positions_are_those_of_the_whole_image(suffix: str, tmp_path: Path, mon
     assert float((found[distance < 1] - expected[near]).mean(0).abs().max()) < 0.1
     assert float((distance < 1).double().mean()) > 0.9
     assert float((points.color[0] - image[:, found[:, 1].long(), found[:, 0].long()].T).abs().mean()) < 0.1
+
+
+def test_images_of_few_features_have_weak_ones_besides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = torch.rand(2, 3, 30, 40, generator=seeded())
+    images = torch.nn.functional.interpolate(noise, size=(240, 320), mode="bicubic").clamp(0, 1)
+    files = [tmp_path / f"{i}.png" for i in range(2)]
+    for file, image in zip(files, images, strict=True):
+        save_image(file, image)
+    pixels = [read_image(file) for file in files]
+    strong = [detect_features(image, enough=0) for image in pixels]
+    enough = min(map(len, strong)) + 40
+    assert max(map(len, strong)) < enough, "either has too few"
+    monkeypatch.setattr(image_points, "ENOUGH", enough)
+    points = detect_all(files, ["a", "b"], Stages(None, False, ""), 5000, 10**6, lambda *_: None)
+    for found, x, weak, image in zip(strong, points.x, points.weak, pixels, strict=True):
+        assert torch.equal(x, detect_features(image, 5000, enough=enough).x)
+        assert weak.tolist() == [False] * len(found) + [True] * (len(x) - len(found))
+        assert torch.equal(x[~weak], found.x)
+        assert weak.any()
+    monkeypatch.setattr(image_points, "ENOUGH", 10)
+    again = detect_all(files, ["a", "b"], Stages(None, False, ""), 5000, 10**6, lambda *_: None)
+    assert not any(weak.any() for weak in again.weak)

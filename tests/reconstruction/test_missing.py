@@ -89,6 +89,15 @@ def across(pairs: Tensor) -> Tensor:
     return (pairs < GROUP).sum(1) == 1
 
 
+def test_weak_points_are_not_missed(generator: torch.Generator) -> None:
+    folded = model(generator, folded=True)
+    weak = torch.rand(len(folded.graph.x), generator=generator) < 0.5
+    for some, conflict in ((weak, True), (torch.ones_like(weak), False)):
+        found = missing_correspondences(replace(folded, graph=replace(folded.graph, weak=some)))
+        assert found.folded == conflict
+        assert bool((found.score > 0).any()) == conflict
+
+
 def test_what_is_seen_through_is_not_there(generator: torch.Generator) -> None:
     """Each camera misses a crate in another part of the image, before a wall that it sees."""
     for _ in range(5):
