@@ -1,6 +1,7 @@
 """Two mappers: where models fall apart images are placed all at once, and what is less in doubt is kept."""
 
 from collections.abc import Callable
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from chance import seeded
 
 from bench.doubt import camera_errors
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
-from torchsfm.reconstruction import SfmResult, reconstruct_tracks
+from torchsfm.reconstruction import SfmResult, attempts, reconstruct_tracks
 from torchsfm.reconstruction.attempts import Attempt
 from torchsfm.simulation import orbit_poses, random_points, simulate_images
 
@@ -61,3 +62,7 @@ def test_models_in_doubt_do_not_replace_others(monkeypatch: pytest.MonkeyPatch) 
     for number, kept in ((2, "incremental"), (4, "global")):
         undoubted["global"] = number
         assert run().report.method == kept
+    hinged = Mock(side_effect=lambda agreement, _: torch.ones_like(agreement.supports))
+    monkeypatch.setattr(attempts, "hinges", hinged)
+    assert run().report.method == "incremental"
+    hinged.assert_called()

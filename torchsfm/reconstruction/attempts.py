@@ -7,7 +7,9 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchsfm.motion.many_views.components import components
+from torchsfm.reconstruction.evidence.consistency import pair_agreement
 from torchsfm.reconstruction.evidence.doubt import Standing, examine
+from torchsfm.reconstruction.evidence.groups import hinges
 from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
 from torchsfm.reconstruction.mappers.growth import Component, Growth, Wanted
 from torchsfm.reconstruction.mappers.unfold import hanging_on_copies
@@ -71,6 +73,13 @@ class Attempt:
         return self.registered - sum(bool(doubt) for one in self.components for doubt in self.judge(one)[0].doubt)
 
     @property
+    def hinged(self) -> bool:
+        """Whether a single pair of images holds a part of a model, which may be turned anywhere then, to the rest."""
+        threshold = self.growth.begun.options.reprojection
+        agreements = ((one.model, one.agreement or pair_agreement(one.model, threshold=threshold)) for one in self.components)
+        return any(bool(hinges(agreement, model).any()) for model, agreement in agreements)
+
+    @property
     def fell_apart(self) -> bool:
         """Whether more than a few of the images that hang together with those of the largest model are not in it."""
         if not self.components:
@@ -86,13 +95,14 @@ def best_attempt(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
     """The models of all images; where the mapper is not prescribed, those by another one if these have fallen apart.
 
     Images that are placed one by one need many points in common with those before. To place all at once takes less, and goes
-    wrong more often; so the models are kept in which more images are not doubtful.
+    wrong more often: a part that is turned about its only relation bends the rest, and the focal length gives way. So models
+    without any such part are taken, if more images are not doubtful in them.
     """
     attempt = Attempt.of(graph, wanted, growth)
     if wanted.method != "auto" or growth.method != "incremental" or not attempt.fell_apart:
         return attempt
     other = Attempt.of(graph, wanted, growth.by("global"))
-    return max(attempt, other, key=lambda one: (one.undoubted, one.registered))
+    return attempt if other.hinged else max(attempt, other, key=lambda one: (one.undoubted, one.registered))
 
 
 def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:
