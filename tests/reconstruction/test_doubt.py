@@ -400,7 +400,7 @@ def test_a_group_on_a_hinge_is_doubted_unless_a_third_image_sees_it(generator: t
         sees[:5, :150] = sees[5:, 150:300] = sees[4:6, 300:] = True
         sees[6, 300:] = third
         doubt = judged(mapping_of(cameras_on_an_arc(8, 0.8), X, sees, generator))
-        hanging = ["holds it, with 2 others" in reason for reason in doubt]
+        hanging = ["holds it, with 2 more," in reason for reason in doubt]
         assert hanging == [False] * 5 + [not third] * 3
 
 

@@ -121,7 +121,8 @@ def examine(
         if count >= 3 and int(supporting[i]) < 2:
             return f"{('no pair', 'only one pair')[int(supporting[i])]} of images agrees with its place"
         if count >= 3 and int(hanging[i]) > 0:
-            return f"one pair of images alone holds it, with {int(hanging[i]) - 1} others, to the rest"
+            others = f", with {int(hanging[i]) - 1} more," if hanging[i] > 1 else ""
+            return f"one pair of images alone holds it{others} to the rest, and says little of how it is turned"
         if count < 3 and bool(guessed[i]):
             return "two images alone, with a guessed focal length"
         if count <= FEW and bool(guessed[i]) and not focal_sigma[i] < HARDLY:
