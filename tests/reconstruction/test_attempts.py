@@ -1,6 +1,8 @@
 """Two mappers: where models fall apart images are placed all at once, and what is less in doubt is kept."""
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from unittest.mock import Mock
 
 import pytest
@@ -8,9 +10,11 @@ import torch
 from chance import seeded
 
 from bench.doubt import camera_errors
-from torchsfm.geometry import Camera, Pose, Radial, intrinsics
+from torchsfm.geometry import Camera, Pose, Radial, intrinsics, rotation_from_euler
 from torchsfm.reconstruction import SfmResult, attempts, reconstruct_tracks
 from torchsfm.reconstruction.attempts import Attempt
+from torchsfm.reconstruction.mappers.growth import Growth, Wanted
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
 from torchsfm.simulation import orbit_poses, random_points, simulate_images
 
 SIZE, VIEWS, RADIUS = (1000, 750), 9, 5.0
@@ -66,3 +70,26 @@ def test_models_in_doubt_do_not_replace_others(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(attempts, "hinges", hinged)
     assert run().report.method == "incremental"
     hinged.assert_called()
+
+
+@pytest.mark.parametrize(("degrees", "kept"), [(8.0, "global"), (13.0, "incremental")])  # half of it to either side
+def test_what_is_placed_at_once_must_not_bend_the_parts(degrees: float, kept: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, _ = chain(2, 18)
+    made = Attempt.of
+
+    def bent(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
+        """The neighbours in each model of two are turned against each other by `degrees` where all are placed at once."""
+        attempt = made(graph, wanted, growth)
+        if growth.method == "incremental":
+            return attempt
+        (one,) = attempt.components
+        poses = one.model.poses
+        turn = torch.arange(VIEWS) % 2 * math.radians(degrees)
+        R = rotation_from_euler(turn[:, None].double(), "z") @ poses.R
+        return replace(attempt, components=(replace(one, model=replace(one.model, poses=replace(poses, R=R))),))
+
+    monkeypatch.setattr(Attempt, "of", bent)
+    monkeypatch.setattr(Attempt, "hinged", False)
+    undoubted = {"incremental": 0, "global": 9}
+    monkeypatch.setattr(Attempt, "undoubted", property(lambda attempt: undoubted[attempt.growth.method]))
+    assert run().report.method == kept

@@ -6,9 +6,11 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from torchsfm.geometry.rotations import rotation_angle
+from torchsfm.linalg import nearest_rotation
 from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import pair_agreement
-from torchsfm.reconstruction.evidence.doubt import Standing, examine
+from torchsfm.reconstruction.evidence.doubt import WRONG_ANGLE, Standing, examine
 from torchsfm.reconstruction.evidence.groups import hinges
 from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
 from torchsfm.reconstruction.mappers.growth import Component, Growth, Wanted
@@ -79,6 +81,16 @@ class Attempt:
         agreements = ((one.model, one.agreement or pair_agreement(one.model, threshold=threshold)) for one in self.components)
         return any(bool(hinges(agreement, model).any()) for model, agreement in agreements)
 
+    def bends(self, other: "Attempt") -> bool:
+        """Whether images of a model of the other attempt are turned against each other by more than `WRONG_ANGLE` here."""
+        for one in self.components:
+            for whole in other.components:
+                both = one.model.registered & whole.model.registered
+                turn = whole.model.poses.R[both].mT @ one.model.poses.R[both]
+                if len(turn) and float(rotation_angle(nearest_rotation(turn.sum(0)).mT @ turn).max().rad2deg()) > WRONG_ANGLE:
+                    return True
+        return False
+
     @property
     def fell_apart(self) -> bool:
         """Whether more than a few of the images that hang together with those of the largest model are not in it."""
@@ -95,14 +107,17 @@ def best_attempt(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
     """The models of all images; where the mapper is not prescribed, those by another one if these have fallen apart.
 
     Images that are placed one by one need many points in common with those before. To place all at once takes less, and goes
-    wrong more often: a part that is turned about its only relation bends the rest, and the focal length gives way. So models
-    without any such part are taken, if more images are not doubtful in them.
+    wrong more often: a part that is turned about its only relation bends the rest, and the focal length gives way. So what is
+    placed at once must not bend the parts that were placed one by one, nor hang on a hinge, and more images must not be
+    doubtful in it.
     """
     attempt = Attempt.of(graph, wanted, growth)
     if wanted.method != "auto" or growth.method != "incremental" or not attempt.fell_apart:
         return attempt
     other = Attempt.of(graph, wanted, growth.by("global"))
-    return attempt if other.hinged else max(attempt, other, key=lambda one: (one.undoubted, one.registered))
+    if other.bends(attempt) or other.hinged:
+        return attempt
+    return max(attempt, other, key=lambda one: (one.undoubted, one.registered))
 
 
 def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:
