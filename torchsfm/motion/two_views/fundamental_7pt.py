@@ -5,9 +5,10 @@ last dimension.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, check_tensors
@@ -19,7 +20,7 @@ from torchsfm.linalg.rows import combine_rows
 from torchsfm.linalg.vectors import fms
 from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
-_INDEPENDENT = 1e-12
+_INDEPENDENT = {torch.float64: 1e-12, torch.float32: 1e-6}
 """Smallest pivot of the normalised equations, and largest coefficient of the cubic, that are not taken for zero."""
 
 
@@ -62,7 +63,7 @@ def fundamental_7pt(
     """
     batch = check_tensors(x1=(x1, "7 2"), x2=(x2, "7 2"))
     with torch.no_grad():
-        rows, good = solve(batch_last(x1, batch), batch_last(x2, batch))
+        rows, good = solve(batch_last(x1.double(), batch), batch_last(x2.double(), batch))
         F = rows.permute(2, 1, 0).reshape(*batch, 3, 3, 3).to(x1.dtype)
         valid = good.mT.reshape(*batch, 3)
     if wants_derivative(x1, x2):
@@ -71,56 +72,89 @@ def fundamental_7pt(
 
 
 def batch_last(x: Float[Tensor, "*#batch 7 2"], batch: tuple[int, ...]) -> Float[Tensor, "2 7 n"]:
-    """Points as (coordinate, point, problem), in float64."""
+    """Points as (coordinate, point, problem)."""
     x = x.detach().expand(*batch, 7, 2)
-    return x.permute(-1, -2, *range(len(batch))).reshape(2, 7, -1).double()
+    return x.permute(-1, -2, *range(len(batch))).reshape(2, 7, -1)
 
 
 @kernel(chunk=8192)
 def solve(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> tuple[Tensor, Tensor]:
     """F as (9, 3, batch) and valid as (3, batch)."""
-    # The points with the first one at the origin and the largest coordinate 1, in both images.
+    some = pencil(x1, x2)
+    F, unit = members(some.basis[:, :, None], some.roots, some.moves)
+    valid = some.real & unit
+    empty = ~valid
+    # An empty slot holds diag(1, 1, 0).
+    F.masked_fill_(empty, 0.0)[0:5:4].add_(empty, alpha=0.5**0.5)
+    return F, valid
+
+
+class Pencil(NamedTuple):
+    """The F = s G + t H of determinant 0 through seven points each, with F33 = 0, of the points moved and scaled."""
+
+    points: tuple[Float[Tensor, "2 6 batch"], Float[Tensor, "2 6 batch"]]
+    """The points of both images, the first one in the origin and left out, the largest coordinate 1."""
+    moves: Float[Tensor, "2 3 batch"]
+    """How they came there: of both images the origin and the unit."""
+    basis: Float[Tensor, "8 2 batch"]
+    """G and H: the entries of rows and columns 1 and 2, then the rest of the third column, and of the third row."""
+    roots: Float[Tensor, "2 3 batch"]
+    """s and t of each."""
+    real: Bool[Tensor, "3 batch"]
+    """Which roots are any; none where the points leave more F than these."""
+
+
+def pencil(x1: Float[Tensor, "2 7 batch"], x2: Float[Tensor, "2 7 batch"]) -> Pencil:
+    """The two matrices that seven linear equations leave, and the roots of det(G + t H) = 0."""
     x = torch.stack((x1, x2))
-    c1, c2 = centre = x[:, :, 0]
+    centre = x[:, :, 0]
     moved = x[:, :, 1:] - centre[:, :, None]
-    s1, s2 = extent = moved.abs().amax((1, 2))
-    (u, v), (a, b) = moved * extent.reciprocal()[:, None, None]
+    extent = moved.abs().amax((1, 2))
+    first, second = moved.mul_(extent.reciprocal()[:, None, None])
     # The first point says that F33 = 0: six equations in eight entries are left.
-    N, pivot = nullspace_columns(torch.stack((a * u, a * v, a, b * u, b * v, b, u, v)))
+    A = x.new_empty(8, 6, x.shape[-1])
+    torch.mul(second[:, None], first, out=A[:4].view(2, 2, *A.shape[1:]))
+    A[4:6], A[6:] = second, first
+    N, pivot = nullspace_columns(A)
     # Each row for G and for H.
-    swapped = N.flip(1)
-    n, crossed = N.unbind(0), swapped.unbind(0)
+    n, crossed = N.unbind(0), N.flip(1).unbind(0)
     C = _cofactors(n)
     # det(G + t H): the coefficients of 1 and t^3, and of t and t^2.
     outer, inner = combine_rows(C[6:], n[6:]), combine_rows(C, crossed)
     cubic = torch.cat((outer[:1], inner, outer[1:]))
     size = cubic.abs()
-    # The larger of the outer coefficients leads: where that is the first one, G and H change places.
+    # The larger of the outer coefficients leads: where that is the first one, the root is 1 / t.
     turn = size[0] > size[3]
     roots, real = cubic_rows(*torch.where(turn, cubic.flip(0), cubic).unbind(0))
-    G, H = torch.split(torch.where(turn, swapped, N), 1, 1)
-    F = N.new_zeros(9, *roots.shape)
-    torch.addcmul(G, H, roots, out=F[:8])
-    # Back to the coordinates that came: T2' F T1 with T = [I, -c] / size, up to scale; by columns, then by rows.
-    rows = F.view(3, 3, *roots.shape)
+    one = roots.new_ones(())
+    pairs = torch.stack((torch.where(turn, roots, one), torch.where(turn, one, roots)))
+    moves = torch.cat((centre, extent[:, None]), 1)
+    determined = torch.minimum(pivot, size.amax(0)) > _INDEPENDENT[x.dtype]
+    return Pencil((first, second), moves, N, pairs, real & determined)
+
+
+def members(
+    basis: Float[Tensor, "8 2 *#slots"], roots: Float[Tensor, "2 *#slots"], moves: Float[Tensor, "2 3 *#slots"]
+) -> tuple[Float[Tensor, "9 *slots"], Bool[Tensor, "*slots"]]:
+    """S G + t H between points as they came, of norm 1, and where it is finite."""
+    F = (basis[:, 0] * roots[0]).addcmul_(basis[:, 1], roots[1])
+    f0, f1, f3, f4, f2, f5, f6, f7 = F
+    F = torch.stack((f0, f1, f2, f3, f4, f5, f6, f7, torch.zeros_like(f7)))
+    # T2' F T1 with T = [I, -c] / size, up to scale; by columns, then by rows.
+    rows = F.view(3, 3, *F.shape[1:])
+    (u, v, s1), (a, b, s2) = moves
     first, second, third = rows.unbind(1)
-    third.mul_(s1)
-    rows[2].mul_(s2)
-    third.addcmul_(c1[0], first, value=-1).addcmul_(c1[1], second, value=-1)
+    third.mul_(s1).addcmul_(u, first, value=-1).addcmul_(v, second, value=-1)
     first, second, third = rows
-    third.addcmul_(c2[0], first, value=-1).addcmul_(c2[1], second, value=-1)
+    third.mul_(s2).addcmul_(a, first, value=-1).addcmul_(b, second, value=-1)
     entries = F.unbind(0)
     square = combine_rows(entries, entries)
-    # False for NaN; an empty slot holds diag(1, 1, 0).
-    valid = real & (torch.minimum(pivot, size.amax(0)) > _INDEPENDENT) & (square > 0) & (square < torch.inf)
-    empty = ~valid
-    F.mul_(square.rsqrt().masked_fill(empty, 0.0)).nan_to_num_(0.0, 0.0, 0.0)
-    F[0:5:4].add_(empty, alpha=0.5**0.5)
-    return F, valid
+    # False for NaN.
+    return F.mul_(square.rsqrt()), (square > 0) & (square < torch.inf)
 
 
 def _cofactors(f: Sequence[Tensor]) -> list[Tensor]:
-    """Of a matrix whose last entry is 0, without the last one."""
-    f0, f1, f2, f3, f4, f5, f6, f7 = f
+    """Of a matrix whose last entry is 0, without the last one; as the entries, those of the first rows and columns first."""
+    f0, f1, f3, f4, f2, f5, f6, f7 = f
     first, second = (-(f5 * f7), f5 * f6, fms(f4, f6, f3 * f7)), (f2 * f7, -(f2 * f6), fms(f0, f7, f1 * f6))
-    return [*first, *second, fms(f2, f4, f1 * f5), fms(f0, f5, f2 * f3)]
+    return [*first[:2], *second[:2], first[2], second[2], fms(f2, f4, f1 * f5), fms(f0, f5, f2 * f3)]
