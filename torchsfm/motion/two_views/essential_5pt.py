@@ -166,6 +166,7 @@ def _joined(parts: list[_Candidates]) -> _Candidates:
 def _chunk(d1: Tensor, d2: Tensor, other_coordinates: bool) -> _Candidates:
     """Every root, after a step."""
     roots = five_point_roots(d1, d2, other_coordinates=other_coordinates)
-    u, E, error = from_roots(roots.rows, roots.s, roots.t, roots.basis)
+    basis = take_columns(roots.basis, roots.item)
+    u, E, error = from_roots(take_columns(roots.rows, roots.item), roots.s, roots.t, basis)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
-    return _Candidates(roots.item, E, error, rest, take_columns(u, rest), take_columns(roots.basis, rest))
+    return _Candidates(roots.item, E, error, rest, take_columns(u, rest), take_columns(basis, rest))

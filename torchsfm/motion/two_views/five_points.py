@@ -17,7 +17,7 @@ from torch import Tensor
 from torchsfm.linalg.constants import Constant
 from torchsfm.linalg.nullspace import nullspace_columns
 from torchsfm.linalg.real_roots import real_root_list
-from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
+from torchsfm.linalg.rows import add_rows, combine_rows
 
 # Cubic monomials in Nister's order, as sorted triples of 0 (x), 1 (y), 2 (z), 3 (w), the last ones by powers of z; quadratic
 # ones as pairs, squares first.
@@ -35,14 +35,16 @@ _INDEPENDENT = 1e-13
 
 
 class FivePointRoots(NamedTuple):
-    """The roots z : w = s : t of the polynomials of some problems, each with a column of its own."""
+    """The roots z : w = s : t of the polynomials of some problems, one after the other, and what belongs to each problem."""
 
     item: Tensor
+    """The problem of each root."""
     s: Tensor
     t: Tensor
     rows: Tensor
-    """See `polynomial`."""
+    """See `polynomial`, (13, 3, problems)."""
     basis: Tensor
+    """(4, 9, problems)"""
     d1: Tensor
     """The rays at length 1, (3, 5, problems)."""
     d2: Tensor
@@ -61,7 +63,7 @@ def five_point_roots(
     # Without five independent equations there is no polynomial and no root.
     fine = fine1 & fine2 & (pivot > _INDEPENDENT)
     item, s, t, _ = real_root_list(torch.where(fine, p, torch.nan), in_order=False)
-    return FivePointRoots(item, s, t, take_columns(rows, item), take_columns(basis, item), d1, d2)
+    return FivePointRoots(item, s, t, rows, basis, d1, d2)
 
 
 def _unit(d: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,7 @@ gives positive depths. So at most one pose of each E remains. All arithmetic has
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import Solutions, broadcast_shapes
@@ -16,6 +16,7 @@ from torchsfm.linalg.real_roots import number_among_equals
 from torchsfm.linalg.rows import add_rows, combine_rows, take_columns
 from torchsfm.motion.two_views.essential_manifold import combine, polish
 from torchsfm.motion.two_views.five_points import (
+    FivePointRoots,
     back_substitute,
     five_point_roots,
     gone_round,
@@ -27,10 +28,8 @@ from torchsfm.optim import attach_implicit, for_slots, wants_derivative
 
 _CHUNK = 4096
 """Samples at a time: their matrices fit the cache."""
-_MARGIN = 1e-3
-"""Angle in radians that starts may be farther from the front than solutions."""
-_GAP = 1e-7
-"""Of a poor start, see `_in_front`: it is about 1e-4 from the essential manifold."""
+_BESIDE = 1e-6
+"""How far starts may be on the wrong side of an epipolar plane in any case, as a sine."""
 _NEAR = 1e-7
 """Distance from the manifold before a Newton step after which E is as good as any data."""
 _MORE = 2
@@ -88,21 +87,19 @@ def relative_5pt(
 def _poses(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack: Tensor) -> tuple[Tensor, Tensor]:
     """The samples, in order, and the poses (12, poses) of those in front of both cameras."""
     roots = five_point_roots(d1, d2)
-    item, u, basis = roots.item, roots.s, roots.basis
-    rays = take_columns(torch.cat((roots.d1, roots.d2)), item)
-    angle = slack.index_select(0, item)
+    u = back_substitute(take_columns(roots.rows, roots.item), roots.s, roots.t)
     # Of wrong data most solutions are behind a camera, which the start tells unless it is a poor one.
-    u, worth = _starts(roots.rows, roots.s, roots.t, basis, rays, angle)
-    keep = worth.nonzero()[:, 0]
-    item, angle = item.index_select(0, keep), angle.index_select(0, keep)
-    u, basis, rays = (take_columns(x, keep) for x in (u, basis, rays))
+    keep = (~_on_wrong_sides(u, roots, slack)).nonzero()[:, 0]
+    item, u = roots.item.index_select(0, keep), take_columns(u, keep)
+    angle, basis = slack.index_select(0, item), take_columns(roots.basis, item)
+    rays = take_columns(torch.cat((roots.d1, roots.d2)), item)
     u, pose, front, error = _polished(u, basis, rays, angle)
     rest = (~(error < _NEAR)).nonzero()[:, 0]
     if len(rest):
         u, basis = take_columns(u, rest), take_columns(basis, rest)
         for _ in range(_MORE):
             u, error = polish(u, basis)
-        better, ahead, _ = _in_front(combine(u, basis), take_columns(rays, rest), angle.index_select(0, rest))
+        better, ahead = _in_front(combine(u, basis), take_columns(rays, rest), angle.index_select(0, rest))
         pose.index_copy_(1, rest, better)
         front.index_copy_(0, rest, ahead & (error < _CONVERGED))
     keep = front.nonzero()[:, 0]
@@ -110,36 +107,41 @@ def _poses(d1: Float[Tensor, "3 5 batch"], d2: Float[Tensor, "3 5 batch"], slack
     return item, take_columns(pose, keep.index_select(0, order))
 
 
-@kernel(chunk=1 << 20)
-def _starts(matrices: Tensor, s: Tensor, t: Tensor, basis: Tensor, rays: Tensor, slack: Tensor) -> tuple[Tensor, Tensor]:
-    """The coordinates of the solution for each root s / t, and whether it may have a pose in front."""
-    slack = slack + _MARGIN
-    u = back_substitute(matrices, s, t)
-    _, front, gap = _in_front(combine(u, basis), rays, slack, only_whether=True)
-    return u, front | ~(gap < _GAP)
+def _on_wrong_sides(
+    u: Float[Tensor, "4 roots"], roots: FivePointRoots, slack: Float[Tensor, " batch"]
+) -> Bool[Tensor, " roots"]:
+    """Where a point cannot be in front of both cameras: it is on different sides of the two epipolar planes of the first.
+
+    That is, a2' E d1 and d2' E a1 have the same sign, a1 and a2 being the rays of the first point (see `oriented_7pt`). Both
+    are linear in the coordinates of E, and small beside an epipole, where the noise decides.
+    """
+    basis = roots.basis.view(4, 3, 3, -1)
+    first, second = combine_rows(basis.unbind(1), roots.d2[:, 0]), combine_rows(basis.unbind(2), roots.d1[:, 0])
+    lines = (first, roots.d1), (second, roots.d2)
+    forms = torch.stack([combine_rows(line[:, :, None].unbind(1), rays[:, 1:]) for line, rays in lines], 1)
+    side, other = combine_rows(take_columns(forms, roots.item), u)
+    least = torch.maximum(torch.minimum(side, other), -torch.maximum(side, other)).amax(0)
+    return least > (2 * slack).clamp(min=_BESIDE).index_select(0, roots.item)
 
 
 @kernel(chunk=1 << 20)
 def _polished(u: Tensor, basis: Tensor, rays: Tensor, slack: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """A Newton step: coordinates, pose, whether it is in front, and the error before."""
     u, error = polish(u, basis)
-    return u, *_in_front(combine(u, basis), rays, slack)[:2], error
+    return u, *_in_front(combine(u, basis), rays, slack), error
 
 
 def _in_front(
-    E: Float[Tensor, "9 batch"], rays: Float[Tensor, "6 5 batch"], slack: Float[Tensor, " batch"], only_whether: bool = False
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The pose (12, batch) of a unit E, whether it has five unit rays in front, and how far E is from an essential matrix.
+    E: Float[Tensor, "9 batch"], rays: Float[Tensor, "6 5 batch"], slack: Float[Tensor, " batch"]
+) -> tuple[Tensor, Tensor]:
+    """The pose (12, batch) of a unit E, and whether it has five unit rays in front.
 
     With C the cofactors of E = [t]x R, the rotations are R = C + T and C - T with T = [t]x E (Horn 1990). For both of them
     t' R = t' C; d2' R d1 is the product of the cosines of the angles to t, plus or minus that of the sines.
     """
     round_ = gone_round(E.view(3, 3, -1))
     C = products_of_minors(round_)
-    squares = add_rows((C * C).unbind(0))
-    # 4 |C|^2 = 1 for unit essential matrices, and nearly so near them.
-    gap = (4 * add_rows(squares) - 1).abs_()
-    t = normalised(longest(squares.unbind(0), C.unbind(1)))
+    t = normalised(longest(add_rows((C * C).unbind(0)).unbind(0), C.unbind(1)))
     around = torch.cat((t, t[:2]))[:, None]
     T = (around[1:4] * round_[2:, :3]).addcmul_(around[2:], round_[1:4, :3], value=-1)
     C *= 2
@@ -154,9 +156,7 @@ def _in_front(
     depth1, depth2 = (cosine * along2).sub_(along1), torch.addcmul(along2, cosine, along1, value=-1)
     ahead = torch.minimum(depth1, depth2).amin(0) > -slack
     behind = torch.maximum(depth1, depth2).amax(0) < slack
-    if only_whether:
-        return C, ahead | behind, gap
     pose = E.new_empty(3, 4, E.shape[-1])
     torch.mul(T, sign, out=pose[:, :3]).add_(C)
     torch.mul(t, torch.where(ahead, 1.0, -1.0).to(t.dtype), out=pose[:, 3])
-    return pose.view(12, -1), ahead | behind, gap
+    return pose.view(12, -1), ahead | behind
