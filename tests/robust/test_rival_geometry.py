@@ -1,6 +1,7 @@
 """Points that two epipolar geometries explain: on ruled quadrics through both centres. And points that one alone explains."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -9,8 +10,8 @@ from torch import Tensor
 
 from torchsfm import Status
 from torchsfm.geometry import cross_matrix, rotation_from_rotvec
-from torchsfm.motion import estimate_essential, estimate_fundamental
-from torchsfm.robust import Degeneracy
+from torchsfm.motion import FundamentalEstimator, estimate_essential, estimate_fundamental
+from torchsfm.robust import Degeneracy, ransac
 
 SCENES, FOCAL = 100, 1000.0
 KIND = {"dtype": torch.float64}
@@ -107,3 +108,31 @@ def test_any_ruled_quadric_leaves_calibrated_cameras_determined() -> None:
     good, wrong = _silent_and_wrong(*_scenes(_rank_two, 100, 0.5, 0.0), 0.5, calibrated=True)
     assert_share(good, 0.95)
     assert_share(~wrong, 0.97)
+
+
+def _refined(second: Callable[[torch.Generator, Tensor], Tensor | None], n: int) -> int:
+    """How many models one of the first steps of refinement is taken from, where each scene is asked for its rivals."""
+    taken: list[int] = []
+
+    class Watched(FundamentalEstimator):
+        def step(self, model: Tensor, *data: Tensor, **options: Any) -> Tensor:
+            taken.append(len(model))
+            return super().step(model, *data, **options)
+
+    x1, x2, _ = _scenes(second, n, 0.5, 0.0)
+    found = ransac(FundamentalEstimator(), x1 / FOCAL, x2 / FOCAL, threshold=1.5 / FOCAL, generator=seeded(1))
+    Watched().degeneracy(
+        found.model,
+        x1 / FOCAL,
+        x2 / FOCAL,
+        inliers=found.inliers,
+        threshold=found.threshold,
+        chance=torch.zeros(SCENES, **KIND),
+    )
+    return max(taken, default=0)
+
+
+def test_rivals_are_refined_only_near_the_second_solution() -> None:
+    """Two for each scene on a critical quadric; of general points the second solution is far from too many."""
+    assert _refined(_rank_two, 100) >= 2 * 0.9 * SCENES
+    assert _refined(_general, 100) <= 2 * 0.1 * SCENES
