@@ -1,7 +1,7 @@
 """What robust estimation needs to know of a problem, and nothing more.
 
-`Estimator` is all that a problem must bring. `NeverZero`, `Mixed`, `Located`, `Differentiable`, `Diagnosed` and
-`WithAlternatives` say what it may bring besides, each by a few members; an estimator that has them is asked.
+`Estimator` is all that a problem must bring. `NeverZero`, `SolvedInSingle`, `Mixed`, `Located`, `Differentiable`,
+`Diagnosed` and `WithAlternatives` say what it may bring besides, each by a few members; an estimator that has them is asked.
 """
 
 from collections.abc import Callable
@@ -102,15 +102,21 @@ class NeverZero(Protocol):
     """True."""
 
 
-def is_never_zero(estimator: object) -> bool:
-    """Whether an estimator is `NeverZero`: its class decides, and is asked once."""
-    kind = type(estimator)
-    if kind not in _NEVER_ZERO:
-        _NEVER_ZERO[kind] = isinstance(estimator, NeverZero)
-    return _NEVER_ZERO[kind]
+@runtime_checkable
+class SolvedInSingle(Protocol):
+    """An estimator whose `minimal`, of samples in single precision, loses no model that noisy data determine well.
 
+    Its samples are solved in the type of scoring, others in float64: polynomials of high degree lose digits, and rounded data
+    are no longer exactly degenerate.
 
-_NEVER_ZERO: WeakKeyDictionary[type, bool] = WeakKeyDictionary()
+    Example:
+        >>> import torchsfm
+        >>> torchsfm.motion.FundamentalEstimator().solved_in_single
+        True
+    """
+
+    solved_in_single: ClassVar[bool]
+    """True."""
 
 
 @runtime_checkable
@@ -134,15 +140,15 @@ class Located(Protocol):
         ...
 
 
-def is_located(estimator: object) -> bool:
-    """Whether an estimator is `Located`: its class decides, and is asked once."""
-    kind = type(estimator)
-    if kind not in _LOCATED:
-        _LOCATED[kind] = isinstance(estimator, Located)
-    return _LOCATED[kind]
+def is_kind(estimator: object, protocol: type) -> bool:
+    """Whether an estimator has what a protocol says: its class decides, and is asked once."""
+    known = _KINDS.setdefault(type(estimator), {})
+    if protocol not in known:
+        known[protocol] = isinstance(estimator, protocol)
+    return known[protocol]
 
 
-_LOCATED: WeakKeyDictionary[type, bool] = WeakKeyDictionary()
+_KINDS: WeakKeyDictionary[type, dict[type, bool]] = WeakKeyDictionary()
 
 
 @runtime_checkable

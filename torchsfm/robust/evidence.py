@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.linalg.farthest_points import farthest_points
-from torchsfm.robust.estimator import Located, is_located
+from torchsfm.robust.estimator import Located, is_kind
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.sampling import hash_integers
 
@@ -35,7 +35,7 @@ def repeats_suspected(
         number: How many these are.
         threshold: The largest distance of an inlier.
     """
-    reach = _REACH * threshold[:, None] if is_located(problems.estimator) else 0
+    reach = _REACH * threshold[:, None] if is_kind(problems.estimator, Located) else 0
     # Data that one coordinate tells apart are apart; beyond the inliers infinities follow.
     first = torch.where(near[:, :_GLANCE], problems.data[0][..., 0][:, :_GLANCE], torch.inf).sort().values
     gaps = (first[:, 1:] - first[:, :-1] > reach).sum(-1)

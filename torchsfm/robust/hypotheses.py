@@ -10,7 +10,9 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.linalg.portions import portion
-from torchsfm.robust.estimator import Estimator, is_never_zero
+from torchsfm.linalg.real_roots import number_among_equals
+from torchsfm.linalg.rows import take_columns
+from torchsfm.robust.estimator import Estimator, NeverZero, is_kind
 from torchsfm.robust.models import cast, take_slots, tensors_of
 from torchsfm.robust.problems import Problems
 from torchsfm.robust.samplers import Sampler
@@ -18,85 +20,126 @@ from torchsfm.robust.scoring import Scoring
 
 M = TypeVar("M")
 
+_SURE = 3.0
+"""Of how many standard deviations a part of the data must show that a model is worse than the best so far."""
 NUMBERS = 1 << 17
 """How many distances to compute at a time, on a CPU."""
-PREFIXES = (64, 512)
-"""Numbers of data on which hypotheses are judged before all data are looked at, where these are four times as many."""
+PREFIXES = (64, 256)
+"""Numbers of data on which hypotheses are judged before all data are looked at; on the second where these are many more."""
 KEPT = (16, 8)
 """The fewest hypotheses that are kept after each."""
+_MANY = 1 << 15
+"""From how many distances on the second of these pays."""
 SHARE = 64
 """Of how many hypotheses one is kept after the first."""
 
 
 def solve_samples(
-    fine: Problems, part: Int[Tensor, "g"], drawn: Int[Tensor, "g"], number: int, seed: int, sampler: Sampler
-) -> tuple[Any, Bool[Tensor, "g number slots"]]:
-    """The models through samples of some of the problems, and which slots hold any.
+    problems: Problems,
+    part: Int[Tensor, "g"],
+    drawn: Int[Tensor, "g"],
+    number: Int[Tensor, "g"],
+    seed: int,
+    sampler: Sampler,
+    least: int = 1,
+) -> tuple[Any, Bool[Tensor, "g columns"]]:
+    """The models through samples of some of the problems, in as many columns as the fullest row needs, and which hold any.
 
     Args:
-        fine: All problems.
+        problems: All problems.
         part: Which of them to draw for.
         drawn: How many samples each had before.
-        number: How many to draw.
+        number: How many to draw for each.
         seed: Seed of the whole call.
         sampler: Draws.
+        least: The fewest columns.
     """
-    index = sampler.draw(fine, part, drawn, number, seed)
-    m = fine.estimator.sample_size
-    # Coordinate, position in the sample, problem, sample: as solvers want it, who have the batch last.
-    flat = (index + (part * fine.width).view(-1, 1, 1)).transpose(0, 1).flatten()
-    sample = []
-    for d in fine.data:
-        picked = d.permute(2, 0, 1).flatten(1).index_select(1, flat)
-        sample.append(picked.view(-1, m, len(part), number).permute(2, 3, 1, 0))
-    estimator = tensor_map(lambda t: t[part, None], fine.estimator)
+    numbers, m = number.tolist(), problems.estimator.sample_size
+    most = max(numbers)
+    index = sampler.draw(problems, part, drawn, most, seed)
+    # Position in the sample, then problem and sample: as solvers want it, who have the batch last.
+    flat = (index + (part * problems.width).view(-1, 1, 1)).transpose(0, 1).flatten(1)
+    if min(numbers) < most:
+        flat = take_columns(flat, (torch.arange(most, device=part.device) < number[:, None]).flatten().nonzero()[:, 0])
+    row, flat = torch.arange(len(part), device=part.device).repeat_interleave(number), flat.flatten()
+    sample = [d.permute(2, 0, 1).flatten(1).index_select(1, flat).view(-1, m, len(row)).permute(2, 1, 0) for d in problems.data]
+    estimator = tensor_map(lambda t: t[part[row]], problems.estimator)
     solutions = estimator.minimal(*sample)
-    return solutions.model, solutions.valid & ~estimator.degenerate(*sample)[..., None]
+    good = (solutions.valid & ~estimator.degenerate(*sample)[:, None]).flatten().nonzero()[:, 0]
+    row = row.index_select(0, good // solutions.valid.shape[1])
+    rank = number_among_equals(row)
+    columns = max(int(rank.max()) + 1 if len(rank) else 0, least)
+    place = torch.add(rank, row, alpha=columns)
+    shape = (len(part), columns)
+    there = torch.zeros(len(part) * columns, dtype=torch.bool, device=part.device).index_fill_(0, place, True)
+
+    def filled(t: Tensor) -> Tensor:
+        t = t.flatten(0, 1).index_select(0, good)
+        return t.new_zeros(len(there), *t.shape[1:]).index_copy_(0, place, t).view(*shape, *t.shape[1:])
+
+    return tensor_map(filled, solutions.model), there.view(shape)
 
 
 def sift(
     coarse: Problems,
     models: Any,
-    valid: Bool[Tensor, "g number slots"],
+    there: Bool[Tensor, "g columns"],
     scoring: Scoring,
-    plan: Sequence[tuple[int, int]],
+    plan: Sequence[tuple[int, Int[Tensor, "g"]]],
     kept: int,
-) -> tuple[Any, Float[Tensor, "g kept"], Bool[Tensor, "g"]]:
-    """The best models and their losses, best first, found by way of ever larger parts of the data; and whether there was any.
+    least: Float[Tensor, "g"] | None = None,
+) -> tuple[Any, Float[Tensor, "g kept"]]:
+    """The best models and their losses, best first, found by way of ever larger parts of the data.
 
     Args:
         coarse: The problems.
         models: Their hypotheses.
-        valid: Which of these are any.
+        there: Which of these are any.
         scoring: How to compare.
-        plan: On how many data to compare, and how many to keep, stage by stage.
+        plan: On how many data to compare, and how many to keep for each problem, stage by stage.
         kept: How many to keep in the end.
+        least: The least loss so far: of what a part of the data shows to be worse only so many as are kept are looked at again.
+            Losses are then sums over the data of 1 at most.
     """
-    wide, slots = coarse.spread(), valid.shape[-1]
-    index, there = gather_valid(valid.flatten(1), kept)
-    row = torch.arange(len(index), device=index.device)[:, None]
-    models = cast(tensor_map(lambda t: t[row, index // slots, index % slots], models), coarse.limit.dtype)
-    loss = there
+    wide, models, loss = coarse.spread(), cast(models, coarse.limit.dtype), coarse.limit
     for number, keep in plan:
         data = [d[:, :, :number] for d in wide.data]
-        counts = coarse.counts[:, :number] if coarse.weight is not None or number == coarse.width else None
+        all_alike = coarse.weight is None and number <= int(coarse.count.min())
+        counts = None if all_alike else coarse.counts[:, :number]
         loss = losses(wide.estimator, models, data, coarse.limit, counts, scoring)
         loss = torch.where(there, loss, torch.inf)
-        chosen = smallest(loss, keep)
-        loss = loss.gather(1, chosen)
-        models, there = take_slots(models, chosen), there.gather(1, chosen)
-    return tensor_map(lambda t: t[:, :kept], models), loss[:, :kept], there[:, 0]
+        chosen = smallest(loss, int(keep.max()))
+        loss, there = loss.gather(1, chosen), there.gather(1, chosen)
+        if number < coarse.width:
+            # How many a problem keeps does not depend on the others.
+            there &= torch.arange(chosen.shape[1], device=keep.device) < keep[:, None]
+            if least is not None:
+                there[:, kept:] &= loss[:, kept:] <= _most_of_part(least, coarse, number)[:, None]
+            columns = max(kept, int(there.sum(-1).max()))
+            chosen, loss, there = chosen[:, :columns], loss[:, :columns], there[:, :columns]
+        models = take_slots(models, chosen)
+    return tensor_map(lambda t: t[:, :kept], models), loss[:, :kept]
 
 
-def stages(width: int, slots: int) -> list[tuple[int, int]]:
-    """On how many data `slots` models are scored, stage by stage, and how many of the models are kept each time."""
-    plan = []
-    for level, (prefix, fewest) in enumerate(zip(PREFIXES, KEPT, strict=True)):
-        keep = max(fewest, slots // SHARE) if level == 0 else fewest
-        if 4 * prefix <= width and keep < slots:
-            plan.append((prefix, keep))
-            slots = keep
-    return [*plan, (width, KEPT[-1])]
+def _most_of_part(least: Float[Tensor, "g"], problems: Problems, number: int) -> Float[Tensor, "g"]:
+    """The loss over the first data, each at most 1, beyond which a model is hardly one of less than the least over all."""
+    counts = problems.counts.to(least.dtype)
+    part = counts[:, :number]
+    share = (least / counts.sum(-1)).clamp(max=1)
+    variance = share * (1 - share)
+    return share * part.sum(-1) + _SURE * (variance * (part * part).sum(-1)).sqrt()
+
+
+def stages(problems: Problems, slots: Int[Tensor, "g"]) -> list[tuple[int, Int[Tensor, "g"]]]:
+    """On how many data so many models of each problem are scored, stage by stage, and how many of them are kept each time."""
+    plan, (first, second) = [], KEPT
+    keep, last = (slots // SHARE).clamp(min=first), torch.full_like(slots, second)
+    if PREFIXES[0] < problems.width:
+        plan.append((PREFIXES[0], keep))
+        many = (problems.count > 2 * PREFIXES[1]) & (keep * problems.count >= _MANY)
+        if bool(many.any()):
+            plan.append((PREFIXES[1], torch.where(many, last, keep)))
+    return [*plan, (problems.width, last)]
 
 
 def squared_residual(estimator: Estimator[M], model: M, *data: Float[Tensor, "*#batch n _"]) -> Float[Tensor, "*batch n"]:
@@ -111,7 +154,7 @@ def _no_numbers_for_none(estimator: Estimator[M], model: M, dims: int) -> M:
         parts = [torch.linalg.vector_norm(t, dim=dim) if dim else t.abs() for t, dim in own]
         size = parts[0] if len(parts) == 1 else torch.stack(parts).sum(0)
         # 1, but 0 / 0 or inf / inf; or 0, but inf - inf.
-        one = size / size if is_never_zero(estimator) else size - size + 1
+        one = size / size if is_kind(estimator, NeverZero) else size - size + 1
     return tensor_map(lambda t: t * one.reshape(one.shape + (1,) * (t.ndim - dims)), model)
 
 
@@ -162,15 +205,3 @@ def smallest(loss: Float[Tensor, "g s"], number: int) -> Int[Tensor, "g number"]
 def _later(columns: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "columns"]:
     with torch.inference_mode(False):
         return torch.arange(columns, device=device, dtype=dtype).mul_(torch.finfo(dtype).eps).add_(1)
-
-
-def gather_valid(valid: Bool[Tensor, "g s"], least: int) -> tuple[Int[Tensor, "g _"], Bool[Tensor, "g _"]]:
-    """Where the valid slots of each row are, in as few columns as the fullest row needs or `least`, and which are filled."""
-    g, slots = valid.shape
-    rank = valid.cumsum(-1)
-    columns = max(int(rank[:, -1].max()) if valid.numel() else 0, least)
-    index = torch.zeros(g, columns + 1, dtype=torch.long, device=valid.device)
-    position = torch.where(valid, rank - 1, columns)
-    index.scatter_(1, position, torch.arange(slots, device=valid.device).expand(g, slots))
-    filled = torch.arange(columns, device=valid.device) < rank[:, -1:]
-    return index[:, :columns], filled

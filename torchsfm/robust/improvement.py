@@ -19,7 +19,9 @@ from torchsfm.robust.hypotheses import losses, sift, smallest, solve_samples, sq
 from torchsfm.robust.local_optimisation import (
     LOCAL_DATA,
     LOCAL_STEPS,
+    NUMBERS,
     RIVAL_STEPS,
+    in_portions,
     optimise_fully,
     optimise_locally,
     step_within,
@@ -43,8 +45,10 @@ share of wrong data among them lets minima compete."""
 _SUPPORT, _CHANCE = 0.6, 1.5
 """How much of what is within the threshold a model may lose by refinement, and how many standard deviations of its support: the
 one before was chosen for it."""
-_SAMPLES, _NUMBERS = 1 << 13, 1 << 15
-"""Samples to solve at a time, and numbers in one row of all data of several models, on a CPU: what fits its cache."""
+_SLOTS = 5 << 13
+"""Slots for solutions of samples at a time, on a CPU."""
+_TOGETHER = 8
+"""Portions of problems that are refined together: few of each take many steps."""
 
 
 @dataclass(frozen=True)
@@ -105,20 +109,40 @@ class Best:
 
 
 def propose(
-    fine: Problems, coarse: Problems, best: Best, part: Int[Tensor, "g"], number: int, options: Options
+    source: Problems,
+    coarse: Problems,
+    best: Best,
+    part: Int[Tensor, "g"],
+    number: Int[Tensor, "g"],
+    options: Options,
 ) -> tuple[Best, Any, Float[Tensor, "g kept"]]:
-    """Draw so many samples for some of the problems, and keep the hypotheses that the data support best.
+    """Draw so many samples for each of some of the problems, and keep the hypotheses that the data support best.
+
+    Args:
+        source: All problems, as they are sampled.
+        coarse: The same in the type of scoring.
+        best: Their best models.
+        part: For which of them to draw.
+        number: How many samples.
+        options: How to draw and to compare.
 
     Returns:
         The best models, with what is known of the samples; the hypotheses, `(g, kept, ...)`; and their losses.
     """
-    parts = []
-    for some in _portions(part, number, _SAMPLES):
-        models, valid = solve_samples(fine, some, best.iterations[some], number, options.seed, options.sampler)
-        plan = stages(coarse.width, number * valid.shape[-1])
-        parts.append(sift(coarse.take(some), models, valid, options.scoring, plan, RIVALS))
-    models = join([one[0] for one in parts])
-    loss, solved = (torch.cat([one[i] for one in parts]) if len(parts) > 1 else parts[0][i] for i in (1, 2))
+    least, parts, slots = None, [], number * coarse.estimator.max_solutions
+    if options.scoring.needs_threshold and best.model is not None:
+        # Where rivals are optimised they need not be better.
+        least = torch.where(_is_crowded(coarse, best), torch.inf, best.minimal_loss)
+    rows = _alike(slots, portion(_SLOTS, part.device))
+    for row in rows:
+        own, count, size = take((part, number, slots), row, len(part))
+        models, there = solve_samples(source, own, best.iterations[own], count, options.seed, options.sampler, RIVALS)
+        some, known = coarse.take(own), None if least is None else least[own]
+        parts.append((*sift(some, models, there, options.scoring, stages(some, size), RIVALS, known), there.any(-1)))
+    models, loss, solved = parts[0]
+    if len(rows) > 1:
+        back = torch.cat(rows).argsort()
+        models, loss, solved = tensor_map(lambda t: t[back], join(parts))
     if best.model is None:
         best = replace(best, model=tensor_map(lambda t: t.new_zeros(len(best.loss), *t.shape[2:]), models))
     old = take((best.solved, best.iterations), part, len(best.loss))
@@ -135,17 +159,22 @@ def optimise(coarse: Problems, best: Best, part: Int[Tensor, "g"], models: Any, 
     """
     least = take(best.minimal_loss, part, len(best.loss))
     improved, first = (loss[:, 0] < least).nonzero()[:, 0], tensor_map(lambda t: t[:, :OPTIMISED], (models, loss))
-    for row in _portions(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), _NUMBERS):
+    for row in _portions(improved, OPTIMISED * min(coarse.width, LOCAL_DATA), NUMBERS):
         index, (top, cost) = take((part, first), row, len(part))
         best = _optimised(coarse.take(index), best, index, top, cost, options)
     if coarse.estimator.codimension == 1:
         return best
-    wrong = best.chance[part]
-    crowded = ((wrong >= _AMBIGUOUS) & (wrong >= _CROWDED * best.near[part].sum(-1))).nonzero()[:, 0]
-    for row in _portions(crowded, RIVALS * min(coarse.width, LOCAL_DATA), _NUMBERS):
+    crowded = _is_crowded(coarse, best)[part].nonzero()[:, 0]
+    for row in _portions(crowded, RIVALS * min(coarse.width, LOCAL_DATA), NUMBERS):
         index, top, cost = take((part, models, loss), row, len(part))
         best = _optimised(coarse.take(index), best, index, top, cost, options, steps=RIVAL_STEPS)
     return best
+
+
+def _is_crowded(problems: Problems, best: Best) -> Bool[Tensor, "p"]:
+    """Where wrong data pass for inliers of models that are points for each datum."""
+    wrong, own = best.chance, best.near.sum(-1)
+    return (wrong >= _AMBIGUOUS) & (wrong >= _CROWDED * own) & (problems.estimator.codimension > 1)
 
 
 def _optimised(
@@ -201,25 +230,26 @@ def _optimised(
     return put(best, index, new)
 
 
-def search_inliers(fine: Problems, coarse: Problems, best: Best, options: Options) -> Best:
+def search_inliers(source: Problems, coarse: Problems, best: Best, options: Options) -> Best:
     """Optimise locally from many samples of the inliers alone, where wrong data may pass for inliers.
 
     Each of these is in or out: the cost has many minima, and a model straight from a sample leads to one of them. The effort
     is a part of that of the search.
     """
-    worthwhile = best.solved & (best.chance >= _AMBIGUOUS) & (best.near.sum(-1) > 2 * fine.estimator.sample_size)
+    worthwhile = best.solved & (best.chance >= _AMBIGUOUS) & (best.near.sum(-1) > 2 * coarse.estimator.sample_size)
     if not bool(worthwhile.any()):
         return best
     number = torch.where(worthwhile, best.iterations // _PER_START, 0)
-    sizes = torch.tensor((0, *STARTS), device=fine.count.device)
+    sizes = torch.tensor((0, *STARTS), device=coarse.count.device)
     starts, sampler = sizes[torch.searchsorted(sizes, number, right=True) - 1], Among(best.near)
     for size in sorted(set(starts.tolist()) - {0}):
         drawn = max(4 * size, 64)
-        for part in _portions((starts == size).nonzero()[:, 0], drawn, _SAMPLES):
-            models, valid = solve_samples(fine, part, best.iterations[part], drawn, options.seed, sampler)
-            some, plan = coarse.take(part), [(min(LOCAL_DATA, coarse.width), size)]
-            models, loss, _ = sift(some, models, valid, options.scoring, plan, size)
-            for row in _portions(_all(some), size * EXPLORED_DATA, _NUMBERS):
+        for part in _portions((starts == size).nonzero()[:, 0], drawn * coarse.estimator.max_solutions, _SLOTS):
+            count = torch.full_like(part, drawn)
+            models, there = solve_samples(source, part, best.iterations[part], count, options.seed, sampler, size)
+            some, plan = coarse.take(part), [(min(LOCAL_DATA, coarse.width), torch.full_like(part, size))]
+            models, loss = sift(some, models, there, options.scoring, plan, size)
+            for row in _portions(_all(some), size * EXPLORED_DATA, NUMBERS):
                 index, top, cost = take((part, models, loss), row, len(part))
                 best = _optimised(some.take(row), best, index, top, cost, options, EXPLORED_DATA)
     return best
@@ -231,7 +261,7 @@ def try_alternatives(fine: Problems, coarse: Problems, best: Best, options: Opti
         return best
     doubtful = glance(fine, cast(best.model, torch.float64), best.limit.double(), best.near, best.chance)
     best = replace(best, doubtful=doubtful)
-    for part in _portions(doubtful.nonzero()[:, 0], fine.width, _NUMBERS):
+    for part in _portions(doubtful.nonzero()[:, 0], fine.width, NUMBERS):
         some, old = fine.take(part), best.take(part)
         estimator: Any = some.estimator
         model, threshold = cast(old.model, torch.float64), old.limit.double().sqrt()
@@ -255,11 +285,11 @@ def refine_finally(fine: Problems, coarse: Problems, best: Best) -> tuple[Best, 
     noise, that of the threshold.
     """
     parts = []
-    for part in _portions(_all(fine), fine.width, _NUMBERS):
+    for part in _portions(_all(fine), fine.width, _TOGETHER * NUMBERS):
         some, rough, old = fine.take(part), coarse.take(part), best.take(part)
-        noisy = scale_of_noise(rough.estimator, old.model, rough.data, old.limit, rough.counts)
+        noisy = in_portions(scale_of_noise, rough.estimator, old.model, rough.data, old.limit, rough.counts)
         old, (start, noise) = cast((old, noisy), torch.float64)
-        model, reach = step_by_noise(some.estimator, start, some.data, old.limit, some.counts, noise)
+        model, reach = in_portions(step_by_noise, some.estimator, start, some.data, old.limit, some.counts, *noise)
         found, squared, won = _refined(some, old, start, model, reach * old.limit)
         lost = (~won & old.solved).nonzero()[:, 0]
         if len(lost):
@@ -304,6 +334,15 @@ def _portions(index: Int[Tensor, "g"], each: int, budget: int) -> Iterator[Int[T
     """A list of problems in portions that need no more than a budget at a time."""
     size = max(1, portion(budget, index.device) // each)
     return (index[i : i + size] for i in range(0, len(index), size))
+
+
+def _alike(number: Int[Tensor, "g"], budget: int) -> list[Int[Tensor, "_"]]:
+    """All problems, in lists of such as have like numbers, of no more than a budget together but for the last of each list."""
+    order = number.argsort(stable=True)
+    if len(order) == 1 or int(number.sum()) <= budget:
+        return [torch.arange(len(order), device=order.device)]
+    group = number[order].cumsum(0).sub_(1) // budget
+    return [row.sort().values for row in torch.split(order, [size for size in group.bincount().tolist() if size])]
 
 
 def _all(problems: Problems) -> Int[Tensor, "p"]:

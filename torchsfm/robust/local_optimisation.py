@@ -1,6 +1,6 @@
 """From a model through a noisy sample to the optimum near it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -8,16 +8,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchsfm._types import tensor_map
+from torchsfm.linalg.portions import portion
 from torchsfm.robust.estimator import Estimator
-from torchsfm.robust.models import put, select, tensors_of, zip_map
+from torchsfm.robust.models import join, put, select, tensors_of, zip_map
 from torchsfm.robust.scoring import Scoring
 
 M = TypeVar("M")
+T = TypeVar("T")
 
 LOCAL_STEPS, RIVAL_STEPS = (9.0, 1.0), (9.0, 4.0, 1.0, 1.0)
 """Squared thresholds of the steps of local optimisation, in units of the squared threshold; and where many minima compete."""
 LOCAL_DATA = 256
 """How many data local optimisation looks at."""
+NUMBERS = 1 << 15
+"""Numbers in one row of all data of several problems, on a CPU."""
 _MOST_STEPS = 64
 """Steps of the final refinement, of which there are two at least, for what still moves."""
 _STILL, _SMALL = 1e-7, 1e-10
@@ -102,7 +106,7 @@ def optimise_fully(
     least, damping = torch.full_like(reach, torch.inf), torch.zeros_like(reach)
     for count in range(2, _MOST_STEPS + 1):
         own, values, edge, counted = problem
-        moved, loss = step_within(own, model, values, edge, counted, damping)
+        moved, loss = in_portions(step_within, own, model, values, edge, counted, damping)
         # A loss that is no number is none.
         good = loss <= least * (1 + _ROUNDING)
         damping = torch.where(good, damping / 4, (4 * damping).clamp(min=1))
@@ -143,6 +147,16 @@ def _entries(model: Any) -> Float[Tensor, "g e"]:
 def _length(entries: Float[Tensor, "g e"]) -> Float[Tensor, "g"]:
     length: Tensor = torch.linalg.vector_norm(entries, dim=-1)
     return length
+
+
+def in_portions(function: Callable[..., T], estimator: Any, model: Any, data: Sequence[Tensor], *known: Tensor) -> T:
+    """A function of problems `(g)` with so much data each, some of them at a time: what stays in a CPU's cache."""
+    problems = (estimator, model, tuple(data), *known)
+    g, n = data[0].shape[:2]
+    size = max(1, portion(NUMBERS, data[0].device) // max(n, 1))
+    if g <= size:
+        return function(*problems)
+    return join([function(*tensor_map(lambda t: t[i : i + size], problems)) for i in range(0, g, size)])  # noqa: B023
 
 
 def step_within(

@@ -166,9 +166,9 @@ class _Problem:
         device = self.problems.count.device
         nothing = torch.full((self.count,), -1, device=device)
         zero = torch.zeros(1, dtype=torch.long, device=device)
-        models, valid = solve_samples(self.problems, zero, zero, hypotheses, seed, Neighbours(_NEIGHBOURS))
-        models = tensor_map(lambda t: t[valid], models)
-        if not bool(valid.any()):
+        models, there = solve_samples(self.problems, zero, zero, zero + hypotheses, seed, Neighbours(_NEIGHBOURS))
+        models = tensor_map(lambda t: t[there], models)
+        if not bool(there.any()):
             return nothing, None, False
         models = self.best(models, kept)
         ratio = self.ratios(models)

@@ -79,7 +79,8 @@ def step_by_noise(
     data: Sequence[Tensor],
     limit: Float[Tensor, "g"],
     counts: Tensor,
-    noise: Noise,
+    variance: Float[Tensor, "g 1"],
+    favour: Float[Tensor, "g 1"],
 ) -> tuple[M, Float[Tensor, "g"]]:
     """A step of reweighted least squares out to the distance where an outlier is as likely as an inlier, and that distance.
 
@@ -92,7 +93,8 @@ def step_by_noise(
         data: The data, each `(g, n, d)`.
         limit: Squared threshold.
         counts: What the data count, `(g, n)`: a boolean or a weight.
-        noise: What `scale_of_noise` found.
+        variance: The noise as `scale_of_noise` found it.
+        favour: The same.
 
     Returns:
         The model, and the square of its reach in units of the squared threshold, rounded to a coarse grid: so the model that
@@ -103,7 +105,7 @@ def step_by_noise(
     def weigh(squared: Tensor) -> tuple[Tensor, Tensor]:
         nonlocal found
         ratio, there, total = _within_window(squared, limit, counts)
-        reach = _reach(_maximised(noise, ratio, there, total, k), k)
+        reach = _reach(_maximised(Noise(variance, favour), ratio, there, total, k), k)
         found = reach[:, 0]
         return falling((ratio / reach).clamp(max=1), counts, k)
 

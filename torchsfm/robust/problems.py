@@ -18,6 +18,10 @@ from torchsfm.robust.sampling import compact, prosac_growth, spread_order
 T = TypeVar("T")
 
 SMALLEST_WIDTH = 8
+_EMPTY = 1 << 13
+"""How many empty slots take less time than a group of problems of its own."""
+_SHOWS = 16
+"""Of problems this small rounding may show, as much is left open: it is not to depend on others."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,9 @@ class Flat:
 
 @dataclass(frozen=True)
 class Problems:
-    """Problems with between `width / 2` and `width` data each, all tensors with the problem first.
+    """Problems with up to `width` data each, most of them with half as many, all tensors with the problem first.
+
+    What becomes of a problem does not depend on the width, but for rounding.
 
     Attributes:
         estimator: What to solve; its tensor fields, if any, are per problem.
@@ -195,7 +201,7 @@ def pack(
     quality: Float[Tensor, "p n"] | None = None,
     weights: Float[Tensor, "p n"] | None = None,
 ) -> Iterator[Problems]:
-    """Sort the chosen problems by their number of usable data: one group for each power of two.
+    """Sort the chosen problems by their number of usable data: one group for each power of two, or for several if they are few.
 
     Args:
         flat: All problems.
@@ -213,7 +219,10 @@ def pack(
         count = usable.sum(-1)
         widths = torch.tensor([SMALLEST_WIDTH << i for i in range(_width(n).bit_length())], device=device)
         width = widths[torch.searchsorted(widths, count)]
-        groups = [(size, chosen & (width == size)) for size in sorted(set(width[chosen].tolist()))]
+        groups, least = [], 0
+        for size in _sizes(width[chosen].tolist()):
+            groups.append((size, chosen & (width > least) & (width <= size)))
+            least = size
     for size, group in groups:
         member = group.nonzero()[:, 0]
         if not len(member):
@@ -238,6 +247,19 @@ def pack(
         fields = tensor_map(own, flat.estimator)
         limit = own(flat.bound) * own(flat.bound)
         yield Problems(fields, packed, inside, own(count), limit, ranking, growth, weight, source, member)
+
+
+def _sizes(widths: list[int]) -> list[int]:
+    """To which widths to bring problems so that empty slots cost less than one more group of them does."""
+    kept: list[int] = []
+    empty = 0
+    for size in sorted(set(widths), reverse=True):
+        # Brought to the next larger one.
+        empty += widths.count(size) * (kept[-1] - size) if kept else 0
+        if not kept or empty > _EMPTY or size <= _SHOWS:
+            kept.append(size)
+            empty = 0
+    return kept[::-1]
 
 
 def _width(number: int) -> int:

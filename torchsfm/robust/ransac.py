@@ -2,7 +2,7 @@
 
 Sample, score, optimise locally, stop: LO-RANSAC (Chum, Matas & Kittler 2003). The batch is
 (problem, hypothesis); every problem has its own number of data and its own end. What becomes of a problem is a function of its
-data and the seed alone: the sizes of all arrays that touch a problem follow from its own number of data.
+data and the seed alone, but for rounding.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchsfm._types import check_options, tensor_map
 from torchsfm.optim import wants_derivative
-from torchsfm.robust.estimator import Differentiable, Estimator
+from torchsfm.robust.estimator import Differentiable, Estimator, SolvedInSingle, is_kind
 from torchsfm.robust.improvement import Best, Options, optimise, propose, refine_finally, search_inliers, try_alternatives
 from torchsfm.robust.models import cast, tensors_of, zip_map
 from torchsfm.robust.optimum import attach_derivative, step_covariance
@@ -23,7 +23,7 @@ from torchsfm.robust.problems import Flat, Problems, pack
 from torchsfm.robust.samplers import Prosac, Sampler, Uniform
 from torchsfm.robust.sampling import draw_seed
 from torchsfm.robust.scoring import LeastMedian, Msac, Scoring
-from torchsfm.robust.stopping import rounds
+from torchsfm.robust.stopping import samples_wanted
 from torchsfm.robust.verdict import Verdict, judge
 
 M = TypeVar("M")
@@ -91,9 +91,10 @@ def ransac(
 ) -> RobustResult[M]:
     """Estimate a model for each problem of a batch from data of which many may be wrong.
 
-    Minimal samples are solved in float64, hypotheses are scored and locally optimised in `scoring_dtype`, and the best model of
-    each problem is refined in float64 on all its inliers with a robust loss. A problem ends when, with the given confidence,
-    one of its samples was free of outliers, by the exact probability of such a sample.
+    Minimal samples are solved in float64, or in `scoring_dtype` where that is as good (see `SolvedInSingle`), hypotheses
+    are scored and locally optimised in `scoring_dtype`, and the best model of each problem is refined in float64 on all its
+    inliers with a robust loss. A problem ends when, with the given confidence, one of its samples was free of outliers, by
+    the exact probability of such a sample.
 
     Rows with NaN or infinite numbers are left out. The result for a problem is the same, up to rounding,
     whatever else is in the batch.
@@ -112,7 +113,7 @@ def ransac(
         generator: Source of randomness; PyTorch's global one if not given.
         confidence: Wanted probability of having drawn a sample without outliers.
         min_iterations: Fewest samples to draw for a problem.
-        max_iterations: Most samples to draw for a problem, rounded up to a whole round.
+        max_iterations: Most samples to draw for a problem.
         scoring_dtype: Type for scoring hypotheses; that of the data if not given. float32 is enough for data of moderate size
             around 0.
         covariance: Compute the covariance of the step, in the sense of the estimator's `retract`, that leads from the refined
@@ -211,16 +212,16 @@ def _solve(flat: Flat, options: Options) -> tuple[Verdict[Any], Float[Tensor, "p
 def search(problems: Problems, options: Options) -> tuple[Best, Float[Tensor, "p width"]]:
     """Find the best model of each problem, in float64, refined, and the squared distances of its data."""
     coarse = problems.cast(options.dtype)
+    source = coarse if is_kind(problems.estimator, SolvedInSingle) else problems
     best = Best.none(coarse)
-    active = torch.arange(len(problems.count), device=problems.count.device)
-    while len(active):
-        going_on = []
-        for number, part in rounds(active, best.iterations, best.needed, options.min_iterations, options.max_iterations):
-            best, models, loss = propose(problems, coarse, best, part, number, options)
-            best = optimise(coarse, best, part, models, loss, options)
-            going_on.append(part)
-        active = torch.cat(going_on).sort().values if going_on else active[:0]
-    best = search_inliers(problems, coarse, best, options)
+    while True:
+        wanted = samples_wanted(best.iterations, best.needed, options.min_iterations, options.max_iterations)
+        part = wanted.nonzero()[:, 0]
+        if not len(part):
+            break
+        best, models, loss = propose(source, coarse, best, part, wanted[part], options)
+        best = optimise(coarse, best, part, models, loss, options)
+    best = search_inliers(source, coarse, best, options)
     best = try_alternatives(problems, coarse, best, options)
     return refine_finally(problems, coarse, best)
 

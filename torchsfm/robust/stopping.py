@@ -1,48 +1,30 @@
 """When enough samples are drawn, and whether what they found is more than chance."""
 
 import math
-from collections.abc import Iterator
-from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchsfm.robust.models import take
-
-ROUNDS = (16, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048, 3072, 4096)
-"""How many samples a round may draw for a problem."""
+_ROUND = 4096
+"""The most samples that are drawn for a problem at a time."""
 _LEAST = 0.5
 """How many data there are between two and six thresholds from a model where none is seen."""
 
 
-def rounds(
-    active: Int[Tensor, "a"], drawn: Int[Tensor, "p"], needed: Float[Tensor, "p"], least: int, most: int
-) -> Iterator[tuple[int, Int[Tensor, "g"]]]:
-    """How many samples to draw next, and for which of the active problems; none for problems that have had enough.
+def samples_wanted(drawn: Int[Tensor, "p"], needed: Float[Tensor, "p"], least: int, most: int) -> Int[Tensor, "p"]:
+    """How many samples to draw next for each problem: none where it has had enough.
 
     So many that there are four times as many, or the rest.
 
     Args:
-        active: Which problems are still looked at.
         drawn: How many samples each problem has had.
         needed: How many would do.
         least: Fewest samples of a problem.
         most: Most samples of a problem.
     """
-    drawn, needed = take((drawn, needed), active, len(drawn))
-    rest = needed.clamp(min=least, max=most) - drawn
-    wanted = torch.minimum(rest, (3 * drawn).clamp(min=max(least, 1)))
-    sizes = _sizes(wanted.dtype, drawn.device)
-    size = sizes[torch.searchsorted(sizes, wanted).clamp(max=len(ROUNDS))]
-    for number in sorted(set(size.tolist()) - {0}):
-        yield int(number), active[size == number]
-
-
-@cache
-def _sizes(dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):
-        return torch.tensor((0.0, *ROUNDS), dtype=dtype, device=device)
+    rest = needed.clamp(min=least, max=most).ceil().long() - drawn
+    return torch.minimum(rest, (3 * drawn).clamp(min=max(least, 1), max=_ROUND)).clamp(min=0)
 
 
 def around_model(

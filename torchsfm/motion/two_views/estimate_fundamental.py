@@ -55,6 +55,7 @@ class FundamentalEstimator:
     codimension: ClassVar[int] = 1
     dimension: ClassVar[int] = 7
     never_zero: ClassVar[bool] = True
+    solved_in_single: ClassVar[bool] = True
 
     def minimal(
         self, x1: Float[Tensor, "*#batch 7 2"], x2: Float[Tensor, "*#batch 7 2"]
