@@ -1,5 +1,6 @@
 """Robust estimation on real pairs: error on the true points, and recall and precision of the labelled inliers."""
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +71,39 @@ def pairs(folder: Path) -> Iterator[Pair]:
     yield Pair("pose6dscene", "pose6dscene", "P", rows[:, 2:], rows[:, :2], K, everything, pose=pose)
 
 
+def together(some: list[Pair], threshold: float) -> Tensor:
+    """The models of pairs of different size in one call."""
+    count = torch.tensor([len(pair.a) for pair in some])
+    mask = torch.arange(int(count.max())) < count[:, None]
+    a, b = (torch.nn.utils.rnn.pad_sequence([getattr(pair, name) for pair in some], batch_first=True) for name in "ab")
+    estimate = estimate_fundamental if some[0].model == "F" else estimate_homography
+    return estimate(a, b, threshold=threshold, mask=mask, generator=torch.Generator().manual_seed(0)).model
+
+
+def report_together(folder: Path, peers: list[str], threshold: float = 1.0, rounds: int = 5) -> None:
+    """Print the CPU time a pair of all pairs in one ragged batch, the least of some rounds, and of peers pair by pair."""
+    everything = [pair for pair in pairs(folder) if pair.group in ("fundamental_matrix", "homography")]
+    print("model pairs      matches candidate    ms/pair   median     mean   (all pairs in one batch; px)")
+    for model in "FH":
+        some = [pair for pair in everything if pair.model == model]
+        arrays = [[t.numpy() for t in (pair.a, pair.b, pair.K)] for pair in some]
+        sizes = [len(pair.a) for pair in some]
+        for name in ("ours", *peers):
+            times = []
+            for _ in range(rounds):
+                start = time.process_time()
+                if name == "ours":
+                    found = list(together(some, threshold))
+                else:
+                    found = [torch.from_numpy(answer(name, model, *three, threshold)) for three in arrays]
+                times.append(time.process_time() - start)
+            e = torch.stack([error(pair, one) for pair, one in zip(some, found, strict=True)])
+            print(
+                f"{model:5} {len(some):5} {min(sizes):5} - {max(sizes):4} {name:9} {min(times) / len(some) * 1e3:10.2f} "
+                f"{e.median():8.4f} {e[e <= FAILED].mean():8.4f}", flush=True,
+            )  # fmt: skip
+
+
 def rays(x: Tensor, K: Tensor) -> Tensor:
     """Rays of image points."""
     return torch.cat((x, torch.ones_like(x[..., :1])), -1) @ K.inverse().mT
@@ -111,6 +145,7 @@ def error(pair: Pair, model: Tensor) -> Tensor:
 
 def report(folder: Path, peers: list[str]) -> None:
     """Print, per data set and threshold, what everybody reaches."""
+    report_together(folder, peers)
     print("data set           model pairs   px candidate   median     mean failed  recall precision")
     everything = list(pairs(folder))
     for group, model in sorted({(p.group, p.model) for p in everything}):
