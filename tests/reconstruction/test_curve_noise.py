@@ -11,7 +11,7 @@ from torchsfm.bundle import bundle_adjust_model
 from torchsfm.bundle.curves import edge_distances
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics, random_rotation, rotation_from_rotvec
 from torchsfm.reconstruction import Curves
-from torchsfm.reconstruction.curves.noise import alike, measured_weights, sample_weights
+from torchsfm.reconstruction.curves.noise import alike, measured_weights, moved_alike, sample_weights
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 
@@ -131,6 +131,27 @@ def test_weights_are_inverse_variances_of_what_is_independent(generator: torch.G
     assert weights[0] == pytest.approx(1 / 2.5**2, rel=0.25)
     assert weights[0] / weights[1] == pytest.approx(19, rel=0.4)
     assert measured_weights(curves, torch.full_like(apart, torch.nan)) is curves
+
+
+def test_what_moves_the_image_of_a_curve_is_one_error(generator: torch.Generator) -> None:
+    """Edges off for themselves count one by one; off by one vector in an image of a curve, as if they were a few.
+
+    Off alike along curves that bend, they count for less than the signs along them tell: most of it cancels.
+    """
+    _, curves = make_scene(generator)
+    shape = (VIEWS, CURVES, SAMPLES)
+    of = (curves.view, curves.curve[curves.sample], curves.sample % SAMPLES)
+    own = torch.randn(shape, generator=generator, dtype=F64)[of]
+    assert moved_alike(curves, own) < 1.4
+    vector = torch.randn(VIEWS, CURVES, 2, generator=generator, dtype=F64)[of[0], of[1]]
+    together = moved_alike(curves, (vector * curves.normal).sum(-1))
+    assert together > 0.25 * SAMPLES
+    waves = torch.cos(
+        2 * torch.pi * (torch.arange(SAMPLES) / 20 + torch.rand(VIEWS, CURVES, 1, generator=generator, dtype=F64))
+    )
+    waved = waves[of] + 0.1 * own
+    assert moved_alike(curves, waved) < 0.5 * alike(waved, curves.view, curves.sample, curves.curve)
+    assert moved_alike(curves, torch.full_like(own, torch.nan)) == 1
 
 
 def test_samples_that_fit_badly_as_a_whole_count_less(generator: torch.Generator) -> None:

@@ -129,7 +129,7 @@ def test_edges_that_lie_aside_leave_cameras_where_many_points_have_them(
         moved = adjust_with_curves(model, curves, None)
         assert moved is not None
         assert turned(moved.mapping.poses).mean() < most * turned(model.poses).mean()
-    monkeypatch.setattr(curve_noise, "alike", lambda *_: 1.0)
+    monkeypatch.setattr(curve_noise, "moved_alike", lambda *_: 1.0)
     assert adjust_with_curves(model, wrong, None) is None
 
 
@@ -197,7 +197,10 @@ def test_cameras_are_refused_that_points_contradict(generator: torch.Generator) 
 
     assert points_agree(model, at(orbit(VIEWS)))
     off = (0.004 * torch.randn(VIEWS, 6, generator=generator, dtype=F64)) * torch.tensor([1, 1, 1, 5, 5, 5], dtype=F64)
-    assert not points_agree(model, at(orbit(VIEWS).retract(off)))
+    other = at(orbit(VIEWS).retract(off))
+    assert not points_agree(model, other)
+    # Points that are off alike say less.
+    assert points_agree(model, other, excess=1e6)
 
 
 def test_no_edges_change_nothing(generator: torch.Generator) -> None:

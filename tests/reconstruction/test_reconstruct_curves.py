@@ -12,8 +12,10 @@ from torchsfm.bundle import bundle_adjust_model
 from torchsfm.geometry import Camera, Similarity, project_points, random_rotation
 from torchsfm.geometry.cameras import intrinsics
 from torchsfm.geometry.distortion import Radial
+from torchsfm.linalg.vectors import across
 from torchsfm.optim import Cauchy
 from torchsfm.reconstruction import Curves, Reconstruction, reconstruct_curves
+from torchsfm.reconstruction.curves.edge_on import seen_edge_on
 from torchsfm.reconstruction.curves.from_edges import curves_of_edges, curves_of_other_cameras
 from torchsfm.reconstruction.curves.image_edges import ImageEdges
 from torchsfm.simulation import look_at, render_sequence
@@ -178,5 +180,36 @@ def test_edges_are_not_those_of_what_hides_a_curve_nor_of_the_rim(generator: tor
     assert behind(found) < 0.15 < behind(by_all)
     later = curves_of_other_cameras(found, edges, (size, size), cameras, poses)
     assert behind(later) < 0.15
+    # Those that look along the ball show no edges of what is painted on it.
+    assert seen_edge_on(by_all, cameras, poses).double().mean() > 0.15
+    assert seen_edge_on(later, cameras, poses).double().mean() < 0.01
     # Those that found a sample are three at least, and most of them show it.
-    assert (found.support() >= 3).double().mean() > 0.9
+    assert (found.support() >= 3).double().mean() > 0.7
+
+
+def test_which_images_see_a_surface_edge_on(generator: torch.Generator) -> None:
+    """Circles painted on a ball, which each of many cameras around it sees, also from behind; a wire is on no surface."""
+    views, circles, samples, radius = 24, 120, 24, 2.0
+    middle = radius * normalize(torch.randn(circles, 3, generator=generator, dtype=torch.float64), dim=-1)
+    first, second = (normalize(v, dim=0).mT for v in across(normalize(middle, dim=-1).mT))
+    angle = torch.arange(samples).double() * (2 * torch.pi / samples)
+    around = angle.cos()[:, None] * first[:, None] + angle.sin()[:, None] * second[:, None]
+    X = radius * normalize((middle[:, None] + 0.25 * around).flatten(0, 1), dim=-1)
+    wire = torch.linspace(-3, 3, 200, dtype=torch.float64)[:, None] * torch.ones(3, dtype=torch.float64) + 20
+    poses = look_at(5 * radius * normalize(torch.randn(views, 3, generator=generator, dtype=torch.float64), dim=-1), 0 * X[0])
+    K = intrinsics(torch.tensor(600.0, dtype=torch.float64), torch.tensor([320.0, 240.0], dtype=torch.float64))
+    n = len(X) + len(wire)
+    view, sample = torch.cartesian_prod(torch.arange(views), torch.arange(n)).unbind(1)
+    curve = torch.cat((torch.arange(circles).repeat_interleave(samples), torch.full((len(wire),), circles)))
+    place, none = torch.cat((X, wire)), torch.zeros(len(view), 2, dtype=torch.float64)
+    curves = Curves(
+        place, curve, torch.zeros(circles + 1, dtype=torch.bool), torch.zeros_like(place), place[:, 0], none, none, none[:, 0],
+        none[:, 0], view, sample,
+    )  # fmt: skip
+    found = seen_edge_on(curves, Camera(K.repeat(views, 1, 1)), poses).view(views, n)
+    sight = normalize(poses.centre[:, None] - X, dim=-1)
+    slant = (sight * normalize(X, dim=-1)).sum(-1).abs()
+    on_ball = found[:, : len(X)]
+    assert on_ball[slant < 0.15].double().mean() > 0.9
+    assert on_ball[slant > 0.4].double().mean() < 0.02
+    assert not found[:, len(X) :].any()

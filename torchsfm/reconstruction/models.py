@@ -85,7 +85,10 @@ def _with_lines_and_curves(
         with stages.timed("curves"):
             # Lines that have moved no camera are contradicted by points.
             agree, prior = model is not component.model, component.options.prior(model)
-            model, lines, curves = find_curves(model, edges(), prior, progress, lines=lines, lines_agree=agree)
+            threshold = component.options.reprojection
+            model, lines, curves = find_curves(
+                model, edges(), prior, progress, lines=lines, lines_agree=agree, threshold=threshold
+            )
     return component.moved(model), replace(model.reconstruction(), lines=lines, curves=curves)
 
 

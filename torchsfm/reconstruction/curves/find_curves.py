@@ -10,11 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchsfm._types import Status
 from torchsfm.geometry import Camera, Pose, rotation_angle
 from torchsfm.images import ImageError, read_image
 from torchsfm.reconstruction.curves.adjustment import WithCurves, adjust_with_curves
 from torchsfm.reconstruction.curves.from_edges import curves_of_edges, curves_of_other_cameras
 from torchsfm.reconstruction.curves.image_edges import ImageEdges
+from torchsfm.reconstruction.evidence.consistency import excess_scatter
 from torchsfm.reconstruction.lines.find_lines import lines_of_cameras
 from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping.mapping import Mapping
@@ -27,8 +29,8 @@ EDGE_SIZE = 1000
 """Longer side, in pixels, to which larger images are scaled down: they have more edges, each with more depths to look at."""
 SHORTEST = 16
 """Edge points of the shortest chains."""
-_ROUNDS = 3
-"""Times, the most, that cameras are adjusted and samples then brought to the edges by these,"""
+_ROUNDS = 4
+"""Times, the most, that cameras are adjusted a few steps and samples then brought to the edges by these,"""
 _STILL = 0.1
 """as images move by more pixels."""
 
@@ -104,6 +106,7 @@ def find_curves(
     *,
     lines: Lines | None = None,
     lines_agree: bool = True,
+    threshold: float = 4.0,
 ) -> WithCurves:
     """Find the curves in space of a finished model, and adjust cameras, points, lines and curves together.
 
@@ -114,6 +117,7 @@ def find_curves(
         progress: Called as the work goes on.
         lines: Lines of the model, if it has any.
         lines_agree: Whether they move the cameras, too. Those that points contradict go with the cameras.
+        threshold: Largest reprojection error of an observation, pixels.
 
     Returns:
         The model after the adjustment, its lines, and the curves with the edge points that show them in pixels of the images.
@@ -130,16 +134,28 @@ def find_curves(
     points = mapping.X[_seen(mapping)]
     curves = curves_of_edges(edges, height_width, *placed(mapping), points=points, finders_alone=True, progress=progress)
     best = WithCurves(mapping, lines, curves.in_images(known, zoom))
+    excess = excess_scatter(mapping, threshold=threshold)
+    steps, still = 0, True
     for _ in range(_ROUNDS):
         before = best.mapping
-        better = adjust_with_curves(before, best.curves, prior, best.lines if lines_agree else None, alone=mapping)
+        own = best.lines if lines_agree else None
+        better = adjust_with_curves(before, best.curves, prior, own, alone=mapping, excess=excess)
         if better is None:
             break
         # Samples were brought to their edges with cameras that were off, which holds these where they were.
         curves = curves_of_other_cameras(replace(curves, X=better.curves.X), edges, height_width, *placed(better.mapping))
         best = WithCurves(better.mapping, better.lines if lines_agree else lines, curves.in_images(known, zoom))
-        if _shift(before, best.mapping) < _STILL:
+        adjusted = better.mapping.adjustment
+        assert adjusted is not None, "it was"
+        steps += adjusted.iterations
+        if still := _shift(before, best.mapping) < _STILL:
             break
+    if steps and best.mapping.adjustment is not None:
+        # Cameras that hardly move any more have come to rest, though samples go on.
+        status = Status.OK if still else Status.NOT_CONVERGED
+        best = best._replace(
+            mapping=replace(best.mapping, adjustment=replace(best.mapping.adjustment, status=status, iterations=steps))
+        )
     if lines is not None and not lines_agree and best.mapping is not mapping:
         best = best._replace(lines=lines_of_cameras(best.mapping, lines))
     return best

@@ -14,6 +14,7 @@ from torchsfm.geometry import BundleProblem, Camera, Pose
 from torchsfm.linalg.devices import on_the_cpu
 from torchsfm.optim import GemanMcClure
 from torchsfm.reconstruction.curves.edge_maps import MapsOfImages
+from torchsfm.reconstruction.curves.edge_on import seen_edge_on
 from torchsfm.reconstruction.curves.fusion import fuse_pieces
 from torchsfm.reconstruction.curves.image_edges import ImageEdges
 from torchsfm.reconstruction.curves.noise import TRUSTED, measured_weights
@@ -203,7 +204,10 @@ def _shown_by(
 
     def tracked(curves: Curves) -> Curves:
         near = track_samples(curves, curves.tangents(), edges, maps, P, threshold)
-        return near if found is None else near.seen_where(torch.isin(near.sample * len(edges) + near.view, found))
+        if found is None:
+            return near
+        near = near.seen_where(torch.isin(near.sample * len(edges) + near.view, found))
+        return near.seen_where(~seen_edge_on(near, cameras, poses))
 
     # After they have moved, what edges no longer run along is left behind.
     curves = tracked(settle_samples(tracked(curves), cameras, poses, threshold))

@@ -22,6 +22,10 @@ FINEST = 0.05
 """Least standard deviation of distances that is believed, in pixels."""
 TRUSTED = 3.0
 """Standard deviations of a distance beyond which edges show something else: outlines of surfaces, highlights."""
+_MOTIONS = 4
+"""Ways in which the image of a curve is moved together: along both axes, turned, and larger or smaller."""
+_ABSORBED = 0.9
+"""What cameras take of these motions themselves, the most that is counted."""
 _DOF = 4.0
 """Degrees of freedom of the distribution of all distances of a sample: the fewer, the faster weights of samples fall."""
 
@@ -37,16 +41,16 @@ def edge_loss(apart: Float[Tensor, "k"]) -> GemanMcClure:
     return GemanMcClure(TRUSTED * usual_distance(apart))
 
 
-def weights_in_a_bundle(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
+def weights_in_a_bundle(curves: Curves, apart: Float[Tensor, "k"], *, beside_points: bool = False) -> Curves:
     """The curves with edge points weighed by what is measured, and less where a sample fits badly as a whole.
 
     Arguments are those of `measured_weights`.
     """
-    weighed = measured_weights(curves, apart)
+    weighed = measured_weights(curves, apart, beside_points=beside_points)
     return replace(weighed, weight=weighed.weight * sample_weights(curves, apart))
 
 
-def measured_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
+def measured_weights(curves: Curves, apart: Float[Tensor, "k"], *, beside_points: bool = False) -> Curves:
     """The curves with edge points weighed so that they count as if each were independent of the others.
 
     Their own variances, scaled so that distances from them are as large as these say (of robust mean size: one distance an edge
@@ -56,6 +60,8 @@ def measured_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
     Args:
         curves: The curves.
         apart: Signed distances of samples from each edge point.
+        beside_points: Count as alike what moves the image of a curve (`moved_alike`) instead of all that goes on along it
+            (`alike`): where points hold the cameras, and edges only say where these turn.
     """
     sound = apart.isfinite()
     if not sound.any():
@@ -63,7 +69,8 @@ def measured_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Curves:
     r, view, sample = (t[sound] for t in (apart * curves.weight.sqrt(), curves.view, curves.sample))
     redundancy = max(0.1, 1 - 2 * len(torch.unique(sample)) / len(r))
     scale = max(float(r.abs().median()) / 0.6745 / redundancy**0.5, LEAST_SCALE)
-    return replace(curves, weight=curves.weight / (scale**2 * alike(r, view, sample, curves.curve)))
+    number = moved_alike(curves, apart) if beside_points else alike(r, view, sample, curves.curve)
+    return replace(curves, weight=curves.weight / (scale**2 * number))
 
 
 def sample_weights(curves: Curves, apart: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
@@ -115,3 +122,40 @@ def alike(r: Float[Tensor, "k"], view: Int[Tensor, "k"], sample: Int[Tensor, "k"
             break
         total += 2 * correlation
     return total
+
+
+def moved_alike(curves: Curves, apart: Float[Tensor, "k"]) -> float:
+    """How many edges of a curve say together where its image belongs, as if they were one: at least 1.
+
+    What is wrong with an edge is wrong with a long piece of it, but which way it pulls an image changes as the curve bends, and
+    most of it cancels. So it is measured how far the edges of each curve in each image want that image to be moved, along both
+    axes, turned and scaled, over what independent ones would: the scatter of least squares by clusters (Liang & Zeger 1986).
+    Cameras are such motions, and have taken what is common to the curves of an image; edges much farther away than most count
+    for nothing, as in the adjustment.
+
+    Args:
+        curves: The curves.
+        apart: Signed distances of samples from each edge point.
+    """
+    r = apart * curves.weight.sqrt()
+    r = torch.where(r.isfinite(), r, torch.inf)
+    known = r.abs() < TRUSTED * DEVIATION * r.abs().median()
+    if not known.any():
+        return 1.0
+    r, x, normal, view = r[known], curves.x[known].double(), curves.normal[known].double(), curves.view[known]
+    _, of = torch.unique(torch.stack((curves.curve[curves.sample[known]], view)), dim=1, return_inverse=True)
+    number = torch.bincount(of).double()
+
+    def mean(values: Tensor) -> Tensor:
+        total = values.new_zeros(len(number), *values.shape[1:]).index_add(0, of, values)
+        return total / number.view(-1, *[1] * (values.ndim - 1))
+
+    away = x - mean(x)[of]
+    away = away / mean(away.square().sum(-1)).sqrt().clamp_min(1.0)[of, None]
+    turn = normal[:, 1] * away[:, 0] - normal[:, 0] * away[:, 1]
+    slopes = torch.stack((*normal.T, turn, (normal * away).sum(-1)), -1)
+    pull = slopes.new_zeros(len(number), _MOTIONS).index_add(0, of, slopes * r[:, None])
+    curved = float(number.sum() ** 2 / number.square().sum())
+    absorbed = min(6 * len(torch.unique(view)) / (_MOTIONS * curved), _ABSORBED)
+    independent = float(slopes.square().sum() * r.square().mean()) * (1 - absorbed)
+    return max(float(pull.square().sum()) / max(independent, 1e-300), 1.0)

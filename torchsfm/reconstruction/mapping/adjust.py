@@ -190,7 +190,7 @@ def support(mapping: Mapping, threshold: float) -> float:
     return float((LOSS(square.new_tensor(threshold**2)) - LOSS(square)).sum())
 
 
-def points_agree(mapping: Mapping, moved: Mapping) -> bool:
+def points_agree(mapping: Mapping, moved: Mapping, excess: float = 1.0) -> bool:
     """Whether points lose no more than their own noise makes likely where lines or curves have moved the cameras.
 
     Their squared distances, over their noise, may grow by one for each number of a camera that lines or curves say better, and
@@ -199,13 +199,15 @@ def points_agree(mapping: Mapping, moved: Mapping) -> bool:
     Args:
         mapping: The model, at the minimum of its points.
         moved: The same with other cameras, and its points where these want them.
+        excess: By how much more points scatter together than by their own noise, as a ratio of variances (`excess_scatter`):
+            true cameras are as much farther from their minimum.
     """
     weights = observation_weights(mapping, LOSS)
     lost = _cost(moved, weights) - _cost(mapping, weights)
     free = {} if mapping.adjustment is None else mapping.adjustment.free
     number = 6 * int(mapping.registered.sum()) + sum(int(mask.sum()) for mask in free.values())
     most = number + UNLIKELY * (2 * number) ** 0.5
-    return bool(2 * lost <= most * measure_noise(mapping, LOSS, weights) ** 2)
+    return bool(2 * lost <= excess * most * measure_noise(mapping, LOSS, weights) ** 2)
 
 
 def _cost(mapping: Mapping, weights: Float[Tensor, "m"]) -> float:
