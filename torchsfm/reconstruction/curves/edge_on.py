@@ -17,7 +17,7 @@ _FLAT = 0.5
 _WIDE = 0.02
 """and how wide that direction is at least, in the distance to which samples are asked: one straight curve has no plane."""
 _SLANT = 0.25
-"""Sine of the angle between a line of sight and a surface that is seen edge-on, 20 degrees."""
+"""Sine of the angle between a line of sight and a surface that is seen edge-on: 14 degrees."""
 
 
 def seen_edge_on(curves: Curves, cameras: Camera, poses: Pose) -> Bool[Tensor, "k"]:
@@ -39,8 +39,8 @@ def seen_edge_on(curves: Curves, cameras: Camera, poses: Pose) -> Bool[Tensor, "
         return curves.view < 0
     pixel = far / cameras.K.double()[curves.view, 0, 0]
     normal, flat = _surfaces(X, curves.curve, _AROUND * float(pixel.median()))
-    slant = (sight * normal[curves.sample]).sum(-1).abs()
-    return flat[curves.sample] & (slant < _SLANT * far)
+    slanted: Tensor = (sight * normal[curves.sample]).sum(-1).abs() < _SLANT * far
+    return flat[curves.sample] & slanted
 
 
 def _surfaces(
