@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose
+from torchsfm.linalg import eigh
 from torchsfm.reconstruction.curves.fusion import near_pairs
 from torchsfm.reconstruction.model.curves import Curves
 
@@ -55,8 +56,8 @@ def _surfaces(
     number = 1 + torch.bincount(a, minlength=len(Y))[:, None].double()
     mean = torch.zeros_like(Y).index_add(0, a, step) / number
     square = Y.new_zeros(len(Y), 9).index_add(0, a, (step[:, :, None] * step[:, None]).flatten(1)) / number
-    spread, axes = torch.linalg.eigh(square.view(-1, 3, 3) - mean[:, :, None] * mean[:, None])
+    spread, axes, known = eigh(square.view(-1, 3, 3) - mean[:, :, None] * mean[:, None])
     across, narrow, _ = spread.clamp(min=0).sqrt().unbind(-1)
-    flat = (across < _FLAT * narrow) & (narrow > _WIDE * radius)
+    flat = known & (across < _FLAT * narrow) & (narrow > _WIDE * radius)
     own = asked.cumsum(0) - 1
     return axes[own, :, 0], flat[own]
