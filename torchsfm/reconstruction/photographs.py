@@ -55,9 +55,9 @@ def reconstruct(
 ) -> SfmResult:
     """Reconstruct cameras and 3D points from photographs, with nothing known of the camera.
 
-    The steps: SIFT features; matches between all pairs, of many images between those whose best features match (see
-    `preview_matches`), less those of what is fixed to the images, as watermarks and parts of a vehicle are; epipolar geometry
-    of these pairs in one batched call; focal length from Exif unless the fundamental matrices refute it, else from these, else
+    The steps: SIFT features, where an image has few also weaker ones; matches between all pairs, of many images between those
+    whose best features match (see `preview_matches`), less those of what is fixed to the images, as watermarks and parts of a
+    vehicle are; epipolar geometry of these pairs in one batched call; focal length from Exif unless the fundamental matrices refute it, else from these, else
     a default; structure from motion (`method`) with bundle adjustment over poses, points, focal length and distortion. Images
     that have nothing in common form several models.
 
