@@ -57,9 +57,9 @@ def reconstruct(
 
     The steps: SIFT features, where an image has few also weaker ones; matches between all pairs, of many images between those
     whose best features match (see `preview_matches`), less those of what is fixed to the images, as watermarks and parts of a
-    vehicle are; epipolar geometry of these pairs in one batched call; focal length from Exif unless the fundamental matrices refute it, else from these, else
-    a default; structure from motion (`method`) with bundle adjustment over poses, points, focal length and distortion. Images
-    that have nothing in common form several models.
+    vehicle are; epipolar geometry of these pairs in one batched call; focal length from Exif unless the fundamental matrices
+    refute it, else from these, else a default; structure from motion (`method`) with bundle adjustment over poses, points,
+    focal length and distortion. Images that have nothing in common form several models.
 
     Args:
         images: A folder with its subfolders, image files, a text file with the path of an image on each line, or several of
