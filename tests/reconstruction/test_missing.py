@@ -98,7 +98,8 @@ def test_weak_points_are_not_missed(generator: torch.Generator) -> None:
     )
     assert torch.equal(none.score, missing_correspondences(folded).score)
     assert none.folded
-    assert 0 < float(half.score.sum()) < 0.8 * float(none.score.sum())
+    assert half.score.any()
+    assert half.strength < none.strength
     assert not every.score.any()
 
 
