@@ -89,6 +89,17 @@ def test_what_is_placed_at_once_must_not_bend_the_parts(degrees: float, kept: st
 
     monkeypatch.setattr(Attempt, "of", bent)
     monkeypatch.setattr(Attempt, "hinged", False)
+    monkeypatch.setattr(Attempt, "sure", lambda attempt, component: component.model.registered)
     undoubted = {"incremental": 0, "global": 9}
     monkeypatch.setattr(Attempt, "undoubted", property(lambda attempt: undoubted[attempt.growth.method]))
     assert run().report.method == kept
+
+
+def test_a_model_in_doubt_is_made_again_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, _ = chain(1, 60)
+    undoubted = {"incremental": 4, "global": 9}
+    monkeypatch.setattr(Attempt, "undoubted", property(lambda attempt: undoubted[attempt.growth.method]))
+    monkeypatch.setattr(Attempt, "bends", lambda attempt, other: False)
+    assert run().report.method == "global"
+    undoubted["incremental"] = 5
+    assert run().report.method == "incremental"

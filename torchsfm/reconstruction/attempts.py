@@ -1,6 +1,6 @@
 """The models of all images by one mapper, what is thought of them, and by which of two mappers they are better."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Int
@@ -38,6 +38,8 @@ class Attempt:
     wanted: Wanted
     growth: Growth
     components: tuple[Component, ...]
+    judged: dict[int, tuple[Standing, Calibration]] = field(default_factory=dict)
+    """What is thought of the components, by their identity."""
 
     @classmethod
     def of(cls, graph: ViewGraph, wanted: Wanted, growth: Growth) -> "Attempt":
@@ -46,6 +48,13 @@ class Attempt:
 
     def judge(self, component: Component) -> tuple[Standing, Calibration]:
         """What is thought of a model's camera poses and intrinsics."""
+        if not any(component is one for one in self.components):
+            return self._judge(component)
+        if id(component) not in self.judged:
+            self.judged[id(component)] = self._judge(component)
+        return self.judged[id(component)]
+
+    def _judge(self, component: Component) -> tuple[Standing, Calibration]:
         model, options, threshold = component.model, component.options, self.growth.begun.options.reprojection
         others = self.growth.taken & ~model.registered
         uncertain = component.uncertain
@@ -72,7 +81,11 @@ class Attempt:
     @property
     def undoubted(self) -> int:
         """How many of these are not doubtful."""
-        return self.registered - sum(bool(doubt) for one in self.components for doubt in self.judge(one)[0].doubt)
+        return sum(int(self.sure(component).sum()) for component in self.components)
+
+    def sure(self, component: Component) -> Bool[Tensor, "v"]:
+        """Images of a model that are not doubtful."""
+        return component.model.registered & ~torch.tensor([bool(doubt) for doubt in self.judge(component)[0].doubt])
 
     @property
     def hinged(self) -> bool:
@@ -82,11 +95,11 @@ class Attempt:
         return any(bool(hinges(agreement, model).any()) for model, agreement in agreements)
 
     def bends(self, other: "Attempt") -> bool:
-        """Whether images of a model of the other attempt are turned against each other by more than `WRONG_ANGLE` here."""
+        """Whether images that are not doubtful in the other attempt are turned against each other by `WRONG_ANGLE` here."""
         for one in self.components:
-            for whole in other.components:
-                both = one.model.registered & whole.model.registered
-                turn = whole.model.poses.R[both].mT @ one.model.poses.R[both]
+            for known in other.components:
+                both = one.model.registered & other.sure(known)
+                turn = known.model.poses.R[both].mT @ one.model.poses.R[both]
                 if len(turn) and float(rotation_angle(nearest_rotation(turn.sum(0)).mT @ turn).max().rad2deg()) > WRONG_ANGLE:
                     return True
         return False
@@ -104,15 +117,17 @@ class Attempt:
 
 
 def best_attempt(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
-    """The models of all images; where the mapper is not prescribed, those by another one if these have fallen apart.
+    """The models of all images; where the mapper is not prescribed, those by another one if these fell apart or are in doubt.
 
     Images that are placed one by one need many points in common with those before. To place all at once takes less, and goes
     wrong more often: a part that is turned about its only relation bends the rest, and the focal length gives way. So what is
-    placed at once must not bend the parts that were placed one by one, nor hang on a hinge, and more images must not be
-    doubtful in it.
+    placed at once must not bend what was placed one by one and is not in doubt, nor hang on a hinge, and fewer images must be
+    in doubt.
     """
     attempt = Attempt.of(graph, wanted, growth)
-    if wanted.method != "auto" or growth.method != "incremental" or not attempt.fell_apart:
+    if wanted.method != "auto" or growth.method != "incremental":
+        return attempt
+    if 2 * attempt.undoubted >= attempt.registered and not attempt.fell_apart:
         return attempt
     other = Attempt.of(graph, wanted, growth.by("global"))
     if other.bends(attempt) or other.hinged:
