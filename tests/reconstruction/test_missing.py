@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
-from torchsfm.reconstruction.evidence.missing import SIGNIFICANCE, Conflicts, _Looks, _Occupied, missing_correspondences
+from torchsfm.reconstruction.evidence.missing import SIGNIFICANCE, Conflicts, missing_correspondences
+from torchsfm.reconstruction.evidence.occupied import Looks, Occupied
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
 
@@ -131,8 +132,8 @@ def test_points_beside_each_other_need_not_look_alike(generator: torch.Generator
 
 
 def test_a_point_at_the_last_pixel_that_looks_unlike_is_none() -> None:
-    looks = _Looks.of(torch.tensor([[9, 0], [0, 9]], dtype=torch.uint8))
-    occupied = _Occupied(torch.tensor([7]), torch.ones(8, dtype=torch.bool), torch.tensor([1]), looks, 4, 2)
+    looks = Looks.of(torch.tensor([[9, 0], [0, 9]], dtype=torch.uint8))
+    occupied = Occupied(torch.tensor([7]), torch.ones(8, dtype=torch.bool), torch.tensor([1]), looks, 4, 2)
     place, view = torch.tensor([[2], [0]]), torch.tensor([0])
     assert occupied.at(view, place, torch.tensor([0])).tolist() == [False]
     assert occupied.at(view, place, torch.tensor([1])).tolist() == [True]

@@ -15,11 +15,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry.intrinsic_parameters import row_from_camera
 from torchsfm.geometry.projection import PixelProjection
+from torchsfm.reconstruction.evidence.occupied import Occupied
 from torchsfm.reconstruction.mapping.mapping import Mapping
 
 MAX_ANGLE = 0.35
@@ -38,8 +39,6 @@ FINER = (48, 36)
 """Columns and rows in which it is known how far an image sees."""
 FARTHER = 0.97
 """A camera that sees this fraction of a point's depth beside its place, and nothing nearer, sees the place itself."""
-ALIKE = 0.85
-"""Descriptors of one point, seen from like viewpoints, have at least this cosine; those of others rarely do."""
 WRONG = 0.02
 """Share of points at which a wrong match is found where there can be no right one."""
 BESIDE = ((7, 7), (-7, 7), (7, -7), (-7, -7))
@@ -51,10 +50,6 @@ PART = 1 / 12
 many, chance refutes some, as points next to each other are missed together."""
 PLACES = 0.01
 """Part of all places that are refuted so in a folded model, at least: of many hundred beside each other chance refutes one."""
-SPARSE = 8
-"""Entries of a table of occupied pixels, at least, for each that is occupied."""
-ROWS = 2048
-"""Descriptors looked at together."""
 NEAREST = 48
 """Cameras with which each one is compared, the nearest, in large models."""
 
@@ -124,7 +119,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     first_sighting = sightings.cumsum(0) - sightings
     site = _places(mapping)
     sites = torch.bincount(torch.unique(point * v + site[view]) // v, minlength=len(mapping.X))
-    occupied = _Occupied.of(mapping)
+    occupied = Occupied.of(mapping)
     nearest, farthest = _DepthMap.of(mapping, FINE, "amin"), _DepthMap.of(mapping, FINER, "amax")
     beside = _DepthMap.of(mapping, FINER, "amin")
     lens = PixelProjection(type(mapping.cameras.distortion), skew=bool((mapping.cameras.K[:, 0, 1] != 0).any()))
@@ -194,75 +189,6 @@ class _Shares:
         dead = ((c + 5 * self.by_chance) / (n + 5)).clamp(WRONG, 0.9)
         ratio = k * (dead / self.found).log() + (n - k) * ((1 - dead) / (1 - self.found)).log()
         return torch.where(dead < self.found, ratio, 0.0).clamp(min=0)
-
-
-@dataclass(frozen=True)
-class _Occupied:
-    """The image points at or beside each pixel of each image."""
-
-    pixel: Int[Tensor, "m"]
-    """Pixels that are occupied, in ascending order, one for each point there."""
-    some: Bool[Tensor, "s"]
-    """Whether any pixel is occupied whose last binary digits these are: nearly all places are empty, and known to be so."""
-    point: Int[Tensor, "m"]
-    looks: "_Looks | None"
-    width: int
-    height: int
-
-    @classmethod
-    def of(cls, mapping: Mapping) -> "_Occupied":
-        graph = mapping.graph
-        width, height = (int(n) + 2 for n in graph.image_size.amax(0))
-        x = graph.x.round().long() + 1
-        step = torch.tensor([-1, 0, 1])
-        column, row = x[:, 0, None, None] + step, x[:, 1, None, None] + step[:, None]
-        pixel = ((graph.view[:, None, None] * height + row) * width + column).flatten()
-        order = pixel.argsort()
-        some = torch.zeros(1 << (SPARSE * max(len(pixel), 1)).bit_length(), dtype=torch.bool)
-        some[pixel & (len(some) - 1)] = True
-        looks = None if graph.descriptors is None else _Looks.of(graph.descriptors())
-        return cls(pixel[order], some, order // 9, looks, width, height)
-
-    def at(self, view: Int[Tensor, "n"], place: Int[Tensor, "2 *k n"], like: Int[Tensor, "n"]) -> Bool[Tensor, "*k n"]:
-        """Whether an image has a point at a pixel, or beside it, that looks like a given one where that is known."""
-        column, row = place + 1
-        inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
-        pixel = (view * self.height + row) * self.width + column
-        found: Tensor = inside & self.some[pixel & (len(self.some) - 1)]
-        maybe = found.nonzero(as_tuple=True)
-        pixel, like = pixel[maybe], like[maybe[-1]]
-        last, there = len(self.pixel) - 1, torch.searchsorted(self.pixel, pixel)
-        own, alike = torch.arange(len(pixel)), torch.zeros_like(pixel, dtype=torch.bool)
-        while len(own):
-            # Of the points at a pixel one after the other, until one looks like it.
-            held = (there <= last) & (self.pixel[there.clamp(max=last)] == pixel[own])
-            own, there = own[held], there[held]
-            fits = self.looks.alike(like[own], self.point[there]) if self.looks is not None else torch.ones_like(there) > 0
-            alike[own[fits]] = True
-            own, there = own[~fits], there[~fits] + 1
-        found[maybe] = alike
-        return found
-
-
-@dataclass(frozen=True)
-class _Looks:
-    """What image points look like."""
-
-    descriptors: UInt8[Tensor, "n d"]
-    length: Float[Tensor, "n"]
-
-    @classmethod
-    def of(cls, descriptors: UInt8[Tensor, "n d"]) -> "_Looks":
-        lengths = [torch.linalg.vector_norm(some.float(), dim=1) for some in torch.split(descriptors, ROWS)]
-        return cls(descriptors, torch.cat(lengths).clamp(min=1e-12))
-
-    def alike(self, first: Int[Tensor, "k"], second: Int[Tensor, "k"]) -> Bool[Tensor, "k"]:
-        """Whether two image points look the same."""
-        products = [
-            (self.descriptors[a].float() * self.descriptors[b].float()).sum(-1)
-            for a, b in zip(torch.split(first, ROWS), torch.split(second, ROWS), strict=True)
-        ]
-        return torch.cat(products) > ALIKE * self.length[first] * self.length[second]
 
 
 @dataclass(frozen=True)
