@@ -4,7 +4,8 @@
 
 prints one markdown table. Photographs are at half size where they are larger than a thousand pixels; nothing is known of the
 cameras. Duplicates count as images of their own; pairs of images from one place have no direction between them, and are left
-out of the AUC. Strangers are images that do not belong to the set.
+out of the AUC. Strangers are images that do not belong to the set. `--set temple --only wall` puts a wall that stands still
+behind an object that turns.
 """
 
 import argparse
@@ -113,6 +114,15 @@ def vignette(image: Image, number: int, random: np.random.Generator) -> Image:
     return image * disc[..., None]
 
 
+def before_wall(image: Image, wall: Image, random: np.random.Generator) -> Image:
+    """What stands on black, before something that stands still: an object on a turntable."""
+    on = cv2.morphologyEx((image.max(-1) > 28).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7)))
+    _, label, sizes, _ = cv2.connectedComponentsWithStats(on)
+    share = cv2.GaussianBlur((label == 1 + sizes[1:, 4].argmax()).astype(np.float64), (0, 0), 1.0)[..., None]
+    mixed = share * image + (1 - share) * cv2.resize(wall, image.shape[1::-1]) + random.normal(0, 2, image.shape)
+    return np.clip(mixed, 0, 255).astype(np.uint8)
+
+
 def plain(image: Image, number: int, random: np.random.Generator) -> Image:
     """As it is."""
     return image
@@ -122,6 +132,8 @@ SPOILS: tuple[Spoil, ...] = (
     plain, watermark, strip, sizes, crops, crops_less, crops_more, zoom, barrel, turned, exposure, blur, vignette,
 )  # fmt: skip
 FOLDERS = (*(spoil.__name__ for spoil in SPOILS), "gray", "jpeg", "duplicates", "again", "mirrored", "strangers")
+WALL = "wall"
+"""For photographs of an object on black."""
 
 
 def folder(
@@ -131,6 +143,7 @@ def folder(
     random, photographs = np.random.default_rng(seed), SETS[name](data)
     spoil = next((spoil for spoil in SPOILS if spoil.__name__ == which), plain)
     poses: dict[str, NDArray[np.float64]] = {}
+    wall = _read(SETS["castle"](data).paths[3])
 
     def write(stem: str, image: Image, pose: NDArray[np.float64] | None, quality: int = 95) -> None:
         path = out / (f"{stem}.png" if image.dtype == np.uint16 else f"{stem}.jpg")
@@ -143,6 +156,8 @@ def folder(
         image = spoil(_read(path), number, random)
         if which == "turned" and number % 3 == 1 and pose is not None:
             pose = QUARTER @ pose
+        if which == WALL:
+            image = before_wall(image, wall, random)
         if which == "gray":
             image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.uint16) * 257  # type: ignore[assignment]
         write(f"{number:03d}", image, pose, 25 if which == "jpeg" else 95)
@@ -201,7 +216,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.spoiled_folders", description="Folders as users have them.")
     parser.add_argument("--data", type=Path, default=data_folder(), help="folder of the data sets (default: $TORCHSFM_DATA)")
     parser.add_argument("--set", choices=sorted(SETS), default="fountain")
-    parser.add_argument("--only", nargs="+", choices=FOLDERS, default=list(FOLDERS))
+    parser.add_argument("--only", nargs="+", choices=(*FOLDERS, WALL), default=list(FOLDERS))
     parser.add_argument("--seed", type=int, default=3, help="of where photographs are cropped")
     parser.add_argument(
         "--images", default=":", metavar="A:B", help="those photographs of the set alone, from 0, B not included"

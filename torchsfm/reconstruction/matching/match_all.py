@@ -13,7 +13,7 @@ from torchsfm.images import Features, match_features, preview_matches, promising
 from torchsfm.images.preemptive import PARTNERS
 from torchsfm.reconstruction.matching.image_points import SHARDS, ImagePoints, SavedFeatures
 from torchsfm.reconstruction.matching.masks import Masks
-from torchsfm.reconstruction.matching.overlays import Overlays, find_overlays
+from torchsfm.reconstruction.matching.overlays import beside_overlays, find_overlays
 from torchsfm.reconstruction.matching.sequence import Corners, sequence_pairs, track_corners
 from torchsfm.reconstruction.matching.stages import Arrays, Shards, Stages, one_thread
 from torchsfm.reconstruction.matching.view_graph import VerifiedPairs, ViewGraph, verify_pairs
@@ -157,21 +157,23 @@ def match_all(
 
     found = FoundMatches(work, pairs, matched, [len(a) for a in points.x], corners)
 
+    offset = torch.tensor([0, *(len(a) for a in x)]).cumsum(0)
+
     def look_for_overlays(_: int) -> Arrays:
-        every = map(found.of, range(work.verify_shards))
         again = torch.Generator().manual_seed(seed)
-        return {"cells": find_overlays(points.image_size, x, pairs, every, generator=again).cells}
+        fixed = find_overlays(points.image_size, x, pairs, lambda: map(found.of, range(work.verify_shards)), generator=again)
+        return {"points": fixed.nonzero()[:, 0]}
 
     after = f"{work.digest} {seed}"
+    fixed = torch.zeros(int(offset[-1]), dtype=torch.bool)
     with one_thread():
-        overlays = Overlays(stages.shards("overlays", 1, look_for_overlays, after=after)[0]["cells"])
+        fixed[stages.shards("overlays", 1, look_for_overlays, after=after)[0]["points"]] = True
 
     def verify(shard: int) -> Arrays:
         progress("verify", work.verified(shard).start, len(pairs))
         matches, still = found.of(shard), 0
         for q, match in matches.items():
-            i, j = pairs[q].tolist()
-            kept = overlays.admit(points.image_size[pairs[q]], x[i][match[:, 0]], x[j][match[:, 1]])
+            kept = ~fixed[match + offset[pairs[q]]].any(-1)
             matches[q], still = match[kept], still + int((~kept).sum())
         chosen = work.verified(shard)
         some = [matches[q] for q in range(len(pairs))[chosen]]
@@ -186,7 +188,7 @@ def match_all(
     still = sum(int(part.pop("still")) for part in parts)
     verified = VerifiedPairs.join([VerifiedPairs(**part) for part in parts])
     graph = verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
-    graph = replace(graph, still=still, weak=torch.cat(weak))
+    graph = replace(graph, still=still, weak=torch.cat(weak) | beside_overlays(points.image_size, x, fixed))
     # Corners that were tracked through a sequence have no descriptors.
     return graph if sequence else replace(graph, descriptors=lambda: torch.cat([f.descriptors for f in features]))
 

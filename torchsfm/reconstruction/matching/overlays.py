@@ -1,12 +1,11 @@
-"""What is fixed to the images and not to the scene: watermarks, dates, a part of the vehicle, the ground of a turntable.
+"""What is fixed to the images and not to the scene: watermarks, dates, a part of the vehicle, the wall behind a turntable.
 
 Its points match at the same place in all images, and may be so many that a camera seems not to have moved. One pair tells when
 its other matches move, agree on an epipolar geometry, and what stands still contradicts that. Many images at the same place
 make sure: a camera that rests for a while, before which something moves, has no such places in most of its images.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,8 +20,13 @@ what moves does at least."""
 _OFF = 2.0
 """How far from its epipolar line, in thresholds of verification, a still point is one of another geometry."""
 _THRESHOLD = 3.0
-_PAIRS = 4
-"""How many pairs of an image are asked: all show the same."""
+_PAIRS = 8
+"""How many pairs of an image are asked, those with most that moves: all show the same, if they show anything."""
+_ABOUT, _BESIDE = 2.0, 16.0
+"""Pixels by which a point about where overlays are moves at most to be one of theirs, by noise; and as far as it reaches into
+what points beside it look like."""
+_ROWS = 1024
+"""Image points whose distances are looked at together."""
 _CELL = 4.0
 """The width of the cells of places, in distances of what stands still."""
 _IMAGES, _SHARE = 3, 0.5
@@ -34,47 +38,81 @@ watermark hides parts of it."""
 Matches = Mapping[int, Int[Tensor, "_ 2"]]
 
 
-@dataclass(frozen=True)
-class Overlays:
-    """Places of images at which something stands still, for each size of image; where there are none, all is admitted."""
-
-    cells: Int[Tensor, "c 3"]
-    """Width and height of the images, and the number of a cell, see `_cells`."""
-
-    def admit(self, size: Int[Tensor, "2 2"], x1: Float[Tensor, "k 2"], x2: Float[Tensor, "k 2"]) -> Bool[Tensor, "k"]:
-        """Which matches of two images of these sizes do not stand still at such a place."""
-        kept = torch.ones(len(x1), dtype=torch.bool)
-        if not len(self.cells) or not bool((size[0] == size[1]).all()):
-            return kept
-        own = self.cells[(self.cells[:, :2] == size[0]).all(-1), 2]
-        still = (_moved(x1, x2) <= _STILL * scale_of_images(size[0])).nonzero()[:, 0]
-        found = torch.isin(_cells(x1[still], size[0]), own).any(-1)
-        return kept.index_copy(0, still, ~found)
-
-
-NONE = Overlays(torch.zeros(0, 3, dtype=torch.long))
-
-
 def find_overlays(
     image_size: Int[Tensor, "v 2"],
     x: Sequence[Float[Tensor, "_ 2"]],
     pairs: Int[Tensor, "q 2"],
-    matches: Iterable[Matches],
+    matches: Callable[[], Iterable[Matches]],
     *,
     generator: torch.Generator | None = None,
-) -> Overlays:
-    """Find the places at which something stands still in images of which the rest moves.
+) -> Bool[Tensor, "n"]:
+    """Find the image points that are fixed to the images, of which the rest moves.
+
+    They stand still, in some pair, at a place where many images have something that does. What they match elsewhere is wrong,
+    or the same but for noise.
 
     Args:
         image_size: Width and height in pixels.
         x: Image points per image, in pixels.
         pairs: Pairs of images.
-        matches: Those of some pairs at a time, by the number of the pair.
+        matches: Goes through the matches of some pairs at a time, by the number of the pair; asked for once or twice.
         generator: Source of randomness.
+
+    Returns:
+        Which points of all images, one image after the other, are of an overlay.
     """
+    offset = torch.tensor([0, *(len(points) for points in x)]).cumsum(0)
+    fixed = torch.zeros(int(offset[-1]), dtype=torch.bool)
+    cells = _places(image_size, x, pairs, matches(), generator)
+    if not len(cells):
+        return fixed
+    for some in matches():
+        for q, match in some.items():
+            i, j = pairs[q].tolist()
+            if bool((image_size[i] == image_size[j]).all()):
+                shown = match[_shown(cells, image_size[i], x[i][match[:, 0]], x[j][match[:, 1]])]
+                fixed[shown + offset[pairs[q]]] = True
+    return fixed
+
+
+def beside_overlays(
+    image_size: Int[Tensor, "v 2"], x: Sequence[Float[Tensor, "_ 2"]], fixed: Bool[Tensor, "n"]
+) -> Bool[Tensor, "n"]:
+    """Which image points are so near to one that is fixed to the image that it changes what they look like."""
+    beside = torch.zeros_like(fixed)
+    end = 0
+    for points, reach in zip(x, (_BESIDE * scale_of_images(image_size)).tolist(), strict=True):
+        begin, end = end, end + len(points)
+        own = points[fixed[begin:end]]
+        for row in range(0, len(points) if len(own) else 0, _ROWS):
+            near = torch.cdist(points[row : row + _ROWS], own) < reach
+            beside[begin + row : begin + row + len(near)] = near.any(-1)
+    return beside
+
+
+def _shown(
+    cells: Int[Tensor, "c 3"], size: Int[Tensor, "2"], x1: Float[Tensor, "k 2"], x2: Float[Tensor, "k 2"]
+) -> Bool[Tensor, "k"]:
+    """Which matches of two images of this size stand still about where overlays are."""
+    own = cells[(cells[:, :2] == size).all(-1)]
+    still = _moved(x1, x2) <= _ABOUT * scale_of_images(size)
+    rows = still.nonzero()[:, 0]
+    here = torch.cat([size.expand(len(rows), 2), _cells(x1[rows], size)[:, :1]], 1)
+    block = _blocks(torch.cat((own, here)))[0]
+    return still.index_copy(0, rows, torch.isin(block[len(own) :], block[: len(own)]))
+
+
+def _places(
+    image_size: Int[Tensor, "v 2"],
+    x: Sequence[Float[Tensor, "_ 2"]],
+    pairs: Int[Tensor, "q 2"],
+    matches: Iterable[Matches],
+    generator: torch.Generator | None,
+) -> Int[Tensor, "c 3"]:
+    """Where something stands still in images of which the rest moves: their width and height, and the number of a cell."""
     scale = scale_of_images(image_size)
     asked: dict[int, tuple[Tensor, Tensor]] = {}
-    moves, often = torch.zeros(len(x), dtype=torch.bool), torch.zeros(len(x), dtype=torch.long)
+    moves = torch.zeros(len(x), dtype=torch.bool)
     alike = (image_size[pairs[:, 0]] == image_size[pairs[:, 1]]).all(-1).tolist()
     for some in matches:
         for q, match in some.items():
@@ -86,11 +124,11 @@ def find_overlays(
             if int(moving.sum()) < 2 * MIN_INLIERS:
                 continue
             moves[pairs[q]] = True
-            if int(still.sum()) >= MIN_INLIERS and bool((often[pairs[q]] < _PAIRS).any()):
+            if int(still.sum()) >= MIN_INLIERS:
                 asked[q] = match[still], match[moving]
-                often[pairs[q]] += 1
+        asked = _most_telling(pairs, asked)
     if not asked:
-        return NONE
+        return pairs.new_zeros(0, 3)
     chosen = sorted(asked)
     moving_ones = [asked[q][1] for q in chosen]
     verified = verify_pairs(image_size, x, pairs[chosen], moving_ones, threshold=_THRESHOLD, generator=generator)
@@ -100,14 +138,29 @@ def find_overlays(
             continue
         (i, j), still = pairs[q].tolist(), asked[q][0]
         x1, x2 = x[i][still[:, 0]], x[j][still[:, 1]]
-        off = sampson_distance(verified.F[k], x1, x2) > _OFF * _THRESHOLD * scale[i]
-        if int(off.sum()) >= MIN_INLIERS:
-            cells = _cells(torch.cat((x1[off], x2[off])), image_size[i])
+        if int((sampson_distance(verified.F[k], x1, x2) > _OFF * _THRESHOLD * scale[i]).sum()) >= MIN_INLIERS:
+            # Also what fits by chance, as all does next to the axis of a small turn; in the scene that is at other places.
+            cells = _cells(torch.cat((x1, x2)), image_size[i])
             rows.append(torch.cat((image_size[i].expand(*cells.shape, 2), cells[..., None]), -1).flatten(0, 1))
-            images.append(pairs[q].repeat_interleave(int(off.sum())).repeat_interleave(cells.shape[1]))
+            images.append(pairs[q].repeat_interleave(len(still)).repeat_interleave(cells.shape[1]))
     if not rows:
-        return NONE
-    return Overlays(_common(torch.cat(rows), torch.cat(images), image_size[moves]))
+        return pairs.new_zeros(0, 3)
+    return _common(torch.cat(rows), torch.cat(images), image_size[moves])
+
+
+def _most_telling(pairs: Int[Tensor, "q 2"], asked: Mapping[int, tuple[Tensor, Tensor]]) -> dict[int, tuple[Tensor, Tensor]]:
+    """Of pairs, with what stands still and what moves in them, those that are among the first of one of their images.
+
+    Where most of what matches stands still, as behind a turntable, the rest tells a geometry only in the few pairs that show
+    the same side of what turns: elsewhere it is wrong.
+    """
+    kept, often = dict[int, tuple[Tensor, Tensor]](), dict[int, int]()
+    for q in sorted(asked, key=lambda q: (-len(asked[q][1]), q)):
+        images = pairs[q].tolist()
+        if any(often.get(i, 0) < _PAIRS for i in images):
+            kept[q] = asked[q]
+            often |= {i: often.get(i, 0) + 1 for i in images}
+    return kept
 
 
 def _common(rows: Int[Tensor, "r 3"], images: Int[Tensor, "r"], sizes: Int[Tensor, "a 2"]) -> Int[Tensor, "c 3"]:

@@ -22,7 +22,7 @@ from torchsfm.reconstruction.model.files import HELD, held_file, load_arrays, wh
 
 Arrays = dict[str, Tensor]
 T = TypeVar("T")
-LAYOUT = 4
+LAYOUT = 5
 """Counts changes of what stages hold: what an earlier version of this library left is not taken for what this one does."""
 PAUSE = 0.05
 """Seconds between two looks whether other processes have finished."""
