@@ -71,7 +71,7 @@ def reconstruct(
         typer.Option(
             callback=known_camera,
             metavar=f"[{'|'.join(DISTORTION_MODELS)}]",
-            help="Lens distortion; radial, or pinhole with --intrinsics.",
+            help="Lens distortion; radial or fisheye by what the images say, or pinhole with --intrinsics.",
             show_default=False,
         ),
     ] = None,

@@ -1,5 +1,6 @@
 """The models of all images by one mapper, what is thought of them, and by which of two mappers they are better."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -12,8 +13,9 @@ from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import pair_agreement
 from torchsfm.reconstruction.evidence.doubt import WRONG_ANGLE, Standing, examine
 from torchsfm.reconstruction.evidence.groups import hinges
+from torchsfm.reconstruction.lenses import FISHEYE, explains_better, may_be_fisheye
 from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
-from torchsfm.reconstruction.mappers.growth import Component, Growth, Wanted
+from torchsfm.reconstruction.mappers.growth import Component, Given, Growth, Wanted
 from torchsfm.reconstruction.mappers.unfold import hanging_on_copies
 from torchsfm.reconstruction.mapping.adjust import LOSS
 from torchsfm.reconstruction.mapping.calibration import (
@@ -24,6 +26,7 @@ from torchsfm.reconstruction.mapping.calibration import (
     calibration_of,
     observation_weights,
 )
+from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
 
 LEFT = 0.1
@@ -74,6 +77,11 @@ class Attempt:
         return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
 
     @property
+    def largest(self) -> Mapping:
+        """The model of most images."""
+        return max((component.model for component in self.components), key=lambda model: int(model.registered.sum()))
+
+    @property
     def registered(self) -> int:
         """How many images are in a model."""
         return sum(int(component.model.registered.sum()) for component in self.components)
@@ -109,27 +117,35 @@ class Attempt:
         """Whether more than a few of the images that hang together with those of the largest model are not in it."""
         if not self.components:
             return False
-        largest = max((component.model.registered for component in self.components), key=lambda own: int(own.sum()))
+        largest = self.largest.registered
         found = torch.maximum(self.graph.fundamental_inliers, self.graph.homography_inliers)
         label = components(self.graph.pairs[found >= MIN_INLIERS], len(largest))
         together = label == label[largest].mode().values
         return int((together & ~largest).sum()) > LEFT * int(together.sum())
 
 
-def best_attempt(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
-    """The models of all images; where the mapper is not prescribed, those by another one if these fell apart or are in doubt.
+def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progress: Callable[[int, int], None]) -> Attempt:
+    """The models of all images; where lens or mapper are not prescribed, those by another one if these leave it open.
 
     Images that are placed one by one need many points in common with those before. To place all at once takes less, and goes
     wrong more often: a part that is turned about its only relation bends the rest, and the focal length gives way. So what is
     placed at once must not bend what was placed one by one and is not in doubt, nor hang on a hinge, and fewer images must be
     in doubt.
     """
-    attempt = Attempt.of(graph, wanted, growth)
-    if wanted.method != "auto" or growth.method != "incremental":
+
+    def made(wanted: Wanted) -> Attempt:
+        return Attempt.of(given.graph, wanted, Growth.of(given, wanted, generator, progress))
+
+    attempt = made(wanted)
+    if wanted.lens_is_open and attempt.components and may_be_fisheye(attempt.largest):
+        wide = made(replace(wanted, camera=FISHEYE))
+        if wide.registered > (1 - LEFT) * attempt.registered and explains_better(attempt.largest, wide.largest):
+            attempt = wide
+    if wanted.method != "auto" or attempt.growth.method != "incremental":
         return attempt
     if 2 * attempt.undoubted >= attempt.registered and not attempt.fell_apart:
         return attempt
-    other = Attempt.of(graph, wanted, growth.by("global"))
+    other = Attempt.of(given.graph, attempt.wanted, attempt.growth.by("global"))
     if other.bends(attempt) or other.hinged:
         return attempt
     return max(attempt, other, key=lambda one: (one.undoubted, one.registered))

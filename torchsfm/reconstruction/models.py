@@ -54,8 +54,7 @@ def build_models(
     """
     number = len(given.graph.names)
     with stages.timed("map"), one_thread() if number <= FEW_IMAGES else nullcontext():
-        growth = Growth.of(given, wanted, generator, lambda done, total: progress("map", done, total))
-        attempt = best_attempt(given.graph, wanted, growth)
+        attempt = best_attempt(given, wanted, generator, lambda done, total: progress("map", done, total))
         made: list[tuple[Component, Reconstruction]] = []
         for component in attempt.components:
             made.append(_with_lines_and_curves(component, segments, edges, stages, progress))

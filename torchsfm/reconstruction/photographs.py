@@ -67,8 +67,8 @@ def reconstruct(
             the reason why it was not read. For a film see `extract_frames`.
         sequence: The images are consecutive frames of a video: corners are tracked through it, and features are matched
             between frames that are near in time or look alike, instead of between all.
-        camera: Name of the distortion model, one of `torchsfm.DISTORTION_MODELS`. By default "radial", or "pinhole"
-            when `K` is given.
+        camera: Name of the distortion model, one of `torchsfm.DISTORTION_MODELS`. By default "pinhole" when `K` is given, else
+            "radial", or "fisheye" where that bends the corners strongly and a fisheye explains the images better.
         shared_camera: Whether one camera took all images of the same size. By default it did where they lie in one folder and
             the files name the same camera and focal length, or name none, unless without a focal length pairs and models say
             that there are several.

@@ -55,7 +55,8 @@ class Wanted:
     """How models are to be made; see `reconstruct`.
 
     Attributes:
-        camera: Name of the distortion model; None for "radial", or "pinhole" where the camera is known.
+        camera: Name of the distortion model; None for "radial", or what explains the images better, or "pinhole" where the
+            camera is known.
         shared_camera: Whether one camera took all images of the same size.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
@@ -82,6 +83,11 @@ class Wanted:
     def lens(self) -> str:
         """Name of the distortion model."""
         return self.camera or ("radial" if self.K is None else "pinhole")
+
+    @property
+    def lens_is_open(self) -> bool:
+        """Whether images may say that another lens took them."""
+        return self.camera is None and self.K is None and self.method != "projective"
 
     @property
     def free(self) -> tuple[str, ...]:
