@@ -3,9 +3,9 @@
     TORCHSFM_DATA=/path/to/data python -m bench.reconstruction [--sets fountain sceaux ...] [--threads 2] [--lines] [--curves]
 
 prints one markdown table; with `--lines` also of points and lines together, with `--curves` of points and curves. Each run
-is a process of its own, so that its peak memory is its own; both programs start from the same knowledge: one shared camera,
-its focal length from the EXIF header where there is one, else unknown, or K where the set gives it.
-`pytest bench/reconstruction.py` times the whole job with pytest-benchmark instead.
+is a process of its own, so that its processor time and its peak memory are its own; both programs start from the same
+knowledge: one shared camera, its focal length from the EXIF header where there is one, else unknown, or K where the set gives
+it. `pytest bench/reconstruction.py` times the whole job with pytest-benchmark instead.
 """
 
 import argparse
@@ -144,7 +144,7 @@ PROGRAMS: dict[str, Callable[[PhotographSet, int, int], Result]] = {
 
 
 def run_apart(program: str, name: str, data: Path, threads: int, seed: int) -> Result:
-    """Run one program on one set in a process of its own, and add its peak memory in MB."""
+    """Run one program on one set in a process of its own, and add its processor time and its peak memory in MB."""
     command = [sys.executable, "-m", "bench.reconstruction", "--data", str(data), "--threads", str(threads)]
     command += ["--seed", str(seed), "--worker", program, name]
     limits = {key: str(threads) for key in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
@@ -177,14 +177,14 @@ def judge(result: Result, photographs: PhotographSet) -> Result:
 
 HEADER = (
     "| data set | program | registered | points | observations | track length | error px | "
-    "start / extract / match / verify / map = total s | memory MB | AUC 1 / 2 / 5 deg | position RMSE | focal (truth) |"
+    "start / extract / match / verify / map = total s | CPU s | memory MB | AUC 1 / 2 / 5 deg | position RMSE | focal (truth) |"
 )
 
 
 def row(program: str, result: Result, photographs: PhotographSet) -> str:
     """One line of the table."""
     if "failed" in result:
-        return f"| {photographs.name} | {program} | {result['failed']} |" + " |" * 9
+        return f"| {photographs.name} | {program} | {result['failed']} |" + " |" * 10
     truth = judge(result, photographs)
     seconds = " / ".join(f"{result['seconds'][stage]:.1f}" for stage in STAGES)
     cells = [
@@ -196,6 +196,7 @@ def row(program: str, result: Result, photographs: PhotographSet) -> str:
         f"{result['observations'] / max(result['points'], 1):.2f}",
         f"{result['error']:.3f}",
         f"{seconds} = {result['total']:.1f}",
+        f"{result['processor']:.0f}",
         f"{result['memory']:.0f}",
         " / ".join(f"{area:.3f}" for area in truth["auc"]) if truth else "",
         "" if not truth else f"{truth['rmse'] * photographs.unit:.2f} mm" if photographs.unit else f"{truth['rmse']:.4g}",
@@ -224,12 +225,13 @@ def main(arguments: list[str] | None = None) -> None:
         result = PROGRAMS[program](SETS[name](options.data), options.threads, options.seed)
         # Linux counts in kilobytes, macOS in bytes.
         unit = 2**20 if platform.system() == "Darwin" else 2**10
-        result["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        result |= {"memory": used.ru_maxrss / unit, "processor": used.ru_utime + used.ru_stime}
         print(json.dumps(result))
         return
     wanted = dict(zip(PROGRAMS, (not options.no_torchsfm, options.lines, options.curves, not options.no_colmap), strict=True))
     chosen = [program for program in PROGRAMS if wanted[program]]
-    print(HEADER, "|---" * 12 + "|", sep="\n", flush=True)
+    print(HEADER, "|---" * 13 + "|", sep="\n", flush=True)
     remarks = []
     for name in options.sets:
         photographs = SETS[name](options.data)
