@@ -1,7 +1,7 @@
 """How the site is built: `python -m sphinx -W .site build/site`, with `-D plot_gallery=0` without running the examples.
 
-What is not in docstrings, README.md, CHANGELOG.md, bench/RESULTS.md, .github/CONTRIBUTING.md and examples/ is on the pages
-beside this file. `building/` turns those sources into pages under `generated/`, which no one edits.
+What is not in docstrings, README.md, CHANGELOG.md, bench/RESULTS.md, bench/HISTORY.md, .github/CONTRIBUTING.md and examples/ is
+on the pages beside this file. `building/` turns those sources into pages under `generated/`, which no one edits.
 """
 
 import sys

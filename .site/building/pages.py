@@ -1,4 +1,4 @@
-"""Pages that are files of the repository: README, benchmark tables, changelog, contributing."""
+"""Pages that are files of the repository: README, benchmark tables and their history, changelog, contributing."""
 
 import inspect
 import re
@@ -11,6 +11,8 @@ SOURCES = ("homography_4pt", "write_tum", "KannalaBrandt")
 """Of these the page on additions shows the files."""
 LINKS = {
     "bench/RESULTS.md": "/generated/pages/results.md",
+    "RESULTS.md": "/generated/pages/results.md",
+    "HISTORY.md": "/generated/pages/history.md",
     "CHANGELOG.md": "/generated/pages/changelog.md",
     ".github/CONTRIBUTING.md": "/generated/pages/contributing.md",
     "examples/fountain.png": "/generated/pages/fountain.png",
@@ -27,6 +29,7 @@ def write(root: Path, folder: Path) -> None:
         "parts/rooms.md": readme["The rooms"],
         "parts/working.md": readme["Working on it"],
         "results.md": (root / "bench" / "RESULTS.md").read_text(),
+        "history.md": (root / "bench" / "HISTORY.md").read_text(),
         "changelog.md": (root / "CHANGELOG.md").read_text(),
         "contributing.md": (root / ".github" / "CONTRIBUTING.md").read_text(),
     }
