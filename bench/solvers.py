@@ -66,12 +66,16 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--gradient-samples", type=int, default=100_000)
     parser.add_argument("--batch", type=int, default=16384, help="samples for timing")
     parser.add_argument("--repeats", type=int, default=5, help="rounds of timing")
-    parser.add_argument("--write", action="store_true", help="write the short table into RESULTS.md and print nothing else")
+    parser.add_argument("--write", action="store_true", help="the short table alone, into RESULTS.md")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     cases = [case for case in CASES if case.name in options.solvers]
     if options.write:
-        write_results([short_row(case, options) for case in cases])
+        rows = []
+        for case in cases:
+            rows.append(short_row(case, options))
+            print(rows[-1], flush=True)
+        write_results(rows)
         return
     for part in options.parts:
         module = {"recall": recall, "speed": speed, "counts": counts, "gradients": gradients, "bad": bad_data}[part]
