@@ -18,11 +18,20 @@ from torch import Tensor
 
 from torchsfm import Status
 from torchsfm.formats import read_vgg
-from torchsfm.geometry import krt_from_camera, pluecker_from_points, point_depths, project_points, rotation_angle
+from torchsfm.geometry import (
+    krt_from_camera,
+    pluecker_from_points,
+    point_depths,
+    point_line_distance,
+    project_lines,
+    project_points,
+    rotation_angle,
+)
 from torchsfm.resection import estimate_camera
 
 F64 = torch.float64
 THRESHOLD = 3.0
+QUERIES = (1, 2)
 BAD = (5.0, 0.1)
 """Degrees, and distances of the camera from the structure, beyond which a pose is called lost."""
 
@@ -126,24 +135,82 @@ def sequences(folder: Path, repeats: int, generator: torch.Generator) -> None:
 def stairs(folder: Path, repeats: int) -> None:
     """Two queries of which three quarters of the matches are wrong: worst and median errors over shuffled data."""
     print("\nStairs   threshold  program   rotation deg: median  worst   centre cm: median  worst")
-    for query in (1, 2):
-        data = np.load(folder / "absolute_pose" / "stairs_points_lines" / f"localization_test_data_stairs_{query}.npz")
-        x, X, l, K = (torch.tensor(data[k].astype(np.float64)) for k in ("p2ds", "p3ds", "l2ds", "K"))  # noqa: E741
-        ends = torch.tensor(data["l3ds"].astype(np.float64))[torch.tensor(data["l3d_ids"].astype(np.int64))]
-        truth = torch.cat((torch.tensor(data["R_gt"]).double(), torch.tensor(data["t_gt"]).double()[:, None]), 1)
+    for query in QUERIES:
+        view = query_view(folder, query)
+        truth = view.pose
         for threshold in (3.0, 6.0, 12.0):
             for program, solve in PROGRAMS.items():
                 result = []
                 for repeat in range(repeats):
-                    g = torch.Generator().manual_seed(repeat)
-                    i, j = torch.randperm(len(x), generator=g), torch.randperm(len(l), generator=g)
-                    view = View(x[i], X[i], l[j], ends[j], K, truth)
-                    pose, _ = solve(view, True, threshold)
+                    every, _ = parted(view, 1.0, repeat)
+                    pose, _ = solve(every, True, threshold)
                     turn = float(torch.rad2deg(rotation_angle(pose[:, :3] @ truth[:, :3].mT)))
                     centre, right = (-P[:, :3].mT @ P[:, 3] for P in (pose, truth))
                     result.append((turn, 100 * float((centre - right).norm())))
                 (a, b), (c, d) = np.median(result, 0), np.max(result, 0)
                 print(f"query {query}  {threshold:9}  {program:8}  {a:20.3f}  {c:5.3f}  {b:18.2f}  {d:5.2f}")
+
+
+def held_out(folder: Path, repeats: int) -> None:
+    """The same queries without their reference: poses from half of the data, judged by the other half.
+
+    A program's figure is the logarithm of the likelihood of the other half, Gaussian noise among evenly spread outliers, over
+    that of outliers alone; the share and the noise, of points and of lines, are the likeliest for each pose.
+    """
+    print("\nStairs   threshold  log-likelihood of the half held out: torchsfm  PoseLib  the reference  torchsfm over PoseLib")
+    for query in QUERIES:
+        view = query_view(folder, query)
+        for threshold in (3.0, 6.0, 12.0):
+            rows = []
+            for repeat in range(repeats):
+                own, other = parted(view, 0.5, repeat)
+                poses = [solve(own, True, threshold)[0] for solve in PROGRAMS.values()]
+                rows.append([likelihood(other, pose) for pose in (*poses, view.pose)])
+            table = np.array(rows)
+            gain, (a, b, c) = table[:, 0] - table[:, 1], np.median(table, 0)
+            low, middle, high = np.quantile(gain, (0.25, 0.5, 0.75))
+            print(
+                f"query {query}  {threshold:9}  {a:46.1f}  {b:7.1f}  {c:13.1f}  {middle:6.1f} ({low:.1f} to {high:.1f}), "
+                f"more in {(gain > 0).mean():.0%}",
+                flush=True,
+            )
+
+
+def query_view(folder: Path, query: int) -> View:
+    """A photograph of the stairs, and the pose that is its reference."""
+    data = np.load(folder / "absolute_pose" / "stairs_points_lines" / f"localization_test_data_stairs_{query}.npz")
+    x, X, l, K = (torch.tensor(data[k].astype(np.float64)) for k in ("p2ds", "p3ds", "l2ds", "K"))  # noqa: E741
+    ends = torch.tensor(data["l3ds"].astype(np.float64))[torch.tensor(data["l3d_ids"].astype(np.int64))]
+    pose = torch.cat((torch.tensor(data["R_gt"]).double(), torch.tensor(data["t_gt"]).double()[:, None]), 1)
+    return View(x, X, l, ends, K, pose)
+
+
+def parted(view: View, share: float, seed: int) -> tuple[View, View]:
+    """A share of points and lines, and the others, in an order that follows from a seed."""
+    g = torch.Generator().manual_seed(seed)
+    i, j = (torch.randperm(len(t), generator=g) for t in (view.x, view.l))
+    a, b = round(share * len(i)), round(share * len(j))
+    first, rest = (
+        View(view.x[p], view.X[p], view.l[q], view.ends[q], view.K, view.pose) for p, q in ((i[:a], j[:b]), (i[a:], j[b:]))
+    )
+    return first, rest
+
+
+def likelihood(view: View, pose: Tensor) -> float:
+    """The logarithm of the likelihood of what a view shows, over that of outliers alone."""
+    P = view.K @ pose
+    away = (project_points(P, view.X) - view.x).square().sum(-1)
+    square = torch.where(point_depths(P, view.X) > 0, away, torch.inf)
+    images = project_lines(P, pluecker_from_points(view.ends[:, 0], view.ends[:, 1]))
+    of_lines = point_line_distance(view.l, images[:, None]).square().sum(-1)
+    area = float(4 * view.K[0, 2] * view.K[1, 2])
+    noise = torch.logspace(-0.3, 1.2, 16, dtype=F64)[:, None, None] ** 2
+    share = torch.linspace(0.02, 0.7, 35, dtype=F64)[:, None]
+    total = 0.0
+    for s in (square, of_lines):
+        density = area * torch.exp(-s / (2 * noise)) / (2 * torch.pi * noise)
+        total += float(torch.log1p(share * (density - 1)).sum(-1).max())
+    return total
 
 
 def staircase(noise: float, wrong: float, generator: torch.Generator) -> View:
@@ -229,6 +296,7 @@ def main() -> None:
     folder = Path(os.environ["TORCHSFM_DATA"])
     drawn_stairs(20 * options.repeats, torch.Generator().manual_seed(options.seed))
     stairs(folder, options.repeats)
+    held_out(folder, 4 * options.repeats)
     sequences(folder, options.repeats, torch.Generator().manual_seed(options.seed))
 
 
