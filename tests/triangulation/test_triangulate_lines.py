@@ -9,12 +9,13 @@ from torchsfm.geometry import (
     pluecker_from_points,
     point_line_distance,
     project_lines,
+    project_points,
     random_rotation,
     rotvec_from_rotation,
     to_homogeneous,
     transform_lines,
 )
-from torchsfm.optim import Cauchy
+from torchsfm.optim import Cauchy, rotation_exponential
 from torchsfm.triangulation import LineFault, triangulate_lines
 
 F64 = torch.float64
@@ -213,6 +214,29 @@ def test_short_segments_are_lines_where_little_noise_is_in_them(make_scene, imag
     noisy = triangulate_lines(l + torch.randn(l.shape, generator=generator, dtype=F64), P)
     assert_share(noisy.status == Status.DEGENERATE, 0.97)
     assert bool((noisy.fault[noisy.status == Status.DEGENERATE] == LineFault.SHORT).any())
+
+
+@pytest.mark.parametrize("v", [3, 8])
+@pytest.mark.parametrize("level", [False, True])
+def test_the_errors_say_whether_planes_of_sight_are_one(generator, v, level):
+    """Lines seen within half a degree are lines where they leave no error; in the plane of the centres they never are."""
+    centre = torch.randn(v, 3, generator=generator, dtype=F64) * (1.0 if level else 3e-3)
+    X = torch.randn(300, 2, 3, generator=generator, dtype=F64) + torch.tensor([0.0, 0, 6])
+    if level:
+        centre[:, 1], X[..., 1] = 0, 0
+    R = rotation_exponential(torch.tensor([0.3, 0, 0], dtype=F64))
+    K = torch.tensor([[800.0, 0, 500], [0, 800, 400], [0, 0, 1]], dtype=F64)
+    P = K @ torch.cat((R.expand(v, 3, 3), -R @ centre[..., None]), -1)
+    l = project_points(P[:, None], X)  # noqa: E741
+    if level:
+        for noise in (1e-3, 0.1, 0.3):
+            moved = l + noise * torch.randn(l.shape, generator=generator, dtype=F64)
+            assert_share(triangulate_lines(moved, P).status == Status.DEGENERATE, 0.995)
+        return
+    found = triangulate_lines(l, P)
+    good = (found.status == Status.OK) | (found.status == Status.BEHIND)
+    assert_share(good, 0.99)
+    assert_share(((found.model - pluecker(X)).norm(dim=-1) < 1e-5)[good], 0.99)
 
 
 @pytest.mark.parametrize("v", [3, 8])

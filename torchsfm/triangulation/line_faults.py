@@ -13,6 +13,8 @@ from torchsfm.triangulation.line_views import ByLine, LineViews
 
 _NOISE = 1.5
 """Distances, in units of noise, that say nothing."""
+_CHANCE = 1e-6
+"""How likely planes of one direction must fit so much worse than a line for it to be chance."""
 
 
 class LineFault(IntEnum):
@@ -82,14 +84,18 @@ def _number_of_centres(centre: Tensor, used: Tensor, size: Tensor) -> Tensor:
     return (used & ~repeated).sum(-1)
 
 
-def one_plane(views: LineViews) -> Tensor:
-    """Whether all rays to the ends of segments lie in planes of one direction, but for noise of a unit (n).
+def one_plane(views: LineViews, error: Tensor) -> Tensor:
+    """Whether all rays to the ends of segments lie in planes of one direction, but for noise of a unit or less (n).
 
     Then the planes of sight are one, or parallel, as far as can be told, and meet anywhere.
+
+    Args:
+        views: The views.
+        error: The root-mean-square distance of the ends from the images of the lines (n).
     """
     found = _nearly_flat(views)
     (at,) = found.nonzero(as_tuple=True)
-    return found.index_put((at,), _one_plane(views.some(at).by_line())) if len(at) else found
+    return found.index_put((at,), _one_plane(views.some(at).by_line(), error[at])) if len(at) else found
 
 
 def _nearly_flat(views: LineViews) -> Tensor:
@@ -115,7 +121,7 @@ def _nearly_flat(views: LineViews) -> Tensor:
     return ~(least > 2.1 * _NOISE**2 * number)
 
 
-def _one_plane(views: ByLine) -> Tensor:
+def _one_plane(views: ByLine, error: Tensor) -> Tensor:
     """The same of some lines, from the direction of planes that fits best."""
     cofactors, h = adjugate_3x3(views.P[..., :3]).mT, to_homogeneous(views.ends)
     rays = h @ cofactors
@@ -125,5 +131,8 @@ def _one_plane(views: ByLine) -> Tensor:
     line = (cofactors.flatten(1, 2) @ vectors[..., :1]).view(*h.shape[:2], 1, 3)
     away = (h * line).sum(-1).square() / line[..., :2].square().sum(-1).clamp_min(1e-300)
     square = torch.where(views.near, views.w * away.mean(-1), 0.0).sum(-1)
-    number = (views.used & views.near).sum(-1)
-    return (square <= _NOISE**2 * number.to(square.dtype)) & (views.used <= views.near).all(-1)
+    number = (views.used & views.near).sum(-1).to(square.dtype)
+    # Of noise of any size, a line having two parameters more: a ratio of sums of squares whose distribution is a power.
+    ratio = number * error.square() / square.clamp_min(1e-300)
+    chance = ratio.clamp(max=1) ** (number - 2).clamp_min(0)
+    return (square <= _NOISE**2 * number) & (chance >= _CHANCE) & (views.used <= views.near).all(-1)

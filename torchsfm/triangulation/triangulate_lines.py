@@ -29,6 +29,8 @@ _POINT = 5.0
 """Root-mean-square length of segments, in deviations of their ends, that says nothing: of points it is 2."""
 _LONG = 16.0
 """The same from which on noise makes no segments seem longer than they are."""
+_RARE = 1e-3
+"""Chance that a line's noise is more than its errors seem to allow."""
 _SLOPE = 1.0
 """Deviation of a line's slope along the rays at which noise leaves its direction open,"""
 _SLOPE_OF_LONG = 4.0
@@ -56,8 +58,9 @@ class LineTriangulation:
     """The part of the line that the segments show together; with four views or more without the farthest of each quarter."""
     status: Int8[Tensor, "*batch n"]
     """OK; NOT_FINITE: a wanted observation is not finite; TOO_FEW: fewer than two; DEGENERATE: the planes of sight are one or
-    parallel, or segments too short to show a direction, but for noise of a unit (one over the root of the weight); BEHIND: what
-    is seen of it is not in front of all views that see it; NOT_CONVERGED."""
+    parallel, or segments too short to show a direction, but for noise of a unit (one over the root of the weight), or of less
+    where what views of it leave of errors says so; BEHIND: what is seen of it is not in front of all views that see it;
+    NOT_CONVERGED."""
     fault: Int8[Tensor, "*batch n"]
     """Why there is no line where the status is TOO_FEW or DEGENERATE, a `LineFault`."""
     in_front: Bool[Tensor, "*batch n"]
@@ -167,8 +170,8 @@ def _solve(views: LineViews, segments: bool, loss: Loss | None, max_iterations: 
         C, determined = parameter_covariance(problem.normal_matrix(image, fixed.w)[0])
         end_covariance, trace = place_covariance(C, chart, d, span)
         # The weights say what noise is; without any it is a unit.
-        blurred = trace > _UNSURE**2 * (2 + combine_rows(d, d) * span.square())
-        lost = begin.lost | ~determined | blurred[0] | blurred[1] | one_plane(fixed)
+        blurred = _most_noise(error, number) * trace > _UNSURE**2 * (2 + combine_rows(d, d) * span.square())
+        lost = begin.lost | ~determined | blurred[0] | blurred[1] | one_plane(fixed, error)
         noise = _noise(error, number)
         length = _square_length(fixed, number) / noise
         limit = torch.where(length < _LONG**2, _SLOPE**2, _SLOPE_OF_LONG**2)
@@ -205,6 +208,15 @@ def _noise(error: Tensor, number: Tensor) -> Tensor:
     some = free.clamp_min(2)
     # The quantile of chi-square, after Wilson and Hilferty.
     least = some * (1 - 2 / (9 * some) - 1.645 * (2 / (9 * some)).sqrt()) ** 3
+    return torch.where(free > 0, (2 * number * error.square() / least).clamp(1e-20, 1), 1.0)
+
+
+def _most_noise(error: Tensor, number: Tensor) -> Tensor:
+    """The same for one line in a thousand."""
+    free = 2 * number - 4
+    half = free.clamp_min(2) / 2
+    # No less of chi-square is below what the first term of its series says.
+    least = 2 * (_RARE * torch.lgamma(half + 1).exp()) ** (1 / half)
     return torch.where(free > 0, (2 * number * error.square() / least).clamp(1e-20, 1), 1.0)
 
 
