@@ -3,12 +3,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from chance import numpy_seeded
+from chance import assert_share, numpy_seeded
 from painting import disc, half_plane, polygon
+from scipy.stats import chi2
 from torch import Tensor
 
 from torchsfm.geometry import line_from_points
 from torchsfm.images import Segments, detect_edges, detect_segments
+from torchsfm.images.step_fit import fit_steps
 from torchsfm.images.straight_runs import axis, moments, straight_runs
 
 NAMES = ("ends", "support", "line", "length", "count", "scatter", "sigma", "independent", "contrast", "log_nfa", "valid")
@@ -67,6 +69,45 @@ def test_what_is_said_of_the_noise_is_so(generator: torch.Generator) -> None:
     # The count of independent points is an approximation; a factor of two would show.
     assert 0.5 < float(score.mean()) < 1.6
     assert bool((weights[~segments.valid] == 0).all())
+
+
+def test_noise_moves_sides_little_more_than_it_must(generator: torch.Generator) -> None:
+    """Against the Cramer-Rao bound of a whole side; near corners, whose points do not count, edge points alone have 1.75."""
+    noise, side, blur = 0.02, 36 * math.sqrt(2), math.sqrt(0.6**2 + 1 / 12)
+    image, corners = squares(60)
+    image = image + noise * torch.randn(image.shape, generator=generator, dtype=image.dtype)
+    angle, offset, _, _ = errors(detect_segments(image, 20), corners)
+    # Pixels tell of a shift of a step of 1 by the square of its slope.
+    information = 1 / (2 * math.sqrt(math.pi) * blur * noise**2)
+    least = torch.rad2deg(torch.tensor(12 / (side**3 * information)).sqrt())
+    assert float((angle / least).square().mean()) < 2.4
+    assert float(offset.square().mean()) * side * information < 2.0
+
+
+def test_steps_are_where_they_were_painted(generator: torch.Generator) -> None:
+    """Distances of the true line from both points of the fit, over their deviations; not where there is more than a step."""
+    noise, angle, offset = 0.02, 0.7, 0.3
+    normal = torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+    middle, along = 31.5 + offset * normal, 20 * torch.tensor([-normal[1], normal[0]])
+    ends = torch.stack((middle - along, middle + along))
+    # The bright side is to the left on the screen.
+    ends = (ends + 0.2 * normal).expand(200, 2, 2)
+    image = half_plane(angle, offset)
+    noisy = image + noise * torch.randn((200, 64, 64), generator=generator, dtype=image.dtype)
+    level, spread = torch.full((200,), noise, dtype=image.dtype), torch.full((200,), 1.0, dtype=image.dtype)
+    found = fit_steps(noisy, level, torch.arange(200), ends, spread)
+    assert_share(found.good, 0.99)
+    half = found.half[:, None] * found.direction
+    points = torch.stack((found.middle - half, found.middle + half), 1)
+    score = ((points - 31.5) @ normal - offset).square() / found.variance[:, None]
+    assert chi2.ppf(1e-6, 400) < float(score[found.good].sum()) * 200 / int(found.good.sum()) < chi2.ppf(1 - 1e-6, 400) * 1.1
+    # Another edge two pixels beside it.
+    bar = noisy - half_plane(angle, offset + 2)
+    assert not bool(fit_steps(bar, level, torch.arange(200), ends, spread).good.any())
+    assert not bool(fit_steps(-noisy, level, torch.arange(200), ends, spread).good.any())
+    none = fit_steps(noisy * torch.nan, level, torch.arange(200), ends, spread)
+    assert not bool(none.good.any())
+    assert all(bool(v.isfinite().all()) for v in none)
 
 
 def test_what_is_bent_is_no_segment(generator: torch.Generator) -> None:

@@ -8,9 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm._types import check_options
+from torchsfm.images.corners import to_gray
 from torchsfm.images.edges import detect_edges
 from torchsfm.images.false_alarms import aligned, log_tail
 from torchsfm.images.slots import lay_in_slots
+from torchsfm.images.step_fit import fit_steps
 from torchsfm.images.straight_runs import Runs, axis, moments, straight_runs
 
 _ROUNDED = 3
@@ -130,7 +132,30 @@ def detect_segments(
     tests = 2.5 * math.log10(pixels)
     good = (found["length"] >= min_length) & (found["log_nfa"] + tests <= 0) & (found["count"] > 2)
     found["log_nfa"] = found["log_nfa"] + tests
+    rows = good.nonzero()[:, 0]
+    found, good = {name: values[rows] for name, values in found.items()}, good[rows]
+    of_run = of_run[rows]
+    wide = edges.width.reshape(-1)[place].double().square()
+    wide = wide.new_zeros(number).index_add(0, runs.number, wide)[rows] / found["count"].clamp_min(1)
+    gray = to_gray(image).reshape(-1, *image.shape[-2:])
+    found |= _on_steps(found, gray, edges.noise.reshape(-1)[of_run], of_run, (wide - blur**2 - 1 / 3).clamp_min(0.1).sqrt())
     return Segments(**lay_in_slots(found, good, found["length"], of_run, batch, max_segments, image.dtype))
+
+
+def _on_steps(found: dict[str, Tensor], gray: Tensor, level: Tensor, image: Tensor, spread: Tensor) -> dict[str, Tensor]:
+    """Segments where they are steps of brightness and nothing else, placed by the pixels beside them."""
+    ends = found["ends"]
+    step = fit_steps(gray, level, image, ends, spread)
+    along = ((ends - step.middle[:, None]) * step.direction[:, None]).sum(-1, keepdim=True)
+    half = step.half[:, None] * step.direction
+    normal = torch.stack((step.direction[:, 1], -step.direction[:, 0]), -1)
+    new = {
+        "ends": step.middle[:, None] + along * step.direction[:, None],
+        "support": torch.stack((step.middle - half, step.middle + half), -2),
+        "line": torch.cat((normal, -(normal * step.middle).sum(-1, keepdim=True)), -1),
+        "independent": 2 * found["sigma"].square() / step.variance.clamp_min(1e-300),
+    }
+    return {name: torch.where(step.good.view(-1, *[1] * (v.ndim - 1)), v, found[name]) for name, v in new.items()}
 
 
 def _fit(x: Tensor, gradient: Tensor, sigma: Tensor, runs: Runs, tied: float) -> dict[str, Tensor]:
