@@ -17,6 +17,7 @@ from torchsfm.geometry import (
 )
 from torchsfm.optim import Cauchy, rotation_exponential
 from torchsfm.triangulation import LineFault, triangulate_lines
+from torchsfm.triangulation.line_problem import LineProblem
 
 F64 = torch.float64
 
@@ -214,6 +215,18 @@ def test_short_segments_are_lines_where_little_noise_is_in_them(make_scene, imag
     noisy = triangulate_lines(l + torch.randn(l.shape, generator=generator, dtype=F64), P)
     assert_share(noisy.status == Status.DEGENERATE, 0.97)
     assert bool((noisy.fault[noisy.status == Status.DEGENERATE] == LineFault.SHORT).any())
+
+
+def test_two_planes_meet_without_a_descent(make_scene, image_of, generator, monkeypatch):
+    l, P, X = segments(make_scene, image_of, v=2, n=300)  # noqa: E741
+    monkeypatch.setattr(LineProblem, "advance", None)
+    found = triangulate_lines(l, P)
+    good = found.status == Status.OK
+    assert_share(good, 0.99)
+    assert ((found.model - pluecker(X)).norm(dim=-1) < 1e-6)[good].all()
+    assert (found.error < 1e-6)[good].all()
+    noisy = triangulate_lines(l.flip(-2) + 0.5 * torch.randn(l.shape, generator=generator, dtype=F64), P)
+    assert (noisy.error < 1e-6)[noisy.status == Status.OK].all()
 
 
 @pytest.mark.parametrize("v", [3, 8])

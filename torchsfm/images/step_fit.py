@@ -93,7 +93,7 @@ def _fit(gray: Tensor, level: Tensor, image: Tensor, ends: Tensor, spread: Tenso
     x = torch.stack(
         (torch.zeros_like(low), torch.zeros_like(low), spread.double().clamp(*_SPREAD), low, above / bright.clamp_min(1) - low)
     )
-    left = information = x
+    left, information = x[0], [x[0]]
     for step in range(_STEPS + 1):
         shift, turn, s, base, contrast = x[:, of].unbind(0)
         u = (q - shift - turn * t) / s

@@ -33,13 +33,17 @@ class Fit(NamedTuple):
 
 
 def fit(views: LineViews, chart: Chart, used: Tensor, loss: Loss | None, max_iterations: int) -> Fit:
-    """Minimise from the third axes of charts; `used` (v, n) is 1 for views that count and 0 for others."""
+    """Minimise from the third axes of charts; `used` (v, n) is 1 for views that count and 0 for others.
+
+    Lines of two views are said to have too few, as those of fewer are.
+    """
     zero = torch.zeros_like(chart.unit)
     problem = LineProblem(chart.cameras(views), views.ends, views.w, used, loss)
     # The start is so near that damping is for the few where it is not.
     # What is left of the cost then is 1e-5 of a standard deviation of the lines at most.
     options = Options(max_iterations, function_tolerance=1e-8, step_tolerance=1e-10, initial_damping=1e-6)
-    found = descend(problem, (zero, zero, zero, zero), options, enough=views.used.sum(0) >= 2)
+    # Two planes meet in one line, which is where it starts: nothing is left to minimise.
+    found = descend(problem, (zero, zero, zero, zero), options, enough=views.used.sum(0) >= 3)
     x, status = found.x, found.status
     (at,) = (combine_rows(x, x) > _FAR**2).nonzero(as_tuple=True)
     if not len(at):

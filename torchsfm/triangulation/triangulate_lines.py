@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors
+from torchsfm.linalg.portions import portion
 from torchsfm.linalg.rows import add_rows, combine_rows
 from torchsfm.linalg.vectors import cross
 from torchsfm.optim import Loss, wants_derivative
@@ -20,7 +21,7 @@ from torchsfm.triangulation.line_start import start
 from torchsfm.triangulation.line_views import LineViews, observe
 
 PIECE = 1 << 16
-"""Observations at a time: more take no less time each."""
+"""Observations at a time, on a CPU: more take no less time each."""
 _EXACT = 1e-11
 """Error, over the size of the coordinates, that is rounding's."""
 _UNSURE = 0.3
@@ -130,7 +131,7 @@ def triangulate_lines(
     v, n = l.shape[-last - 2 : -last]
     lines = batch.numel() * n
     data = lay_out(batch, l, last, P, visible, weights)
-    step = max(1, PIECE // max(2, v))
+    step = max(1, portion(PIECE, P.device) // max(2, v))
     pieces = []
     for begin in range(0, max(lines, 1), step):
         some = (t if t is None or t.shape[-1] == 1 else t[..., begin : begin + step] for t in data)
