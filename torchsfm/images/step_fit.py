@@ -18,6 +18,10 @@ _INSET = 0.5
 """What is left out at each end, as corners bend it."""
 _NOISY = 1.5
 """Standard deviation of what is left, in those of the image's noise, up to which that is noise."""
+_LOOKS, _BESIDE = 12, 2.5
+"""How many pixels along each side, how many spreads away, are looked at first,"""
+_UNEVEN = 6.0
+"""and their variance, in that of the noise, at which there is more than that."""
 _STEPS = 4
 _MOST = 0.5
 """Farthest that a step is from where its edge points are, in pixels."""
@@ -65,12 +69,30 @@ def fit_steps(
         ends: Of segments, in pixels.
         spread: Standard deviations of the profiles of their steps, about, in pixels.
     """
-    found = _fit(gray, level, image, ends, spread, _REACHES[0])
-    for reach in _REACHES[1:]:
-        (at,) = (~found.good).nonzero(as_tuple=True)
-        near = _fit(gray, level[at], image[at], ends[at], spread[at], reach)
-        found = StepFit(*(old.index_copy(0, at, new) for old, new in zip(found, near, strict=True)))
+    zero = torch.zeros_like(ends[:, 0], dtype=torch.float64)
+    found = StepFit(torch.zeros_like(image, dtype=torch.bool), zero, zero, zero[:, 0], zero[:, 0])
+    even = _even(gray, level, image, ends.double(), spread.double())
+    for reach in _REACHES:
+        (at,) = (even & ~found.good).nonzero(as_tuple=True)
+        if len(at):
+            near = _fit(gray, level[at], image[at], ends[at], spread[at], reach)
+            found = StepFit(*(old.index_copy(0, at, new) for old, new in zip(found, near, strict=True)))
     return found
+
+
+def _even(gray: Tensor, level: Tensor, image: Tensor, ends: Tensor, spread: Tensor) -> Tensor:
+    """Where little more than noise is seen along both sides of segments, at a few pixels: what else there is takes no time."""
+    height, width = gray.shape[1:]
+    middle, half = ends.mean(1), 0.5 * (ends[:, 1] - ends[:, 0])
+    direction = half / torch.linalg.vector_norm(half, dim=-1, keepdim=True).clamp_min(1e-9)
+    off = _BESIDE * spread.clamp_min(1.0)[:, None] * torch.stack((direction[:, 1], -direction[:, 0]), -1)
+    t = torch.linspace(-0.9, 0.9, _LOOKS, dtype=ends.dtype, device=ends.device)[:, None]
+    # (n, side, look, coordinate)
+    at = middle[:, None, None] + torch.stack((off, -off), 1)[:, :, None] + half[:, None, None] * t
+    column, row = at[..., 0].round().long().clamp(0, width - 1), at[..., 1].round().long().clamp(0, height - 1)
+    value = gray[image[:, None, None], row, column].double()
+    even: Tensor = (value.var(-1) <= (_UNEVEN * level.double().square())[:, None]).all(-1)
+    return even
 
 
 def _fit(gray: Tensor, level: Tensor, image: Tensor, ends: Tensor, spread: Tensor, reach: float) -> StepFit:
