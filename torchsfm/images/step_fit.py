@@ -91,7 +91,8 @@ def _even(gray: Tensor, level: Tensor, image: Tensor, ends: Tensor, spread: Tens
     at = middle[:, None, None] + torch.stack((off, -off), 1)[:, :, None] + half[:, None, None] * t
     column, row = at[..., 0].round().long().clamp(0, width - 1), at[..., 1].round().long().clamp(0, height - 1)
     value = gray[image[:, None, None], row, column].double()
-    even: Tensor = (value.var(-1) <= (_UNEVEN * level.double().square())[:, None]).all(-1)
+    variance = (value - value.mean(-1, keepdim=True)).square().mean(-1)
+    even: Tensor = (variance <= (_UNEVEN * level.double().square())[:, None]).all(-1)
     return even
 
 
