@@ -110,6 +110,19 @@ def test_steps_are_where_they_were_painted(generator: torch.Generator) -> None:
     assert all(bool(v.isfinite().all()) for v in none)
 
 
+@pytest.mark.parametrize(("width", "contrast"), [(4.0, 0.8), (6.0, 0.2)])
+def test_bars_keep_their_width(generator: torch.Generator, width: float, contrast: float) -> None:
+    """By edge points bars of 4 px are 0.11 px too wide; one step alone would be drawn to the other where noise hides that."""
+    angle = 0.4
+    image = contrast * (half_plane(angle, -width / 2) - half_plane(angle, width / 2))
+    image = image + 0.02 * torch.randn((60, 1, 64, 64), generator=generator, dtype=image.dtype)
+    ends = detect_segments(image, 2).ends
+    normal = torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+    outward = ((ends.mean(-2) - 31.5) @ normal).abs() - width / 2
+    assert abs(float(outward.median())) < 0.025
+    assert float(outward.std()) < 0.06
+
+
 def test_what_is_bent_is_no_segment(generator: torch.Generator) -> None:
     assert int(detect_segments(disc(31, 32, 20), 50).valid.sum()) == 0
     image = 0.5 + 0.1 * torch.randn(4, 1, 128, 128, generator=generator, dtype=torch.float64)

@@ -45,7 +45,8 @@ class Segments:
     line: Float[Tensor, "*batch n 3"]
     """The line with a normal of length 1, towards the brighter side."""
     support: Float[Tensor, "*batch n 2 2"]
-    """The two points of the line that say where it is as all edge points do: their standard deviation from the middle away."""
+    """The two points of the line that say where it is as all that it was fitted to does: edge points, their standard deviation
+    from the middle away, or pixels."""
     length: Float[Tensor, "*batch n"]
     """Distance between the ends, in pixels."""
     count: Int[Tensor, "*batch n"]
@@ -55,7 +56,7 @@ class Segments:
     sigma: Float[Tensor, "*batch n"]
     """Standard deviation of an edge point across the line: by the image's noise, or the scatter if that is larger."""
     independent: Float[Tensor, "*batch n"]
-    """How many independent edge points tell as much as those the line was fitted to: smoothing ties neighbours together."""
+    """How many independent edge points tell as much as what the line was fitted to: smoothing ties neighbours together."""
     contrast: Float[Tensor, "*batch n"]
     """Mean gradient across the line, in image values per pixel."""
     log_nfa: Float[Tensor, "*batch n"]
@@ -87,7 +88,8 @@ def detect_segments(
     """Line segments of each image, from linked edges (`detect_edges`).
 
     Chains are cut into straight runs, lines fitted by total least squares without the points that corners bend, and kept where
-    that many edge points with gradients along one normal are not to be expected in noise.
+    that many edge points with gradients along one normal are not to be expected in noise. Where the pixels beside a segment are a
+    blurred step and noise, nothing else, they say where it is, better than edge points do.
 
     Args:
         image: Grey (c = 1) or red, green, blue images.

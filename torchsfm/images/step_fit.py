@@ -22,6 +22,8 @@ _LOOKS, _BESIDE = 12, 2.5
 """How many pixels along each side, how many spreads away, are looked at first,"""
 _UNEVEN = 6.0
 """and their variance, in that of the noise, at which there is more than that."""
+_TREND, _ROUGH = 4.5, 0.01
+"""Mean of what is left in a strip, in its standard deviations, and in contrasts, that noise and the shape of pixels explain."""
 _STEPS = 4
 _MOST = 0.5
 """Farthest that a step is from where its edge points are, in pixels."""
@@ -102,6 +104,7 @@ def _fit(gray: Tensor, level: Tensor, image: Tensor, ends: Tensor, spread: Tenso
     length = torch.linalg.vector_norm(half, dim=-1).clamp_min(1e-9)
     direction = half / length[:, None]
     normal = torch.stack((direction[:, 1], -direction[:, 0]), -1)
+    strips = math.ceil(2 * reach)
     of, t, q, value = _beside(gray, image, middle, direction, length - _INSET, reach)
     # Numbers of about one size.
     t = t / length[of]
@@ -127,6 +130,8 @@ def _fit(gray: Tensor, level: Tensor, image: Tensor, ends: Tensor, spread: Tenso
         if step == _STEPS:
             weight = slope * slope
             left, *information = total(torch.stack((r * r, weight, weight * t, weight * t * t), -1)).unbind(-1)
+            strip = of * strips + (q + reach).long().clamp(max=strips - 1)
+            plain = _even_strips(r, strip, (n, strips), level, x[4])
             break
         sums = total(torch.stack([*(rows[i] * rows[j] for i, j in _UPPER), *(row * r for row in rows)], -1))
         N = sums.new_zeros(n, 5, 5)
@@ -144,13 +149,30 @@ def _fit(gray: Tensor, level: Tensor, image: Tensor, ends: Tensor, spread: Tenso
     wide = (second / whole - centre * centre).clamp_min(0).sqrt()
     shift, turn, s, _, contrast = x.unbind(0)
     good = (variance <= (_NOISY * level) ** 2) & (number > 20) & (contrast > 0) & (s > _SPREAD[0]) & (s < _SPREAD[1])
-    good &= (shift.abs() + turn.abs() <= _MOST) & (wide > 0.1)
+    good &= (shift.abs() + turn.abs() <= _MOST) & (wide > 0.1) & plain
     slope = turn / length
     along = direction + slope[:, None] * normal
     point = middle + (shift + turn * centre)[:, None] * normal + (centre * length)[:, None] * direction
     size = (1 + slope * slope).sqrt()
     variance = 2 * torch.maximum(variance, level * level) / whole
     return StepFit(good, point, along / size[:, None], wide * length * size, variance)
+
+
+def _even_strips(r: Tensor, strip: Tensor, size: tuple[int, int], level: Tensor, contrast: Tensor) -> Tensor:
+    """Whether what is left may be noise (n) in the mean of each strip, a pixel wide, along segments: of another step it is not.
+
+    Args:
+        r: What is left of pixels.
+        strip: The number of the strip of each, segment by segment.
+        size: How many segments, and strips of each.
+        level: The standard deviation of noise.
+        contrast: Of the steps, of which a hundredth is what a pixel is no part of a Gaussian profile by.
+    """
+    rows = r.new_zeros(size[0] * size[1], 2).index_add(0, strip, torch.stack((r, torch.ones_like(r)), -1))
+    total, number = rows.view(*size, 2).unbind(-1)
+    most = _TREND * level[:, None] * number.sqrt() + _ROUGH * contrast.abs()[:, None] * number
+    even: Tensor = (total.abs() <= most).all(-1)
+    return even
 
 
 def _beside(gray: Tensor, image: Tensor, middle: Tensor, direction: Tensor, half: Tensor, reach: float) -> _Pixels:
