@@ -88,8 +88,8 @@ def detect_segments(
     """Line segments of each image, from linked edges (`detect_edges`).
 
     Chains are cut into straight runs, lines fitted by total least squares without the points that corners bend, and kept where
-    that many edge points with gradients along one normal are not to be expected in noise. Where the pixels beside a segment are a
-    blurred step and noise, nothing else, they say where it is, better than edge points do.
+    that many edge points with gradients along one normal are not to be expected in noise. Where the pixels beside a segment
+    are a blurred step and noise, nothing else, they say where it is, better than edge points do.
 
     Args:
         image: Grey (c = 1) or red, green, blue images.
