@@ -1,6 +1,7 @@
 """What is fixed to the images is told from what the camera sees, and nothing else is."""
 
 import math
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -9,7 +10,9 @@ from torch import Tensor
 
 from torchsfm.geometry import camera_from_krt, intrinsics, project_points, rotation_from_rotvec
 from torchsfm.reconstruction import reconstruct
-from torchsfm.reconstruction.matching.overlays import beside_overlays, find_overlays
+from torchsfm.reconstruction.matching.masks import Masks
+from torchsfm.reconstruction.matching.overlays import WithoutOverlays, beside_overlays, find_overlays
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
 
 SIZE = torch.tensor([1000, 750])
 K = intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
@@ -164,3 +167,20 @@ def test_parts_of_an_overlay_that_most_images_hide(generator):
     assert hidden(generator, text, images) > 0.5
     apart = torch.where(images[:, None] == 5, text + torch.tensor([600.0, 500.0]), text)
     assert hidden(generator, apart, images) < 0.1
+
+
+def test_edges_beside_an_overlay_are_not_looked_at(tmp_path):
+    """Nor is what masks do not admit."""
+    files = (tmp_path / "a.png", tmp_path / "b.png")
+    x = torch.tensor([[100.0, 100.0], [400.0, 100.0], [100.0, 100.0]]).double()
+    graph = mock.Mock(ViewGraph, fixed=torch.tensor([True, False, False]), view=torch.tensor([0, 0, 1]), x=x)
+    places = torch.tensor([[[100.0, 112.0], [100.0, 120.0]], [[400.0, 100.0], [101.0, 99.0]]])
+    scene = WithoutOverlays.of(files, graph, None)
+    assert scene.admit(files[0], places, (1000, 750)).tolist() == [[False, True], [True, False]]
+    assert scene.admit(files[1], places, (1000, 750)).all()
+    masks = mock.Mock(Masks)
+    masks.admit.return_value = torch.tensor([[True, False], [True, True]])
+    both = WithoutOverlays.of(files, graph, masks)
+    assert both.admit(files[0], places, (1000, 750)).tolist() == [[False, False], [True, False]]
+    graph.fixed = None
+    assert WithoutOverlays.of(files, graph, masks) is masks

@@ -18,6 +18,7 @@ from torchsfm.reconstruction.mappers.growth import METHODS, Given, Wanted
 from torchsfm.reconstruction.matching.image_points import ENOUGH, ImagePoints, detect_all
 from torchsfm.reconstruction.matching.masks import Masks
 from torchsfm.reconstruction.matching.match_all import match_all
+from torchsfm.reconstruction.matching.overlays import WithoutOverlays
 from torchsfm.reconstruction.matching.segments import detect_all_segments
 from torchsfm.reconstruction.matching.sources import Source, Sources
 from torchsfm.reconstruction.matching.stages import Stages, fingerprint
@@ -145,15 +146,14 @@ def reconstruct(
         images, sequence=sequence, max_features=max_features, max_pixels=max_pixels, neighbours=neighbours, out=out,
         resume=resume, seed=seed, progress=report, masks=masks,
     )  # fmt: skip
+    scene = WithoutOverlays.of(seen.points.files, seen.graph, seen.masks)
 
     def segments() -> FoundSegments:
-        found = seen.stages.run("segments", lambda: detect_all_segments(seen.points.files, max_pixels, report, seen.masks))
+        found = seen.stages.run("segments", lambda: detect_all_segments(seen.points.files, max_pixels, report, scene))
         return FoundSegments.of(found)
 
     def edges() -> FoundEdges:
-        return FoundEdges.of(
-            seen.stages.run("edges", lambda: detect_all_edges(seen.points.files, max_pixels, report, seen.masks))
-        )
+        return FoundEdges.of(seen.stages.run("edges", lambda: detect_all_edges(seen.points.files, max_pixels, report, scene)))
 
     result = build_models(
         Given(seen.graph, seen.points.labels, seen.points.focal),

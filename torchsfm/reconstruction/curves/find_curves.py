@@ -20,7 +20,7 @@ from torchsfm.reconstruction.evidence.consistency import excess_scatter
 from torchsfm.reconstruction.lines.find_lines import lines_of_cameras
 from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping.mapping import Mapping
-from torchsfm.reconstruction.matching.masks import Masks
+from torchsfm.reconstruction.matching.masks import Admission
 from torchsfm.reconstruction.matching.stages import Arrays
 from torchsfm.reconstruction.messages import Progress
 from torchsfm.reconstruction.model.lines import Lines
@@ -66,7 +66,7 @@ class _Photograph(NamedTuple):
 
 
 def detect_all_edges(
-    files: Sequence[Path], max_pixels: int, progress: Progress, masks: Masks | None = None, *, longest: int = EDGE_SIZE
+    files: Sequence[Path], max_pixels: int, progress: Progress, masks: Admission | None = None, *, longest: int = EDGE_SIZE
 ) -> Arrays:
     """Edges of all files as tensors to save, those of a file after those of the one before; none of what cannot be read."""
 

@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,6 +12,15 @@ from torch import Tensor
 from torchsfm.images import ImageError, read_image
 from torchsfm.reconstruction.matching.sources import Sources
 from torchsfm.reconstruction.messages import ReconstructionError
+
+
+@runtime_checkable
+class Admission(Protocol):
+    """Says which places of photographs count."""
+
+    def admit(self, file: Path, x: Float[Tensor, "*n 2"], size: tuple[int, int]) -> Bool[Tensor, "*n"]:
+        """Which places of a photograph of this width and height count."""
+        ...
 
 
 @dataclass(frozen=True)

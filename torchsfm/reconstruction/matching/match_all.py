@@ -188,7 +188,8 @@ def match_all(
     still = sum(int(part.pop("still")) for part in parts)
     verified = VerifiedPairs.join([VerifiedPairs(**part) for part in parts])
     graph = verified.graph(points.names, points.image_size, x, [c.double() for c in color], pairs)
-    graph = replace(graph, still=still, weak=torch.cat(weak) | beside_overlays(points.image_size, x, fixed))
+    beside = beside_overlays(points.image_size, x, fixed)
+    graph = replace(graph, still=still, fixed=fixed if bool(fixed.any()) else None, weak=torch.cat(weak) | beside)
     # Corners that were tracked through a sequence have no descriptors.
     return graph if sequence else replace(graph, descriptors=lambda: torch.cat([f.descriptors for f in features]))
 

@@ -6,13 +6,16 @@ make sure: a camera that rests for a while, before which something moves, has no
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import sampson_distance
-from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, scale_of_images, verify_pairs
+from torchsfm.reconstruction.matching.masks import Admission, Masks
+from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph, scale_of_images, verify_pairs
 
 _STILL, _MOVING = 1.0, 5.0
 """Pixels, of images of 1600 pixels or less, by which what stands still differs from one image to another at most; and by which
@@ -83,11 +86,43 @@ def beside_overlays(
     end = 0
     for points, reach in zip(x, (_BESIDE * scale_of_images(image_size)).tolist(), strict=True):
         begin, end = end, end + len(points)
-        own = points[fixed[begin:end]]
-        for row in range(0, len(points) if len(own) else 0, _ROWS):
-            near = torch.cdist(points[row : row + _ROWS], own) < reach
-            beside[begin + row : begin + row + len(near)] = near.any(-1)
+        beside[begin:end] = _beside(points, points[fixed[begin:end]], reach)
     return beside
+
+
+@dataclass(frozen=True)
+class WithoutOverlays:
+    """Where photographs show the scene: where their masks admit it, and not beside what is fixed to the images."""
+
+    fixed: dict[Path, Float[Tensor, "_ 2"]]
+    """The image points of overlays in each photograph."""
+    masks: Masks | None
+
+    @classmethod
+    def of(cls, files: Sequence[Path], graph: ViewGraph, masks: Masks | None) -> "Admission | None":
+        """Of the photographs that a view graph is of; the masks alone where there are no overlays."""
+        if graph.fixed is None:
+            return masks
+        own = [graph.fixed & (graph.view == i) for i in range(len(files))]
+        return cls({file: graph.x[points] for file, points in zip(files, own, strict=True)}, masks)
+
+    def admit(self, file: Path, x: Float[Tensor, "*n 2"], size: tuple[int, int]) -> Bool[Tensor, "*n"]:
+        """Which places of a photograph of this width and height count.
+
+        Raises:
+            ImageError: Its mask cannot be read, or has another shape.
+        """
+        reach = _BESIDE * float(scale_of_images(torch.tensor(size)))
+        free = ~_beside(x.flatten(0, -2).double(), self.fixed[file], reach).view(x.shape[:-1])
+        return free if self.masks is None else free & self.masks.admit(file, x, size)
+
+
+def _beside(x: Float[Tensor, "n 2"], fixed: Float[Tensor, "m 2"], reach: float) -> Bool[Tensor, "n"]:
+    """Which places are nearer than this to one that is fixed."""
+    near = torch.zeros(len(x), dtype=torch.bool)
+    for row in range(0, len(x) if len(fixed) else 0, _ROWS):
+        near[row : row + _ROWS] = (torch.cdist(x[row : row + _ROWS], fixed) < reach).any(-1)
+    return near
 
 
 def _shown(

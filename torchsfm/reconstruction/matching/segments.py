@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsfm.images import ImageError, describe_segments, detect_segments, read_image
 from torchsfm.reconstruction.matching.image_points import DETECTION_SIZE, nearest_colors
-from torchsfm.reconstruction.matching.masks import Masks
+from torchsfm.reconstruction.matching.masks import Admission
 from torchsfm.reconstruction.matching.stages import Arrays
 from torchsfm.reconstruction.messages import Progress
 
@@ -22,10 +22,10 @@ EDGE = 0.3
 """Standard deviation, pixels, with which the edges that views show of one line differ: of rounded corners, shadows, paint."""
 
 
-def detect_all_segments(files: Sequence[Path], max_pixels: int, progress: Progress, masks: Masks | None = None) -> Arrays:
+def detect_all_segments(files: Sequence[Path], max_pixels: int, progress: Progress, masks: Admission | None = None) -> Arrays:
     """Segments of all files as tensors to save, those of a file after those of the one before; none of what cannot be read.
 
-    Of masked photographs those of which masks admit both ends and the middle.
+    Where not all places of photographs count, those whose ends and middle do.
     """
 
     def work(path: Path) -> dict[str, Tensor]:

@@ -77,7 +77,8 @@ class ViewGraph:
         match_pair: Pair of each verified match.
         descriptors: Reads what the image points look like; None where that is not known of all.
         weak: Image points that are less distinct, so that it says nothing if another image misses them; None where none is.
-        still: Matches left out because they stand still where the scene moves, see `find_overlays`.
+        fixed: Image points that are fixed to the images and not to the scene, see `find_overlays`; None where none is.
+        still: Matches left out because one of their points is.
     """
 
     names: tuple[str, ...]
@@ -95,6 +96,7 @@ class ViewGraph:
     match_pair: Int[Tensor, "k"]
     descriptors: Callable[[], UInt8[Tensor, "n d"]] | None = None
     weak: Bool[Tensor, "n"] | None = None
+    fixed: Bool[Tensor, "n"] | None = None
     still: int = 0
 
     def only(self, kept: Bool[Tensor, "q"]) -> "ViewGraph":
@@ -133,6 +135,7 @@ class ViewGraph:
             match_pair=(kept.cumsum(0) - 1)[self.match_pair[own]],
             descriptors=None,
             weak=None if self.weak is None else self.weak[node],
+            fixed=None if self.fixed is None else self.fixed[node],
         )
         return part, node
 
