@@ -25,9 +25,11 @@ def matched(folder: Path, out: Path | None = None, **options: Any) -> MatchedPho
 
 
 def same_graph(a: ViewGraph, b: ViewGraph) -> bool:
-    tensors = ViewGraph.__dataclass_fields__.keys() - {"names", "descriptors", "still"}
+    tensors = ViewGraph.__dataclass_fields__.keys() - {"names", "descriptors", "fixed", "still"}
     return (
         (a.names, a.still) == (b.names, b.still)
+        and (a.fixed is None) == (b.fixed is None)
+        and (a.fixed is None or b.fixed is None or torch.equal(a.fixed, b.fixed))
         and all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
         and (a.descriptors is None) == (b.descriptors is None)
         and (a.descriptors is None or b.descriptors is None or torch.equal(a.descriptors(), b.descriptors()))
