@@ -41,8 +41,8 @@ def lens_of(found: SfmResult) -> type[Distortion]:
     return type(found.model.cameras.distortion)
 
 
-@pytest.mark.parametrize("focal", [500.0, 650.0])
-def test_fisheyes_are_recognised(focal: float) -> None:
+def test_a_fisheye_is_recognised() -> None:
+    focal = 600.0
     found, error = reconstructed(focal, "fisheye", [0.02, -0.005, 0.0, 0.0])
     assert lens_of(found) is DISTORTION_MODELS["fisheye"]
     assert float(found.model.cameras.K[0, 0, 0]) == pytest.approx(focal, rel=5e-3)
