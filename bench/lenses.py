@@ -48,8 +48,11 @@ def ours(files: list[Path], camera: str | None) -> dict[str, Any]:
 
 
 def colmap(files: list[Path]) -> dict[str, Any]:
-    """What COLMAP makes of them in its default settings."""
-    found = run_colmap(PhotographSet("fisheye", files), 1, 0)
+    """What COLMAP makes of them in its default settings; nothing where it is not installed, or makes no model."""
+    try:
+        found = run_colmap(PhotographSet("fisheye", files), 1, 0)
+    except (ImportError, RuntimeError):
+        return {}
     matrix = torch.eye(3, 4, dtype=torch.float64).repeat(len(files), 1, 1)
     registered = torch.zeros(len(files), dtype=torch.bool)
     for i, path in enumerate(files):

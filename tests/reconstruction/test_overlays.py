@@ -10,9 +10,11 @@ from torch import Tensor
 
 from torchsfm.geometry import camera_from_krt, intrinsics, project_points, rotation_from_rotvec
 from torchsfm.reconstruction import reconstruct
+from torchsfm.reconstruction.matching import match_all
 from torchsfm.reconstruction.matching.masks import Masks
 from torchsfm.reconstruction.matching.overlays import WithoutOverlays, beside_overlays, find_overlays
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
+from torchsfm.reconstruction.photographs import match_photographs
 
 SIZE = torch.tensor([1000, 750])
 K = intrinsics(torch.tensor(900.0), torch.tensor([499.5, 374.5])).double()
@@ -121,17 +123,49 @@ def test_what_is_beside_an_overlay_looks_other_there(generator):
     assert beside_overlays(SIZE.repeat(2, 1), x, fixed).tolist() == [True, True, False, False]
 
 
-def test_photographs_with_a_large_logo(courtyard, tmp_path):
-    """The same model as of photographs without it."""
+def with_logo(courtyard, folder):
+    """Photographs with the same texture in a corner."""
     logo = np.random.default_rng(0).integers(0, 255, (14, 40, 3)).astype(np.uint8)
-    plain = reconstruct(courtyard)
     for path in sorted(courtyard.iterdir()):
         image = cv2.imread(str(path))
         if image is None:
             continue
         h, w = image.shape[:2]
         image[-h // 5 :, : w // 2] = cv2.resize(logo, (w // 2, h // 5), interpolation=cv2.INTER_NEAREST)
-        cv2.imwrite(str(tmp_path / f"{path.stem}.png"), image)
+        cv2.imwrite(str(folder / f"{path.stem}.png"), image)
+
+
+def test_points_of_overlays_match_nothing_and_those_beside_are_not_expected(courtyard, tmp_path):
+    with_logo(courtyard, tmp_path)
+    options = {"sequence": False, "max_features": 1500, "max_pixels": 10**7, "neighbours": 20, "masks": None, "out": None}
+    graph = match_photographs(tmp_path, resume=False, seed=0, progress=lambda *_: None, **options).graph
+    assert graph.fixed.sum() > 100
+    assert not graph.fixed[graph.match].any()
+    assert graph.still > 100
+    assert graph.weak[graph.fixed].all()
+    assert not graph.weak[graph.x[:, 1] < 0.5 * float(graph.image_size[0, 1])].all()
+
+
+def test_one_end_on_an_overlay_is_enough(courtyard, monkeypatch):
+    """What a point of one matches in another image is no point of the scene."""
+
+    def every_third(size, x, pairs, matches, *, generator):
+        number = torch.arange(sum(map(len, x)))
+        return (number % 3 == 0) & (number < len(x[0]))
+
+    monkeypatch.setattr(match_all, "find_overlays", every_third)
+    options = {"sequence": False, "max_features": 600, "max_pixels": 10**7, "neighbours": 20, "masks": None, "out": None}
+    graph = match_photographs(courtyard, resume=False, seed=0, progress=lambda *_: None, **options).graph
+    assert graph.fixed.any()
+    assert (graph.view[graph.match] == 0).any()
+    assert not graph.fixed[graph.match].any()
+    assert graph.still > 0
+
+
+def test_photographs_with_a_large_logo(courtyard, tmp_path):
+    """The same model as of photographs without it."""
+    with_logo(courtyard, tmp_path)
+    plain = reconstruct(courtyard)
     result = reconstruct(tmp_path)
     assert result.report.still > 100
     assert plain.report.still == 0

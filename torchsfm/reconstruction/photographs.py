@@ -1,7 +1,7 @@
 """The main job: photographs in, cameras and points out."""
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +57,10 @@ def reconstruct(
     """Reconstruct cameras and 3D points from photographs, with nothing known of the camera.
 
     The steps: SIFT features, where an image has few also weaker ones; matches between all pairs, of many images between those
-    whose best features match (see `preview_matches`), less those of what is fixed to the images, as watermarks and parts of a
-    vehicle are; epipolar geometry of these pairs in one batched call; focal length from Exif unless the fundamental matrices
-    refute it, else from these, else a default; structure from motion (`method`) with bundle adjustment over poses, points,
-    focal length and distortion. Images that have nothing in common form several models.
+    whose best features match (see `preview_matches`), less those of what is fixed to the images, as watermarks, parts of a
+    vehicle and the wall behind a turntable are; epipolar geometry of these pairs in one batched call; focal length from Exif
+    unless the fundamental matrices refute it, else from these, else a default; structure from motion (`method`) with bundle
+    adjustment over poses, points, focal length and distortion. Images that have nothing in common form several models.
 
     Args:
         images: A folder with its subfolders, image files, a text file with the path of an image on each line, or several of
@@ -147,13 +147,16 @@ def reconstruct(
         resume=resume, seed=seed, progress=report, masks=masks,
     )  # fmt: skip
     scene = WithoutOverlays.of(seen.points.files, seen.graph, seen.masks)
+    # Overlays are found with the seed.
+    after = "" if seen.graph.fixed is None else str(seed)
 
     def segments() -> FoundSegments:
-        found = seen.stages.run("segments", lambda: detect_all_segments(seen.points.files, max_pixels, report, scene))
-        return FoundSegments.of(found)
+        find = partial(detect_all_segments, seen.points.files, max_pixels, report, scene)
+        return FoundSegments.of(seen.stages.run("segments", find, after=after))
 
     def edges() -> FoundEdges:
-        return FoundEdges.of(seen.stages.run("edges", lambda: detect_all_edges(seen.points.files, max_pixels, report, scene)))
+        find = partial(detect_all_edges, seen.points.files, max_pixels, report, scene)
+        return FoundEdges.of(seen.stages.run("edges", find, after=after))
 
     result = build_models(
         Given(seen.graph, seen.points.labels, seen.points.focal),

@@ -76,9 +76,9 @@ class Stages:
     seconds: dict[str, float] = field(default_factory=dict)
     made: set[Path] = field(default_factory=set)
 
-    def run(self, name: str, compute: Callable[[], Arrays]) -> Arrays:
-        """The tensors of a stage, from disk if they are there and fit, else computed and saved."""
-        return self.shards(name, 1, lambda _: compute())[0]
+    def run(self, name: str, compute: Callable[[], Arrays], *, after: str = "") -> Arrays:
+        """The tensors of a stage, from disk if they are there and fit, else computed and saved; `after` as for `shards`."""
+        return self.shards(name, 1, lambda _: compute(), after=after)[0]
 
     def shards(self, name: str, count: int, compute: Callable[[int], Arrays], *, after: str = "", threads: int = 1) -> Shards:
         """A stage of many shards, each from disk if it is there and fits, else computed and saved.
