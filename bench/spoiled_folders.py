@@ -89,6 +89,16 @@ def barrel(image: Image, number: int, random: np.random.Generator) -> Image:
     return _image(cv2.remap(image, source, None, cv2.INTER_CUBIC))
 
 
+def squares(image: Image, number: int, random: np.random.Generator) -> Image:
+    """Resized to a square, as for networks."""
+    return _image(cv2.resize(image, (640, 640), interpolation=cv2.INTER_AREA))
+
+
+def squeezed(image: Image, number: int, random: np.random.Generator) -> Image:
+    """A tenth narrower, as films with pixels that are not square."""
+    return _image(cv2.resize(image, None, fx=0.9, fy=1.0, interpolation=cv2.INTER_AREA))
+
+
 def turned(image: Image, number: int, random: np.random.Generator) -> Image:
     """One in three by a quarter."""
     return _image(cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)) if number % 3 == 1 else image
@@ -129,7 +139,8 @@ def plain(image: Image, number: int, random: np.random.Generator) -> Image:
 
 
 SPOILS: tuple[Spoil, ...] = (
-    plain, watermark, strip, sizes, crops, crops_less, crops_more, zoom, barrel, turned, exposure, blur, vignette,
+    plain, watermark, strip, sizes, crops, crops_less, crops_more, zoom, barrel, squares, squeezed, turned, exposure, blur,
+    vignette,
 )  # fmt: skip
 FOLDERS = (*(spoil.__name__ for spoil in SPOILS), "gray", "jpeg", "duplicates", "again", "mirrored", "strangers")
 WALL = "wall"

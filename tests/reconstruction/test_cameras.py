@@ -1,5 +1,7 @@
 """Which word on the focal length counts: that of the file, or that of the pairs."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -42,3 +44,18 @@ def test_a_stated_focal_length_counts_where_the_pairs_do_not_refute_it(generator
     # What is flat says nothing of the focal length.
     flat = X * X.new_tensor([1.0, 1.0, 0.0])
     assert guess(photographs(flat, generator), 0.5 * FOCAL) == (0.5 * FOCAL, "exif")
+
+
+def test_the_pairs_of_stretched_images_tell_the_focal_length(generator: torch.Generator) -> None:
+    graph, aspect = photographs(random_points(300, generator=generator), generator), 0.6
+    back = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1 / aspect, 0.5 / aspect - 0.5], [0.0, 0.0, 1.0]]).double()
+    size = torch.tensor([[SIZE[0], round(SIZE[1] * aspect)]] * 8)
+    stretched = replace(graph, F=back.mT @ graph.F @ back, image_size=size)
+    cameras = [
+        guess_cameras(one, torch.zeros(8).long(), model="radial", K=None, exif_focal=[None] * 8, aspect=ratio)[0].K[0]
+        for one, ratio in ((graph, 1.0), (stretched, aspect), (stretched, 1.0))
+    ]
+    assert float(cameras[1][0, 0] / cameras[0][0, 0]) == pytest.approx(1, rel=1e-2)
+    assert float(cameras[1][1, 1] / cameras[1][0, 0]) == pytest.approx(aspect)
+    assert cameras[1][:2, 2].tolist() == [499.5, 224.5]
+    assert abs(float(cameras[2][0, 0]) / FOCAL - 1) > 0.1

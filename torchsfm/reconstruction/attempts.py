@@ -28,6 +28,7 @@ from torchsfm.reconstruction.mapping.calibration import (
 )
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
+from torchsfm.reconstruction.stretched import apparent_aspect
 
 LEFT = 0.1
 """Models have fallen apart where a larger part of the images that hang together with the largest one is not in it."""
@@ -125,7 +126,7 @@ class Attempt:
 
 
 def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progress: Callable[[int, int], None]) -> Attempt:
-    """The models of all images; where lens or mapper are not prescribed, those by another one if these leave it open.
+    """The models of all images; where camera or mapper are not prescribed, those by another one if these leave it open.
 
     Images that are placed one by one need many points in common with those before. To place all at once takes less, and goes
     wrong more often: a part that is turned about its only relation bends the rest, and the focal length gives way. So what is
@@ -137,10 +138,12 @@ def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progr
         return Attempt.of(given.graph, wanted, Growth.of(given, wanted, generator, progress))
 
     attempt = made(wanted)
-    if wanted.lens_is_open and attempt.components and may_be_fisheye(attempt.largest):
-        wide = made(replace(wanted, camera=FISHEYE))
-        if wide.registered > (1 - LEFT) * attempt.registered and explains_better(attempt.largest, wide.largest):
-            attempt = wide
+    for question in (_stretched, _fisheye):
+        another = question(attempt) if attempt.components else None
+        if another is not None:
+            trial = made(another)
+            if trial.registered > (1 - LEFT) * attempt.registered and explains_better(attempt.largest, trial.largest):
+                attempt = trial
     if wanted.method != "auto" or attempt.growth.method != "incremental":
         return attempt
     if 2 * attempt.undoubted >= attempt.registered and not attempt.fell_apart:
@@ -149,6 +152,21 @@ def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progr
     if other.bends(attempt) or other.hinged:
         return attempt
     return max(attempt, other, key=lambda one: (one.undoubted, one.registered))
+
+
+def _stretched(attempt: Attempt) -> Wanted | None:
+    """The same with pixels that are not square, where they are open and seem so."""
+    model = attempt.largest
+    (options,) = (component.options for component in attempt.components if component.model is model)
+    aspect = apparent_aspect(model, options.prior(model)) if attempt.wanted.pixels_are_open else None
+    return None if aspect is None else replace(attempt.wanted, aspect=aspect)
+
+
+def _fisheye(attempt: Attempt) -> Wanted | None:
+    """The same with a fisheye, where the lens is open and may be one."""
+    if not attempt.wanted.lens_is_open or not may_be_fisheye(attempt.largest):
+        return None
+    return replace(attempt.wanted, camera=FISHEYE)
 
 
 def matches_across(graph: ViewGraph, registered: Bool[Tensor, "v"], others: Bool[Tensor, "v"]) -> Int[Tensor, "v"]:

@@ -27,7 +27,7 @@ def may_be_fisheye(mapping: Mapping) -> bool:
     cameras = mapping.cameras[mapping.camera_index[mapping.registered]]
     K = cameras.K
     d, valid = cameras.unproject(corners)
-    straight = (corners - K[:, None, :2, 2]) / K[:, 0, 0, None, None]
+    straight = (corners - K[:, None, :2, 2]) / K.diagonal(dim1=-2, dim2=-1)[:, None, :2]
     bent = straight.norm(dim=-1) < BENT * (d[..., :2] / d[..., 2:]).norm(dim=-1)
     return bool((bent | ~valid).any(-1).double().mean() > 0.5)
 

@@ -77,7 +77,8 @@ def reconstruct(
         free_principal_point: Estimate the principal point too, of models of four images or more, expected within 1 % of the
             image's size from its centre, instead of holding it there. Where images of different sizes say that they were
             cropped, it is looked for within 10 %, and if one camera may have taken them all, they share its focal length and
-            distortion; the report says so (`Calibration.remark`).
+            distortion; the report says so (`Calibration.remark`). It also says where pixels are not square: where images
+            that were stretched along one side explain much more, the ratio is estimated, too.
         method: "incremental" starts from two images and a first focal length; "projective" reconstructs all images together
             without calibration, by factorisation of the longest tracks, and finds the camera by autocalibration. It refuses
             rather than guesses where the images do not determine the focal length (`report.autocalibration` says why);

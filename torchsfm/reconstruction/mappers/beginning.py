@@ -39,10 +39,11 @@ class Beginning:
         exif_focal: Sequence[float | None],
         free: tuple[str, ...],
         generator: torch.Generator,
+        aspect: float = 1.0,
         body: Int[Tensor, "v"] | None = None,
     ) -> "Beginning":
         """With the best guess of the cameras; see `guess_cameras` and `MappingOptions`, of the `body` that took each image."""
-        cameras, source = guess_cameras(graph, camera_index, model=model, K=K, exif_focal=exif_focal)
+        cameras, source = guess_cameras(graph, camera_index, model=model, K=K, exif_focal=exif_focal, aspect=aspect)
         options = MappingOptions(free=free, expected=cameras, focal_sigma=focal_uncertainty(source), generator=generator)
         if body is not None:
             options = replace(options, body=torch.zeros(len(cameras.K), dtype=torch.long).index_copy(0, camera_index, body))

@@ -23,7 +23,7 @@ from torchsfm.reconstruction.mappers.beginning import Grown
 from torchsfm.reconstruction.mappers.incremental import MappingOptions, extend_model
 from torchsfm.reconstruction.mapping.adjust import LOSS, adjust, support
 from torchsfm.reconstruction.mapping.calibration import calibration_of, choose_free, images_of_cameras, measure_noise
-from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs
+from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs, with_square_pixels
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS
 
@@ -192,21 +192,20 @@ def _one_camera(model: Mapping, options: MappingOptions) -> bool:
 
 def _focal_of_pairs(empty: Mapping) -> float | None:
     """The focal length that the pairs tell if all images have the same."""
-    graph = empty.graph
-    c = (graph.image_size.to(graph.x.dtype) - 1) / 2
+    graph, K = empty.graph, empty.cameras.K
+    F, size, c = with_square_pixels(graph, float((K[:, 1, 1] / K[:, 0, 0]).median()))
     good = telling_pairs(graph)
     if not bool(good.any()):
         return None
     i, j = graph.pairs[good].unbind(1)
     weights = graph.fundamental_inliers[good].to(c.dtype)
-    size = graph.image_size.amax(0).to(c.dtype)
-    found = focal_from_fundamentals(graph.F[good], c[i], c[j], weights=weights, image_size=size)
+    found = focal_from_fundamentals(F[good], c[i], c[j], weights=weights, image_size=size.amax(0))
     return float(found.model) if found.status == Status.OK else None
 
 
 def _with_focal(cameras: Camera, focal: float) -> Camera:
     """Cameras with another focal length, all the same, and without distortion."""
     K: Float[Tensor, "g 3 3"] = cameras.K.clone()
-    K[:, 0, 0] = K[:, 1, 1] = focal
+    K[:, :2, :2] *= (focal / K[:, 0, 0])[:, None, None]
     lens = type(cameras.distortion)
     return Camera(K, lens.from_parameters(torch.zeros_like(cameras.distortion.parameters())))

@@ -60,6 +60,8 @@ class Wanted:
         shared_camera: Whether one camera took all images of the same size.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
+        aspect: About how many times as much as along x images are stretched along y, which is estimated then; 1 where pixels
+            are square.
         method: "incremental", "projective", "global", "windows", or "auto" for what `choose_mapper` and `best_attempt` say.
     """
 
@@ -68,6 +70,7 @@ class Wanted:
     K: Float[Tensor, "3 3"] | None = None
     free_principal_point: bool = True
     method: str = "auto"
+    aspect: float = 1.0
 
     def __post_init__(self) -> None:
         if self.camera is not None and self.camera not in DISTORTION_MODELS:
@@ -85,15 +88,21 @@ class Wanted:
         return self.camera or ("radial" if self.K is None else "pinhole")
 
     @property
+    def pixels_are_open(self) -> bool:
+        """Whether images may say that they were stretched."""
+        return self.K is None and self.method != "projective"
+
+    @property
     def lens_is_open(self) -> bool:
         """Whether images may say that another lens took them."""
-        return self.camera is None and self.K is None and self.method != "projective"
+        return self.camera is None and self.pixels_are_open
 
     @property
     def free(self) -> tuple[str, ...]:
         """The intrinsic parameters to estimate."""
         focal, centre = (("focal",), ("principal_point",)) if self.K is None else ((), ())
-        return focal + DISTORTION_MODELS[self.lens].parameter_names + (centre if self.free_principal_point else ())
+        aspect = ("aspect",) if self.aspect != 1 else ()
+        return focal + aspect + DISTORTION_MODELS[self.lens].parameter_names + (centre if self.free_principal_point else ())
 
 
 @dataclass(frozen=True)
@@ -172,7 +181,7 @@ class Growth:
             track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
         begin = partial(
             Beginning.of, graph, track, model=wanted.lens, K=wanted.K, exif_focal=given.exif_focal, free=wanted.free,
-            generator=generator,
+            generator=generator, aspect=wanted.aspect,
         )  # fmt: skip
         together = group_cameras(graph.image_size, given.labels, wanted.shared_camera)
         unsaid = wanted.shared_camera is None and not given.known_cameras
@@ -182,7 +191,8 @@ class Growth:
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, begun.options.focal_sigma[together])
         first: Grown | None = None
         if unsaid and wanted.K is None and method != "projective":
-            apart = part_zoomed(graph, together, torch.tensor([focal is not None for focal in given.exif_focal]))
+            told = torch.tensor([focal is not None for focal in given.exif_focal])
+            apart = part_zoomed(graph, together, told, wanted.aspect)
             if apart is not None:
                 own, more = apart
                 begun, first = better_beginning(begun, begin(own, body=body), more, partial(_settled, method, progress))

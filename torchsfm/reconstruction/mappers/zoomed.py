@@ -19,7 +19,7 @@ from torchsfm.linalg import svdvals
 from torchsfm.reconstruction.mappers.beginning import Beginning, Grown
 from torchsfm.reconstruction.mappers.incremental import MappingOptions
 from torchsfm.reconstruction.mapping.adjust import support
-from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs
+from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs, with_square_pixels
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
 
@@ -35,7 +35,7 @@ MOST = 60
 
 
 def part_zoomed(
-    graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"]
+    graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"], aspect: float = 1.0
 ) -> tuple[Int[Tensor, "v"], float] | None:
     """Give each image a camera of its own where the pairs say that those of one have several focal lengths, or cannot tell.
 
@@ -43,13 +43,14 @@ def part_zoomed(
         graph: Verified pairs.
         camera_index: Which camera took each image, as far as sizes and files tell.
         told: Images whose file states a focal length: those of one camera have the same.
+        aspect: Focal lengths along y over those along x.
 
     Returns:
         Which camera took each image, numbered from 0 in the order of the images, and how many times as much models with these
         cameras must explain to be believed; None where it stays as it is.
     """
     differ: dict[int, bool | None] = {
-        k: _focal_lengths_differ(graph, camera_index == k)
+        k: _focal_lengths_differ(graph, camera_index == k, aspect)
         for k in torch.unique(camera_index[~told]).tolist()
         if not bool(told[camera_index == k].any())
     }
@@ -89,7 +90,7 @@ def better_beginning(
     return together, None if one is None else one[0]
 
 
-def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"]) -> bool | None:
+def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: float) -> bool | None:
     """Whether a focal length for each image explains the pairs of some images so much better than one for all.
 
     None where too few pairs tell, but models of as many pairs as there are do.
@@ -105,9 +106,8 @@ def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"]) -> bool |
     if len(ends) <= len(images):
         within = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1)
         return None if int(within.sum()) >= ENOUGH * int(member.sum()) else False
-    F = graph.F[telling][among].double()
-    size = graph.image_size[images].double()
-    c = (size - 1) / 2
+    F, size, c = with_square_pixels(graph, aspect)
+    F, size, c = F[telling][among].double(), size[images].double(), c[images].double()
     tried = size.max() * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()
     costs = _disagreement(_asymmetry(F, c[ends], tried[:, None, None]))
     common = tried[costs.argmin()].expand(len(images))

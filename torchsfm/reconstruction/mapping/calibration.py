@@ -50,8 +50,9 @@ class Calibration:
         status: Of the last adjustment: `OK` where it reached the minimum, `NOT_CONVERGED` where its limit of steps came first.
         iterations: Steps of that adjustment.
         noise: Standard deviation of an image coordinate in pixels, as the robust cost counts it.
-        names: The numbers of a camera: "focal", "cx", "cy" and the distortion parameters.
-        values: The numbers of each camera, pixels for the first three.
+        names: The numbers of a camera: "focal", "aspect" where pixels were found not to be square, "cx", "cy" and the
+            distortion parameters.
+        values: The numbers of each camera, pixels for focal length and principal point.
         estimated: Which of them were estimated; the others were held where they were expected or given.
         deviation: Their standard deviations; zero where they were given.
         prior: Their standard deviations before any image point was seen; zero where they were given.
@@ -73,10 +74,17 @@ class Calibration:
     @property
     def remark(self) -> str:
         """What is unusual about the cameras, in plain words; empty where nothing is."""
-        if not self.cropped:
-            return ""
-        whose = "all of one camera, whose focal length they share" if self.alike else "of several cameras"
-        return f"the images seem to be cropped, {whose}: their principal points were looked for far from the middle, too"
+        remarks = []
+        if "aspect" in self.names:
+            place = self.names.index("aspect")
+            (seen,) = self.estimated[:, place].nonzero(as_tuple=True)
+            aspect = self.values[seen if len(seen) else slice(None), place].median()
+            remarks.append(f"the images seem to be stretched, {float(aspect):.3f} times as much along y as along x")
+        if self.cropped:
+            whose = "all of one camera, whose focal length they share" if self.alike else "of several cameras"
+            text = f"the images seem to be cropped, {whose}: their principal points were looked for far from the middle, too"
+            remarks.append(text)
+        return "; ".join(remarks)
 
     def camera_doubts(self, camera: int) -> list[str]:
         """What should not be trusted in a camera, in plain words."""
@@ -109,14 +117,14 @@ def calibration_of(
         covariance: Numbers of cameras, and their covariance by the noise of the image points, where that is known.
     """
     labels = intrinsic_labels(type(mapping.cameras.distortion))
-    names = tuple(name for name in labels if name not in ("aspect", "skew"))
+    adjusted = mapping.adjustment or Adjustment(Status.OK, 0, {})
+    names = tuple(name for name in labels if name not in {"aspect", "skew"} - set(adjusted.free))
     values = row_from_camera(mapping.cameras)[:, [labels.index(name) for name in names]]
     deviation, before, estimated = (
         torch.zeros_like(values),
         torch.zeros_like(values),
         torch.zeros_like(values, dtype=torch.bool),
     )
-    adjusted = mapping.adjustment or Adjustment(Status.OK, 0, {})
     noise = measure_noise(mapping, loss, weights)
     if adjusted.free:
         given = covariance[1] if covariance is not None and set(covariance[0]) == set(adjusted.free) else None
@@ -246,8 +254,8 @@ def choose_free(
     A number that is held is off by what cameras differ, its prior's width; estimated, by what the noise of the image points
     makes of it, and a principal point also by what each photograph's own faults (wrong matches, a bent structure) make it look
     like, which only other photographs of the same camera average out. The smaller of the two decides, for one number after
-    the other: distortion from the lowest order up, then the principal point, each given those chosen before. The focal length
-    is always estimated.
+    the other: the ratio of focal lengths where pixels are not square, distortion from the lowest order up, then the principal
+    point, each given those chosen before. The focal length is always estimated.
 
     Args:
         mapping: The model so far.
@@ -258,7 +266,8 @@ def choose_free(
     """
     images = images_of_cameras(mapping)
     taken = prior.sum_of_body(images)
-    candidates = [name for name in ("focal", *mapping.cameras.distortion.parameter_names, "principal_point") if name in names]
+    order = ("focal", "aspect", *mapping.cameras.distortion.parameter_names, "principal_point")
+    candidates = [name for name in order if name in names]
     if not candidates:
         return {}
     if int(mapping.registered.sum()) < MIN_IMAGES:

@@ -21,6 +21,8 @@ CROPPED_SIGMA = 0.1
 """The same where images may have been cut out of larger ones."""
 ONE_BODY = 0.002
 """How far apart, in the same unit, those of one camera lie as its lens zooms."""
+ASPECT_SIGMA = 0.01
+"""By how much the shape of pixels may differ from what it was found to be, as a ratio of sides."""
 RADIAL_SIGMA = 0.3
 TANGENTIAL_SIGMA = 0.01
 """How large the distortion parameters of lenses are."""
@@ -60,12 +62,12 @@ class CameraPrior:
         alike: bool = False,
         body: Int[Tensor, "g"] | None = None,
     ) -> "CameraPrior":
-        """The prior of the cameras of a mapping: principal points about the middle, no distortion."""
+        """The prior of the cameras of a mapping: principal points about the middle, pixels as they are, no distortion."""
         g = len(mean.K)
         size = mapping.graph.image_size.max(-1).values.to(mean.K.dtype)
         side = torch.ones_like(focal_sigma).scatter_reduce(0, mapping.camera_index, size, "amax")
         off = CROPPED_SIGMA if cropped else PRINCIPAL_POINT_SIGMA
-        sigma = {"focal": focal_sigma, "principal_point": off * side}
+        sigma = {"focal": focal_sigma, "aspect": torch.full_like(focal_sigma, ASPECT_SIGMA), "principal_point": off * side}
         for name in mean.distortion.parameter_names:
             width = TANGENTIAL_SIGMA if name in ("p1", "p2") else RADIAL_SIGMA
             sigma[name] = torch.full((g,), width, dtype=mean.K.dtype)
@@ -119,12 +121,16 @@ class CameraPrior:
         """The prior with more weight, for image points that say less than their noise lets them, by a variance ratio."""
         return replace(self, sigma={name: width / excess**0.5 for name, width in self.sigma.items()})
 
+    def widened(self, name: str, sigma: float) -> "CameraPrior":
+        """The prior that says so little of one of the numbers."""
+        return replace(self, sigma={**self.sigma, name: torch.full_like(self.sigma[name], sigma)})
+
     def made_alike(self, cameras: Camera, used: Bool[Tensor, "g"]) -> Camera:
         """The cameras with the lens that those in use have on average, if all are one."""
         if not self.alike or not bool(used.any()):
             return cameras
         rows = row_from_camera(cameras)
-        lens = list(free_columns(("focal", *cameras.distortion.parameter_names), type(cameras.distortion)))
+        lens = list(free_columns(("focal", "aspect", *cameras.distortion.parameter_names), type(cameras.distortion)))
         rows[:, lens] = rows[used][:, lens].mean(0)
         return camera_from_row(rows, type(cameras.distortion))
 

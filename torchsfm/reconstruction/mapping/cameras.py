@@ -68,6 +68,7 @@ def guess_cameras(
     model: str,
     K: Float[Tensor, "3 3"] | None,
     exif_focal: Sequence[float | None],
+    aspect: float = 1.0,
 ) -> tuple[Camera, tuple[str, ...]]:
     """Cameras to start from: no distortion, centred principal point, and the best word on the focal length.
 
@@ -77,22 +78,23 @@ def guess_cameras(
         model: Name of the distortion model.
         K: Known intrinsics.
         exif_focal: Focal length in pixels that each file states; it counts unless the pairs refute it.
+        aspect: Of cameras that are not known: focal length along y over that along x.
 
     Returns:
         The cameras, and where each focal length comes from, a key of `FOCAL_SIGMA`.
     """
     g = int(camera_index.max()) + 1
     dtype = graph.x.dtype
+    F, sizes, centres = with_square_pixels(graph, aspect)
     first = torch.stack([(camera_index == k).nonzero()[0, 0] for k in range(g)])
-    size = graph.image_size[first].to(dtype)
-    c = (size - 1) / 2
+    size, c = sizes[first], centres[first]
     focal, source = [], []
     for k in range(g):
         stated = [f for f, index in zip(exif_focal, camera_index.tolist(), strict=True) if index == k and f]
         value, word = float(size[k].max()) * DEFAULT_FOCAL, "default"
         if stated:
             value, word = float(torch.tensor(stated, dtype=dtype).median()), "exif"
-        found = None if K is not None else _focal_of_pairs(graph, camera_index == k, c[k], size[k])
+        found = None if K is not None else _focal_of_pairs(graph, F, camera_index == k, c[k], size[k])
         if found is not None and (not stated or _refutes(found, value)):
             value, word = found, "fundamental matrices"
         focal.append(value)
@@ -100,7 +102,8 @@ def guess_cameras(
     if K is not None:
         matrices, source = K.to(dtype).expand(g, 3, 3).clone(), ["given"] * g
     else:
-        matrices = intrinsics(_focals_of_graph(graph, camera_index, c, torch.tensor(focal, dtype=dtype), source), c)
+        f = _focals_of_graph(graph, F, camera_index, c, torch.tensor(focal, dtype=dtype), source)
+        matrices = intrinsics(f, (graph.image_size[first].to(dtype) - 1) / 2, aspect=aspect)
     if model not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{model}'; there are {', '.join(DISTORTION_MODELS)}")
     distortion = DISTORTION_MODELS[model]
@@ -109,7 +112,7 @@ def guess_cameras(
 
 
 def _focal_of_pairs(
-    graph: ViewGraph, member: Bool[Tensor, "v"], c: Float[Tensor, "2"], size: Float[Tensor, "2"]
+    graph: ViewGraph, F: Float[Tensor, "q 3 3"], member: Bool[Tensor, "v"], c: Float[Tensor, "2"], size: Float[Tensor, "2"]
 ) -> float | None:
     """One focal length that makes the fundamental matrices of a camera's pairs essential; None where they do not tell."""
     good = member[graph.pairs].all(-1) & telling_pairs(graph)
@@ -117,7 +120,7 @@ def _focal_of_pairs(
         return None
     weights = graph.fundamental_inliers[good].to(c.dtype)
     count = int(good.sum())
-    found = focal_from_fundamentals(graph.F[good], c.expand(count, 2), c.expand(count, 2), weights=weights, image_size=size)
+    found = focal_from_fundamentals(F[good], c.expand(count, 2), c.expand(count, 2), weights=weights, image_size=size)
     return float(found.model) if found.status == Status.OK else None
 
 
@@ -128,18 +131,32 @@ def _refutes(found: float, stated: float) -> bool:
 
 
 def _focals_of_graph(
-    graph: ViewGraph, camera_index: Int[Tensor, "v"], c: Float[Tensor, "g 2"], focal: Float[Tensor, "g"], source: list[str]
+    graph: ViewGraph,
+    F: Float[Tensor, "q 3 3"],
+    camera_index: Int[Tensor, "v"],
+    c: Float[Tensor, "g 2"],
+    focal: Float[Tensor, "g"],
+    source: list[str],
 ) -> Float[Tensor, "g"]:
     """Focal lengths that nothing told so far, by the pairs of images of different cameras; their `source` is changed."""
     if "default" not in source:
         return focal
     pairs = camera_index[graph.pairs]
     telling = telling_pairs(graph) & (pairs[:, 0] != pairs[:, 1])
-    found = calibrate_view_graph(graph.F[telling], pairs[telling], c, focal, focal_uncertainty(source).to(focal.dtype))
+    found = calibrate_view_graph(F[telling], pairs[telling], c, focal, focal_uncertainty(source).to(focal.dtype))
     told = (found.status == Status.OK) & torch.tensor([word == "default" for word in source])
     for k in told.nonzero()[:, 0].tolist():
         source[k] = "view graph"
     return torch.where(told, found.model, focal)
+
+
+def with_square_pixels(
+    graph: ViewGraph, aspect: float
+) -> tuple[Float[Tensor, "q 3 3"], Float[Tensor, "v 2"], Float[Tensor, "v 2"]]:
+    """Fundamental matrices, and sizes and middles of the images, had these not been stretched along y by `aspect`."""
+    stretch = torch.tensor([1.0, aspect, 1.0], dtype=graph.x.dtype)
+    size = graph.image_size.to(graph.x.dtype)
+    return stretch[:, None] * graph.F * stretch, size / stretch[:2], (size - 1) / 2 / stretch[:2]
 
 
 def telling_pairs(graph: ViewGraph) -> Bool[Tensor, "q"]:

@@ -1,0 +1,42 @@
+"""Images that were stretched along one side, where no one says so: resized to a square, or of pixels that are not square.
+
+Cameras with square pixels fit what stretched images show by poses, focal length and points that are wrong together, and do so
+well enough for nothing to be in doubt. One number more, the ratio of the focal lengths along y and x, tells it.
+"""
+
+import math
+from typing import Any
+
+from torchsfm.reconstruction.mapping.adjust import adjust
+from torchsfm.reconstruction.mapping.calibration import images_of_cameras
+from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
+from torchsfm.reconstruction.mapping.mapping import Mapping
+
+ANY = 1.0
+"""Standard deviation of a ratio of focal lengths of which nothing is known."""
+STRETCHED, MUST_GAIN = 0.02, 0.04
+"""A ratio off by less, or which lowers the cost by a smaller part, comes of other faults of a model as well."""
+ENOUGH: dict[str, Any] = {"max_iterations": 20, "tolerance": 1e-4}
+"""How far to adjust before the ratio is looked at."""
+
+
+def apparent_aspect(mapping: Mapping, prior: CameraPrior) -> float | None:
+    """About how many times as much as along x the images seem to be stretched along y; None where they do not seem so.
+
+    Args:
+        mapping: A finished model with square pixels.
+        prior: What was expected of its cameras.
+    """
+    if mapping.adjustment is None or not mapping.adjustment.free:
+        return None
+    images, free = images_of_cameras(mapping), mapping.adjustment.free
+    wide = prior.widened("aspect", ANY)
+    # Both go as far, so that what they differ by is the ratio's.
+    before = adjust(mapping, free=free, prior=wide, **ENOUGH)
+    after = adjust(before, free={**free, "aspect": images > 0}, prior=wide, **ENOUGH)
+    if before.adjustment is None or after.adjustment is None:
+        return None
+    K = after.cameras.K
+    ratio = (K[:, 1, 1] / K[:, 0, 0]).repeat_interleave(images).median()
+    gained = after.adjustment.cost < (1 - MUST_GAIN) * before.adjustment.cost
+    return float(ratio) if gained and abs(math.log(float(ratio))) > STRETCHED else None
