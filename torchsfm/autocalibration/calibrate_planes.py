@@ -13,21 +13,26 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from torchsfm._types import Status, check_options, check_tensors, tensor_map
-from torchsfm.autocalibration.circle_outlines import centre_weights, circle_points, outline_centres
-from torchsfm.autocalibration.plane_start import CameraAndPoses, start_from_homographies
+from torchsfm.autocalibration.board_shape import BOARD, NAMES, shaped
+from torchsfm.autocalibration.circle_outlines import circle_points
+from torchsfm.autocalibration.plane_copies import first_of_copies, of_first
+from torchsfm.autocalibration.plane_covariance import plane_covariance, view_disagreement, without_lens
+from torchsfm.autocalibration.plane_problem import PlaneProblem
+from torchsfm.autocalibration.plane_start import start_from_homographies
 from torchsfm.geometry import Camera, Distortion, Pose, Radial
 from torchsfm.geometry.intrinsic_parameters import (
     ASPECT,
     FOCAL,
     HEAD,
+    INTRINSICS,
     SKEW,
     camera_from_row,
     intrinsic_columns,
     intrinsic_labels,
 )
-from torchsfm.geometry.projection import PixelProjection, turn_slopes
+from torchsfm.geometry.projection import PixelProjection
 from torchsfm.linalg import eigvalsh, usable
-from torchsfm.optim import Loss, levenberg_marquardt, loss_slope, rotation_exponential
+from torchsfm.optim import Loss, levenberg_marquardt, loss_slope
 
 MAX_DEVIATION = 0.3
 """Standard deviation of the logarithm of the focal length beyond which the views do not determine it."""
@@ -55,19 +60,32 @@ class PlaneCalibration:
     """Intrinsics and distortion that all views share."""
     poses: Pose
     """Camera from plane, batch (*batch, v)."""
+    cost: Float[Tensor, "*batch"]
+    """Half the sum of the loss, or of the squares, of all distances."""
     rms: Float[Tensor, "*batch"]
     """Root mean square distance between observation and projection, pixels."""
     view_rms: Float[Tensor, "*batch v"]
     """The same of each view."""
     used: Bool[Tensor, "*batch v"]
-    """Views with at least four points that are not on a line."""
+    """Views with at least four points that are not on a line, and not a copy of another one."""
+    copy_of: Int[Tensor, "*batch v"]
+    """The first view that shows the same noise, of which this one is a copy, or the view itself: copies are no new evidence."""
     parameter_names: tuple[str, ...]
     """What was estimated."""
     covariance: Float[Tensor, "*batch q q"]
     """Of the free parameters in the order of `parameter_names`: "fx", "fy" (one of them stands for both without "aspect"),
-    "skew", "cx", "cy" in pixels, and the distortion, from the residuals' own noise."""
+    "skew", "cx", "cy" in pixels, the distortion, and the shape of the board, from the residuals' own noise and from how far the
+    views disagree."""
     pose_covariance: Float[Tensor, "*batch v 6 6"]
     """Of each pose, rotation vector and translation from the left."""
+    disagreement: Float[Tensor, "*batch"]
+    """How many times more the views contradict each other about what they share than the noise of each lets them, at least 1;
+    covariances have been multiplied by its square. Much more than 1 says that they are not of one camera, that the board is
+    bent or its squares are not square, or that the lens is of another kind."""
+    board: Float[Tensor, "*batch n 3"]
+    """Where the points of the board are, in the unit of X; X and zero where its shape is not free."""
+    board_shape: Float[Tensor, "*batch 5"]
+    """Stretch, shear and bends, see `calibrate_planes`; zero where they are not free."""
     iterations: Int[Tensor, "*batch"]
     """Steps tried."""
     status: Int8[Tensor, "*batch"]
@@ -105,7 +123,9 @@ def calibrate_planes(
             is not free; the middle of the observations by default.
         visible: Which points each view sees; all by default. What stands elsewhere is not looked at.
         distortion: The distortion model.
-        free: Which of "focal" (always), "aspect", "skew", "principal_point" are estimated; all of the distortion is.
+        free: Which of "focal" (always), "aspect", "skew", "principal_point" are estimated; all of the distortion is. With
+            "board" also five numbers of a board that is nearly what it should be: "stretch" along x and "shear" in its plane,
+            and its bend `z = bend_xx x^2 + bend_xy x y + bend_yy y^2` around its middle, in one over the unit of X.
         loss: Of squared distances in pixels, see `torchsfm.optim.loss`; the squares if not given.
         radius: Of the circles, in the unit of X; points if not given. The middle of a circle is not seen in the middle of its
             outline, the less so the larger it is: what the outlines look like through the lens is taken into account.
@@ -132,7 +152,10 @@ def calibrate_planes(
         image_size=(image_size, "?2 float > 0"), free=(free, Sequence), loss=(loss, Callable | None),
         radius=(radius, "?float > 0"), max_iterations=(max_iterations, "int >= 0"),
     )  # fmt: skip
-    columns = tuple(sorted(set(intrinsic_columns(free))))
+    wrong = [name for name in free if name not in (*INTRINSICS, BOARD)]
+    if wrong:
+        raise ValueError(f"free: wanted names among {sorted((*INTRINSICS, BOARD))}, got {wrong[0]!r}")
+    columns = tuple(sorted(set(intrinsic_columns([name for name in free if name != BOARD]))))
     if "focal" not in free:
         raise ValueError("free: wanted 'focal' among the free parameters")
     v, n = x.shape[-3:-1]
@@ -152,9 +175,9 @@ def calibrate_planes(
     with torch.no_grad():
         start = start_from_homographies(x64, X64, seen, used, image_size, columns, distortion.num_parameters)
     columns += tuple(range(HEAD, HEAD + distortion.num_parameters))
-    q = len(columns)
+    problem = PlaneProblem(PixelProjection(distortion, columns, SKEW in columns), radius is not None, BOARD in free)
+    q = problem.shared
     weights = seen.double().flatten(-2)
-    problem = _Problem(PixelProjection(distortion, columns, SKEW in columns), radius is not None)
     result = levenberg_marquardt(
         problem.residual,
         start,
@@ -178,14 +201,18 @@ def calibrate_planes(
         residual = torch.where((flat[3] > 0)[..., None], residual, 0.0)
         # What the loss trusts an observation.
         trust = flat[3] if loss is None else flat[3] * loss_slope(loss, residual.square().sum(-1))
-        covariance, pose_covariance = _covariance(residual, J, trust, q, v, used.reshape(-1, v))
+        at = (residual, J, trust, q, v, used.reshape(-1, v))
+        covariance, pose_covariance = plane_covariance(*at)
+        disagreement, noise = view_disagreement(*at)
+        covariance = disagreement[:, None, None] * covariance
+        pose_covariance = disagreement[:, None, None, None] * pose_covariance
         units = torch.stack((torch.ones_like(unit), unit), -1).repeat_interleave(3, -1).reshape(-1, 1, 6)
         pose_covariance = units[..., :, None] * pose_covariance * units[..., None, :]
         square = residual.square().sum(-1) * flat[3]
         rms = (square.sum(-1) / flat[3].sum(-1).clamp_min(1)).sqrt().reshape(batch)
         view_rms = (square.view(-1, v, n).sum(-1) / seen.reshape(-1, v, n).sum(-1).clamp_min(1)).sqrt().reshape(*batch, v)
         focal = settled.row[..., FOCAL].abs().clamp_min(1e-12)
-        straight = _without_lens(problem, flat[:3], residual, trust, used.reshape(-1, v))
+        straight = without_lens(problem, flat[:3], residual, trust, used.reshape(-1, v))
         deviations = torch.stack((covariance[..., 0, 0], straight[..., 0, 0])).clamp_min(0).sqrt()
         unsure = ~(deviations.amax(0).reshape(batch) <= MAX_DEVIATION * focal)
         measured, unknowns = 2 * seen.sum((-2, -1)), q + 6 * used.sum(-1)
@@ -193,23 +220,43 @@ def calibrate_planes(
         unsure = unsure | ~(held[0] & held[1])
         status = torch.where(unsure, int(Status.DEGENERATE), result.status)
         status = torch.where((measured < unknowns) | ~used.any(-1), int(Status.TOO_FEW), status).to(torch.int8)
+        first = first_of_copies(flat[1], seen.reshape(-1, v, n), noise).reshape(*batch, v)
+        new = first == torch.arange(v, device=x.device)
+    if not bool(new.all()):
+        alone = calibrate_planes(
+            x, X, image_size=image_size, visible=seen & new[..., None], distortion=distortion, free=free, loss=loss,
+            radius=radius, max_iterations=max_iterations,
+        )  # fmt: skip
+        poses, view_rms, pose_covariance = of_first(first, (alone.poses, alone.view_rms, alone.pose_covariance))
+        return replace(alone, poses=poses, view_rms=view_rms, pose_covariance=pose_covariance, copy_of=first)
     dtype = x.dtype
     t = unit[..., None, None] * found.t - (found.R[..., :2] @ middle[..., None, :, None])[..., 0]
+    board = unit[..., None, None] * shaped(X64, found.shape) + torch.nn.functional.pad(middle, (0, 1))[..., None, :]
+    bend = unit.reciprocal()
     names = [intrinsic_labels(distortion)[column] for column in columns]
     names[0] = "fx"
     if ASPECT in columns:
         names[1], covariance = "fy", _lengths(covariance, flat[0].row)
+    if BOARD in free:
+        names += NAMES
+        scales = torch.cat((torch.ones_like(covariance[:, 0, :-3]), bend.reshape(-1, 1).expand(-1, 3)), -1)
+        covariance = scales[:, :, None] * covariance * scales[:, None]
     return PlaneCalibration(
         camera=camera_from_row(found.row.to(dtype), distortion),
         poses=Pose(found.R.to(dtype), t.to(dtype)),
+        cost=result.cost.to(dtype),
         rms=rms.to(dtype),
         view_rms=view_rms.to(dtype),
         used=used,
+        copy_of=first,
         parameter_names=tuple(names),
         covariance=covariance.reshape(*batch, q, q).to(dtype),
         pose_covariance=pose_covariance.reshape(*batch, v, 6, 6).to(dtype),
         iterations=result.iterations,
         status=status,
+        disagreement=disagreement.sqrt().reshape(batch).to(dtype),
+        board=board.to(dtype),
+        board_shape=torch.cat((found.shape[..., :2], bend[..., None] * found.shape[..., 2:]), -1).to(dtype),
     )
 
 
@@ -219,52 +266,6 @@ def _lengths(covariance: Tensor, found: Tensor) -> Tensor:
     J = torch.eye(covariance.shape[-1], dtype=f.dtype, device=f.device).repeat(*f.shape, 1, 1)
     J[..., 1, 0], J[..., 1, 1] = aspect, f
     return J @ covariance @ J.mT
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """Reprojection of the plane's points, or of the outlines of its circles, and its derivatives."""
-
-    projection: PixelProjection
-    circles: bool
-
-    def retract(self, u: CameraAndPoses, delta: Tensor) -> CameraAndPoses:
-        free = self.projection.free
-        q = len(free)
-        pose = delta[..., q:].reshape(*u.t.shape[:-1], 6)
-        turn = rotation_exponential(pose[..., :3])
-        moved = (turn @ u.t[..., None])[..., 0] + pose[..., 3:]
-        place = torch.tensor(free, device=delta.device)
-        row = u.row + torch.zeros_like(u.row).index_add(-1, place, delta[..., :q])
-        return CameraAndPoses(row, turn @ u.R, moved)
-
-    def residual(self, u: CameraAndPoses, x: Tensor, X: Tensor) -> Tensor:
-        pixels = self.projection.pixels(*_seen(u, X))
-        if self.circles:
-            pixels = outline_centres(centre_weights(pixels), pixels)
-        return (pixels.movedim(0, -1) - x).flatten(-3, -2)
-
-    def linearize(self, u: CameraAndPoses, x: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals and Jacobian; every view depends on its own pose alone, so that all poses are differentiated at once."""
-        b, v, n = x.shape[:3]
-        q = len(self.projection.free)
-        ray, row = _seen(u, X)
-        local = x.new_empty(2, 6 + q, b, v, ray.shape[-1])
-        pixels = self.projection.linearize(ray, row, local[:, 3:6], local[:, 6:])
-        turn_slopes(ray, local[:, 3:6], local)
-        if self.circles:
-            K = centre_weights(pixels)
-            pixels, local = outline_centres(K, pixels), outline_centres(K[:, :, None], local)
-        J = x.new_zeros(b, v, n, 2, q + 6 * v)
-        J[..., :q] = local[:, 6:].permute(2, 3, 4, 0, 1)
-        J[..., q:].view(b, v, n, 2, v, 6).diagonal(dim1=1, dim2=4).copy_(local[:, :6].permute(2, 4, 0, 1, 3))
-        return (pixels.movedim(0, -1) - x).flatten(1, 2), J.flatten(1, 2)
-
-
-def _seen(u: CameraAndPoses, X: Tensor) -> tuple[Tensor, Tensor]:
-    """The plane's points in the frames of the views (3, *batch, v, n), and the rows of the cameras (k, *batch, 1, 1)."""
-    Y = u.R[..., :2] @ X.mT[..., None, :, :] + u.t[..., None]
-    return Y.movedim(-2, 0), u.row.movedim(-1, 0)[..., None, None]
 
 
 def _extent(X: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -284,38 +285,3 @@ def _spread_out(X: Tensor, seen: Tensor) -> Tensor:
     values, _ = eigvalsh(D.mT @ D)
     spans: Tensor = values[..., 0] > 1e-10 * values[..., 1].clamp_min(1e-300)
     return spans
-
-
-def _without_lens(
-    problem: _Problem, at: tuple[CameraAndPoses, Tensor, Tensor], residual: Tensor, w: Tensor, used: Tensor
-) -> Tensor:
-    """The covariance that the intrinsics had for such residuals if the lens were known not to bend.
-
-    What a lens bends tells of the camera, too, but along a valley that no covariance shows: planes must do without.
-    """
-    u, x, X = at
-    columns = torch.arange(u.row.shape[-1], device=u.row.device)
-    _, J = problem.linearize(replace(u, row=torch.where(columns < HEAD, u.row, 0.0)), x, X)
-    free = problem.projection.free
-    head = sum(column < HEAD for column in free)
-    J = torch.cat((J[..., :head], J[..., len(free) :]), -1)
-    return _covariance(residual, J, w, head, x.shape[1], used)[0]
-
-
-def _covariance(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, used: Tensor) -> tuple[Tensor, Tensor]:
-    """Covariances of intrinsics and of each pose, scaled by the residuals."""
-    J = J * w.sqrt()[..., None, None]
-    A = J.flatten(1, 2)
-    information = A.mT @ A
-    scale = information.diagonal(dim1=-2, dim2=-1)
-    live = scale > 0
-    scale = torch.where(live, scale, 1.0).rsqrt()
-    information = scale[:, :, None] * information * scale[:, None]
-    eye = torch.eye(information.shape[-1], dtype=J.dtype, device=J.device)
-    inverse = torch.linalg.inv_ex(torch.nan_to_num(information) + (1e-13 + 1.0 * ~live[:, None, :]) * eye).inverse
-    inverse = inverse * scale[:, :, None] * scale[:, None]
-    redundancy = 2 * w.sum(-1) - q - 6 * used.sum(-1)
-    variance = (residual.square().sum(-1) * w).sum(-1) / redundancy.clamp_min(1)
-    inverse = torch.nan_to_num(inverse * variance[:, None, None], 0.0, 0.0, 0.0)
-    blocks = inverse[:, q:, q:].reshape(-1, v, 6, v, 6).diagonal(dim1=1, dim2=3).permute(0, 3, 1, 2)
-    return inverse[:, :q, :q], blocks * used[..., None, None]

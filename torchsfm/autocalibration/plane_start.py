@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsfm.autocalibration.board_shape import NAMES
 from torchsfm.geometry.intrinsic_parameters import CX, HEAD, intrinsic_matrix
 from torchsfm.linalg import cross, nearest_rotation, null_vector
 from torchsfm.motion import homography_dlt
@@ -25,6 +26,8 @@ class CameraAndPoses:
     """Of the camera, see `intrinsic_parameters`."""
     R: Tensor
     t: Tensor
+    shape: Tensor
+    """Of the board, see `board_shape`."""
 
 
 def start_from_homographies(
@@ -94,7 +97,8 @@ def start_from_homographies(
     pixel, ratio = scale[..., None], torch.ones_like(scale[..., None])
     first_row = chosen * torch.cat((pixel, ratio, pixel, pixel, pixel), -1)
     none = pixel.new_zeros(*pixel.shape[:-1], lens)
-    return CameraAndPoses(torch.cat((first_row[..., :CX], first_row[..., CX:] + middle, none), -1), R, t)
+    flat = pixel.new_zeros(*pixel.shape[:-1], len(NAMES))
+    return CameraAndPoses(torch.cat((first_row[..., :CX], first_row[..., CX:] + middle, none), -1), R, t, flat)
 
 
 def _poses(K: Tensor, H: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchsfm._types import Status
-from torchsfm.autocalibration import PlaneCalibration, calibrate_planes
+from torchsfm.autocalibration import PlaneCalibration
+from torchsfm.autocalibration.board_shape import BOARD, NAMES
+from torchsfm.autocalibration.plane_models import LENSES, bend, calibrate_unknown_planes
 from torchsfm.cli.job import NOTHING, Job, UserError, told
 from torchsfm.cli.output import output_folder
 from torchsfm.cli.results import VERSION
@@ -36,6 +38,9 @@ from torchsfm.reconstruction.model.files import write_whole_files
 
 _FAR = 3.0
 """How many times the median error of photographs is an error worth a remark."""
+_DISAGREE = 2.5
+"""How many times more than by noise photographs may disagree before it is worth a remark."""
+_FREE = "focal,aspect,principal_point"
 
 
 class Pattern(StrEnum):
@@ -67,11 +72,22 @@ def calibrate(
     ] = "9x6",
     pattern: Annotated[Pattern, typer.Option(help="What the board shows.")] = Pattern.chessboard,
     size: Annotated[float, typer.Option(help="Distance between neighbouring corners or centres, in any unit.")] = 1.0,
-    camera: Annotated[str, typer.Option(metavar=f"[{'|'.join(DISTORTION_MODELS)}]", help="Lens distortion.")] = "radial",
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar=f"[{'|'.join(DISTORTION_MODELS)}]",
+            help="Lens distortion; radial, opencv or fisheye by what the photographs say.",
+            show_default=False,
+        ),
+    ] = None,
     free: Annotated[
-        str,
-        typer.Option(help="Intrinsics to find besides the distortion: focal, aspect, skew, principal_point, with commas."),
-    ] = "focal,aspect,principal_point",
+        str | None,
+        typer.Option(
+            help="What to find besides the distortion: focal, aspect, skew, principal_point, and board, its stretch and bend,"
+            f" with commas; {_FREE}, and board where the photographs say so.",
+            show_default=False,
+        ),
+    ] = None,
     loss_scale: Annotated[float, typer.Option(min=1e-6, help="Pixels from which on errors count less.")] = 1.0,
     previews: Annotated[int, typer.Option(min=0, help="Most undistorted pictures to write.")] = 4,
     threads: Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")] = None,
@@ -83,7 +99,7 @@ def calibrate(
     with told(Job(out)) as job, output_folder(out):
         job.set_threads(threads)
         columns, rows = _board(board)
-        if camera not in DISTORTION_MODELS:
+        if camera is not None and camera not in DISTORTION_MODELS:
             raise UserError(f"--camera: {camera!r} is not one of {', '.join(map(repr, DISTORTION_MODELS))}")
         if not 0 < size < float("inf"):
             raise UserError(f"--size: wanted a length greater than 0, got {size:g}")
@@ -99,19 +115,33 @@ def calibrate(
         X = size * torch.stack((place % columns, place // columns), -1).double()
         x = torch.stack([p.x for p in seen if p.x is not None]).double()
         try:
-            found = calibrate_planes(
-                x, X, image_size=(float(seen[0].size[0]), float(seen[0].size[1])), distortion=DISTORTION_MODELS[camera],
-                free=tuple(word.strip() for word in free.split(",")), loss=Huber(loss_scale), radius=_radius(seen, size),
-            )  # fmt: skip
+            words = tuple(word.strip() for word in (free or _FREE).split(","))
+            options: dict[str, Any] = {
+                "boards": (False, True) if free is None else (BOARD in words,),
+                "free": tuple(word for word in words if word != BOARD),
+                "loss": Huber(loss_scale),
+                "radius": _radius(seen, size),
+                "image_size": (float(seen[0].size[0]), float(seen[0].size[1])),
+            }
+            lenses = LENSES if camera is None else (camera, *(lens for lens in LENSES if lens != camera))
+            likeliest, found = calibrate_unknown_planes(x, X, lenses=lenses, **options)
+            better = ""
+            if camera not in (None, likeliest):
+                better = f"Doubtful: a lens of the kind {likeliest} explains the photographs better: {float(found.rms):.3f} px."
+                found = calibrate_unknown_planes(x, X, lenses=[camera], **options)[1]
+            else:
+                camera = likeliest
         except ValueError as error:
             raise UserError(" ".join(str(error).split())) from None
-        for p, rms in zip(seen, found.view_rms.tolist(), strict=True):
-            p.rms = rms
         typical = float(found.view_rms.median())
-        for p in seen:
-            if p.rms is not None and p.rms > _FAR * typical:
-                p.problem = f"fits badly: {p.rms / typical:.1f} times the median error"
+        for p, rms, first in zip(seen, found.view_rms.tolist(), [seen[i] for i in found.copy_of.tolist()], strict=True):
+            p.rms = rms
+            if first is not p:
+                p.x, p.problem = None, f"is {printable(first.path.name)} once more"
+            elif rms > _FAR * typical:
+                p.problem = f"fits badly: {rms / typical:.1f} times the median error"
         record = _record(found, photographs, camera, seen[0].size, {"board": board, "pattern": pattern.value, "size": size})
+        record["remarks"] = [better, *record["remarks"]] if better else record["remarks"]
         texts = {"calibration.json": json.dumps(record, indent=1), "calibration.md": _markdown(record)}
         if found.status == Status.OK:
             texts["camera.txt"] = _camera_file(record, found.camera.K)
@@ -185,6 +215,7 @@ def _record(
     values = {"fx": K[0, 0], "fy": K[1, 1], "skew": K[0, 1], "cx": K[0, 2], "cy": K[1, 2]}
     values |= dict(zip(intrinsic_labels(model)[HEAD:], row_from_camera(found.camera)[HEAD:], strict=True))
     sigma = dict(zip(found.parameter_names, found.deviation.tolist(), strict=True))
+    shape = dict(zip(NAMES, found.board_shape.tolist(), strict=True)) if NAMES[0] in sigma else {}
     return {
         "torchsfm": VERSION,
         "command": shlex.join(sys.argv[1:]),
@@ -194,10 +225,32 @@ def _record(
         "camera": camera,
         "intrinsics": {name: {"value": float(value), "sigma": sigma.get(name)} for name, value in values.items()},
         "rms": float(found.rms),
+        "disagreement": float(found.disagreement),
+        "board": {name: {"value": value, "sigma": sigma[name]} for name, value in shape.items()},
+        "remarks": _remarks(found, shape, board["size"]),
         "photographs": [
             {"name": p.path.name, "used": p.x is not None, "rms": p.rms, "problem": p.problem} for p in photographs
         ],
     }
+
+
+def _remarks(found: PlaneCalibration, shape: dict[str, float], size: float) -> list[str]:
+    """What the residuals say besides noise."""
+    remarks = []
+    if shape:
+        too = "long" if shape["stretch"] > 0 else "short"
+        remarks.append(
+            f"The board is not what was said: its rows are {100 * abs(shape['stretch']):.2f} % too {too}, and its points are"
+            f" {bend(found.board):.3g} off a plane, from the lowest to the highest, where neighbours are {size:g} apart."
+            " The camera was found with that."
+        )
+    if found.status == Status.OK and found.disagreement > _DISAGREE:
+        remarks.append(
+            f"Doubtful: the photographs contradict each other {float(found.disagreement):.1f} times more than their noise lets"
+            " them, by which the standard deviations are multiplied. They may be of different cameras or zooms, one may be"
+            " mirrored, the lens may be of another kind, or the board may have moved or bent between them."
+        )
+    return remarks
 
 
 def _markdown(record: dict[str, Any]) -> str:
@@ -209,6 +262,7 @@ def _markdown(record: dict[str, Any]) -> str:
         f"{used} of {len(record['photographs'])} photographs of {width} x {height} pixels used, root mean square error"
         f" {record['rms']:.3f} px, lens: {record['camera']}",
         "",
+        *(line for remark in record["remarks"] for line in (remark, "")),
         "| intrinsic | value | standard deviation |",
         "|---|---|---|",
     ]
