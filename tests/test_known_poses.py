@@ -89,6 +89,8 @@ def test_a_new_photograph_is_placed(courtyard: Path, run: Path) -> None:
     assert bool(model.registered.all())
     assert torch.equal(model.poses.R[registered], poses.poses.R[registered])
     assert torch.equal(model.poses.t[registered], poses.poses.t[registered])
+    assert torch.equal(model.cameras.K, poses.cameras.K)
+    assert bool((model.camera_index == 0).all())
     assert float(rotation_angle(model.poses.R[2:3] @ poses.poses.R[2:3].mT)) < 0.003
     assert float((model.poses.centre[2] - poses.poses.centre[2]).norm()) < 0.02
     # Without that wish it stays outside, and the report says why.
@@ -111,6 +113,29 @@ def test_a_camera_of_its_own_is_estimated(courtyard: Path, tmp_path: Path) -> No
     assert torch.equal(model.cameras.K[model.camera_index[0]], some.cameras.K[0])
     assert abs(float(model.cameras.K[model.camera_index[2], 0, 0]) - FOCAL) < 0.05 * FOCAL
     assert float((model.poses.centre[2] - some.poses.centre[2]).norm()) < 0.2
+
+
+@pytest.mark.parametrize(("zoom", "off"), [(1.06, 0.08), (1.3, 0.08), (2.0, 0.2)])
+def test_a_zoomed_photograph_has_a_camera_of_its_own(zoom: float, off: float, courtyard: Path, tmp_path: Path) -> None:
+    """No file tells the lens: it was taken for the camera of the model, and placed aside, by 1.2 where it zooms 1.3 times."""
+    from torchsfm.images import read_image
+
+    for i in range(VIEWS):
+        photo = read_image(courtyard / f"view{i}.png").pixels
+        if i == 2:
+            across = [torch.linspace(-1, 1, n) * (n - 1) / (n * zoom) for n in (WIDTH, HEIGHT)]
+            place = torch.stack(torch.meshgrid(*across, indexing="xy"), -1)
+            photo = torch.nn.functional.grid_sample(photo[None], place[None], mode="bicubic", align_corners=False)[0].clamp(
+                0, 1
+            )
+        save_image(tmp_path / f"view{i}.png", photo)
+    some = replace(truth(), registered=torch.tensor([True, True, False, True, True]))
+    model = triangulate_photographs(tmp_path, some, register=True).model
+    assert bool(model.registered.all())
+    assert len(model.cameras.K) == 2
+    assert torch.equal(model.cameras.K[model.camera_index[[0, 1, 3, 4]]], some.cameras.K.expand(4, 3, 3))
+    assert float(model.cameras.K[model.camera_index[2], 0, 0] / (zoom * FOCAL)) == pytest.approx(1, abs=0.02)
+    assert float((model.poses.centre[2] - some.poses.centre[2]).norm()) < off
 
 
 def test_wrong_input_is_told(courtyard: Path, run: Path, tmp_path: Path) -> None:

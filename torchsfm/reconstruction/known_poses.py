@@ -1,8 +1,9 @@
 """Photographs of which the poses are known: points for them, and poses for further photographs of the same scene."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Int
@@ -17,10 +18,10 @@ from torchsfm.reconstruction.evidence.doubt import examine
 from torchsfm.reconstruction.image_reports import image_reports
 from torchsfm.reconstruction.mappers.incremental import LAST_ITERATIONS, LAST_TOLERANCE, MappingOptions, next_images
 from torchsfm.reconstruction.mapping.adjust import LOSS, about_cameras, adjust
-from torchsfm.reconstruction.mapping.calibration import choose_free
+from torchsfm.reconstruction.mapping.calibration import choose_free, measure_noise
 from torchsfm.reconstruction.mapping.cameras import focal_uncertainty, group_cameras, guess_cameras
 from torchsfm.reconstruction.mapping.mapping import Mapping
-from torchsfm.reconstruction.mapping.register import register_images
+from torchsfm.reconstruction.mapping.register import SURPRISE, TOGETHER, register_images
 from torchsfm.reconstruction.mapping.structure import complete_tracks, filter_points, merge_points, triangulate_tracks
 from torchsfm.reconstruction.mapping.tracks import build_tracks
 from torchsfm.reconstruction.matching.sources import Source
@@ -62,7 +63,8 @@ def triangulate_photographs(
         refine_poses: Adjust the poses together with the points, the cameras held; the result is moved back to where the camera
             centres fit those given best.
         register: Also place the photographs that are not in the model, in the frame that the others make. Those that the files
-            say the same camera took as others of the model get its intrinsics; the intrinsics of other cameras are estimated.
+            say the same camera took as others of the model get its intrinsics, and where files say nothing those of the same
+            size, unless another focal length explains them clearly better; the intrinsics of other cameras are estimated.
             The poses and cameras given stay as they are.
         sequence: The images are consecutive frames of a video.
         masks: Folder of masks, see `reconstruct`.
@@ -100,7 +102,7 @@ def triangulate_photographs(
     reasons = dict.fromkeys((place < 0).nonzero()[:, 0].tolist(), "has no pose in the given model")
     with seen.stages.timed("map"):
         report("map", 0, len(place))
-        mapping, options, own = start_mapping(
+        mapping, options, new = start_mapping(
             seen.graph, seen.points.labels, seen.points.focal, poses.to("cpu", torch.float64), place, generator
         )
         given = mapping
@@ -110,9 +112,9 @@ def triangulate_photographs(
                 mapping = _structure(adjust(mapping, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE), options)
             mapping = _moved_back(mapping, given)
         if register and len(mapping.X):
-            mapping, reasons = place_images(mapping, options, own, report)
+            mapping, options, new, reasons = place_images(mapping, options, new, report)
         report("map", int(mapping.registered.sum()), len(place))
-        result = result_of(mapping, options, own, reasons, seen.points.failures, seen.names)
+        result = result_of(mapping, options, new.own, reasons, seen.points.failures, seen.names)
     course = replace(result.report, seconds=dict(seen.stages.seconds), skipped=seen.skipped)
     return replace(result, report=course)
 
@@ -169,6 +171,16 @@ def _places(seen: MatchedPhotographs, poses: Reconstruction) -> Int[Tensor, "v"]
     return place
 
 
+@dataclass(frozen=True)
+class NewCameras:
+    """What photographs that are new may have been taken with."""
+
+    own: Bool[Tensor, "g"]
+    """Cameras that are not the model's and are estimated."""
+    like: Int[Tensor, "g"]
+    """The model's camera that each one is thought to be, itself for those that nothing is thought of."""
+
+
 def start_mapping(
     graph: ViewGraph,
     labels: Sequence[str],
@@ -176,8 +188,11 @@ def start_mapping(
     poses: Reconstruction,
     place: Int[Tensor, "v"],
     generator: torch.Generator,
-) -> tuple[Mapping, MappingOptions, Bool[Tensor, "g"]]:
-    """Photographs with the poses and cameras of a model, without points; and which cameras are not the model's.
+) -> tuple[Mapping, MappingOptions, NewCameras]:
+    """Photographs with the poses and cameras of a model, without points; and what is thought of the other cameras.
+
+    A photograph of the same size as others, of which no file tells the focal length, has a camera like theirs for itself, until
+    `place_images` knows better.
 
     Args:
         graph: The photographs and their verified matches.
@@ -192,23 +207,30 @@ def start_mapping(
     name = next(name for name, model in DISTORTION_MODELS.items() if model is kind)
     guessed, source = guess_cameras(graph, group, model=name, K=None, exif_focal=focal)
     camera = torch.where(place >= 0, poses.camera_index[place.clamp(min=0)], -1)
+    first, second = len(poses.cameras.K), len(poses.cameras.K) + len(guessed.K)
+    original = torch.arange(second + len(place))
     for i in (place < 0).nonzero()[:, 0].tolist():
-        like = ((group == group[i]) & (place >= 0)).nonzero()[:, 0]
-        camera[i] = camera[like[0]] if len(like) else len(poses.cameras.K) + group[i]
+        same = ((group == group[i]) & (place >= 0)).nonzero()[:, 0]
+        camera[i] = first + group[i]
+        if len(same):
+            original[second + i] = camera[same[0]]
+            camera[i] = camera[same[0]] if focal[i] else second + i
     used, index = torch.unique(camera, return_inverse=True)
-    K = torch.cat([poses.cameras.K, guessed.K])[used]
+    rows = original[used]
+    K = torch.cat([poses.cameras.K, guessed.K])[rows]
     both = (poses.cameras, guessed)
     numbers = [one.distortion.parameters().reshape(len(one.K), kind.num_parameters).to(K) for one in both]
-    cameras = Camera(K, kind.from_parameters(torch.cat(numbers)[used]))
-    own = used >= len(poses.cameras.K)
-    sigma = torch.cat([torch.full((len(poses.cameras.K),), 0.01, dtype=K.dtype), focal_uncertainty(source)])[used]
+    cameras = Camera(K, kind.from_parameters(torch.cat(numbers)[rows]))
+    new = NewCameras((used >= first) & (used < second), torch.searchsorted(used, rows))
+    words = (*("given",) * first, *source, *("default",) * len(place))
+    sigma = focal_uncertainty(words)[used].to(K.dtype)
     track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
     mapping = Mapping.start(graph, track, cameras, index)
     known = place >= 0
     chosen = poses.poses[place.clamp(min=0)]
     R = torch.where(known[:, None, None], chosen.R, mapping.poses.R)
     mapping = replace(mapping, poses=Pose(R, torch.where(known[:, None], chosen.t, 0.0)), registered=known)
-    return mapping, MappingOptions(free=(), expected=cameras, focal_sigma=sigma, generator=generator), own
+    return mapping, MappingOptions(free=(), expected=cameras, focal_sigma=sigma, generator=generator), new
 
 
 def _structure(mapping: Mapping, options: MappingOptions) -> Mapping:
@@ -232,12 +254,13 @@ def _adjust(
     moving: Bool[Tensor, "v"],
     own: Bool[Tensor, "g"] | None = None,
     options: MappingOptions | None = None,
+    cameras: dict[str, Any] | None = None,
 ) -> Mapping:
     """Move all points, some of the poses, and of some cameras what the images determine."""
     node = mapping.observations()
     if not len(node):
         return mapping
-    cameras = {}
+    cameras = cameras or {}
     if own is not None and options is not None and bool(own.any()):
         prior = options.prior(mapping)
         names = ("focal", *mapping.cameras.distortion.parameter_names)
@@ -268,24 +291,57 @@ def _moved_back(mapping: Mapping, given: Mapping) -> Mapping:
 
 
 def place_images(
-    mapping: Mapping, options: MappingOptions, own: Bool[Tensor, "g"], progress: Progress
-) -> tuple[Mapping, dict[int, str]]:
-    """Poses for the images that have none, and why some get none."""
+    mapping: Mapping, options: MappingOptions, new: NewCameras, progress: Progress
+) -> tuple[Mapping, MappingOptions, NewCameras, dict[int, str]]:
+    """Poses for the images that have none, and why some get none; with the cameras that are left."""
     given, failed = mapping.registered, dict[int, str]()
     nowhere = torch.zeros_like(given)
     sigma = options.focal_sigma.index_fill(0, mapping.camera_index[given], 0.0)
+    own = new.own
+    thought = new.like != torch.arange(len(own))
     while len(images := next_images(mapping, nowhere, failed)):
         before = mapping.registered
         mapping, count, inliers = register_images(
-            mapping, images, threshold=options.registration, focal_sigma=sigma, generator=options.generator
-        )
-        new = mapping.registered & ~before
+            mapping, images, threshold=options.registration, focal_sigma=sigma, least=SURPRISE * thought,
+            generator=options.generator,
+        )  # fmt: skip
+        placed = mapping.registered & ~before
         for i, n, k in zip(images.tolist(), count.tolist(), inliers.tolist(), strict=True):
-            if not new[i]:
+            if not placed[i]:
                 failed[i] = f"a pose fits only {k} of the {n} points it sees"
-        if bool(new.any()):
-            sigma = sigma.index_fill(0, mapping.camera_index[new], 0.0)
+        if bool(placed.any()):
+            # A camera that has found another focal length is not the one it was thought to be.
+            focal = mapping.cameras.K[:, 0, 0]
+            other = thought & (focal != focal[new.like])
+            other = other | _other_focal_lengths(mapping, options, placed, thought & ~other)
+            own = own | other
+            index = torch.where(placed & ~other[mapping.camera_index], new.like[mapping.camera_index], mapping.camera_index)
+            mapping = replace(mapping, camera_index=index)
+            sigma = sigma.index_fill(0, mapping.camera_index[placed], 0.0)
             mapping = _adjust(mapping, moving=mapping.registered & ~given, own=own, options=options)
             mapping = _structure(mapping, options)
             progress("map", int(mapping.registered.sum()), len(given))
-    return _adjust(mapping, moving=mapping.registered & ~given, own=own, options=options), failed
+    mapping = _adjust(mapping, moving=mapping.registered & ~given, own=own, options=options)
+    index = torch.where(mapping.registered, mapping.camera_index, new.like[mapping.camera_index])
+    used, index = torch.unique(index, return_inverse=True)
+    left = NewCameras(own[used], torch.arange(len(used)))
+    choices = replace(options, expected=options.expected[used], focal_sigma=options.focal_sigma[used])
+    return replace(mapping, cameras=mapping.cameras[used], camera_index=index), choices, left, failed
+
+
+def _other_focal_lengths(
+    mapping: Mapping, options: MappingOptions, placed: Bool[Tensor, "v"], thought: Bool[Tensor, "g"]
+) -> Bool[Tensor, "g"]:
+    """Which cameras that are thought to be others of the model explain their image clearly better by another focal length."""
+    known = _adjust(mapping, moving=placed)
+    node = known.observations()
+    open_ = thought[known.camera_index] & placed
+    if not bool(open_.any()):
+        return torch.zeros_like(thought)
+    free = torch.zeros_like(thought).index_fill(0, known.camera_index[open_], True)
+    other = _adjust(known, moving=placed, cameras=about_cameras(known, {"focal": free}, options.prior(known)))
+    noise = measure_noise(other, LOSS)
+    costs = [LOSS(one.errors(one.point[node], node).clamp_max(1e6).square()) for one in (known, other)]
+    camera = known.camera_index[known.graph.view[node]]
+    gain = torch.zeros(len(thought), dtype=costs[0].dtype).index_add(0, camera, costs[0] - costs[1]) / noise**2
+    return free & (gain > TOGETHER * SURPRISE)

@@ -43,7 +43,8 @@ def register_photographs(
     The features of the new photographs are matched with those of the old ones and of each other; poses are estimated robustly
     from the points that these show, and the new photographs are added with new points. The poses and cameras of the model
     stay as they are, as does its world frame. A photograph that the files say the same camera took as others of the model gets
-    its intrinsics; those of other cameras are estimated.
+    its intrinsics, and where they say nothing one of the same size, unless another focal length explains it clearly better;
+    those of other cameras are estimated.
 
     Args:
         images: A folder or image files, also a single one; those that the model has poses for are passed over.
@@ -116,16 +117,16 @@ def register_photographs(
     with stages.timed("map"):
         report("map", int(model.registered.sum()), count)
         labels, focal = (*old_labels, *new.labels), (*(None for _ in range(old)), *new.focal)
-        mapping, choices, own = start_mapping(graph, labels, focal, model, place, generator)
+        mapping, choices, cameras = start_mapping(graph, labels, focal, model, place, generator)
         point = mapping.point.clone()
         point[node] = model.point[there]
         mapping = replace(mapping, X=model.X, point=point).compacted()
         absent = ~posed
         before = mapping.registered
         mapping = replace(mapping, registered=before | absent)
-        mapping, reasons = place_images(mapping, choices, own, report)
+        mapping, choices, cameras, reasons = place_images(mapping, choices, cameras, report)
         mapping = replace(mapping, registered=mapping.registered & ~absent)
-        result = result_of(mapping, choices, own, reasons, new.failures, (*model.names, *sources.names))
+        result = result_of(mapping, choices, cameras.own, reasons, new.failures, (*model.names, *sources.names))
     course = replace(result.report, seconds=dict(stages.seconds), skipped=sources.skipped)
     models = tuple(replace(found, lines=model.lines, conics=model.conics, curves=model.curves) for found in result.models)
     return SfmResult(models, course)

@@ -20,6 +20,8 @@ SEARCHED = 0.1
 DEVIATIONS, TOGETHER = 4.0, 10.0
 """The largest error of an inlier in standard deviations of image points, as long as a model is rough; so many image points err
 alike, as neighbours and things that look alike do, and count as one."""
+SURPRISE = 10.0
+"""Twice the logarithm of how many times likelier an image must be with another focal length than its camera has."""
 
 
 def visibility_scores(mapping: Mapping) -> tuple[Int[Tensor, "v"], Float[Tensor, "v"]]:
@@ -48,6 +50,7 @@ def register_images(
     *,
     threshold: float,
     focal_sigma: Float[Tensor, "g"],
+    least: Float[Tensor, "g"] | None = None,
     generator: torch.Generator | None,
 ) -> tuple[Mapping, Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Estimate the poses of several images in one batched call, and register those that find enough support.
@@ -57,6 +60,7 @@ def register_images(
         images: Images to try.
         threshold: Largest reprojection error of an inlier in pixels.
         focal_sigma: How uncertain the focal lengths are, as a fraction; those of more than `SEARCHED` are estimated as well.
+        least: What another focal length must gain, twice the logarithm of a likelihood; 0 where it is not given.
         generator: Source of randomness.
 
     Returns:
@@ -81,7 +85,8 @@ def register_images(
     x = x[..., :2] / x[..., 2:].clamp(min=1e-9)
     result = estimate_camera(x, X, K, threshold=threshold, mask=mask, generator=generator)
     model, inliers, status = result.model.clone(), result.inliers.clone(), result.status.clone()
-    K, changed = _with_focal_lengths(x, X, K, mask, camera, focal_sigma[camera], result.support, threshold, generator)
+    surplus = focal_sigma.new_zeros(k) if least is None else least[camera]
+    K, changed = _with_focal_lengths(x, X, K, mask, camera, focal_sigma[camera], result.support, surplus, threshold, generator)
     if len(changed):
         again = estimate_camera(
             x[changed], X[changed], K[changed], threshold=threshold, mask=mask[changed], generator=generator
@@ -109,6 +114,7 @@ def _with_focal_lengths(
     camera: Int[Tensor, "k"],
     sigma: Float[Tensor, "k"],
     support: Float[Tensor, "k"],
+    least: Float[Tensor, "k"],
     threshold: float,
     generator: torch.Generator | None,
 ) -> tuple[Float[Tensor, "k 3 3"], Int[Tensor, "c"]]:
@@ -125,7 +131,7 @@ def _with_focal_lengths(
     )
     focal = krt_from_camera(found.model)[0][:, 0, 0]
     gain = (found.support - support[open_]) * DEVIATIONS**2 / TOGETHER
-    gain = gain - ((focal / K[open_, 0, 0]).log() / sigma[open_]).square()
+    gain = gain - ((focal / K[open_, 0, 0]).log() / sigma[open_]).square() - least[open_]
     gain = torch.where(found.status == Status.OK, gain, -1.0).nan_to_num(-1.0)
     K = K.clone()
     for own in torch.unique(camera[open_]).tolist():
