@@ -87,6 +87,17 @@ def test_what_the_user_can_put_right(box: Path, tmp_path: Path) -> None:
         assert_one_line(stderr, said)
 
 
+def test_photographs_of_another_size_are_not_those_of_the_model(box: Path, tmp_path: Path) -> None:
+    """They were taken for such, and hardly any curve was found."""
+    half = tmp_path / "half"
+    half.mkdir()
+    for name, image in zip((f"view{i}.png" for i in range(VIEWS)), photograph(orbit(VIEWS)), strict=True):
+        save_image(half / name, torch.nn.functional.avg_pool2d(image[None], 2)[0])
+    status, _, stderr = torchsfm("curves", half, "--poses", box / "model.npz", "--out", tmp_path / "out")
+    assert status == 2
+    assert f"view0.png: {SIZE // 2} x {SIZE // 2} pixels, in the model of the poses {SIZE} x {SIZE}" in stderr
+
+
 def test_no_curves(box: Path, tmp_path: Path) -> None:
     model = replace(Reconstruction.load(box / "model.npz"))
     folder = tmp_path / "images"

@@ -50,7 +50,7 @@ def curves(
         read: list[bool] = []
         share = shares(model.image_size[known], max_size)
         found = reconstruct_curves(
-            photographs(files, max_size, max_pixels, read),
+            photographs(files, model.image_size[known], max_size, max_pixels, read),
             scaled(model.cameras[model.camera_index[known]], share),
             model.poses[known],
             points=model.X[torch.isfinite(model.X).all(-1)],
@@ -93,18 +93,29 @@ def shares(size: Int[Tensor, "v 2"], max_size: int) -> Float[Tensor, "v 2"]:
     return small / size
 
 
-def photographs(files: list[Path], max_size: int, max_pixels: int, read: list[bool]) -> Iterator[Tensor | None]:
-    """The images one after another, None and a word to the user for one that cannot be read; `read` tells which can."""
-    for file in files:
+def photographs(
+    files: list[Path], sizes: Int[Tensor, "v 2"], max_size: int, max_pixels: int, read: list[bool]
+) -> Iterator[Tensor | None]:
+    """The images one after another, None and a word to the user for one that cannot be read; `read` tells which can.
+
+    Raises:
+        UserError: One has another size than the model says: its camera is not that of these pixels.
+    """
+    for file, wanted in zip(files, sizes.tolist(), strict=True):
         try:
-            pixels = read_image(file, max_size=max_size, max_pixels=max_pixels).pixels
+            photograph = read_image(file, max_size=max_size, max_pixels=max_pixels)
         except (ImageError, OSError) as error:
             typer.echo(f"torchsfm: left out: {printable(str(error))}", err=True)
             read.append(False)
             yield None
             continue
+        if list(photograph.size) != wanted:
+            told_sizes = (
+                f"{photograph.size[0]} x {photograph.size[1]} pixels, in the model of the poses {wanted[0]} x {wanted[1]}"
+            )
+            raise UserError(f"{printable(str(file))}: {told_sizes}")
         read.append(True)
-        yield pixels
+        yield photograph.pixels
 
 
 def write(found: Curves, model: Reconstruction, images: Path, folder: Path, max_pixels: int) -> list[tuple[str, str]]:
