@@ -122,6 +122,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
     occupied = Occupied.of(mapping)
     nearest, farthest = _DepthMap.of(mapping, FINE, "amin"), _DepthMap.of(mapping, FINER, "amax")
     beside = _DepthMap.of(mapping, FINER, "amin")
+    low, high = _pictures(mapping)
     lens = PixelProjection(type(mapping.cameras.distortion), skew=bool((mapping.cameras.K[:, 0, 1] != 0).any()))
     rows_of_cameras = row_from_camera(mapping.cameras).mT
     for a in torch.unique(directed[:, 0]).tolist():
@@ -143,7 +144,7 @@ def missing_correspondences(mapping: Mapping) -> Conflicts:
         k, n = near.nonzero(as_tuple=True)
         image, ray = b[k], ray.flatten(1).index_select(1, k * len(p) + n)
         x, depth = lens.pixels(ray, rows_of_cameras[:, mapping.camera_index[image]]), ray[2]
-        inside = ((x >= 0) & (x <= (mapping.graph.image_size.mT - 1)[:, image])).all(0)
+        inside = ((x >= low[:, image]) & (x <= high[:, image])).all(0)
         fine, finer = (_cell(x.mT, mapping.graph.image_size[image], grid) for grid in (FINE, FINER))
         bare = nearest.at(image, fine) >= BEHIND * depth
         through = (farthest.at(image, finer) > FARTHER * depth) & (beside.at(image, finer) > BEHIND * depth)
@@ -277,3 +278,15 @@ def _cell(x: Float[Tensor, "*batch 2"], size: Int[Tensor, "*#batch 2"], grid: tu
     place = (x / size).nan_to_num(0.0).clamp(0, 1 - 1e-9)
     index: Tensor = (place[..., 0] * columns).long() * rows + (place[..., 1] * rows).long()
     return index
+
+
+def _pictures(mapping: Mapping) -> tuple[Float[Tensor, "2 v"], Float[Tensor, "2 v"]]:
+    """The box in which images of the size of each one have any image points: bars beside a picture show nothing."""
+    graph = mapping.graph
+    _, kind = torch.unique(graph.image_size, dim=0, return_inverse=True)
+    of_points = kind[graph.view].expand(2, -1)
+    box = [
+        graph.x.new_zeros(2, int(kind.max()) + 1).scatter_reduce(1, of_points, graph.x.mT, extreme, include_self=False)
+        for extreme in ("amin", "amax")
+    ]
+    return box[0][:, kind], box[1][:, kind]

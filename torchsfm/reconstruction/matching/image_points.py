@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchsfm._types import tensor_map
 from torchsfm.images import Features, ImageError, Photograph, detect_features, read_image
+from torchsfm.images.bars import picture_in_bars
 from torchsfm.reconstruction.matching.masks import Masks
 from torchsfm.reconstruction.matching.stages import Arrays, Shards, Stages
 from torchsfm.reconstruction.messages import Progress, ReconstructionError
@@ -105,10 +106,13 @@ def detect_all(
             photo = read_image(path, max_size=DETECTION_SIZE, max_pixels=max_pixels)
         except ImageError as error:
             return str(error)
-        features = detect_features(photo, max_features, max_size=DETECTION_SIZE)
+        rows, columns = picture_in_bars(photo.pixels)
+        inside = photo.pixels[:, rows, columns]
+        features = detect_features(inside, max_features, max_size=DETECTION_SIZE)
         strong = len(features)
         if strong < ENOUGH:
-            features = detect_features(photo, max_features, enough=ENOUGH, max_size=DETECTION_SIZE)
+            features = detect_features(inside, max_features, enough=ENOUGH, max_size=DETECTION_SIZE)
+        features = replace(features, x=features.x + torch.tensor([columns.start, rows.start], dtype=features.x.dtype))
         weak = torch.arange(len(features)) >= strong
         zoom = torch.tensor([photo.size[0] / photo.width, photo.size[1] / photo.height])
         if masks is not None:
