@@ -116,6 +116,23 @@ def test_pure_rotation_is_refused() -> None:
     assert "turned" in result.failure()
 
 
+def test_a_camera_that_stands_and_zooms_is_refused() -> None:
+    still = make_scene(turning(1), points=600, outliers=0.0, distortion=0.0)
+    centre = (torch.tensor(SIZE).double() - 1) / 2
+    parts = []
+    for i, zoom in enumerate((1.0, 1.15, 1.3, 1.5, 1.7)):
+        x = centre + zoom * (still.x - centre) + 0.4 * torch.randn(still.x.shape, generator=seeded(i), dtype=torch.float64)
+        inside = ((x > 0) & (x < 2 * centre)).all(-1)
+        parts.append((x[inside], torch.full_like(still.track[inside], i), still.track[inside]))
+    x, view, track = (torch.cat(column) for column in zip(*parts, strict=True))
+    result = reconstruct_tracks(x, view, track, torch.tensor([SIZE] * 5))
+    assert not result.models
+    assert "zoomed" in result.failure()
+    # Where the focal lengths are known to be the same, it came nearer to a plane.
+    known = reconstruct_tracks(x, view, track, torch.tensor([SIZE] * 5), focal=1100.0)
+    assert known.report.pairs.count(Verdict.PLANAR) >= 8
+
+
 def test_a_plane_is_called_planar() -> None:
     result = run(make_scene(kind="plane", points=600, outliers=0.0))
     assert result.report.pairs.count(Verdict.PLANAR) > result.report.pairs.count(Verdict.GENERAL)

@@ -180,7 +180,7 @@ class SfmResult:
         >>> len(found.models)
         0
         >>> found.failure()
-        'the camera only turned about its centre, which gives no depth'
+        'the camera only turned about its centre, or zoomed, which gives no depth'
     """
 
     models: tuple[Reconstruction, ...]
@@ -211,7 +211,7 @@ class SfmResult:
         if not related:
             return f"none of the {len(pairs.pairs)} pairs of images have enough in common"
         if pairs.count(Verdict.ROTATION) == related:
-            return "the camera only turned about its centre, which gives no depth"
+            return "the camera only turned about its centre, or zoomed, which gives no depth"
         if self.report.autocalibration:
             return "autocalibration: " + self.report.autocalibration[0]
         return f"no model could be started from the {related} pairs of images that have something in common"

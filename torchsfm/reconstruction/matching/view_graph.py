@@ -18,6 +18,8 @@ from torchsfm.robust.sampling import draw_seed
 MIN_INLIERS = 15
 """Fewer epipolar inliers than this also occur between unrelated images."""
 
+MOST_ZOOM = 4.0
+"""Largest ratio of the focal lengths of two images."""
 CONFIDENCE = 0.999
 MAX_ITERATIONS = 3000
 """Pairs of unrelated images, the most of many, never reach the confidence; this is what they may cost."""
@@ -54,7 +56,7 @@ class Verdict(IntEnum):
     PLANAR = 2
     """A homography explains nearly all: one plane, seen from two places."""
     ROTATION = 3
-    """A homography explains nearly all and is that of a camera turning about its centre: no depth can be found."""
+    """A homography explains nearly all and is that of a camera turning about its centre, or zooming: no depth can be found."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,8 @@ class ViewGraph:
 
         A pair is called planar or rotating when its homography explains at least 80 % of what the fundamental matrix does
         (Schönberger & Frahm 2016, section 4.1). The singular values of `K2^-1 H K1` are equal for a rotation alone; where the
-        focal length is a guess, equal at any focal length will do.
+        focal length is a guess, equal at any focal length will do, and where both are, with any other in the second image: who
+        zooms and stays where he is sees no depth either.
         """
         related = torch.maximum(self.fundamental_inliers, self.homography_inliers) >= MIN_INLIERS
         flat = self.homography_inliers >= 0.8 * self.fundamental_inliers.double()
@@ -154,7 +157,12 @@ class ViewGraph:
         tried[..., :2, :2] *= scales[..., None, None]
         K1, K2 = tried[:, self.pairs[:, 0]], tried[:, self.pairs[:, 1]]
         turn = torch.linalg.solve_ex(K2, self.H @ K1).result
-        s, _ = svdvals(turn)
+        # The rows of a rotation are of one length, which the second focal length can make them.
+        length = turn.norm(dim=-1)
+        zoom = length[..., 2] / (length[..., 0] * length[..., 1]).sqrt().clamp(min=1e-12)
+        zoom = torch.where(unknown_focal[self.pairs].all(-1), zoom.clamp(1 / MOST_ZOOM, MOST_ZOOM), 1.0)
+        zoomed = turn * torch.stack((zoom, zoom, torch.ones_like(zoom)), -1)[..., None]
+        s, _ = svdvals(torch.cat((turn, zoomed)))
         spread = (s[..., 0] / s[..., 2].clamp(min=1e-12) - 1).amin(0)
         verdict = torch.where(flat, int(Verdict.PLANAR), int(Verdict.GENERAL))
         verdict = torch.where(flat & (spread < 0.05), int(Verdict.ROTATION), verdict)
