@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import pytest
 import torch
@@ -120,3 +120,32 @@ def test_the_package_is_checked(request: pytest.FixtureRequest) -> None:
         pytest.skip("the checks are not asked for")
     with broken:
         torchsfm.geometry.rotation_from_rotvec(torch.zeros(4))
+
+
+class Pair(NamedTuple):
+    x: Tensor
+    y: Tensor
+
+
+@checked
+def joined(pair: Pair, *more: int, both: tuple[Tensor, Tensor], kind: type = Tensor) -> Pair:
+    return Pair(*both) if not more else both  # type: ignore[return-value]
+
+
+def test_where_the_class_is_all_that_is_asked_for_others_do_not_pass() -> None:
+    x = torch.ones(3)
+    for _ in range(2):
+        assert torch.equal(joined(Pair(x, x), both=(x, x)).y, x)
+        assert torch.equal(joined(Pair(x[:2], x), both=Pair(x, x), kind=Pair).y, x)
+        for pair, more, options in (
+            ((x, x), (), {"both": (x, x)}),
+            (Pair(x, x), ("1",), {"both": (x, x)}),
+            (Pair(x, x), (1,), {"both": (x, x)}),
+            (Pair(x, x), (), {"both": (x, 1)}),
+            (Pair(x, x), (), {"both": Pair(x, None)}),  # type: ignore[arg-type]
+            (Pair(x, x), (), {"both": (x, x), "kind": x}),
+        ):
+            with broken:
+                joined(pair, *more, **options)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"joined\(\) missing 1 required keyword-only argument: 'both'"):
+        joined(Pair(x, x))  # type: ignore[call-arg]

@@ -35,25 +35,30 @@ def checked(target: Any = None, *, typechecker: Any = None) -> Any:
             target.__init__ = checked(target.__init__)
         return target
     checks = _CHECKS.setdefault((target.__module__, target.__qualname__, target.__code__.co_firstlineno), _Checks())
-    config = jaxtyping.config
+    config, passed_for = jaxtyping.config, checks.passed.get
 
     @functools.wraps(target)
     def call(*args: Any, **kwargs: Any) -> Any:
         if config.jaxtyping_disable:
             return target(*args, **kwargs)
-        given = _kinds(args, kwargs)
-        passed = checks.passed.get(given)
-        if passed is None:
+        if checks.given is None:
             checks.make(target)
+        try:
+            given = checks.given(*args, **kwargs)
+        except TypeError:
+            checks.arguments(*args, **kwargs)  # says what is wrong with the call
+            raise
+        passed = passed_for(given)
+        if passed is None:
             with _names_of_axes("context"):
                 checks.arguments(*args, **kwargs)
                 checks.passed[given] = passed = set()
                 value = target(*args, **kwargs)
                 checks.result(value)
-                passed.add(_kinds((value,), {}))
+                passed.add(checks.kind(value))
             return value
         value = target(*args, **kwargs)
-        kind = _kinds((value,), {})
+        kind = checks.kind(value)
         if kind not in passed:
             with _names_of_axes("context"):
                 checks.arguments(*args, **kwargs)
@@ -68,32 +73,44 @@ _names_of_axes = jaxtyping.jaxtyped
 
 
 class _Checks:
-    """Those of one function, once it is called."""
+    """Those of one function, made once it is called."""
 
     arguments: Callable[..., None]
     result: Callable[[Any], Any]
+    given: Callable[..., Hashable] | None = None
+    """All that the annotations of arguments can tell of these,"""
+    kind: Callable[[Any], Hashable]
+    """and that of the result of one."""
 
     def __init__(self) -> None:
         self.passed: dict[Hashable, set[Hashable]] = {}
         """Kinds of results by those of arguments."""
 
     def make(self, target: Callable[..., Any]) -> None:
-        if not hasattr(self, "result"):
-            self.arguments, self.result = _arguments(target), _result(target)
+        self.arguments, self.result = _arguments(target), _result(target)
+        self.kind = type if _is_told_by_type(target.__annotations__.get("return", Any)) else _kind
+        self.given = _given(target)
 
 
-def _kinds(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Hashable:
-    """The kinds of arguments; two entries for a tensor, of which the second is a dtype."""
-    kinds: list[Hashable] = []
-    for x in args:
-        what = type(x)
-        if what is Tensor:
-            kinds += (x.shape, x.dtype)
+def _is_told_by_type(hint: Any) -> bool:
+    """Whether a hint asks for a class, and for nothing in which two of its values may differ."""
+    return hint is None or (inspect.isclass(hint) and not type(hint).__module__.startswith("jaxtyping"))
+
+
+def _given(function: Callable[..., Any]) -> Callable[..., Hashable]:
+    """Takes what the function takes, and gives all that its annotations can tell of that; written out, as loops take longer."""
+    parts = []
+    for name, p in inspect.signature(function).parameters.items():
+        if p.kind is p.VAR_POSITIONAL:
+            parts.append(f"*_map(_kind, {name})")
+        elif p.kind is p.VAR_KEYWORD:
+            parts.append(f"*{name}, *_map(_kind, {name}.values())")
+        elif _is_told_by_type(p.annotation):
+            parts.append(f"_type({name})")
         else:
-            kinds.append(what if what in _PLAIN else _kind(x))
-    for name in kwargs:
-        kinds += (name, _kind(kwargs[name]))
-    return tuple(kinds)
+            parts.append(f"({name}.shape, {name}.dtype) if _type({name}) is _Tensor else _kind({name})")
+    names = {"_kind": _kind, "_map": map, "_type": type, "_Tensor": Tensor}
+    return _taking(function, f"return ({''.join(part + ', ' for part in parts)})", names)
 
 
 def _kind(x: Any) -> Hashable:
@@ -121,15 +138,20 @@ def _kind(x: Any) -> Hashable:
 
 def _arguments(function: Callable[..., Any]) -> Callable[..., None]:
     """Takes what the function takes, does nothing, and is checked."""
+    take = _taking(function, "pass", {})
+    take.__defaults__, take.__kwdefaults__ = function.__defaults__, function.__kwdefaults__
+    return _like(function, take, {name: hint for name, hint in function.__annotations__.items() if name != "return"})
+
+
+def _taking(function: Callable[..., Any], do: str, names: dict[str, Any]) -> Callable[..., Any]:
+    """A function that takes the same arguments; those left out are `...`."""
     bare = [
         p.replace(annotation=p.empty, default=p.empty if p.default is p.empty else ...)
         for p in inspect.signature(function).parameters.values()
     ]
-    space: dict[str, Any] = {}
-    exec(f"def take{inspect.Signature(bare)}: pass", space)
-    take = space["take"]
-    take.__defaults__, take.__kwdefaults__ = function.__defaults__, function.__kwdefaults__
-    return _like(function, take, {name: hint for name, hint in function.__annotations__.items() if name != "return"})
+    space = dict(names)
+    exec(f"def take{inspect.Signature(bare)}: {do}", space)
+    return space["take"]
 
 
 def _result(function: Callable[..., Any]) -> Callable[[Any], Any]:
