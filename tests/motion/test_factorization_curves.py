@@ -1,6 +1,7 @@
 """Cameras and curves from images of curves alone: exact data, laws, noise, what the data do not determine, what is wrong."""
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,7 +21,7 @@ from torchsfm.geometry import (
     to_homogeneous,
 )
 from torchsfm.motion import CurveFactorization, factorize_curves
-from torchsfm.motion.many_views import factorization_curves
+from torchsfm.motion.many_views import curve_verdict, factorization_curves
 from torchsfm.triangulation import triangulate_points_dlt
 
 F64 = torch.float64
@@ -203,6 +204,27 @@ def test_flat_curves_that_begin_anywhere_are_told(generator: torch.Generator) ->
     x = x + 0.3 * torch.randn(x.shape, generator=generator, dtype=F64)
     found = factorize_curves(curve_from_samples(x, closed=True), samples=24)
     assert (found.status != Status.OK).all()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_planes_are_fitted_closely_where_that_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of noise alone homographies leave what space does, and three times that at most."""
+    left = {curve_verdict._ROUGHLY: [2.0, 20.0, 20.0, 60.0], curve_verdict._CLOSELY: [0.0, 2.0, 10.0, 2.0]}
+    asked = []
+
+    def left_by(images: object, found: object, tolerance: float) -> Tensor:
+        asked.append(tolerance)
+        return torch.tensor(left[tolerance]).double()
+
+    monkeypatch.setattr(curve_verdict, "_left_by_plane", left_by)
+    end = SimpleNamespace(end=SimpleNamespace(cost=torch.ones(4, dtype=F64)))
+    found: Any = SimpleNamespace(end=end, measured=torch.ones(4, 3, 40, dtype=torch.bool))
+    flat = curve_verdict._flat(None, found, torch.full((4,), 5), torch.full((4,), 10**9))  # type: ignore[arg-type]
+    assert flat.tolist() == [True, True, False, False]
+    assert asked == [curve_verdict._ROUGHLY, curve_verdict._CLOSELY]
+    left[curve_verdict._ROUGHLY][1:3] = [60.0, 60.0]
+    curve_verdict._flat(None, found, torch.full((4,), 5), torch.full((4,), 10**9))  # type: ignore[arg-type]
+    assert asked[2:] == [curve_verdict._ROUGHLY]
 
 
 def test_images_of_other_curves_have_no_consensus(generator: torch.Generator) -> None:

@@ -31,6 +31,10 @@ ones: of what was found for one curve in six views, or two in three, an eighth w
 more, nothing of 150."""
 _FLAT_STEPS = 30
 """Most steps of the homographies that are fitted for comparison: where they do not fit, their minimum does not matter."""
+_ROUGHLY, _CLOSELY = 0.3, 1e-3
+"""Part of their cost that may be left to gain, at first and where the answer is not clear then."""
+_CLEAR = 10.0
+"""Times more than the answer asks for, what is left roughly is clear: closely it was up to three times less."""
 
 
 def enough_shown(shown: Float[Tensor, "p c m"], view: Bool[Tensor, "p v"]) -> Bool[Tensor, "p"]:
@@ -86,7 +90,6 @@ def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor, anew
         anew: Whether to look for homographies by all curves but one, whichever that is, and to find this one's points by them:
             a fourth dimension may have been made of a curve of a plane whose points were put together wrongly.
     """
-    left = _left_by_planes_anew(images, found) if anew else _left_by_plane(images, found)
     end = found.end.end
     seen = found.measured.flatten(1)[:, None]
     n = seen.sum((-2, -1)).double()
@@ -94,32 +97,37 @@ def _flat(images: CurvePlaces, found: Found, v: Tensor, redundancy: Tensor, anew
     redundancy = redundancy.clamp(min=0).double()
     beyond = ((3 * v).double().sqrt() + n.sqrt()).square() - (3 * v + n - 7)
     of_noise = redundancy * redundancy / (redundancy + beyond).clamp(min=1) / flat_redundancy
+    left_by = _left_by_planes_anew if anew else _left_by_plane
     cost: Tensor = end.cost
-    return cost > of_noise / 3 * left
+    explained = of_noise / 3 * left_by(images, found, _ROUGHLY)
+    unclear = (cost <= explained) & (_CLEAR * cost > explained)
+    if bool(unclear.any()):
+        explained = torch.where(unclear, of_noise / 3 * left_by(images, found, _CLOSELY), explained)
+    return cost > explained
 
 
-def _by_plane(images: CurvePlaces, x: Scene, counts: Float[Tensor, "p v c m"]) -> Descent:
+def _by_plane(images: CurvePlaces, x: Scene, counts: Float[Tensor, "p v c m"], tolerance: float) -> Descent:
     """Homographies and points of a plane at the least squares of the distances that count."""
     seen = (counts.sum(1) > 0).flatten(1)[:, None]
     plane = eigh((x.u * seen) @ x.u.mT)[1][..., 1:]
     P, u = unit_frame(x.P @ plane[:, None], plane.mT @ x.u)
     flat = Scene(P, u, x.place)
-    return descend(pinned(images, counts, flat), flat, Options(_FLAT_STEPS, 1e-3))
+    return descend(pinned(images, counts, flat), flat, Options(_FLAT_STEPS, tolerance))
 
 
-def _left_by_plane(images: CurvePlaces, found: Found) -> Float[Tensor, "p"]:
-    left: Tensor = _by_plane(images, found.end.end.x, found.weight * found.measured[:, None]).cost
+def _left_by_plane(images: CurvePlaces, found: Found, tolerance: float) -> Float[Tensor, "p"]:
+    left: Tensor = _by_plane(images, found.end.end.x, found.weight * found.measured[:, None], tolerance).cost
     return left
 
 
-def _left_by_planes_anew(images: CurvePlaces, found: Found) -> Float[Tensor, "p"]:
+def _left_by_planes_anew(images: CurvePlaces, found: Found, tolerance: float) -> Float[Tensor, "p"]:
     """The least that is left by homographies that begin with those of all curves but one."""
     p, v, c, m = found.weight.shape
     each = torch.arange(p, device=found.weight.device).repeat_interleave(c)
     k = torch.arange(c, device=each.device).repeat(p)
     images, x, counts = pick((each,), (images, found.end.end.x, found.weight * found.measured[:, None]))
     own = torch.nn.functional.one_hot(k, c)[:, None, :, None] > 0
-    rest = _by_plane(images, x, torch.where(own, 0, counts)).x
+    rest = _by_plane(images, x, torch.where(own, 0, counts), tolerance).x
     # The curve's points in the plane, by the view that sees most of it; and those of its images next to theirs.
     row = torch.arange(len(each), device=each.device)
     view = counts[row, :, k].sum(-1).argmax(-1)
@@ -131,7 +139,7 @@ def _left_by_planes_anew(images: CurvePlaces, found: Found) -> Float[Tensor, "p"
     y = divide_safely(y[:, :, :2].movedim(2, -1), y[:, :, 2]).reshape(len(each), v, c, m, 2)
     place = torch.where(own, nearest_places(images, y), rest.place)
     flat = Scene(rest.P, u, place)
-    left: Tensor = descend(pinned(images, counts, flat), flat, Options(_FLAT_STEPS, 1e-3)).cost
+    left: Tensor = descend(pinned(images, counts, flat), flat, Options(_FLAT_STEPS, tolerance)).cost
     return left.view(p, c).amin(-1)
 
 
