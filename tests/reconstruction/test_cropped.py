@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from chance import seeded
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
@@ -18,6 +19,9 @@ from torchsfm.simulation import look_at, random_points, simulate_images
 
 SIZE = (1000, 750)
 MIDDLE = torch.tensor([499.5, 374.5], dtype=torch.float64)
+
+
+Crops = tuple[SfmResult, Pose, Tensor, tuple[Mapping, MappingOptions]]
 
 
 def photographs(
@@ -53,8 +57,23 @@ def angles(result: SfmResult, poses: Pose) -> Tensor:
     return pose_errors(result.model.poses, poses, result.model.registered).rotation
 
 
-def test_crops_of_one_camera(generator: torch.Generator) -> None:
-    result, poses, c = photographs(generator, torch.tensor([1200.0]).double(), share=0.2)
+@pytest.fixture(scope="module")
+def of_one_camera() -> Crops:
+    """Crops of one camera, and the first model that was asked whether principal points may be off the middle."""
+    asked: list[tuple[Mapping, MappingOptions]] = []
+
+    def remember(model: Mapping, options: MappingOptions) -> bool:
+        asked.append((model, options))
+        return may_be_off_centre(model, options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(growth, "may_be_off_centre", remember)
+        result, poses, c = photographs(seeded(), torch.tensor([1200.0]).double(), share=0.2)
+    return result, poses, c, asked[0]
+
+
+def test_crops_of_one_camera(of_one_camera: Crops) -> None:
+    result, poses, c, _ = of_one_camera
     assert bool(result.model.registered.all())
     assert float(angles(result, poses).max()) < 0.5
     (found,) = result.report.calibrations
@@ -83,17 +102,9 @@ def test_crops_of_a_plane_are_doubtful(generator: torch.Generator) -> None:
     assert all("one plane" in image.doubt for image in result.report.images)
 
 
-def test_photographs_of_one_size_are_not_taken_for_crops(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_of_one_size_are_not_taken_for_crops(of_one_camera: Crops) -> None:
     """Of a zoom lens, a bent structure moves principal points, and freeing them bends it more."""
-    asked: list[tuple[Mapping, MappingOptions]] = []
-
-    def remember(model: Mapping, options: MappingOptions) -> bool:
-        asked.append((model, options))
-        return may_be_off_centre(model, options)
-
-    monkeypatch.setattr(growth, "may_be_off_centre", remember)
-    photographs(generator, torch.tensor([1200.0]).double(), share=0.2)
-    model, options = asked[0]
+    model, options = of_one_camera[-1]
     assert may_be_off_centre(model, options)
     same = replace(model.graph, image_size=model.graph.image_size[:1].expand_as(model.graph.image_size))
     assert not may_be_off_centre(replace(model, graph=same), options)
