@@ -70,3 +70,16 @@ def test_threads_may_be_the_first_to_ask() -> None:
         "print(all(values == read(start) for start, values in zip(starts, found)))"
     )
     assert said_by(code) == "True"
+
+
+def test_no_compiler_is_imported() -> None:
+    program = (
+        "import sys, torch, torchsfm\n"
+        "x = torch.rand(3, 4, 2, dtype=torch.float64, requires_grad=True)\n"
+        "torchsfm.homography_4pt(x, torch.rand(3, 4, 2, dtype=torch.float64)).model.sum().backward()\n"
+        "d = torch.rand(2, 5, 3, dtype=torch.float64, requires_grad=True)\n"
+        "torchsfm.essential_5pt(d, torch.rand(2, 5, 3, dtype=torch.float64)).model.sum().backward()\n"
+        "assert 'torch._dynamo' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
