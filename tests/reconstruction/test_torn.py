@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -27,6 +28,12 @@ def told(model: Mapping) -> PairAgreement:
 
 def ring(stream: int) -> tuple[Mapping, Mapping, MappingOptions]:
     """A ball seen from all around, each side by few images: the model, and one torn so far that pairs contradict it."""
+    right, torn, options = _ring(stream)
+    return right, torn, replace(options, generator=seeded(stream))
+
+
+@cache
+def _ring(stream: int) -> tuple[Mapping, Mapping, MappingOptions]:
     g = seeded(stream)
     # In no order, so that of pairs across the tear either side comes first.
     turn = torch.randperm(VIEWS, generator=g)
