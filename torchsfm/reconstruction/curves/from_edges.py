@@ -18,6 +18,7 @@ from torchsfm.reconstruction.curves.edge_on import seen_edge_on
 from torchsfm.reconstruction.curves.fusion import fuse_pieces
 from torchsfm.reconstruction.curves.image_edges import ImageEdges
 from torchsfm.reconstruction.curves.noise import TRUSTED, measured_weights
+from torchsfm.reconstruction.curves.outlines import on_outlines
 from torchsfm.reconstruction.curves.pieces import Pieces, image_pieces
 from torchsfm.reconstruction.curves.tracks import track_samples
 from torchsfm.reconstruction.messages import Progress
@@ -55,7 +56,8 @@ def reconstruct_curves(
     side on the same side; of these the path of most votes is taken, and refined to the least squares of distances. Pieces from
     different images that lie on each other are averaged; what too few images found is dropped; the rest is linked.
 
-    Outlines of smooth surfaces are images of no one curve: pieces of them survive where surfaces are bent much.
+    Outlines of smooth surfaces are images of no one curve: what lines of sight touch on one side is left out (`on_outlines`).
+    Short pieces that three images show, or where surfaces are bent by less than ten pixels, survive.
 
     Args:
         images: The photographs, one after another, grey or red, green, blue; None for one that is missing.
@@ -211,6 +213,10 @@ def _shown_by(
 
     # After they have moved, what edges no longer run along is left behind.
     curves = tracked(settle_samples(tracked(curves), cameras, poses, threshold))
+    outline = on_outlines(curves, cameras, poses)
+    if bool(outline.any()):
+        curves = curves.runs_where(~outline)
+        curves = curves.select(curves.number >= _SHORTEST)
     return measured_weights(curves, edge_distances(poses, cameras, curves.bundle()))
 
 
