@@ -56,8 +56,8 @@ def reconstruct_curves(
     side on the same side; of these the path of most votes is taken, and refined to the least squares of distances. Pieces from
     different images that lie on each other are averaged; what too few images found is dropped; the rest is linked.
 
-    Outlines of smooth surfaces are images of no one curve: what lines of sight touch on one side is left out (`on_outlines`).
-    Short pieces that three images show, or where surfaces are bent by less than ten pixels, survive.
+    Outlines of smooth surfaces are images of no one curve. Where four images and more say so, as lines of sight do not meet
+    there but pass on one side, ten pixels and more away, they are left out; other pieces of them survive.
 
     Args:
         images: The photographs, one after another, grey or red, green, blue; None for one that is missing.

@@ -18,6 +18,8 @@ _ROUND = 10.0
 """and pixels in the images that it has at least: of paint on what is bent edges lie up to three aside, by shades."""
 _NEIGHBOURS = 3
 """Samples before and behind by which it is told: the middle one of all."""
+_OFF = 0.1
+"""Standard deviation of edges, pixels, at least: of few images some agree by chance."""
 _MEDIAN = 0.455
 """Of the square of one normal number."""
 _STEP = 1e-4
@@ -31,8 +33,8 @@ def on_outlines(curves: Curves, cameras: Camera, poses: Pose) -> Bool[Tensor, "n
 
     Seen along a curve in space, the lines of sight to it meet in a point. Where it is the outline of a smooth surface they
     touch that: all pass on one side of a point, as far away as the surface has its radius there (Giblin & Weiss 1987; Cipolla &
-    Blake 1992). So a point and a radius are fitted to the lines of sight of each sample, which three images determine. A radius
-    of few pixels, or of few standard deviations, is none: edges are rounded, and shades move them.
+    Blake 1992). So a point and a radius are fitted to the lines of sight of each sample, which three images determine and more
+    confirm. A radius of few pixels, or of few standard deviations, is none: edges are rounded, and shades move them.
 
     Args:
         curves: The curves, with edge points of the images.
@@ -40,12 +42,13 @@ def on_outlines(curves: Curves, cameras: Camera, poses: Pose) -> Bool[Tensor, "n
         poses: Of each image (v).
     """
     found = _radii(curves, cameras, poses)
-    some, known = found.left > 0, found.left >= 0
-    if not bool(some.any()):
-        return torch.zeros_like(known)
-    noise = (float((found.square / found.left)[some].median()) / _MEDIAN) ** 0.5
-    sure = _smoothed(torch.where(known, found.radius / (noise * found.deviation), torch.nan), curves.curve)
-    size = _smoothed(torch.where(known, found.radius / found.pixel, torch.nan), curves.curve)
+
+    def usual(values: Tensor) -> Tensor:
+        return _smoothed(torch.where(found.left > 0, values, torch.nan), curves.curve)
+
+    # Edges of other curves may be off by more.
+    noise = (usual(found.square / found.left) / _MEDIAN).sqrt().clamp(min=_OFF)
+    sure, size = usual(found.radius / (noise * found.deviation)), usual(found.radius / found.pixel)
     return (sure.abs() > _SURE) & (size.abs() > _ROUND)
 
 
