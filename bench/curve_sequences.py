@@ -41,6 +41,7 @@ class Sequence:
     images: Tensor
     poses: Pose
     camera: Camera
+    scene: TexturedScene
 
 
 def smooth_sequence(number: int, frames: int, step: float = 3.0) -> Sequence:
@@ -72,7 +73,7 @@ def smooth_sequence(number: int, frames: int, step: float = 3.0) -> Sequence:
         ).images
         for i in range(frames)
     ]  # fmt: skip
-    return Sequence(torch.cat(images), poses, camera)
+    return Sequence(torch.cat(images), poses, camera, scene)
 
 
 def rotation_errors(found: Pose, truth: Pose) -> Tensor:
