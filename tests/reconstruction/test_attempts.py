@@ -112,3 +112,30 @@ def test_a_model_in_doubt_is_made_again_all_at_once(monkeypatch: pytest.MonkeyPa
     assert run().report.method == "global"
     undoubted["incremental"] = 5
     assert run().report.method == "incremental"
+
+
+def test_pairs_that_were_given_up_are_asked_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images that stand elsewhere are doubtful, though what joins them to the others was taken for copies of it."""
+    made: list[Attempt] = []
+    of = Attempt.of
+
+    def kept(graph: ViewGraph, wanted: Wanted, growth: Growth) -> Attempt:
+        made.append(of(graph, wanted, growth))
+        return made[-1]
+
+    monkeypatch.setattr(Attempt, "of", kept)
+    run, _ = chain(1, 60)
+    run()
+    attempt = made[0]
+    (one,) = attempt.components
+    model, apart = one.model, torch.arange(VIEWS) < 3
+    turn = rotation_from_euler(torch.where(apart, 0.7, 0.0)[:, None].double(), "y")
+    across = apart[attempt.graph.pairs].sum(1) == 1
+    moved = replace(
+        model,
+        graph=attempt.graph.only(~across),
+        poses=replace(model.poses, R=model.poses.R @ turn),
+        point=torch.where(apart[model.graph.view], -1, model.point),
+    )
+    standing, _ = attempt.judge(one.moved(moved))
+    assert [("contradict how it stands" in doubt) for doubt in standing.doubt] == apart.tolist()

@@ -58,6 +58,7 @@ def examine(
     conflicts: Conflicts | None = None,
     agreement: PairAgreement | None = None,
     elsewhere: Int[Tensor, "v"] | None = None,
+    outvoted: Bool[Tensor, "v"] | None = None,
     flat: bool = False,
     rival: Float[Tensor, "v"] | None = None,
 ) -> Standing:
@@ -73,6 +74,7 @@ def examine(
         conflicts: What missing correspondences say of this model where that is known; else it is found.
         agreement: How all pairs agree with this model where that is known; else it is found.
         elsewhere: How many verified matches each image has with images of other models.
+        outvoted: Images that pairs which were given up contradict, see `outvoted_groups`.
         flat: Whether most pairs of images that seem to be cropped show little besides one plane, see `crops_of_one_plane`.
         rival: The focal length that explains each of few images nearly as well, in pixels; not a number where none does.
     """
@@ -86,8 +88,9 @@ def examine(
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
     matches, agreeing = (agreement.per_view(one > 0, n, v) for n in (agreement.matches, agreement.agreeing))
     explained, verified = int(agreement.agreeing.sum()), int(agreement.matches.sum())
-    outvoted = agreement.balance(v) < 0
+    misplaced = agreement.balance(v) < 0
     hinged = outvoted_groups(agreement, mapping.registered)
+    hinged = hinged if outvoted is None else hinged | outvoted
     hanging = hanging_groups(agreement, mapping.registered, hinges(agreement, mapping))
     conflicts = conflicts or missing_correspondences(mapping)
     refuted, folded = conflicts.refuted, conflicts.folded
@@ -106,7 +109,7 @@ def examine(
             return (
                 "nothing that stands in one place alone connects it with the rest, and things that look alike stand in several"
             )
-        if bool(outvoted[i]):
+        if bool(misplaced[i]):
             return f"{int(contradicting[i])} pairs of images contradict its place, {int(supporting[i])} agree with it"
         if bool(hinged[i]):
             return (
