@@ -49,7 +49,7 @@ def test_a_zoom_lens(generator: torch.Generator) -> None:
 
 def test_models_decide_where_pairs_mislead(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lens that distorts and is off the middle makes pairs look as if focal lengths differed."""
-    monkeypatch.setattr(growth, "part_zoomed", lambda graph, camera_index, told: (torch.arange(len(camera_index)), 1.01))
+    monkeypatch.setattr(growth, "part_zoomed", lambda graph, camera_index, *told: (torch.arange(len(camera_index)), 1.01))
     model = photographs(torch.full((7,), 900.0, dtype=torch.float64), (559.5, 344.5), -0.2, generator).model
     assert model.registered.all()
     assert len(model.cameras.K) == 1
