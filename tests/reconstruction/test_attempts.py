@@ -137,5 +137,5 @@ def test_pairs_that_were_given_up_are_asked_too(monkeypatch: pytest.MonkeyPatch)
         poses=replace(model.poses, R=model.poses.R @ turn),
         point=torch.where(apart[model.graph.view], -1, model.point),
     )
-    standing, _ = attempt.judge(one.moved(moved))
+    standing, _ = attempt.judge(one.moved(moved.compacted()))
     assert [("contradict how it stands" in doubt) for doubt in standing.doubt] == apart.tolist()
