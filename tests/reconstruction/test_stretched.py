@@ -72,6 +72,14 @@ def test_square_pixels_are_square_and_known_cameras_are_not_asked(monkeypatch: p
     asked.assert_called_once()
 
 
+def test_two_images_are_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their focal length is the first guess, and a ratio would make up for what that is off."""
+    answers: list[float | None] = []
+    monkeypatch.setattr(attempts, "apparent_aspect", lambda *given: answers.append(apparent_aspect(*given)))
+    reconstructed(0.85, views=2)
+    assert answers == [None]
+
+
 def test_faults_of_another_kind_are_not_taken_for_a_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the ratio is next to one, or explains little more, it stays one."""
     assert aspect_of(reconstructed(1.01)[0]) == 1

@@ -16,7 +16,7 @@ ANY = 1.0
 """Standard deviation of a ratio of focal lengths of which nothing is known."""
 STRETCHED, MUST_GAIN = 0.02, 0.04
 """A ratio off by less, or which lowers the cost by a smaller part, comes of other faults of a model as well."""
-ENOUGH: dict[str, Any] = {"max_iterations": 20, "tolerance": 1e-4}
+ENOUGH: dict[str, Any] = {"max_iterations": 20, "tolerance": 1e-3}
 """How far to adjust before the ratio is looked at."""
 
 
@@ -27,9 +27,10 @@ def apparent_aspect(mapping: Mapping, prior: CameraPrior) -> float | None:
         mapping: A finished model with square pixels.
         prior: What was expected of its cameras.
     """
-    if mapping.adjustment is None or not mapping.adjustment.free:
+    images, free = images_of_cameras(mapping), {} if mapping.adjustment is None else mapping.adjustment.free
+    if "focal" not in free or not bool(free["focal"][images > 0].all()):
+        # What does not tell the focal length tells no ratio of two: it would make up for one that is wrong.
         return None
-    images, free = images_of_cameras(mapping), mapping.adjustment.free
     wide = prior.widened("aspect", ANY)
     # Both go as far, so that what they differ by is the ratio's.
     before = adjust(mapping, free=free, prior=wide, **ENOUGH)
