@@ -12,6 +12,7 @@ from torch import Tensor
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
 from torchsfm.motion.many_views.components import components
+from torchsfm.reconstruction.evidence.consistency import pair_agreement
 from torchsfm.reconstruction.evidence.distinctive import Backbone, Distinctiveness
 from torchsfm.reconstruction.evidence.doubt import examine
 from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
@@ -172,6 +173,30 @@ def test_what_contradicts_the_most_distinctive_relations_is_doubted(
     assert unfolded.uncertain.any()
 
 
+def test_what_distinctive_relations_give_again_was_refuted_by_chance(
+    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A right model that is refuted once, and not when its backbone gives it again, is kept and leaves no image uncertain."""
+    empty, truth, true = street(generator, apart=8.0)
+    graph = empty.graph.only(true)
+    right = replace(empty, graph=graph, track=build_tracks(graph.view, graph.match))
+    model, asked = mapped(right), []
+    chance = Conflicts(torch.tensor([[0, 1], [1, 2]]), torch.tensor([12.0, 12.0]).double(), 10.0, torch.arange(VIEWS))
+
+    def refuted_at_first(model: Mapping) -> Conflicts:
+        asked.append(model)
+        return chance if len(asked) == 1 else replace(chance, score=torch.tensor([12.0, 9.0]).double())
+
+    monkeypatch.setattr(unfolding, "missing_correspondences", refuted_at_first)
+    unfolded = unfold(right, model, right.registered, options(right), quiet)
+    assert chance.folded
+    assert len(asked) == 2
+    assert unfolded.model is model
+    assert not unfolded.conflicts.folded
+    assert not unfolded.uncertain.any()
+    assert wrong_cameras(asked[1], truth) == 0
+
+
 def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) -> None:
     empty, truth, true = street(generator, apart=8.0)
     across = (empty.graph.pairs < VIEWS // 2).sum(1) == 1
@@ -316,7 +341,9 @@ def test_no_image_is_given_up_for_less_than_a_fold(generator: torch.Generator, m
 
     def found(model: Mapping, *score: float) -> Unfolded:
         conflicts = Conflicts(pairs, torch.tensor(score, dtype=torch.float64), 10.0, place)
-        return Unfolded(model, ~everything, conflicts, 1.0)
+        # None of the pairs that agree with the first model agree with these.
+        other = pair_agreement(model, threshold=4.0, poses_alone=True)
+        return Unfolded(model, ~everything, conflicts, 1.0, replace(other, agreeing=0 * other.agreeing))
 
     better = found(whole, 10.1, 0.0)
     monkeypatch.setattr(unfolding, "missing_correspondences", lambda _: found(whole, 12.0, 12.0).conflicts)

@@ -30,12 +30,14 @@ class Unfolded:
         uncertain: Images that hang on a relation which contradicts the model, or is no more distinctive than false ones are.
         conflicts: What missing correspondences say of it.
         support: How distinctive the pairs are together that agree with it.
+        agreement: All pairs of images beside it.
     """
 
     model: Mapping
     uncertain: Bool[Tensor, "v"]
     conflicts: Conflicts
     support: float
+    agreement: PairAgreement
 
 
 def unfold(
@@ -69,16 +71,27 @@ def unfold(
     agreement = pair_agreement(replace(model, graph=graph), threshold=options.reprojection, poses_alone=True)
     contradicted = agreement.index[agreement.contradicts & backbone.chosen[agreement.index]]
     uncertain = _hanging_on(backbone, contradicted, model.registered)
-    first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, distinct.weight))
+    first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, distinct.weight), agreement)
     if not len(contradicted) and not first.conflicts.folded:
         return first
     for trial in _trials(empty, distinct, elsewhere, options, progress, grow):
+        if not trial.conflicts.folded and not len(contradicted) and _alike(trial, first):
+            # The most distinctive relations alone give the same model, and refute nothing: chance had refuted it.
+            return replace(first, conflicts=trial.conflicts)
         # Less than a fold is no reason to give images up.
         complete = int(trial.model.registered.sum()) >= int(best.model.registered.sum())
         better = (trial.conflicts.strength, -trial.support) < (best.conflicts.strength, -best.support)
         if better and (complete or best.conflicts.folded):
             best = trial
     return best
+
+
+def _alike(one: Unfolded, other: Unfolded) -> bool:
+    """Whether two models have the same images, and no pair of these that agrees with the one contradicts the other."""
+    if not torch.equal(one.model.registered, other.model.registered):
+        return False
+    a, b = one.agreement, other.agreement
+    return not bool(((a.supports & b.contradicts) | (a.contradicts & b.supports)).any())
 
 
 def _support(agreement: PairAgreement, weight: Float[Tensor, "q"]) -> float:
@@ -156,7 +169,7 @@ def _trials(
         doubtful = suspected | imitated(distinct, backbone, false, grown.registered)
         uncertain = _hanging_on(backbone, (backbone.chosen & doubtful).nonzero()[:, 0], grown.registered)
         model = _with_pairs(grown, graph, _agreeing(agreement, ~refuted))
-        yield Unfolded(model, uncertain, conflicts, _support(agreement, weight))
+        yield Unfolded(model, uncertain, conflicts, _support(agreement, weight), agreement)
         if not any(ways):
             return
         refuted = refuted | _given_up(backbone, weight, ways, agreement, v)
