@@ -9,18 +9,19 @@ from chance import seeded
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchsfm.geometry import Camera, Pose, intrinsics
+from torchsfm.geometry import Camera, Pose, intrinsics, rotation_from_euler
 from torchsfm.geometry.distortion import Radial
 from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import pair_agreement
 from torchsfm.reconstruction.evidence.distinctive import Backbone, Distinctiveness
 from torchsfm.reconstruction.evidence.doubt import examine
+from torchsfm.reconstruction.evidence.groups import outvoted_groups
 from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
 from torchsfm.reconstruction.mappers import unfold as unfolding
 from torchsfm.reconstruction.mappers.beginning import grow_by
 from torchsfm.reconstruction.mappers.incremental import MappingOptions, grow_model
 from torchsfm.reconstruction.mappers.settle import settle
-from torchsfm.reconstruction.mappers.unfold import Unfolded, hanging_on_copies, imitated, unfold
+from torchsfm.reconstruction.mappers.unfold import Unfolded, hanging_on_copies, imitated, outvoted_by_rivals, unfold
 from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.mapping.tracks import build_tracks
@@ -214,6 +215,21 @@ def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) 
     uncertain = hanging_on_copies(thin, unfolded.model, ~own, threshold=4.0)
     assert uncertain.any()
     assert not uncertain[~own].any()
+
+
+def test_only_pairs_as_distinctive_as_those_believed_say_how_groups_stand(generator: torch.Generator) -> None:
+    empty, truth, true = street(generator, apart=8.0)
+    graph = empty.graph.only(true)
+    model = mapped(replace(empty, graph=graph, track=build_tracks(graph.view, graph.match)))
+    assert wrong_cameras(model, truth) == 0
+    # Matches of copies with each other would outvote the right ones.
+    assert outvoted_groups(pair_agreement(replace(model, graph=empty.graph), threshold=4.0), model.registered).any()
+    assert not outvoted_by_rivals(empty.graph, model, threshold=4.0).any()
+    apart = torch.arange(VIEWS) < 4
+    turn = rotation_from_euler(torch.where(apart, 0.4, 0.0)[:, None].double(), "y")
+    poses = replace(model.poses, R=model.poses.R @ turn)
+    bent = replace(model, poses=poses, point=torch.where(apart[model.graph.view], -1, model.point)).compacted()
+    assert torch.equal(outvoted_by_rivals(empty.graph, bent, threshold=4.0), apart)
 
 
 @pytest.mark.parametrize("rival", [0.5, 0.95, 1.05])

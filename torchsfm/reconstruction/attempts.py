@@ -12,11 +12,11 @@ from torchsfm.linalg import nearest_rotation
 from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import pair_agreement
 from torchsfm.reconstruction.evidence.doubt import WRONG_ANGLE, Standing, examine
-from torchsfm.reconstruction.evidence.groups import hinges, outvoted_groups
+from torchsfm.reconstruction.evidence.groups import hinges
 from torchsfm.reconstruction.lenses import FISHEYE, explains_better, may_be_fisheye
 from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
 from torchsfm.reconstruction.mappers.growth import Component, Given, Growth, Wanted
-from torchsfm.reconstruction.mappers.unfold import hanging_on_copies
+from torchsfm.reconstruction.mappers.unfold import hanging_on_copies, outvoted_by_rivals
 from torchsfm.reconstruction.mapping.adjust import LOSS
 from torchsfm.reconstruction.mapping.calibration import (
     ENOUGH,
@@ -66,11 +66,7 @@ class Attempt:
             uncertain = uncertain | hanging_on_copies(self.graph, model, others, threshold=threshold)
         # Where nothing tells whether images are cropped, cameras are as uncertain as if they were.
         widest = replace(options, cropped=options.cropped or component.off_centre).prior(model)
-        # What was given up as matches of like things may be of one thing: all pairs are asked.
-        outvoted: Bool[Tensor, "v"] | None = None
-        if model.graph is not self.graph:
-            everything = pair_agreement(replace(model, graph=self.graph), threshold=threshold)
-            outvoted = outvoted_groups(everything, model.registered)
+        outvoted = None if model.graph is self.graph else outvoted_by_rivals(self.graph, model, threshold=threshold)
         # What few wrong matches of two views hold fast is not known: deviations are those that longer tracks leave.
         weights = observation_weights(model, LOSS, enough=ENOUGH_OF_FEW if int(model.registered.sum()) <= FEW else ENOUGH)
         standing = examine(

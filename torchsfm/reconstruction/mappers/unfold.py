@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsfm.reconstruction.evidence.consistency import PairAgreement, pair_agreement
 from torchsfm.reconstruction.evidence.distinctive import Backbone, Distinctiveness
+from torchsfm.reconstruction.evidence.groups import outvoted_groups
 from torchsfm.reconstruction.evidence.missing import Conflicts, missing_correspondences
 from torchsfm.reconstruction.mappers.incremental import MappingOptions, extend_model, grow_model
 from torchsfm.reconstruction.mapping.mapping import Mapping
@@ -108,13 +109,40 @@ def hanging_on_copies(graph: ViewGraph, model: Mapping, others: Bool[Tensor, "v"
         threshold: Largest reprojection error of an observation, in pixels.
     """
     distinct = Distinctiveness.of(graph)
-    agreement = pair_agreement(replace(model, graph=graph), threshold=threshold, poses_alone=True)
-    supports = torch.zeros(len(graph.pairs), dtype=torch.bool)
-    supports[agreement.index] = agreement.supports
-    backbone = Backbone.of(graph.pairs, torch.where(supports, distinct.weight, 0.0), len(graph.names))
+    backbone = _agreeing_backbone(
+        distinct, graph, pair_agreement(replace(model, graph=graph), threshold=threshold, poses_alone=True)
+    )
     given_up = model.registered[graph.pairs].any(1) & others[graph.pairs].any(1)
     doubtful = backbone.chosen & imitated(distinct, backbone, given_up, model.registered)
     return _hanging_on(backbone, doubtful.nonzero()[:, 0], model.registered)
+
+
+def outvoted_by_rivals(graph: ViewGraph, model: Mapping, *, threshold: float) -> Bool[Tensor, "v"]:
+    """The images of a model whose place pairs contradict that are as distinctive as those which the model believes instead.
+
+    What was given up as matches of like things may be of one thing. All pairs are asked how groups of images stand to each
+    other, but for those that are less distinctive, by more than chance, than each relation on the way between their images.
+
+    Args:
+        graph: All pairs of images, those that were given up among them.
+        model: The model.
+        threshold: Largest reprojection error of an observation, in pixels.
+    """
+    distinct, agreement = Distinctiveness.of(graph), pair_agreement(replace(model, graph=graph), threshold=threshold)
+    backbone, rival = _agreeing_backbone(distinct, graph, agreement), ~agreement.contradicts
+    for k in agreement.contradicts.nonzero()[:, 0].tolist():
+        q, way = int(agreement.index[k]), backbone.way(*agreement.pairs[k].tolist())
+        scatter = (distinct.variance[way] + distinct.variance[q]).sqrt()
+        rival[k] = bool((distinct.weight[q] > distinct.weight[way] - scatter).any()) or not way
+    asked = (field[rival] for field in (agreement.pairs, agreement.matches, agreement.agreeing, agreement.index))
+    return outvoted_groups(PairAgreement(*asked), model.registered)
+
+
+def _agreeing_backbone(distinct: Distinctiveness, graph: ViewGraph, agreement: PairAgreement) -> Backbone:
+    """The most distinctive of the pairs that agree with a model."""
+    supports = torch.zeros(len(graph.pairs), dtype=torch.bool)
+    supports[agreement.index] = agreement.supports
+    return Backbone.of(graph.pairs, torch.where(supports, distinct.weight, 0.0), len(graph.names))
 
 
 def imitated(
