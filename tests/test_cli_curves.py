@@ -10,6 +10,7 @@ from command_line import assert_one_line, torchsfm
 from painted_box import SIZE, camera, orbit, photograph, true_curves
 
 from torchsfm.formats import read_ply, write_colmap
+from torchsfm.geometry import Pose
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction
 
@@ -46,7 +47,7 @@ def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("model", ["model.npz", "colmap"])
 def test_curves_of_a_box(box: Path, model: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    status, stdout, _ = torchsfm("curves", box / "images", "--poses", box / model, "--out", out)
+    status, stdout, stderr = torchsfm("curves", box / "images", "--poses", box / model, "--out", out)
     assert status == 0
     assert f"{VIEWS} of {VIEWS} images" in stdout
     X = read_ply(out / "curves.ply").X
@@ -55,6 +56,8 @@ def test_curves_of_a_box(box: Path, model: str, tmp_path: Path) -> None:
     records = json.loads((out / "curves.json").read_text())["curves"]
     assert {record["closed"] for record in records} == {False, True}
     assert f"{len(records)} curves" in (out / "page.html").read_text()
+    assert "poses" not in stderr.replace("checking the poses", "")
+    assert "doubtful" not in stderr
 
 
 def test_images_may_be_smaller_than_the_model_says_or_missing(box: Path, tmp_path: Path) -> None:
@@ -108,3 +111,23 @@ def test_no_curves(box: Path, tmp_path: Path) -> None:
     assert status == 1
     assert "no curves found" in stderr
     assert "0 curves" in stdout
+
+
+def test_wrong_poses_are_told(box: Path, tmp_path: Path) -> None:
+    """Few curves came out, and no word. Of one image with the pose of another it is said, and where the page shows it."""
+    model = Reconstruction.load(box / "model.npz")
+    R, t = model.poses.R.clone(), model.poses.t.clone()
+    R[2], t[2] = R[3], t[3]
+    replace(model, poses=Pose(R, t)).save(tmp_path / "one.npz")
+    status, stdout, stderr = torchsfm("curves", box / "images", "--poses", tmp_path / "one.npz", "--out", tmp_path / "out")
+    assert status == 0
+    assert_one_line("\n".join(line for line in stderr.splitlines() if "..." not in line), "doubtful: view2.png (it shows ")
+    assert "1 doubtful image, drawn in red" in (tmp_path / "out" / "page.html").read_text()
+    replace(model, poses=model.poses[torch.tensor([3, 6, 1, 4, 7, 2, 5, 0])]).save(tmp_path / "all.npz")
+    words = ("--poses", tmp_path / "all.npz", "--out", tmp_path / "other", "--json")
+    status, stdout, stderr = torchsfm("curves", box / "images", *words)
+    assert status == 1
+    record = json.loads(stdout)
+    assert not record["poses_fit"]
+    assert len(record["doubts"]) == 1
+    assert record["doubts"][0] in stderr

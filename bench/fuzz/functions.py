@@ -598,6 +598,7 @@ EXCEPTIONS: dict[str, str] = {
     **{f"reconstruction.{name}": "takes a whole model; tests of models spoil it" for name in (
         "adjust_to_points", "align_models", "align_to_gps", "align_to_ground", "align_to_points", "align_to_positions",
         "align_upright", "merge_models", "part_of_model", "up_direction")},
+    "reconstruction.check_poses": "photographs one after another, and seconds",
     "reconstruction.reconstruct_curves": "photographs one after another, and seconds",
     "reconstruction.reconstruct": "photographs; its stages are tried by reconstruct_tracks",
     "reconstruction.register_photographs": "photographs; tests/test_register.py spoils them",

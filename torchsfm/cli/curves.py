@@ -15,11 +15,15 @@ from torchsfm.cli.output import output_folder, replacing_results
 from torchsfm.formats import write_curves
 from torchsfm.formats.problem import as_reconstruction
 from torchsfm.formats.registry import read_model_or_problem
+from torchsfm.geometry import Camera, Pose
 from torchsfm.images import MAX_PIXELS, ImageError, read_image
 from torchsfm.plot import write_page
-from torchsfm.reconstruction import Curves, Reconstruction, reconstruct_curves
+from torchsfm.reconstruction import Curves, ImageReport, PoseCheck, Reconstruction, Report
 from torchsfm.reconstruction.curves.find_curves import scaled
-from torchsfm.reconstruction.messages import printable
+from torchsfm.reconstruction.curves.from_edges import SeenEdges, curves_of_edges, edges_of_images
+from torchsfm.reconstruction.curves.pose_check import check_by_edges
+from torchsfm.reconstruction.messages import Progress, printable
+from torchsfm.reconstruction.report import pair_report
 
 
 def curves(
@@ -34,7 +38,10 @@ def curves(
     max_pixels: Annotated[int, typer.Option(min=1, help="Leave out images that have more pixels.")] = MAX_PIXELS,
     threads: Annotated[int | None, typer.Option(min=1, help="Processor threads; all by default.")] = None,
 ) -> None:
-    """Find the curves in space whose images are the edges of photographs with known cameras."""
+    """Find the curves in space whose images are the edges of photographs with known cameras.
+
+    Where the poses do not fit the photographs, or those of some images do not, that is said.
+    """
     with told(Job(out)) as job, output_folder(out):
         job.set_threads(threads)
         model = load(poses)
@@ -49,29 +56,60 @@ def curves(
         files = [file for file, found in zip(files, there, strict=True) if found]
         read: list[bool] = []
         share = shares(model.image_size[known], max_size)
-        found = reconstruct_curves(
-            photographs(files, model.image_size[known], max_size, max_pixels, read),
-            scaled(model.cameras[model.camera_index[known]], share),
-            model.poses[known],
-            points=model.X[torch.isfinite(model.X).all(-1)],
-            neighbours=neighbours,
-            threshold=threshold,
-            progress=job.progress,
-        )
+        pixels = photographs(files, model.image_size[known], max_size, max_pixels, read)
+        found, check = find(
+            pixels, scaled(model.cameras[model.camera_index[known]], share), model.poses[known],
+            model.X[torch.isfinite(model.X).all(-1)], neighbours, threshold, job.progress,
+        )  # fmt: skip
         found = found.in_images(known, 1 / share)
+        names = [model.names[i] for i in known.tolist()]
         job.progress("write", 0, 1)
         with replacing_results(out) as folder:
-            written = write(found, model, images, folder, max_pixels)
+            written = write(found, model, images, folder, max_pixels, told_of(check, names))
         job.progress("write", 1, 1)
         job.close()
         number, length = len(found), float(found.length().sum())
         typer.echo(f"{number} curves of length {length:.6g} in all, from {sum(read)} of {model.num_registered} images")
-        job.voice.record.update(curves=number, length=length, files=[str(out / name) for name, _ in written])
+        doubts = [printable(line) for line in check.doubts(names)]
+        job.voice.record.update(
+            curves=number, length=length, poses_fit=not doubts, doubts=doubts, files=[str(out / name) for name, _ in written]
+        )
         for name, what in written:
             typer.echo(f"{out / name}  {what}")
+        for line in doubts:
+            typer.echo(f"torchsfm: {line}", err=True)
         if not number:
             job.fail("no curves found")
+        elif check.refuted:
+            job.voice.record["error"] = doubts[0]
+        if check.refuted or not number:
             raise typer.Exit(NOTHING)
+
+
+def find(
+    images: Iterator[Tensor | None],
+    cameras: Camera,
+    poses: Pose,
+    points: Float[Tensor, "n 3"],
+    neighbours: int,
+    threshold: float,
+    progress: Progress,
+) -> tuple[Curves, PoseCheck]:
+    """`reconstruct_curves` and `check_poses`, with edges found once."""
+    edges, size = edges_of_images(images, len(poses.R), progress)
+    seen = SeenEdges.of(edges, size, cameras)
+    found = curves_of_edges(
+        edges, size, cameras, poses, points=points, neighbours=neighbours, threshold=threshold, seen=seen, progress=progress
+    )
+    check = check_by_edges(seen, size, cameras, poses, found, points=points, neighbours=neighbours, progress=progress)
+    return found, check
+
+
+def told_of(check: PoseCheck, names: list[str]) -> Report:
+    """What the page tells of the images."""
+    images = tuple(ImageReport(name, 0, doubt=doubt) for name, doubt in zip(names, check.image_doubts(), strict=True))
+    none = torch.zeros(0, dtype=torch.long)
+    return Report(images, pair_report(none.reshape(0, 2), none, none, none, none), {})
 
 
 def load(path: Path) -> Reconstruction:
@@ -118,7 +156,9 @@ def photographs(
         yield photograph.pixels
 
 
-def write(found: Curves, model: Reconstruction, images: Path, folder: Path, max_pixels: int) -> list[tuple[str, str]]:
+def write(
+    found: Curves, model: Reconstruction, images: Path, folder: Path, max_pixels: int, report: Report
+) -> list[tuple[str, str]]:
     """Write the curves in all forms; names and what they are."""
     write_curves(found, folder / "curves.ply")
     write_curves(found, folder / "curves.json")
@@ -127,7 +167,7 @@ def write(found: Curves, model: Reconstruction, images: Path, folder: Path, max_
     shown = replace(
         model, X=found.X.to(model.X), color=found.color.to(model.X), x=model.x[:0], view=none, point=none, curves=found
     )
-    write_page(shown, folder / "page.html", title="Curves", images=images, max_pixels=max_pixels)
+    write_page(shown, folder / "page.html", title="Curves", report=report, images=images, max_pixels=max_pixels)
     return [
         ("page.html", "open it in a browser and turn the curves with the mouse"),
         ("curves.ply", "samples, coloured, and edges between them"),

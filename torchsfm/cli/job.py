@@ -47,6 +47,7 @@ LABELS = {
     "motion": "finding what moves where",
     "follow": "following edges through images",
     "curves": "finding curves in space",
+    "poses": "checking the poses",
     "write": "writing results",
     "pictures": "writing pictures",
 }

@@ -7,6 +7,7 @@ stand beside them.
 """
 
 from torchsfm.reconstruction.curves.from_edges import reconstruct_curves
+from torchsfm.reconstruction.curves.pose_check import PoseCheck, check_poses
 from torchsfm.reconstruction.known_poses import triangulate_photographs
 from torchsfm.reconstruction.localise import register_photographs
 from torchsfm.reconstruction.matched import MatchedImages, reconstruct_matches
@@ -43,6 +44,7 @@ __all__ = [
     "MatchedImages",
     "MergedModel",
     "PairReport",
+    "PoseCheck",
     "Reconstruction",
     "ReconstructionError",
     "Report",
@@ -55,6 +57,7 @@ __all__ = [
     "align_to_points",
     "align_to_positions",
     "align_upright",
+    "check_poses",
     "merge_models",
     "part_of_model",
     "reconstruct",

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -35,6 +36,20 @@ _AGREE = 4
 """Images, the followed one included, that must see a sample."""
 _SETTLED, _STEPS = 2, 5
 """Rounds in which samples come to the least squares of all edges that show them, and the most steps of each."""
+
+
+class SeenEdges(NamedTuple):
+    """The edges of images that their lenses show."""
+
+    kept: list[ImageEdges]
+    maps: MapsOfImages
+    """Where they are without distortion."""
+
+    @classmethod
+    def of(cls, edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera) -> "SeenEdges":
+        """Those of images of which `size` is the largest height and width."""
+        seen = [own.seen_by(cameras[i]) for i, own in enumerate(edges)]
+        return cls([own for own, _ in seen], MapsOfImages([straight for _, straight in seen], size))
 
 
 @on_the_cpu
@@ -83,32 +98,44 @@ def reconstruct_curves(
         >>> found.X.shape[-1], len(found) > 0, bool((found.support() >= 2).float().mean() > 0.9)
         (3, True, True)
     """
-    check_tensors(K=(cameras.K, "3 3"), R=(poses.R, "3 3"), t=(poses.t, "3"))
-    check_options(
-        neighbours=(neighbours, "int >= 1"), threshold=(threshold, "float > 0"), least_images=(least_images, "int >= 1")
-    )
+    check_views(cameras, poses, neighbours=neighbours)
+    check_options(threshold=(threshold, "float > 0"), least_images=(least_images, "int >= 1"))
     report = progress or (lambda stage, done, total: None)
+    edges, size = edges_of_images(images, len(poses.R), report)
+    return curves_of_edges(
+        edges, size, cameras, poses, points=points, neighbours=neighbours, threshold=threshold,
+        least_images=least_images, progress=report,
+    )  # fmt: skip
+
+
+def check_views(cameras: Camera, poses: Pose, *, neighbours: int) -> None:
+    """Raise where cameras and poses are not one of each for every image."""
+    check_tensors(K=(cameras.K, "3 3"), R=(poses.R, "3 3"), t=(poses.t, "3"))
+    check_options(neighbours=(neighbours, "int >= 1"))
     v = len(poses.R)
     if poses.R.shape != (v, 3, 3) or cameras.K.shape != (v, 3, 3):
         raise ValueError(
             f"cameras, poses: wanted one of each for every image, got {tuple(cameras.K.shape[:-2])} and {tuple(poses.shape)}"
         )
+
+
+def edges_of_images(
+    images: Iterable[Float[Tensor, "c h w"] | None], number: int, progress: Progress
+) -> tuple[list[ImageEdges], tuple[int, int]]:
+    """The edges of so many images, and the largest height and width."""
     edges = []
     height = width = 8
     for i, image in enumerate(images):
-        report("edges", i, v)
-        if i >= v:
-            raise ValueError(f"images: wanted {v}, as many as cameras, got more")
+        progress("edges", i, number)
+        if i >= number:
+            raise ValueError(f"images: wanted {number}, as many as cameras, got more")
         if image is not None:
             height, width = max(height, image.shape[-2]), max(width, image.shape[-1])
         edges.append(ImageEdges.none() if image is None else ImageEdges.of(image))
-    report("edges", v, v)
-    if len(edges) != v:
-        raise ValueError(f"images: wanted {v}, as many as cameras, got {len(edges)}")
-    return curves_of_edges(
-        edges, (height, width), cameras, poses, points=points, neighbours=neighbours, threshold=threshold,
-        least_images=least_images, progress=report,
-    )  # fmt: skip
+    progress("edges", number, number)
+    if len(edges) != number:
+        raise ValueError(f"images: wanted {number}, as many as cameras, got {len(edges)}")
+    return edges, (height, width)
 
 
 def curves_of_edges(
@@ -122,6 +149,7 @@ def curves_of_edges(
     threshold: float = 2.0,
     least_images: int = 3,
     finders_alone: bool = False,
+    seen: SeenEdges | None = None,
     progress: Progress,
 ) -> Curves:
     """`reconstruct_curves` from the edges of images, of which `size` is the largest height and width.
@@ -129,10 +157,10 @@ def curves_of_edges(
     With `finders_alone` samples are shown by images alone whose own edges led there, for cameras that are to be adjusted by
     them. Elsewhere samples are behind something, next to its edges by chance, or on the rim of what is round, where every curve
     runs along the outline and lies inside of it: a third of all edges of smooth objects, and off alike. Where cameras are right
-    already, samples are somewhat better by all edges.
+    already, samples are somewhat better by all edges. `seen` are the edges by these cameras, where they are known.
     """
     v = len(edges)
-    kept, maps = _seen_by(edges, size, cameras)
+    kept, maps = seen or SeenEdges.of(edges, size, cameras)
     P = cameras.K.double() @ poses.matrix().double()
     around = neighbouring_views(P, size, None if points is None else points.double(), neighbours)
     pieces = []
@@ -180,13 +208,7 @@ def curves_of_other_cameras(
     Images that did not show a sample before do not show it now.
     """
     shown = curves.sample * len(edges) + curves.view
-    return _shown_by(curves, shown, *_seen_by(edges, size, cameras), cameras, poses, threshold)
-
-
-def _seen_by(edges: Sequence[ImageEdges], size: tuple[int, int], cameras: Camera) -> tuple[list[ImageEdges], MapsOfImages]:
-    """The edges that lenses show, and where they are without distortion."""
-    seen = [own.seen_by(cameras[i]) for i, own in enumerate(edges)]
-    return [own for own, _ in seen], MapsOfImages([straight for _, straight in seen], size)
+    return _shown_by(curves, shown, *SeenEdges.of(edges, size, cameras), cameras, poses, threshold)
 
 
 def _shown_by(
