@@ -106,4 +106,5 @@ def foretold_edges(
 def runs_of(curve: Int[Tensor, "n"], length: int = _RUN) -> Int[Tensor, "n"]:
     """Numbers of runs of so many neighbours, of samples in the order of their curves."""
     rank = torch.arange(len(curve), device=curve.device) - torch.searchsorted(curve, curve)
-    return torch.unique_consecutive(torch.stack((curve, rank // length)), dim=1, return_inverse=True)[1]
+    runs: Tensor = torch.unique_consecutive(torch.stack((curve, rank // length)), dim=1, return_inverse=True)[1]
+    return runs
