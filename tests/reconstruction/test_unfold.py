@@ -28,6 +28,7 @@ from torchsfm.reconstruction.mapping.tracks import build_tracks
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
 from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import look_at
+from torchsfm.tensors import fundamental_from_cameras
 
 SIZE = (640, 480)
 VIEWS = 14
@@ -215,6 +216,38 @@ def test_halves_that_only_copies_connect_are_parted(generator: torch.Generator) 
     uncertain = hanging_on_copies(thin, unfolded.model, ~own, threshold=4.0)
     assert uncertain.any()
     assert not uncertain[~own].any()
+
+
+def test_matches_along_epipolar_lines_alone_do_not_come_in(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pair that joins different points, at places where their rays meet, is left out: the points are elsewhere."""
+    empty, truth, true = street(generator, apart=8.0)
+    graph = empty.graph
+    model = mapped(replace(empty, graph=graph.only(true), track=build_tracks(graph.view, graph.only(true).match)))
+    P = model.cameras.K[0] @ model.poses.matrix()
+    seen = (model.point >= 0) & (torch.bincount(model.point.clamp(min=0), minlength=1)[model.point.clamp(min=0)] >= 3)
+    first, second = ((seen & (graph.view == k)).nonzero()[:, 0] for k in (2, 6))
+    line = torch.nn.functional.pad(graph.x[first], (0, 1), value=1.0) @ fundamental_from_cameras(P[2], P[6]).mT
+    away = (line @ torch.nn.functional.pad(graph.x[second], (0, 1), value=1.0).mT).abs() / line[:, None, :2].norm(dim=-1)
+    away[empty.track[first][:, None] == empty.track[second]] = torch.inf
+    false = torch.stack([first, second[away.argmin(1)]], 1)
+    pair = int((graph.pairs == torch.tensor([2, 6])).all(1).nonzero())
+    others = graph.only(true & (torch.arange(len(true)) != pair))
+    match = torch.cat([others.match, false])
+    of = torch.cat([others.match_pair, torch.full((len(false),), pair)])
+    count = torch.bincount(of, minlength=len(true))
+    wrong = replace(graph, match=match, match_pair=of, num_matches=count, fundamental_inliers=count)
+    poses, points = (pair_agreement(replace(model, graph=wrong), threshold=4.0, poses_alone=alone) for alone in (True, False))
+    assert bool(poses.supports[poses.index == pair])
+    assert bool(points.contradicts[points.index == pair])
+    chance = Conflicts(torch.tensor([[0, 1], [1, 2]]), torch.tensor([12.0, 12.0]).double(), 10.0, torch.arange(VIEWS))
+    answers = iter([replace(chance, score=torch.tensor([13.0, 13.0]).double()), chance])
+    monkeypatch.setattr(unfolding, "ROUNDS", 1)
+    monkeypatch.setattr(unfolding, "missing_correspondences", lambda model: next(answers))
+    kept = replace(empty, graph=wrong, track=build_tracks(graph.view, others.match))
+    unfolded = unfold(kept, model, kept.registered, options(kept), quiet)
+    assert unfolded.model is not model
+    assert pair not in unfolded.model.graph.match_pair
+    assert wrong_cameras(unfolded.model, truth) == 0
 
 
 def test_only_pairs_as_distinctive_as_those_believed_say_how_groups_stand(generator: torch.Generator) -> None:

@@ -59,6 +59,14 @@ class PoseCheck:
         left_out: What became of the pieces so found in the images of the other half, all together: a single number each.
         images: What became of the curves that two or more of the images around each image show.
         camera: Which camera would fit the edges better; None where no curves tell.
+
+    Example:
+        >>> import torch, torchsfm
+        >>> scene = torchsfm.render_sequence(views=6, width=160, height=120, generator=torch.Generator().manual_seed(0))
+        >>> given = scene.images, scene.cameras, scene.poses
+        >>> check = torchsfm.reconstruction.check_poses(*given, torchsfm.reconstruction.reconstruct_curves(*given))
+        >>> check.confirmed, check.refuted, int(check.contradicts.sum())
+        (True, False, 0)
     """
 
     followed: int

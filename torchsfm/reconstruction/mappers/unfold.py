@@ -95,6 +95,14 @@ def _alike(one: Unfolded, other: Unfolded) -> bool:
     return not bool(((a.supports & b.contradicts) | (a.contradicts & b.supports)).any())
 
 
+def _contradicted_by_points(model: Mapping, graph: ViewGraph, threshold: float) -> Bool[Tensor, "q"]:
+    """Pairs whose matches show points of a model elsewhere than it has them."""
+    agreement = pair_agreement(replace(model, graph=graph), threshold=threshold)
+    wrong = torch.zeros(len(graph.pairs), dtype=torch.bool)
+    wrong[agreement.index] = agreement.contradicts
+    return wrong
+
+
 def _support(agreement: PairAgreement, weight: Float[Tensor, "q"]) -> float:
     return float(weight[agreement.index[agreement.supports]].sum())
 
@@ -196,7 +204,8 @@ def _trials(
         false[agreement.index[agreement.contradicts]] = True
         doubtful = suspected | imitated(distinct, backbone, false, grown.registered)
         uncertain = _hanging_on(backbone, (backbone.chosen & doubtful).nonzero()[:, 0], grown.registered)
-        model = _with_pairs(grown, graph, _agreeing(agreement, ~refuted))
+        kept = _agreeing(agreement, ~refuted) & ~_contradicted_by_points(grown, graph, options.reprojection)
+        model = _with_pairs(grown, graph, kept)
         yield Unfolded(model, uncertain, conflicts, _support(agreement, weight), agreement)
         if not any(ways):
             return
