@@ -9,6 +9,7 @@ from painted_box import SIZE, camera, orbit, photograph
 from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose
+from torchsfm.reconstruction.curves.foretold_edges import Foretold
 from torchsfm.reconstruction.curves.from_edges import SeenEdges, curves_of_edges
 from torchsfm.reconstruction.curves.image_edges import ImageEdges
 from torchsfm.reconstruction.curves.pose_check import PoseCheck, check_by_edges
@@ -133,3 +134,16 @@ def test_counts_are_of_samples(box: list[ImageEdges]) -> None:
         assert bool((told.chance <= told.samples).all())
     small: Tensor = check.left_out.chance / check.left_out.samples
     assert float(small) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("samples", "hits", "confirmed", "refuted"), [(1000, 60, False, True), (1000, 600, True, False), (100, 6, False, False)]
+)
+def test_few_samples_refute_nothing(samples: float, hits: float, confirmed: bool, refuted: bool) -> None:
+    """Runs of ten samples, a twentieth of them at edges by chance."""
+    told = Foretold(*(torch.tensor([float(n)], dtype=torch.float64) for n in (samples, hits, samples / 20, 10 * samples)))
+    check = PoseCheck(1000, told, Foretold.none(4), None)
+    assert (check.confirmed, check.refuted) == (confirmed, refuted)
+    (line,) = check.doubts(names(4)) or [""]
+    assert line.startswith("the poses do not fit the photographs" if refuted else "" if confirmed else "nothing confirms")
+    assert all(check.image_doubts()) == refuted
