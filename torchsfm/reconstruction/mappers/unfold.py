@@ -31,7 +31,7 @@ class Unfolded:
         uncertain: Images that hang on a relation which contradicts the model, or is no more distinctive than false ones are.
         conflicts: What missing correspondences say of it.
         support: How distinctive the pairs are together that agree with it.
-        agreement: All pairs of images beside it.
+        agreement: How all pairs of images agree with its poses.
     """
 
     model: Mapping
@@ -65,6 +65,7 @@ def unfold(
 
     Returns:
         The best of the given model and the new ones: that which is refuted least and which the most distinctive pairs support.
+        The given one where the most distinctive relations alone give the same and nothing refutes it any more.
     """
     graph, v = empty.graph, len(empty.graph.names)
     distinct = Distinctiveness.of(graph)
