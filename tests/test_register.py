@@ -75,6 +75,38 @@ def test_one_photograph_by_the_stages_of_a_run(photographs: Path, run: Path) -> 
     assert torch.equal(register_photographs(photographs, old, known).model.poses.t, result.model.poses.t)
 
 
+def test_the_photographs_of_the_model_are_not_judged_by_the_new_one(photographs: Path, run: Path) -> None:
+    old = Reconstruction.load(run / "model.npz")
+    known = saved_features(run, old)
+    assert known is not None
+    # Of each of them one pair is known here, that with the new one.
+    report = register_photographs([photographs / NEW], old, known).report
+    assert [image.doubt for image in report.images] == [""] * 5
+
+
+@pytest.mark.parametrize(("along_x", "along_y", "cropped"), [(1.0, 1.15, True), (1.12, 1.0, True), (0.9, 1.2, False)])
+def test_a_photograph_that_was_stretched_says_so_itself(
+    photographs: Path, run: Path, tmp_path: Path, along_x: float, along_y: float, cropped: bool
+) -> None:
+    old = Reconstruction.load(run / "model.npz")
+    known = saved_features(run, old)
+    assert known is not None
+    image = read_image(photographs / NEW).pixels
+    h, w = image.shape[-2:]
+    size = (round(along_y * h), round(along_x * w))
+    image = torch.nn.functional.interpolate(image[None], size=size, mode="bilinear", antialias=True)[0]
+    if cropped:
+        top, left = ((now - before) // 2 for now, before in zip(size, (h, w), strict=True))
+        image = image[:, top : top + h, left : left + w]
+    save_image(tmp_path / NEW, image)
+    result = register_photographs(tmp_path, old, known)
+    poses, K = truth(), result.model.cameras.K[result.model.camera_index[4]]
+    assert float(K[1, 1] / K[0, 0]) == pytest.approx(size[0] * w / (size[1] * h), rel=0.01)
+    assert float(rotation_angle(result.model.poses.R[4] @ poses.poses.R[2].mT)) < 0.01
+    assert torch.equal(result.model.poses.t[:4], old.poses.t)
+    assert not result.report.images[4].doubt
+
+
 def test_the_command(photographs: Path, run: Path, tmp_path: Path) -> None:
     new = copies(photographs, tmp_path / "new", NEW)
     status, text, stderr = torchsfm("register", new, "--into", run, "--out", tmp_path / "out")

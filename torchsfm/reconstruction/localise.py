@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsfm.images import MAX_PIXELS, Features, match_features, retrieve_pairs
 from torchsfm.linalg.devices import on_the_cpu
-from torchsfm.reconstruction.known_poses import place_images, result_of, start_mapping
+from torchsfm.reconstruction.known_poses import result_of
 from torchsfm.reconstruction.matching.image_points import detect_all
 from torchsfm.reconstruction.matching.known_features import KnownFeatures, observed_features
 from torchsfm.reconstruction.matching.masks import Masks
@@ -19,6 +19,7 @@ from torchsfm.reconstruction.matching.stages import Stages, fingerprint, one_thr
 from torchsfm.reconstruction.matching.view_graph import verify_pairs
 from torchsfm.reconstruction.messages import Progress, ReconstructionError
 from torchsfm.reconstruction.model.reconstruction import Reconstruction
+from torchsfm.reconstruction.new_images import place_images, start_mapping
 from torchsfm.reconstruction.photographs import NEIGHBOURS
 from torchsfm.reconstruction.report import SfmResult
 
@@ -44,7 +45,8 @@ def register_photographs(
     from the points that these show, and the new photographs are added with new points. The poses and cameras of the model
     stay as they are, as does its world frame. A photograph that the files say the same camera took as others of the model gets
     its intrinsics, and where they say nothing one of the same size, unless another focal length explains it clearly better;
-    those of other cameras are estimated.
+    those of other cameras are estimated, with the ratio of focal lengths where a photograph was stretched along one side. The
+    report judges the new photographs.
 
     Args:
         images: A folder or image files, also a single one; those that the model has poses for are passed over.
@@ -126,7 +128,9 @@ def register_photographs(
         mapping = replace(mapping, registered=before | absent)
         mapping, choices, cameras, reasons = place_images(mapping, choices, cameras, report)
         mapping = replace(mapping, registered=mapping.registered & ~absent)
-        result = result_of(mapping, choices, cameras.own, reasons, new.failures, (*model.names, *sources.names))
+        # Of the old images only pairs with new ones are known here, which say little of them.
+        everyone = (*model.names, *sources.names)
+        result = result_of(mapping, choices, cameras, reasons, new.failures, everyone, judged=place < 0)
     course = replace(result.report, seconds=dict(stages.seconds), skipped=sources.skipped)
     models = tuple(replace(found, lines=model.lines, conics=model.conics, curves=model.curves) for found in result.models)
     return SfmResult(models, course)

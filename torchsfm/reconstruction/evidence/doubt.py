@@ -61,6 +61,7 @@ def examine(
     outvoted: Bool[Tensor, "v"] | None = None,
     flat: bool = False,
     rival: Float[Tensor, "v"] | None = None,
+    judged: Bool[Tensor, "v"] | None = None,
 ) -> Standing:
     """Judge the cameras of a finished model by all that is known of its images.
 
@@ -77,6 +78,7 @@ def examine(
         outvoted: Images that pairs which were given up contradict, see `outvoted_groups`.
         flat: Whether most pairs of images that seem to be cropped show little besides one plane, see `crops_of_one_plane`.
         rival: The focal length that explains each of few images nearly as well, in pixels; not a number where none does.
+        judged: Images that are judged, all of whose pairs are known; the others stand as they were given. All when None.
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
@@ -140,11 +142,12 @@ def examine(
             return f"its place is known to {100 * position[i]:.1f} % of its distance from the points only"
         return ""
 
-    doubts = [doubt(i) if mapping.registered[i] else "" for i in range(v)]
+    asked = (mapping.registered if judged is None else mapping.registered & judged).tolist()
+    doubts = [doubt(i) if ask else "" for i, ask in enumerate(asked)]
     if 2 * sum(map(bool, doubts)) > count:
         # Which images are right is then not known: the others agree with too few.
         few = "most images of its model are doubtful"
-        doubts = [known or few if mapping.registered[i] else "" for i, known in enumerate(doubts)]
+        doubts = [known or few if ask else "" for known, ask in zip(doubts, asked, strict=True)]
     return Standing(rotation, position, tuple(doubts), intrinsics)
 
 

@@ -1,5 +1,6 @@
 """Place further images by the points they see."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -51,6 +52,7 @@ def register_images(
     threshold: float,
     focal_sigma: Float[Tensor, "g"],
     least: Float[Tensor, "g"] | None = None,
+    ratios: Sequence[float] = (1.0,),
     generator: torch.Generator | None,
 ) -> tuple[Mapping, Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Estimate the poses of several images in one batched call, and register those that find enough support.
@@ -61,6 +63,8 @@ def register_images(
         threshold: Largest reprojection error of an inlier in pixels.
         focal_sigma: How uncertain the focal lengths are, as a fraction; those of more than `SEARCHED` are estimated as well.
         least: What another focal length must gain, twice the logarithm of a likelihood; 0 where it is not given.
+        ratios: How many times as much as their cameras have it images may have been stretched along y where the focal length is
+            estimated; each but 1 must gain `SURPRISE` more.
         generator: Source of randomness.
 
     Returns:
@@ -86,7 +90,9 @@ def register_images(
     result = estimate_camera(x, X, K, threshold=threshold, mask=mask, generator=generator)
     model, inliers, status = result.model.clone(), result.inliers.clone(), result.status.clone()
     surplus = focal_sigma.new_zeros(k) if least is None else least[camera]
-    K, changed = _with_focal_lengths(x, X, K, mask, camera, focal_sigma[camera], result.support, surplus, threshold, generator)
+    K, changed = _with_focal_lengths(
+        x, X, K, mask, camera, focal_sigma[camera], result.support, surplus, ratios, threshold, generator
+    )
     if len(changed):
         again = estimate_camera(
             x[changed], X[changed], K[changed], threshold=threshold, mask=mask[changed], generator=generator
@@ -115,6 +121,7 @@ def _with_focal_lengths(
     sigma: Float[Tensor, "k"],
     support: Float[Tensor, "k"],
     least: Float[Tensor, "k"],
+    ratios: Sequence[float],
     threshold: float,
     generator: torch.Generator | None,
 ) -> tuple[Float[Tensor, "k 3 3"], Int[Tensor, "c"]]:
@@ -126,18 +133,26 @@ def _with_focal_lengths(
     open_ = (sigma > SEARCHED).nonzero()[:, 0]
     if not len(open_):
         return K, open_
+    # Images as cameras with square pixels would show them, at the scale that they have, so that errors stay as large.
+    ratio = K[open_, 1, 1] / K[open_, 0, 0] * x.new_tensor(ratios)[:, None]
+    squared = torch.stack((ratio.sqrt(), ratio.rsqrt()), -1)
+    centre = K[open_, :2, 2]
     found = estimate_camera_focal(
-        x[open_], X[open_], K[open_, :2, 2], threshold=threshold, mask=mask[open_], generator=generator
-    )
-    focal = krt_from_camera(found.model)[0][:, 0, 0]
+        x[open_] + (x[open_] - centre[:, None]) * (squared[:, :, None] - 1), X[open_], centre,
+        threshold=threshold, mask=mask[open_], generator=generator,
+    )  # fmt: skip
+    focal = krt_from_camera(found.model)[0][..., 0, 0, None] / squared
+    expected = K[open_].diagonal(dim1=-2, dim2=-1)[:, :2].log().mean(-1)
     gain = (found.support - support[open_]) * DEVIATIONS**2 / TOGETHER
-    gain = gain - ((focal / K[open_, 0, 0]).log() / sigma[open_]).square() - least[open_]
-    gain = torch.where(found.status == Status.OK, gain, -1.0).nan_to_num(-1.0)
+    gain = gain - ((focal.log().mean(-1) - expected) / sigma[open_]).square() - least[open_]
+    gain = gain - SURPRISE * (x.new_tensor(ratios) != 1)[:, None]
+    gain, which = torch.where(found.status == Status.OK, gain, -1.0).nan_to_num(-1.0).max(0)
+    focal = focal.gather(0, which[None, :, None].expand(1, -1, 2))[0]
     K = K.clone()
     for own in torch.unique(camera[open_]).tolist():
         # Images of one camera have one focal length: that of the image which tells most of it.
         row = (camera[open_] == own).nonzero()[:, 0]
         best = row[gain[row].argmax()]
         if gain[best] > 0:
-            K[camera == own, :2, :2] *= float(focal[best] / K[open_[best], 0, 0])
+            K[camera == own, :2, :2] *= (focal[best] / K[open_[best]].diagonal()[:2])[:, None]
     return K, open_[torch.isin(camera[open_], camera[open_][gain > 0])]
