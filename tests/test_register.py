@@ -107,6 +107,22 @@ def test_a_photograph_that_was_stretched_says_so_itself(
     assert not result.report.images[4].doubt
 
 
+def test_a_photograph_that_was_cropped_says_so_itself(photographs: Path, run: Path, tmp_path: Path) -> None:
+    old = Reconstruction.load(run / "model.npz")
+    known = saved_features(run, old)
+    assert known is not None
+    image = read_image(photographs / NEW).pixels
+    h, w = image.shape[-2:]
+    save_image(tmp_path / NEW, image[:, : round(0.85 * h), round(0.2 * w) :])
+    result = register_photographs(tmp_path, old, known)
+    poses, K = truth(), result.model.cameras.K
+    shift = K[result.model.camera_index[4], :2, 2] - K[old.camera_index[0], :2, 2] + torch.tensor([round(0.2 * w), 0])
+    assert float(shift.norm()) < 0.03 * w
+    assert float((result.model.poses.centre[4] - poses.poses.centre[2]).norm()) < 0.05
+    assert float(rotation_angle(result.model.poses.R[4] @ poses.poses.R[2].mT)) < 0.02
+    assert not result.report.images[4].doubt
+
+
 def test_the_command(photographs: Path, run: Path, tmp_path: Path) -> None:
     new = copies(photographs, tmp_path / "new", NEW)
     status, text, stderr = torchsfm("register", new, "--into", run, "--out", tmp_path / "out")

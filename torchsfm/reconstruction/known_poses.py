@@ -55,8 +55,8 @@ def triangulate_photographs(
             centres fit those given best.
         register: Also place the photographs that are not in the model, in the frame that the others make. Those that the files
             say the same camera took as others of the model get its intrinsics, and where files say nothing those of the same
-            size, unless another focal length explains them clearly better; the intrinsics of other cameras are estimated.
-            The poses and cameras given stay as they are.
+            size, unless another focal length explains them clearly better; the intrinsics of other cameras are estimated, as
+            `register_photographs` does. The poses and cameras given stay as they are.
         sequence: The images are consecutive frames of a video.
         masks: Folder of masks, see `reconstruct`.
         max_features: Features per image.

@@ -45,8 +45,8 @@ def register_photographs(
     from the points that these show, and the new photographs are added with new points. The poses and cameras of the model
     stay as they are, as does its world frame. A photograph that the files say the same camera took as others of the model gets
     its intrinsics, and where they say nothing one of the same size, unless another focal length explains it clearly better;
-    those of other cameras are estimated, with the ratio of focal lengths where a photograph was stretched along one side. The
-    report judges the new photographs.
+    those of other cameras are estimated, the ratio of focal lengths and the principal point where the photograph was clearly
+    stretched along one side, or cropped. The report judges the new photographs.
 
     Args:
         images: A folder or image files, also a single one; those that the model has poses for are passed over.

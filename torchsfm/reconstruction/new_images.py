@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose
@@ -22,6 +22,8 @@ from torchsfm.reconstruction.messages import Progress
 from torchsfm.reconstruction.model.reconstruction import Reconstruction
 from torchsfm.reconstruction.stretched import ANY, STRETCHED
 
+ODD = "aspect", "principal_point"
+"""Numbers that the images of a camera tell only of what was done to them after: stretched along one side, or cropped."""
 RATIOS = tuple(1.1**k for k in range(-6, 7))
 """How many times as much as along x photographs may have been stretched along y: 16 : 9 resized to a square, and back."""
 
@@ -31,16 +33,16 @@ class NewCameras:
     """What photographs that are new may have been taken with."""
 
     own: Bool[Tensor, "g"]
-    """Cameras that are not the model's and are estimated."""
+    """Cameras that are not the model's: focal length and distortion are estimated."""
     like: Int[Tensor, "g"]
     """The model's camera that each one is thought to be, itself for those that nothing is thought of."""
-    stretched: Bool[Tensor, "g"]
-    """Cameras whose images were found to have been stretched along one side, so that their pixels are not square."""
+    odd: dict[str, Bool[Tensor, "g"]]
+    """Of which cameras more is estimated, by the names of `ODD`."""
 
     @property
     def open_numbers(self) -> tuple[str, ...]:
         """What was estimated of some camera besides its distortion, by the names that `bundle_adjust` knows."""
-        return ("focal",) * bool(self.own.any()) + ("aspect",) * bool(self.stretched.any())
+        return ("focal",) * bool(self.own.any()) + tuple(name for name in ODD if bool(self.odd[name].any()))
 
 
 def start_mapping(
@@ -84,7 +86,7 @@ def start_mapping(
     numbers = [one.distortion.parameters().reshape(len(one.K), kind.num_parameters).to(K) for one in both]
     cameras = Camera(K, kind.from_parameters(torch.cat(numbers)[rows]))
     own = (used >= first) & (used < second)
-    new = NewCameras(own, torch.searchsorted(used, rows), torch.zeros_like(own))
+    new = NewCameras(own, torch.searchsorted(used, rows), {name: torch.zeros_like(own) for name in ODD})
     words = (*("given",) * first, *source, *("default",) * len(place))
     sigma = focal_uncertainty(words)[used].to(K.dtype)
     track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
@@ -118,7 +120,7 @@ def place_images(
             if not placed[i]:
                 failed[i] = f"a pose fits only {k} of the {n} points it sees"
         if bool(placed.any()):
-            new = _with_own_numbers(mapping, options, placed, new, thought)
+            mapping, new = _with_own_numbers(mapping, options, placed, new, thought)
             other = new.own[mapping.camera_index]
             index = torch.where(placed & ~other, new.like[mapping.camera_index], mapping.camera_index)
             mapping = replace(mapping, camera_index=index)
@@ -129,32 +131,45 @@ def place_images(
     mapping = _adjust_new(mapping, options, mapping.registered & ~given, new)
     index = torch.where(mapping.registered, mapping.camera_index, new.like[mapping.camera_index])
     used, index = torch.unique(index, return_inverse=True)
-    left = NewCameras(new.own[used], torch.arange(len(used)), new.stretched[used])
+    left = NewCameras(new.own[used], torch.arange(len(used)), {name: mask[used] for name, mask in new.odd.items()})
     choices = replace(options, expected=options.expected[used], focal_sigma=options.focal_sigma[used])
     return replace(mapping, cameras=mapping.cameras[used], camera_index=index), choices, left, failed
 
 
 def _with_own_numbers(
     mapping: Mapping, options: MappingOptions, placed: Bool[Tensor, "v"], new: NewCameras, thought: Bool[Tensor, "g"]
-) -> NewCameras:
+) -> tuple[Mapping, NewCameras]:
     """What is thought of the cameras of images just placed, with those that explain their image clearly better by own numbers.
 
-    A camera that has found another focal length already is not the one it was thought to be.
+    Such cameras, and their images, stand where these numbers were found: steps from elsewhere may not come there. A camera that
+    has found another focal length already is not the one it was thought to be.
     """
     there = torch.zeros_like(thought).index_fill(0, mapping.camera_index[placed], True)
-    own, focal = new.own, mapping.cameras.K[:, 0, 0]
-    stretched = new.stretched | (there & ((_ratio(mapping.cameras) / _ratio(options.expected)).log().abs() > STRETCHED))
-    own = own | stretched | (thought & (focal != focal[new.like]))
+    focal = mapping.cameras.K[:, 0, 0]
+    odd = {name: mask | (there & _far_off(name, mapping, options)) for name, mask in new.odd.items()}
+    own = new.own | (thought & (focal != focal[new.like])) | torch.stack(tuple(odd.values())).any(0)
     own = own | _clearly_better(mapping, options, placed, {}, {"focal": there & thought & ~own})[0]
-    asked = there & (own | thought) & ~stretched
-    better, after = _clearly_better(mapping, options, placed, {"focal": own & there}, {"focal": asked, "aspect": asked})
-    better = better & ((_ratio(after.cameras) / _ratio(options.expected)).log().abs() > STRETCHED)
-    return replace(new, own=own | better, stretched=stretched | better)
+    asked = there & (own | thought)
+    for name in ODD:
+        free = {"focal": own & there} | odd
+        better, after = _clearly_better(mapping, options, placed, free, free | {"focal": asked, name: asked | odd[name]})
+        better = better & _far_off(name, after, options)
+        odd[name], own = odd[name] | better, own | better
+        moved = placed & better[mapping.camera_index]
+        R = torch.where(moved[:, None, None], after.poses.R, mapping.poses.R)
+        t = torch.where(moved[:, None], after.poses.t, mapping.poses.t)
+        K = torch.where(better[:, None, None], after.cameras.K, mapping.cameras.K)
+        mapping = replace(mapping, poses=Pose(R, t), cameras=Camera(K, mapping.cameras.distortion))
+    return mapping, replace(new, own=own, odd=odd)
 
 
-def _ratio(cameras: Camera) -> Float[Tensor, "g"]:
-    """The focal lengths along y over those along x."""
-    return cameras.K[:, 1, 1] / cameras.K[:, 0, 0]
+def _far_off(name: str, mapping: Mapping, options: MappingOptions) -> Bool[Tensor, "g"]:
+    """Which cameras have another ratio of focal lengths, or another principal point, than images of cameras have."""
+    K, expected = mapping.cameras.K, options.expected.K
+    if name == "aspect":
+        return (K[:, 1, 1] / K[:, 0, 0] * expected[:, 0, 0] / expected[:, 1, 1]).log().abs() > STRETCHED
+    shift = (K - expected)[:, :2, 2].square().sum(-1).sqrt()
+    return shift > 3 * options.prior(mapping).sigma["principal_point"]
 
 
 def _clearly_better(
@@ -165,12 +180,11 @@ def _clearly_better(
     more: Free,
 ) -> tuple[Bool[Tensor, "g"], Mapping]:
     """Which cameras explain the images just placed clearly better with `more` of their numbers free; with the mapping then."""
-    asked = next(iter(more.values()))
+    asked = more["focal"]
     if not bool(asked.any()):
         return torch.zeros_like(asked), mapping
     prior = _prior(mapping, options)
     before = adjust_held(mapping, moving=placed, cameras=about_cameras(mapping, free, prior))
-    more = {name: mask | free.get(name, torch.zeros_like(mask)) for name, mask in more.items()}
     after = adjust_held(before, moving=placed, cameras=about_cameras(before, more, prior))
     node, noise = before.observations(), measure_noise(after, LOSS)
     costs = [LOSS(one.errors(one.point[node], node).clamp_max(1e6).square()) for one in (before, after)]
@@ -180,8 +194,8 @@ def _clearly_better(
 
 
 def _prior(mapping: Mapping, options: MappingOptions) -> CameraPrior:
-    """What is expected of cameras whose images may have been stretched."""
-    return options.prior(mapping).widened("aspect", ANY)
+    """What is expected of cameras whose images may have been stretched or cut out of larger ones."""
+    return replace(options, cropped=True).prior(mapping).widened("aspect", ANY)
 
 
 def _adjust_new(mapping: Mapping, options: MappingOptions, moving: Bool[Tensor, "v"], new: NewCameras) -> Mapping:
@@ -190,6 +204,6 @@ def _adjust_new(mapping: Mapping, options: MappingOptions, moving: Bool[Tensor, 
         return adjust_held(mapping, moving=moving)
     prior = _prior(mapping, options)
     names = (*new.open_numbers, *mapping.cameras.distortion.parameter_names)
-    whose = {"aspect": new.stretched}
-    free = {name: mask & whose.get(name, new.own) for name, mask in choose_free(mapping, names, prior, loss=LOSS).items()}
+    chosen = choose_free(mapping, names, prior, loss=LOSS, faultless=len(mapping.registered))
+    free = {name: mask & new.odd.get(name, new.own) for name, mask in chosen.items()}
     return adjust_held(mapping, moving=moving, cameras=about_cameras(mapping, free, prior))
