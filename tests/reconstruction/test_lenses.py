@@ -69,3 +69,14 @@ def test_who_says_which_lens_it_is_has_it(monkeypatch: pytest.MonkeyPatch) -> No
     found, _ = reconstructed(700.0, "radial", [-0.3, 0.11], camera="simple_radial")
     assert lens_of(found) is DISTORTION_MODELS["simple_radial"]
     assert all(call.args[1].camera == "simple_radial" for call in made.call_args_list)
+
+
+def test_a_polynomial_prescribed_for_a_fisheye_is_told() -> None:
+    found, _ = reconstructed(600.0, "fisheye", [0.02, -0.005, 0.0, 0.0], camera="radial")
+    assert "fisheye" in found.report.summary()
+    for camera, focal, lens, parameters in (
+        ("fisheye", 600.0, "fisheye", [0.02, -0.005, 0.0, 0.0]),
+        ("radial", 900.0, "radial", [-0.05, 0.02]),
+    ):
+        found, _ = reconstructed(focal, lens, parameters, camera=camera)
+        assert "fisheye" not in found.report.summary()

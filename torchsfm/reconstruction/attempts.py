@@ -13,7 +13,7 @@ from torchsfm.motion.many_views.components import components
 from torchsfm.reconstruction.evidence.consistency import pair_agreement
 from torchsfm.reconstruction.evidence.doubt import WRONG_ANGLE, Standing, examine
 from torchsfm.reconstruction.evidence.groups import hinges
-from torchsfm.reconstruction.lenses import FISHEYE, explains_better, may_be_fisheye
+from torchsfm.reconstruction.lenses import FISHEYE, POLYNOMIALS, explains_better, may_be_fisheye
 from torchsfm.reconstruction.mappers.cropped import crops_of_one_plane
 from torchsfm.reconstruction.mappers.growth import Component, Given, Growth, Wanted
 from torchsfm.reconstruction.mappers.unfold import hanging_on_copies, outvoted_by_rivals
@@ -76,7 +76,9 @@ class Attempt:
             flat=crops_of_one_plane(model, options), rival=component.rival,
         )  # fmt: skip
         covariance = None if standing.intrinsics is None or component.off_centre else (self.wanted.free, standing.intrinsics)
-        return standing, calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
+        calibration = calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
+        strained = self.wanted.camera in POLYNOMIALS and may_be_fisheye(model)
+        return standing, replace(calibration, strained=strained)
 
     @property
     def largest(self) -> Mapping:

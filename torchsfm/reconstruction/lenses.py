@@ -12,6 +12,8 @@ from torchsfm.reconstruction.mapping.mapping import Mapping
 
 FISHEYE = "fisheye"
 """What is tried besides."""
+POLYNOMIALS = "simple_radial", "radial", "opencv"
+"""What is prescribed for most lenses, and wrongly for those."""
 BENT = 0.9
 """A lens may be a fisheye that brings corners of images nearer to the middle than this part of where a pinhole has them."""
 LIKELIER = 20.0

@@ -58,6 +58,7 @@ class Calibration:
         prior: Their standard deviations before any image point was seen; zero where they were given.
         cropped: Whether the images were found to be cut out of larger ones, so that principal points lie anywhere.
         alike: Whether they were found to be of one camera then, and have its focal length and distortion in common.
+        strained: Whether a polynomial was prescribed for a lens that bends the corners of images strongly.
     """
 
     status: Status
@@ -70,6 +71,7 @@ class Calibration:
     prior: Float[Tensor, "g k"]
     cropped: bool = False
     alike: bool = False
+    strained: bool = False
 
     @property
     def remark(self) -> str:
@@ -84,6 +86,8 @@ class Calibration:
             whose = "all of one camera, whose focal length they share" if self.alike else "of several cameras"
             text = f"the images seem to be cropped, {whose}: their principal points were looked for far from the middle, too"
             remarks.append(text)
+        if self.strained:
+            remarks.append("the lens bends the corners of the images strongly: if it is a fisheye, camera='fisheye' is right")
         return "; ".join(remarks)
 
     def camera_doubts(self, camera: int) -> list[str]:
