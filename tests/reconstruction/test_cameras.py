@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchsfm.geometry import Camera, intrinsics
+from torchsfm.reconstruction import ReconstructionError
 from torchsfm.reconstruction.mapping.cameras import guess_cameras
 from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
@@ -29,6 +30,15 @@ def photographs(X: Tensor, generator: torch.Generator) -> ViewGraph:
 def guess(graph: ViewGraph, stated: float) -> tuple[float, str]:
     cameras, source = guess_cameras(graph, torch.zeros(8).long(), model="radial", K=None, exif_focal=[stated] * 8)
     return float(cameras.K[0, 0, 0]), source[0]
+
+
+def test_intrinsics_in_units_of_the_image_are_refused(generator: torch.Generator) -> None:
+    graph = photographs(random_points(300, generator=generator), generator)
+    K = torch.tensor([[FOCAL, 0, 499.5], [0, FOCAL, 374.5], [0, 0, 1]], dtype=torch.float64)
+    with pytest.raises(ReconstructionError, match=r"K: wanted pixels, got a focal length of 1 for images of 1000 x 750"):
+        guess_cameras(graph, torch.zeros(8).long(), model="pinhole", K=torch.diag(1 / K.diagonal()) @ K, exif_focal=[None] * 8)
+    cameras, _ = guess_cameras(graph, torch.zeros(8).long(), model="pinhole", K=K, exif_focal=[None] * 8)
+    assert torch.equal(cameras.K[0], K)
 
 
 @pytest.mark.parametrize("stated", [0.5 * FOCAL, 2.2 * FOCAL])

@@ -185,6 +185,22 @@ def test_pixels_are_not_radians(generator: torch.Generator) -> None:
         assert estimate_essential(d1, d2, threshold=right, max_iterations=64).status.shape == (2,)
 
 
+def test_pixels_are_not_rays(generator: torch.Generator) -> None:
+    scene = DOORS["upright"].make(2, 60, generator)
+    d1, d2 = (rays(x) for x in scene.data)
+    K = torch.tensor([[900.0, 0, 500], [0, 900, 375], [0, 0, 1]], dtype=F64)
+    d1, d2 = d1 / d1[..., 2:], d2 / d2[..., 2:]
+    for pixels in (d2 @ K.mT, d2 * d2.new_tensor([900.0, 900, 1])):
+        with pytest.raises(ValueError, match=r"d2: wanted rays.*pixels"):
+            estimate_essential(d1, pixels, threshold=1e-3)
+        with pytest.raises(ValueError, match=r"d1: wanted rays.*pixels"):
+            estimate_upright(pixels, d2, *scene.known, threshold=1e-3)
+    # Half of the points of one problem lie far to the side.
+    d1[0, :31, :2] *= 1e4
+    for a, b in ((d1, d2), (3 * d1, d2 / 5)):
+        assert estimate_essential(a, b, threshold=1e-3, max_iterations=64).status.shape == (2,)
+
+
 @pytest.mark.parametrize("scoring", [Msac(), LeastMedian()])
 def test_thresholds_as_wide_as_the_data_find_nothing(scoring: object, generator: torch.Generator) -> None:
     """In pixels, for points in focal lengths: any model would do."""

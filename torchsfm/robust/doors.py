@@ -16,6 +16,10 @@ from torchsfm.robust.scoring import Scoring
 
 _MOST_RADIANS = 0.1
 """No camera is so inexact: a larger threshold is one in pixels."""
+_MOST_TANGENT = 30.0
+"""Half of the image points of a camera are not farther from its axis, in units of the focal length: 88 degrees."""
+_MOST_PIXELS = 1e6
+"""No image is so wide; what is farther away is wrong in another way."""
 _WIDEST = 0.5
 """The widest threshold that tells right from wrong, in units of the median distance of the data from their middle."""
 
@@ -93,7 +97,7 @@ def check_door(
         threshold: The threshold.
         options: The other options.
         kind: What options there are.
-        radians: Whether the threshold is an angle: one that cannot be meant as such is refused.
+        radians: Whether the data are rays and the threshold is an angle: what cannot be meant as such is refused.
         of_problem: Dimensions of what belongs to a problem, of which there may be several in an element of the batch.
         of_datum: Dimensions of what belongs to a datum.
 
@@ -121,6 +125,9 @@ def check_door(
     batch = check_tensors(**data, threshold=(limit, f"?{of_problem}"), **more)
     if radians:
         _check_radians(threshold)
+        for name, (d, shape) in data.items():
+            if shape == f"{of_datum} 3":
+                _check_rays(name, d)
     return batch
 
 
@@ -144,6 +151,17 @@ def check_counts(count: int, **given: Tensor | None) -> None:
     for name, t in given.items():
         if t is not None and t.shape[-1] != count:
             raise ValueError(f"{name}: wanted {count} in the last dimension, for all data, got shape {tuple(t.shape)}")
+
+
+def _check_rays(name: str, d: Tensor | None) -> None:
+    """Refuse image points in pixels, with a one behind them: most of those are nearly at right angles to the axis.
+
+    Rays of cameras whose images reach so far to the side do not all have the same third coordinate.
+    """
+    if d is None or not d.numel() or not bool((d[..., 2] == 1).all()):
+        return
+    if _MOST_TANGENT < float(d[..., :2].detach().abs().amax(-1).median()) < _MOST_PIXELS:
+        raise ValueError(f"{name}: wanted rays, got image points in pixels: take K^-1 (u, v, 1), or `Camera.unproject`")
 
 
 def _check_radians(threshold: float | Tensor | None) -> None:

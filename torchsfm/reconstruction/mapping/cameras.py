@@ -13,6 +13,8 @@ from torchsfm.geometry import DISTORTION_MODELS, Camera, intrinsics
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
 from torchsfm.reconstruction.messages import ReconstructionError
 
+SHORTEST = 0.01
+"""No lens has a shorter focal length, in units of the longer side of its images, whose ends it would see at 89 degrees."""
 DEFAULT_FOCAL = 1.2
 """Focal length over the longer side of the image (a view of 45 degrees) when nothing tells it."""
 
@@ -82,7 +84,15 @@ def guess_cameras(
 
     Returns:
         The cameras, and where each focal length comes from, a key of `FOCAL_SIGMA`.
+
+    Raises:
+        ReconstructionError: There is no such distortion model, or K is not in pixels.
     """
+    if K is not None and float(K[0, 0]) < SHORTEST * float(graph.image_size.max()):
+        width, height = graph.image_size[0].tolist()
+        raise ReconstructionError(
+            f"K: wanted pixels, got a focal length of {float(K[0, 0]):g} for images of {width} x {height}"
+        )
     g = int(camera_index.max()) + 1
     dtype = graph.x.dtype
     F, sizes, centres = with_square_pixels(graph, aspect)
