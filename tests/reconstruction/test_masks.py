@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from command_line import HEIGHT, VIEWS, WIDTH, assert_one_line, torchsfm
@@ -74,6 +76,25 @@ def test_other_masks_make_other_stages(courtyard: Path, tmp_path: Path) -> None:
         save_image(tmp_path / f"view{i}.png", mask())
     assert bool(black(matched(courtyard, None, out=tmp_path / "out").graph.x).any())
     assert not bool(black(matched(courtyard, tmp_path, out=tmp_path / "out").graph.x).any())
+
+
+def test_masks_of_labels_and_of_other_kinds(tmp_path: Path) -> None:
+    photograph, x = tmp_path / "a.jpg", torch.tensor([[0.0, 0.0], [3.0, 0.0]])
+    masks = Masks(tmp_path / "masks", tmp_path)
+    masks.folder.mkdir()
+    half = np.array([[0, 0, 1, 1]], dtype=np.uint8)
+    for name, values, kept in (
+        ("a.webp", 255 * half, [False, True]),
+        ("a.jpg.bmp", half, [False, True]),
+        ("a.jpg", 0 * half, [False, False]),
+        ("a.png", half.astype(np.uint16), [False, True]),
+        ("a.jpg.png", 3 * half, [False, False]),
+    ):
+        cv2.imwrite(str(masks.folder / name), values)
+        path = masks.path(photograph)
+        assert path is not None
+        assert path.name == name
+        assert masks.admit(photograph, x, (4, 1)).tolist() == kept
 
 
 def test_places_between_pixels(tmp_path: Path) -> None:

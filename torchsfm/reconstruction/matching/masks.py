@@ -9,9 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchsfm.images import ImageError, read_image
+from torchsfm.images import SUFFIXES, ImageError, read_image
 from torchsfm.reconstruction.matching.sources import Sources
 from torchsfm.reconstruction.messages import ReconstructionError
+
+_LABEL = 1.5 / 255
+"""What is darker even where it is brightest holds labels."""
 
 
 @runtime_checkable
@@ -27,9 +30,9 @@ class Admission(Protocol):
 class Masks:
     """Pictures in a folder whose black parts (below half of white) are those of photographs that do not count.
 
-    The mask of `view.jpg` is `view.jpg.png`, `view.png` or `view.jpg`, the first that is there, of the same shape as the
-    upright photograph; a photograph that has none counts as a whole. Masks of photographs in subfolders lie in subfolders of
-    the same names.
+    The mask of `view.jpg` is `view.jpg.png`, `view.png`, `view.jpg` or a picture of another kind, the first that is there, of
+    the same shape as the upright photograph; a photograph that has none counts as a whole. Masks of photographs in subfolders
+    lie in subfolders of the same names. Where the values are 0 and 1 alone, of 255 or 65,535, as labels are, 1 is white.
     """
 
     folder: Path
@@ -51,7 +54,8 @@ class Masks:
 
     def path(self, file: Path) -> Path | None:
         """The mask of a photograph; None where there is none."""
-        names = (f"{file.name}.png", f"{file.stem}.png", file.name)
+        kinds = [name + kind for name in (file.name, file.stem) for kind in sorted(SUFFIXES)]
+        names = (f"{file.name}.png", f"{file.stem}.png", file.name, *kinds)
         place = self.folder / os.path.relpath(file.parent, self.photographs)
         return next((place / name for name in names if (place / name).is_file()), None)
 
@@ -70,5 +74,7 @@ class Masks:
             raise ImageError(f"{path}: a mask of {width} x {height} pixels for an image of {wanted[0]} x {wanted[1]}")
         zoom = torch.tensor([width / wanted[0], height / wanted[1]], dtype=x.dtype)
         column, row = ((x + 0.5) * zoom - 0.5).round().long().unbind(-1)
-        admitted: Tensor = mask.pixels[0, row.clamp(0, height - 1), column.clamp(0, width - 1)] >= 0.5
+        white = float(mask.pixels.max())
+        level = 0.5 * white if 0 < white < _LABEL else 0.5
+        admitted: Tensor = mask.pixels[0, row.clamp(0, height - 1), column.clamp(0, width - 1)] >= level
         return admitted
