@@ -123,6 +123,31 @@ def test_a_photograph_that_was_cropped_says_so_itself(photographs: Path, run: Pa
     assert not result.report.images[4].doubt
 
 
+def cut_out(photograph: Path, top: float, left: float, share: float, out: Path) -> None:
+    """A part of a photograph, half as large as the whole."""
+    image = read_image(photograph).pixels
+    h, w = image.shape[-2:]
+    a, b, height, width = (round(s * size) for s, size in ((top, h), (left, w), (share, h), (share, w)))
+    part = image[None, :, a : a + height, b : b + width]
+    save_image(out, torch.nn.functional.interpolate(part, size=(h // 2, w // 2), mode="bilinear", antialias=True)[0])
+
+
+@pytest.mark.parametrize("zoomed", [True, False])
+def test_photographs_of_one_size_need_not_have_one_camera(photographs: Path, run: Path, tmp_path: Path, zoomed: bool) -> None:
+    old = Reconstruction.load(run / "model.npz")
+    known = saved_features(run, old)
+    assert known is not None
+    cut_out(photographs / NEW, 0, 0, 1, tmp_path / "a.png")
+    cut_out(photographs / "view1.png", *((0.15, 0.15, 0.7) if zoomed else (0, 0, 1)), tmp_path / "b.png")
+    model, poses = register_photographs(tmp_path, old, known).model, truth().poses
+    assert bool(model.registered.all())
+    K = model.cameras.K[model.camera_index[4:], 0, 0] / float(old.cameras.K[0, 0, 0])
+    assert K.tolist() == pytest.approx([0.5, 0.5 / 0.7 if zoomed else 0.5], rel=0.02)
+    assert (int(model.camera_index[4]) != int(model.camera_index[5])) == zoomed
+    for i, true in ((4, 2), (5, 1)):
+        assert float((model.poses.centre[i] - poses.centre[true]).norm()) < 0.05
+
+
 def test_the_command(photographs: Path, run: Path, tmp_path: Path) -> None:
     new = copies(photographs, tmp_path / "new", NEW)
     status, text, stderr = torchsfm("register", new, "--into", run, "--out", tmp_path / "out")

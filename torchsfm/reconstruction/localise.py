@@ -44,9 +44,10 @@ def register_photographs(
     The features of the new photographs are matched with those of the old ones and of each other; poses are estimated robustly
     from the points that these show, and the new photographs are added with new points. The poses and cameras of the model
     stay as they are, as does its world frame. A photograph that the files say the same camera took as others of the model gets
-    its intrinsics, and where they say nothing one of the same size, unless another focal length explains it clearly better;
-    those of other cameras are estimated, the ratio of focal lengths and the principal point where the photograph was clearly
-    stretched along one side, or cropped. The report judges the new photographs.
+    its intrinsics, and where they say nothing one of the same size, unless other numbers explain it clearly better: another
+    focal length, the ratio of both where it was stretched along one side, the principal point where it was cropped. Those of
+    other cameras are estimated; photographs of one size of which files say nothing share them where that explains none of them
+    clearly worse. The report judges the new photographs.
 
     Args:
         images: A folder or image files, also a single one; those that the model has poses for are passed over.

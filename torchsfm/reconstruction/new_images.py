@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchsfm.geometry import DISTORTION_MODELS, Camera, Pose
+from torchsfm.geometry.intrinsic_parameters import camera_from_row, row_from_camera
 from torchsfm.reconstruction.held_poses import adjust_held, structure_of_held
 from torchsfm.reconstruction.mappers.incremental import MappingOptions, next_images
 from torchsfm.reconstruction.mapping.adjust import LOSS, about_cameras
@@ -36,6 +37,8 @@ class NewCameras:
     """Cameras that are not the model's: focal length and distortion are estimated."""
     like: Int[Tensor, "g"]
     """The model's camera that each one is thought to be, itself for those that nothing is thought of."""
+    alike: Int[Tensor, "g"]
+    """Cameras of which files do not say that they are two have the same number; -1 for those of which files tell."""
     odd: dict[str, Bool[Tensor, "g"]]
     """Of which cameras more is estimated, by the names of `ODD`."""
 
@@ -55,8 +58,8 @@ def start_mapping(
 ) -> tuple[Mapping, MappingOptions, NewCameras]:
     """Photographs with the poses and cameras of a model, without points; and what is thought of the other cameras.
 
-    A photograph of the same size as others, of which no file tells the focal length, has a camera like theirs for itself, until
-    `place_images` knows better.
+    A photograph of which no file tells the focal length has a camera for itself, as it may have been zoomed or cropped; one
+    like the model's where it has the size of its photographs, until `place_images` knows better.
 
     Args:
         graph: The photographs and their verified matches.
@@ -70,24 +73,29 @@ def start_mapping(
     kind = type(poses.cameras.distortion)
     name = next(name for name, model in DISTORTION_MODELS.items() if model is kind)
     guessed, source = guess_cameras(graph, group, model=name, K=None, exif_focal=focal)
-    camera = torch.where(place >= 0, poses.camera_index[place.clamp(min=0)], -1)
+    # One after the other: the cameras of the model, those of which files tell, and one of each photograph.
     first, second = len(poses.cameras.K), len(poses.cameras.K) + len(guessed.K)
-    original = torch.arange(second + len(place))
+    camera = torch.where(place >= 0, poses.camera_index[place.clamp(min=0)], -1)
+    like, row = torch.arange(second + len(place)), torch.cat((torch.arange(second), first + group))
+    words = [*("given",) * first, *source, *(source[k] for k in group.tolist())]
     for i in (place < 0).nonzero()[:, 0].tolist():
         same = ((group == group[i]) & (place >= 0)).nonzero()[:, 0]
-        camera[i] = first + group[i]
+        if focal[i]:
+            camera[i] = camera[same[0]] if len(same) else first + group[i]
+            continue
+        camera[i] = second + i
         if len(same):
-            original[second + i] = camera[same[0]]
-            camera[i] = camera[same[0]] if focal[i] else second + i
+            like[camera[i]] = row[camera[i]] = camera[same[0]]
+            words[int(camera[i])] = "default"
     used, index = torch.unique(camera, return_inverse=True)
-    rows = original[used]
+    rows = row[used]
     K = torch.cat([poses.cameras.K, guessed.K])[rows]
     both = (poses.cameras, guessed)
     numbers = [one.distortion.parameters().reshape(len(one.K), kind.num_parameters).to(K) for one in both]
     cameras = Camera(K, kind.from_parameters(torch.cat(numbers)[rows]))
-    own = (used >= first) & (used < second)
-    new = NewCameras(own, torch.searchsorted(used, rows), {name: torch.zeros_like(own) for name in ODD})
-    words = (*("given",) * first, *source, *("default",) * len(place))
+    own = (used >= first) & (like[used] == used)
+    alike = torch.cat((torch.full((second,), -1), group))[used]
+    new = NewCameras(own, torch.searchsorted(used, like[used]), alike, {name: torch.zeros_like(own) for name in ODD})
     sigma = focal_uncertainty(words)[used].to(K.dtype)
     track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])
     mapping = Mapping.start(graph, track, cameras, index)
@@ -129,9 +137,12 @@ def place_images(
             mapping = structure_of_held(mapping, options)
             progress("map", int(mapping.registered.sum()), len(given))
     mapping = _adjust_new(mapping, options, mapping.registered & ~given, new)
+    mapping, new = _made_one(mapping, options, mapping.registered & ~given, new)
     index = torch.where(mapping.registered, mapping.camera_index, new.like[mapping.camera_index])
     used, index = torch.unique(index, return_inverse=True)
-    left = NewCameras(new.own[used], torch.arange(len(used)), {name: mask[used] for name, mask in new.odd.items()})
+    left = NewCameras(
+        new.own[used], torch.arange(len(used)), new.alike[used], {name: mask[used] for name, mask in new.odd.items()}
+    )
     choices = replace(options, expected=options.expected[used], focal_sigma=options.focal_sigma[used])
     return replace(mapping, cameras=mapping.cameras[used], camera_index=index), choices, left, failed
 
@@ -186,11 +197,37 @@ def _clearly_better(
     prior = _prior(mapping, options)
     before = adjust_held(mapping, moving=placed, cameras=about_cameras(mapping, free, prior))
     after = adjust_held(before, moving=placed, cameras=about_cameras(before, more, prior))
-    node, noise = before.observations(), measure_noise(after, LOSS)
+    return asked & (_gain(before, after, before.camera_index) > TOGETHER * SURPRISE), after
+
+
+def _gain(before: Mapping, after: Mapping, camera: Int[Tensor, "v"]) -> Float[Tensor, "g"]:
+    """By how much images that are said to be of some cameras are likelier after than before, twice the logarithm of it."""
+    node = before.observations()
     costs = [LOSS(one.errors(one.point[node], node).clamp_max(1e6).square()) for one in (before, after)]
-    camera = before.camera_index[before.graph.view[node]]
-    gain = torch.zeros(len(asked), dtype=costs[0].dtype).index_add(0, camera, costs[0] - costs[1]) / noise**2
-    return asked & (gain > TOGETHER * SURPRISE), after
+    gain = torch.zeros(len(before.cameras.K), dtype=costs[0].dtype)
+    return gain.index_add(0, camera[before.graph.view[node]], costs[0] - costs[1]) / measure_noise(after, LOSS) ** 2
+
+
+def _made_one(
+    mapping: Mapping, options: MappingOptions, moving: Bool[Tensor, "v"], new: NewCameras
+) -> tuple[Mapping, NewCameras]:
+    """New cameras of which no file says that they are two, made one where that explains none of their images clearly worse."""
+    there = torch.zeros_like(new.own).index_fill(0, mapping.camera_index[moving], True)
+    for number in torch.unique(new.alike[new.own & there & (new.alike >= 0)]).tolist():
+        members = (new.own & there & (new.alike == number)).nonzero()[:, 0]
+        if len(members) < 2:
+            continue
+        together = torch.isin(mapping.camera_index, members)
+        rows = row_from_camera(mapping.cameras)
+        rows[members] = rows[members].median(0).values
+        camera_index = torch.where(together, members[0], mapping.camera_index)
+        cameras = camera_from_row(rows, type(mapping.cameras.distortion))
+        odd = {name: mask.index_fill(0, members, bool(mask[members].any())) for name, mask in new.odd.items()}
+        one, same = replace(mapping, cameras=cameras, camera_index=camera_index), replace(new, odd=odd)
+        one = _adjust_new(one, options, moving, same)
+        if float(_gain(one, mapping, mapping.camera_index)[members].max()) <= TOGETHER * SURPRISE:
+            mapping, new = one, same
+    return mapping, new
 
 
 def _prior(mapping: Mapping, options: MappingOptions) -> CameraPrior:
