@@ -20,6 +20,7 @@ from torchsfm.reconstruction.curves.from_edges import no_curves
 from torchsfm.reconstruction.curves.fusion import count_different, near_pairs
 from torchsfm.reconstruction.curves.image_edges import ImageEdges
 from torchsfm.reconstruction.curves.noise import TRUSTED, edge_loss, usual_distance, weights_in_a_bundle
+from torchsfm.reconstruction.curves.outlines import on_outlines
 from torchsfm.reconstruction.curves.pieces import image_pieces
 from torchsfm.reconstruction.curves.resection import Resection, pose_from_edges
 from torchsfm.reconstruction.curves.tracks import track_samples
@@ -229,13 +230,17 @@ def covariance(mapping: CurveMapping, cameras: Named[str, Any]) -> BundleCovaria
 
 
 def prune(mapping: CurveMapping, near: float = NEAR) -> CurveMapping:
-    """Without samples that their frames do not show in one place, as those of outlines."""
+    """Without samples that their frames do not show in one place, as those of outlines.
+
+    These are told while all samples are there, by those beside them on their outline, of which most fit no place.
+    """
     r, scale = distances(mapping)
     old = mapping.curves
     n = len(old.X)
     number = torch.bincount(old.sample, minlength=n)
     square = torch.zeros_like(old.X[:, 0]).index_add(0, old.sample, r.square())
     keep = (square < (TRUSTED * scale) ** 2 * (number - 2)) & (number >= _AGREE) & _confirmed(mapping, near)
+    keep = keep & ~on_outlines(old, mapping.one_camera, mapping.poses)
     seen = old.seen_where(keep[old.sample])
     left, curve = torch.unique(old.curve[keep], return_inverse=True)
     curves = replace(
