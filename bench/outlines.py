@@ -19,7 +19,7 @@ from torch import Tensor
 from bench.curve_sequences import Sequence, smooth_sequence
 from torchsfm.images import save_image
 from torchsfm.reconstruction import Reconstruction, reconstruct
-from torchsfm.reconstruction.curves import from_edges
+from torchsfm.reconstruction.curves import from_edges, mapping
 from torchsfm.reconstruction.model.curves import Curves
 from torchsfm.reconstruction.model.evaluation import pose_auc, pose_errors
 from torchsfm.simulation.ray_casting import cast
@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--all", action="store_true", help="leave in what is taken for outlines")
     options = parser.parse_args(arguments)
     if options.all:
-        from_edges.on_outlines = lambda curves, *_: torch.zeros(len(curves.X), dtype=torch.bool)
+        from_edges.on_outlines = mapping.on_outlines = lambda curves, *_: torch.zeros(len(curves.X), dtype=torch.bool)
     print("| scene | placed | samples | on outlines | AUC 1 deg | AUC 2 deg | CPU s |")
     print("|---" * 7 + "|", flush=True)
     for number in options.scenes.split(","):
