@@ -10,6 +10,7 @@ from torch import Tensor
 from bench.doubt import camera_errors
 from torchsfm.geometry import Camera, Pose, Radial, intrinsics
 from torchsfm.reconstruction import SfmResult, attempts, reconstruct_tracks, stretched
+from torchsfm.reconstruction.mapping.adjust import adjust
 from torchsfm.reconstruction.stretched import apparent_aspect
 from torchsfm.simulation import orbit_poses, random_points, simulate_images
 
@@ -57,14 +58,17 @@ def test_stretched_images_are_told_and_right(aspect: float) -> None:
 
 
 def test_square_pixels_are_square_and_known_cameras_are_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = Mock(side_effect=apparent_aspect)
+    asked, adjusted = Mock(side_effect=apparent_aspect), Mock(side_effect=adjust)
     monkeypatch.setattr(attempts, "apparent_aspect", asked)
+    monkeypatch.setattr(stretched, "adjust", adjusted)
     found, _ = reconstructed(1.0)
     assert aspect_of(found) == 1
     (calibration,) = found.report.calibrations
     assert "aspect" not in calibration.names
     assert not calibration.remark
     asked.assert_called_once()
+    # Where a ratio hardly lowers the cost, nothing needs to be compared with it.
+    adjusted.assert_called_once()
     x, view, track, _, size = images(1.1)
     K = intrinsics(torch.tensor(FOCAL).double(), (torch.tensor(size).double() - 1) / 2)
     known = reconstruct_tracks(x, view, track, torch.tensor([size] * VIEWS), K=K)

@@ -98,6 +98,18 @@ def test_like_things_that_are_two_stay_two() -> None:
     assert close_tears(model, options) is model
 
 
+def test_what_is_one_already_is_not_joined() -> None:
+    """Pairs may contradict cameras that see the same points: adjusting these again would change nothing."""
+    right, torn, _ = ring(0)
+    point = right.point[right.graph.match]
+    seen = (point[:, 0] >= 0) & (point[:, 0] == point[:, 1])
+    clean = replace(right.graph, match=right.graph.match[seen], match_pair=right.graph.match_pair[seen])
+    matches = torch.bincount(clean.match_pair, minlength=len(clean.pairs))
+    says = PairAgreement(clean.pairs, matches, torch.zeros_like(matches), torch.arange(len(matches)))
+    assert join_torn(replace(right, graph=clean), says) is None
+    assert join_torn(replace(torn, graph=clean), says) is not None
+
+
 def test_points_are_joined_whichever_side_comes_first() -> None:
     """Of each point there are two, one for images of even and one for those of odd numbers."""
     right, _, _ = ring(0)

@@ -7,6 +7,9 @@ well enough for nothing to be in doubt. One number more, the ratio of the focal 
 import math
 from typing import Any
 
+from jaxtyping import Int
+from torch import Tensor
+
 from torchsfm.reconstruction.mapping.adjust import adjust
 from torchsfm.reconstruction.mapping.calibration import images_of_cameras
 from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
@@ -32,12 +35,19 @@ def apparent_aspect(mapping: Mapping, prior: CameraPrior) -> float | None:
         # What does not tell the focal length tells no ratio of two: it would make up for one that is wrong.
         return None
     wide = prior.widened("aspect", ANY)
-    # Both go as far, so that what they differ by is the ratio's.
-    before = adjust(mapping, free=free, prior=wide, **ENOUGH)
-    after = adjust(before, free={**free, "aspect": images > 0}, prior=wide, **ENOUGH)
-    if before.adjustment is None or after.adjustment is None:
+    open_: dict[str, Any] = {"free": {**free, "aspect": images > 0}, "prior": wide, **ENOUGH}
+    trial = adjust(mapping, **open_)
+    if trial.adjustment is None or _gained(trial, trial.adjustment.initial_cost, images) is None:
         return None
-    K = after.cameras.K
-    ratio = (K[:, 1, 1] / K[:, 0, 0]).repeat_interleave(images).median()
-    gained = after.adjustment.cost < (1 - MUST_GAIN) * before.adjustment.cost
-    return float(ratio) if gained and abs(math.log(float(ratio))) > STRETCHED else None
+    # Now both go as far, so that what they differ by is the ratio's.
+    before = adjust(mapping, free=free, prior=wide, **ENOUGH)
+    after = adjust(before, **open_)
+    return None if before.adjustment is None else _gained(after, before.adjustment.cost, images)
+
+
+def _gained(model: Mapping, cost: float, images: Int[Tensor, "g"]) -> float | None:
+    """The ratio of a model in which it was free, if that is not near 1 and lowers a cost by enough."""
+    K = model.cameras.K
+    ratio = float((K[:, 1, 1] / K[:, 0, 0]).repeat_interleave(images).median())
+    gained = model.adjustment is not None and model.adjustment.cost < (1 - MUST_GAIN) * cost
+    return ratio if gained and abs(math.log(ratio)) > STRETCHED else None

@@ -37,8 +37,9 @@ ROUNDS = 3
 """Adjustments with poses and points alone, at most, each with a loss half as wide as the last, while that exceeds a pixel."""
 WIDEST = 16.0
 """Scale of the first of their losses in pixels, at most."""
-ROUGH = 1e-3
-"""Part of the cost that is left to what comes after."""
+ROUGH, ROUGHER = 1e-3, 1e-2
+"""Part of the cost that is left to what comes after: by rotations and the first adjustment of everything; by positions, and by
+adjustments before that."""
 RETURNS, CHANGED = 3, 0.05
 """Times that all is done again, where a focal length has changed by more than this part."""
 TEARS = 3
@@ -109,7 +110,7 @@ def _at_once(
     node, d = node[valid], d[valid]
     _, point = torch.unique(track[node], return_inverse=True)
     count = int(point.max()) + 1 if len(point) else 0
-    placed = position_globally(d, graph.view[node], point, turned.model, points=count, tolerance=ROUGH)
+    placed = position_globally(d, graph.view[node], point, turned.model, points=count, tolerance=ROUGHER)
     registered = largest(placed.component, torch.isin(placed.status, torch.tensor(USABLE)) & rotated)
     if int(registered.sum()) < 2:
         return None
@@ -211,7 +212,7 @@ def _adjust(model: Mapping, width: float) -> Mapping:
     """The minimum of reprojection errors, without what then lies behind a camera or far off."""
     node = model.observations()
     problem = model.problem(node)
-    result = bundle_adjust(problem, loss=Cauchy(width), free=(), max_iterations=20, tolerance=ROUGH)
+    result = bundle_adjust(problem, loss=Cauchy(width), free=(), max_iterations=20, tolerance=ROUGHER)
     if result.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
     moved = replace(model, poses=result.poses, X=result.X)

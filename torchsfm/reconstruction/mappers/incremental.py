@@ -40,11 +40,19 @@ UNKNOWN_FOCAL = 0.4
 """Focal lengths more uncertain than this fraction are guesses, by which no pair of images is judged."""
 LAST_ITERATIONS, LAST_TOLERANCE = 300, 1e-7
 """The last adjustment goes to the minimum, to a small part of the standard deviations; there it is given up."""
+SETTLED, HARDLY = 0.01, 0.05
+"""A model is settled where a smaller part of its observations came or went than the first; the second does not change which
+numbers of its cameras are determined."""
 ROUGHLY: dict[str, Any] = {"max_iterations": 20, "tolerance": 1e-4}
 """How far principal points of lone cameras go before they are looked at."""
 STANDING = 1e-6
 """Damping of the first step of an adjustment of cameras that stand about where they should: more would only hold back what is
 left, long rows of cameras that bend as a whole."""
+
+FIRST: dict[str, Any] = {"max_iterations": 20, "tolerance": 3e-4, "initial_damping": STANDING}
+NEARLY: dict[str, Any] = {"max_iterations": LAST_ITERATIONS, "tolerance": 1e-5, "initial_damping": STANDING}
+"""How far to adjust before observations are looked for once more, at first, and then: about to the minimum, as what is asked of
+a model does not tell it from one there, and `finish` goes on to another one."""
 
 
 @dataclass(frozen=True)
@@ -225,19 +233,20 @@ def _drop_unsupported(model: Mapping, failed: dict[int, str]) -> Mapping:
 
 def _refine(model: Mapping, options: MappingOptions) -> Mapping:
     """Alternate global bundle adjustment with filtering, merging, completion and re-triangulation until little changes."""
-    settled = False
+    changed, limits, rough = 1.0, FIRST, True
     for _ in range(4):
-        model = options.adjust(model, last=True, max_iterations=20, tolerance=3e-4, initial_damping=STANDING)
+        model = options.adjust(model, last=True, settled=changed <= HARDLY, **limits)
         before = model.point
         model = filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
         model = merge_points(model, threshold=options.reprojection)
         model = complete_tracks(model, threshold=options.reprojection)
         model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
-        changed = int(((before >= 0) != (model.point >= 0)).sum())
-        settled = changed <= 0.01 * max(1, int((before >= 0).sum()))
-        if settled:
+        changed = int(((before >= 0) != (model.point >= 0)).sum()) / max(1, int((before >= 0).sum()))
+        rough, limits = limits is FIRST, NEARLY
+        if changed <= SETTLED:
             break
-    model = options.adjust(model, last=True, settled=settled, max_iterations=LAST_ITERATIONS, tolerance=LAST_TOLERANCE)
+    if rough or changed > SETTLED:
+        model = options.adjust(model, last=True, settled=changed <= HARDLY, **limits)
     lone = not options.cropped and bool((options.prior(model).sum_of_body(images_of_cameras(model)) == 1).any())
     if lone and "principal_point" in options.free:
         freed = model

@@ -37,7 +37,7 @@ def join_torn(model: Mapping, agreement: PairAgreement) -> Mapping | None:
 
     Returns:
         The model, its cameras where they were, to be adjusted under a wide loss; None where no such pair has enough points that
-        are one already, or that one similarity makes one.
+        are one already, or that one similarity makes one, or where all that they show are one already and seen by both sides.
     """
     graph = model.graph
     contradicts = torch.zeros(len(graph.pairs), dtype=torch.bool)
@@ -60,7 +60,8 @@ def join_torn(model: Mapping, agreement: PairAgreement) -> Mapping | None:
     # Which side comes first is not the same in all pairs, and three points may be one.
     group = components(point, len(model.X))
     new = model.point.index_copy(0, node.flatten(), point.flatten())
-    return replace(model, point=torch.where(new >= 0, group[new.clamp(min=0)], -1)).compacted()
+    new = torch.where(new >= 0, group[new.clamp(min=0)], -1)
+    return replace(model, point=new).compacted() if int((new != model.point).sum()) >= SHARED else None
 
 
 def _one(model: Mapping, points: Int[Tensor, "k 2"], known: Float[Tensor, "p"]) -> Bool[Tensor, "k"]:

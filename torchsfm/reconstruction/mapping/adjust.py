@@ -150,7 +150,7 @@ def as_adjusted(mapping: Mapping, result: BundleResult, free: Free | None, prior
     cameras = result.cameras
     if free and prior is not None:
         cameras = prior.made_alike(cameras, images_of_cameras(mapping) > 0)
-    adjustment = Adjustment(result.status, result.iterations, free or {}, result.cost)
+    adjustment = Adjustment(result.status, result.iterations, free or {}, result.cost, result.initial_cost)
     return replace(mapping, poses=result.poses, cameras=cameras, X=result.X, adjustment=adjustment)
 
 

@@ -22,12 +22,14 @@ class Adjustment:
         iterations: Steps tried.
         free: By the names that `bundle_adjust` knows, the cameras in which a number was estimated.
         cost: Half the sum of losses, and of what was expected of the cameras, square pixels.
+        initial_cost: The same before it.
     """
 
     status: Status
     iterations: int
     free: Dict[str, Bool[Tensor, "g"]]
     cost: float = 0.0
+    initial_cost: float = 0.0
 
 
 @dataclass(frozen=True)
