@@ -3,6 +3,7 @@
     python -m bench.averaging                                     # 1,000 cameras of each family, all methods
     python -m bench.averaging --views 1000 10000 100000 --families corridor crowd --methods torchsfm
     python -m bench.averaging --outliers 0 0.2 0.4 --families orbit
+    python -m bench.averaging --nearest 32 --methods torchsfm     # more edges: of each camera with so many of the nearest
     python -m bench.averaging --symmetric 0.3                     # wrong edges that agree with each other
     python -m bench.averaging --positions --views 100 1000        # centres and points from true rotations
 
@@ -26,7 +27,7 @@ import torch
 from torch import Tensor
 
 from bench.scale import memory
-from bench.view_graphs import FAMILIES, ViewGraphTruth, look_around, make_view_graph
+from bench.view_graphs import FAMILIES, NEAREST, ViewGraphTruth, look_around, make_view_graph
 from torchsfm.geometry import similarity_from_points
 from torchsfm.linalg import nearest_rotation
 from torchsfm.motion import average_rotations, position_globally
@@ -118,9 +119,9 @@ def errors(model: Tensor, truth: Tensor) -> Tensor:
     return torch.rad2deg(turn_angle(difference @ world.mT))
 
 
-def rotations(method: str, family: str, views: int, outliers: float, symmetric: float) -> Row:
+def rotations(method: str, family: str, views: int, outliers: float, symmetric: float, nearest: int) -> Row:
     """One row."""
-    graph = make_view_graph(family, views, outliers=outliers, symmetric=symmetric)
+    graph = make_view_graph(family, views, outliers=outliers, symmetric=symmetric, nearest=nearest)
     before, start = memory(), time.process_time()
     model = METHODS[method](graph)
     spent = time.process_time() - start
@@ -132,7 +133,7 @@ def rotations(method: str, family: str, views: int, outliers: float, symmetric: 
     }  # fmt: skip
 
 
-def positions(method: str, family: str, views: int, outliers: float, symmetric: float) -> Row:
+def positions(method: str, family: str, views: int, outliers: float, symmetric: float, nearest: int) -> Row:
     """Centres from true rotations and rays a thousandth of a radian off, in parts of the cameras' extent."""
     g = torch.Generator().manual_seed(0)
     seen = look_around(family, views, 1100.0, (1000, 750), generator=g)
@@ -161,6 +162,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.2])
     parser.add_argument("--symmetric", type=float, default=0.0)
+    parser.add_argument("--nearest", type=int, default=NEAREST, help="partners of each camera that are nearest to it")
     parser.add_argument("--positions", action="store_true", help="global positioning in place of rotation averaging")
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -168,7 +170,7 @@ def main(arguments: list[str] | None = None) -> None:
     job, methods = (positions, ["torchsfm"]) if options.positions else (rotations, options.methods)
     if options.worker:
         (family,), (views,), (outliers,) = options.families, options.views, options.outliers
-        print(json.dumps(job(methods[0], family, views, outliers, options.symmetric)))
+        print(json.dumps(job(methods[0], family, views, outliers, options.symmetric, options.nearest)))
         return
     titled = False
     for family in options.families:
@@ -177,7 +179,7 @@ def main(arguments: list[str] | None = None) -> None:
                 for method in methods:
                     words = [sys.executable, "-m", "bench.averaging", "--worker", "--families", family, "--views", str(views)]
                     words += ["--outliers", str(outliers), "--symmetric", str(options.symmetric), "--methods", method]
-                    words += ["--positions"] * options.positions
+                    words += ["--nearest", str(options.nearest)] + ["--positions"] * options.positions
                     done = subprocess.run(words, capture_output=True, text=True, env=os.environ)
                     cells = [family, str(views), f"{outliers:g}", method]
                     if done.returncode:
