@@ -132,7 +132,7 @@ def result_of(
     """
     graph = mapping.graph
     numbers = (*new.open_numbers, *mapping.cameras.distortion.parameter_names) if bool(new.own.any()) else ()
-    standing = examine(mapping, open_numbers=numbers, prior=options.prior(mapping), threshold=options.reprojection,
+    standing = examine(mapping, open_numbers=numbers, prior=new.prior(mapping, options), threshold=options.reprojection,
                        judged=judged)  # fmt: skip
     found = [(mapping.reconstruction(), standing)] if len(mapping.X) else []
     known = torch.zeros(len(graph.names), dtype=torch.bool)

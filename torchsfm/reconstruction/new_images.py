@@ -34,18 +34,25 @@ class NewCameras:
     """What photographs that are new may have been taken with."""
 
     own: Bool[Tensor, "g"]
-    """Cameras that are not the model's: focal length and distortion are estimated."""
+    """Cameras that are not the model's: all of their numbers are estimated that the images determine."""
     like: Int[Tensor, "g"]
     """The model's camera that each one is thought to be, itself for those that nothing is thought of."""
     alike: Int[Tensor, "g"]
     """Cameras of which files do not say that they are two have the same number; -1 for those of which files tell."""
     odd: dict[str, Bool[Tensor, "g"]]
-    """Of which cameras more is estimated, by the names of `ODD`."""
+    """Of which cameras a number may be anything, by the names of `ODD`."""
 
     @property
     def open_numbers(self) -> tuple[str, ...]:
-        """What was estimated of some camera besides its distortion, by the names that `bundle_adjust` knows."""
-        return ("focal",) * bool(self.own.any()) + tuple(name for name in ODD if bool(self.odd[name].any()))
+        """What was open in some camera besides its distortion, by the names that `bundle_adjust` knows."""
+        aspect = ("aspect",) * bool(self.odd["aspect"].any())
+        return ("focal", *aspect, "principal_point") if bool(self.own.any()) else ()
+
+    def prior(self, mapping: Mapping, options: MappingOptions) -> CameraPrior:
+        """What is expected of the cameras, of those whose images were stretched or cropped less."""
+        usual, wide = options.prior(mapping), _wide_prior(mapping, options)
+        sigma = {name: torch.where(self.odd[name], wide.sigma[name], usual.sigma[name]) for name in ODD}
+        return replace(usual, sigma={**usual.sigma, **sigma})
 
 
 def start_mapping(
@@ -194,7 +201,7 @@ def _clearly_better(
     asked = more["focal"]
     if not bool(asked.any()):
         return torch.zeros_like(asked), mapping
-    prior = _prior(mapping, options)
+    prior = _wide_prior(mapping, options)
     before = adjust_held(mapping, moving=placed, cameras=about_cameras(mapping, free, prior))
     after = adjust_held(before, moving=placed, cameras=about_cameras(before, more, prior))
     return asked & (_gain(before, after, before.camera_index) > TOGETHER * SURPRISE), after
@@ -230,8 +237,8 @@ def _made_one(
     return mapping, new
 
 
-def _prior(mapping: Mapping, options: MappingOptions) -> CameraPrior:
-    """What is expected of cameras whose images may have been stretched or cut out of larger ones."""
+def _wide_prior(mapping: Mapping, options: MappingOptions) -> CameraPrior:
+    """What is expected of cameras whose images may have been stretched, or cut out of larger ones."""
     return replace(options, cropped=True).prior(mapping).widened("aspect", ANY)
 
 
@@ -239,8 +246,8 @@ def _adjust_new(mapping: Mapping, options: MappingOptions, moving: Bool[Tensor, 
     """Move all points, the new poses, and of the new cameras what the images determine."""
     if not bool(new.own.any()) or not len(mapping.observations()):
         return adjust_held(mapping, moving=moving)
-    prior = _prior(mapping, options)
+    prior = new.prior(mapping, options)
     names = (*new.open_numbers, *mapping.cameras.distortion.parameter_names)
     chosen = choose_free(mapping, names, prior, loss=LOSS, faultless=len(mapping.registered))
-    free = {name: mask & new.odd.get(name, new.own) for name, mask in chosen.items()}
+    free = {name: mask & (new.odd[name] if name == "aspect" else new.own) for name, mask in chosen.items()}
     return adjust_held(mapping, moving=moving, cameras=about_cameras(mapping, free, prior))
