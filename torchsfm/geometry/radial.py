@@ -16,6 +16,8 @@ GUARDED = 3
 """Newton steps that narrow a bracket around the root; then the rest converges by itself on all but contrived functions."""
 PLAIN = 7
 """Newton steps that only stay inside that bracket."""
+CHORD = 0.3
+"""Part of the height of a fold above the diagonal below which a chord tells less than single terms."""
 BLOCK = 32768
 """Points worked on at once on a CPU, so that the many passes over them stay in its cache."""
 NEAREST = 1e20
@@ -146,8 +148,8 @@ def first_fold(coefficients: Sequence[Tensor]) -> Tensor:
 def solve_radial(rho: Tensor, coefficients: Sequence[Tensor], limit: Tensor, folds: Tensor, plain: int = PLAIN) -> Tensor:
     """Solve r (1 + k1 r^2 + ...) = rho for r in [0, limit], where the left side increases. Not differentiated.
 
-    The start is exact to first order at both ends where `limit` is a fold (there r grows like a square root), and otherwise the
-    least of the bounds that the single terms put on r.
+    The start is exact to first order at both ends where `limit` is a fold (there r grows like a square root); without one, and
+    far below a high one, it is the least of the bounds that the single terms put on r.
     """
     tiny, largest = torch.finfo(rho.dtype).tiny, torch.finfo(rho.dtype).max
     slopes = slope_coefficients(coefficients)
@@ -164,7 +166,9 @@ def solve_radial(rho: Tensor, coefficients: Sequence[Tensor], limit: Tensor, fol
         power = torch.where(k > 0, 1 / (2 * i + 3), 0.0).to(rho.dtype)
         shift = torch.where(k > 0, -power * k.clamp(min=tiny).log(), torch.inf)
         bound = torch.minimum(bound, torch.addcmul(shift, logarithm, power))
-    r = torch.minimum(torch.where(folds, start, bound.exp()), limit)
+    # Where the function rises above the diagonal before it folds, the start is on the chord: far too low in its lower part.
+    known = folds & ((top <= bounded) | (t > CHORD))
+    r = torch.minimum(torch.where(known, start, bound.exp()), limit)
     low, high = torch.zeros_like(r), limit
     for i in range(GUARDED + plain):
         s = r * r
