@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from command_line import assert_one_line, copies, photograph, torchsfm
+from PIL import Image
 from test_known_poses import truth
 
 from torchsfm.cli.known_poses import find_features
@@ -121,6 +122,28 @@ def test_a_photograph_that_was_cropped_says_so_itself(photographs: Path, run: Pa
     assert float((result.model.poses.centre[4] - poses.poses.centre[2]).norm()) < 0.05
     assert float(rotation_angle(result.model.poses.R[4] @ poses.poses.R[2].mT)) < 0.02
     assert not result.report.images[4].doubt
+
+
+def test_photographs_cropped_by_a_program_that_keeps_their_tags(photographs: Path, run: Path, tmp_path: Path) -> None:
+    """Of one camera and one size, with the focal length of the whole in millimetres, and cut out at different places."""
+    old = Reconstruction.load(run / "model.npz")
+    known = saved_features(run, old)
+    assert known is not None
+    f = float(old.cameras.K[0, 0, 0])
+    tags = Image.Exif()
+    tags[0x010F], tags[0x0110] = "Acme", "Ix 1"
+    for name, source, top, left in (("a.jpg", NEW, 0.0, 0.15), ("b.jpg", "view1.png", 0.15, 0.0)):
+        image = Image.open(photographs / source).convert("RGB")
+        w, h = image.size
+        tags.get_ifd(0x8769)[0xA405] = round(36 * f / w)
+        box = (round(left * w), round(top * h), round(left * w) + round(0.85 * w), round(top * h) + round(0.85 * h))
+        image.crop(box).save(tmp_path / name, quality=97, exif=tags)
+    assert read_image(tmp_path / "a.jpg").focal is not None
+    model, poses = register_photographs(tmp_path, old, known).model, truth().poses
+    assert bool(model.registered.all())
+    for i, true in ((4, 2), (5, 1)):
+        assert float(model.cameras.K[model.camera_index[i], 0, 0]) == pytest.approx(f, rel=0.02)
+        assert float((model.poses.centre[i] - poses.centre[true]).norm()) < 0.05
 
 
 def cut_out(photograph: Path, top: float, left: float, share: float, out: Path) -> None:

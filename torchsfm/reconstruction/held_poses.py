@@ -44,7 +44,7 @@ def adjust_held(mapping: Mapping, *, moving: Bool[Tensor, "v"], cameras: dict[st
         max_iterations=LAST_ITERATIONS,
         tolerance=LAST_TOLERANCE,
         **({"free": ()} | (cameras or {})),
-    )  # fmt: skip
+    )
     if result.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
     return replace(mapping, poses=result.poses, cameras=result.cameras, X=result.X)

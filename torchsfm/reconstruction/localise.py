@@ -46,8 +46,8 @@ def register_photographs(
     stay as they are, as does its world frame. A photograph that the files say the same camera took as others of the model gets
     its intrinsics, and where they say nothing one of the same size, unless other numbers explain it clearly better: another
     focal length, the ratio of both where it was stretched along one side, the principal point where it was cropped. Those of
-    other cameras are estimated; photographs of one size of which files say nothing share them where that explains none of them
-    clearly worse. The report judges the new photographs.
+    other cameras are estimated; photographs of which files do not say that two took them share them where that explains none of
+    them clearly worse. The report judges the new photographs.
 
     Args:
         images: A folder or image files, also a single one; those that the model has poses for are passed over.

@@ -38,7 +38,7 @@ class NewCameras:
     like: Int[Tensor, "g"]
     """The model's camera that each one is thought to be, itself for those that nothing is thought of."""
     alike: Int[Tensor, "g"]
-    """Cameras of which files do not say that they are two have the same number; -1 for those of which files tell."""
+    """Cameras of which files do not say that they are two have the same number; -1 for those of the model."""
     odd: dict[str, Bool[Tensor, "g"]]
     """Of which cameras a number may be anything, by the names of `ODD`."""
 
@@ -65,8 +65,8 @@ def start_mapping(
 ) -> tuple[Mapping, MappingOptions, NewCameras]:
     """Photographs with the poses and cameras of a model, without points; and what is thought of the other cameras.
 
-    A photograph of which no file tells the focal length has a camera for itself, as it may have been zoomed or cropped; one
-    like the model's where it has the size of its photographs, until `place_images` knows better.
+    A photograph has a camera for itself, as it may have been zoomed or cropped, until `place_images` knows better; that of the
+    model where its file says so, and one like that where no file tells and it has the size of the model's photographs.
 
     Args:
         graph: The photographs and their verified matches.
@@ -80,20 +80,18 @@ def start_mapping(
     kind = type(poses.cameras.distortion)
     name = next(name for name, model in DISTORTION_MODELS.items() if model is kind)
     guessed, source = guess_cameras(graph, group, model=name, K=None, exif_focal=focal)
-    # One after the other: the cameras of the model, those of which files tell, and one of each photograph.
-    first, second = len(poses.cameras.K), len(poses.cameras.K) + len(guessed.K)
-    camera = torch.where(place >= 0, poses.camera_index[place.clamp(min=0)], -1)
-    like, row = torch.arange(second + len(place)), torch.cat((torch.arange(second), first + group))
-    words = [*("given",) * first, *source, *(source[k] for k in group.tolist())]
+    # One after the other: the cameras of the model, and one of each photograph.
+    first = len(poses.cameras.K)
+    camera = torch.where(place >= 0, poses.camera_index[place.clamp(min=0)], first + torch.arange(len(place)))
+    like, row = torch.arange(first + len(place)), torch.cat((torch.arange(first), first + group))
+    words = [*("given",) * first, *(source[k] for k in group.tolist())]
     for i in (place < 0).nonzero()[:, 0].tolist():
         same = ((group == group[i]) & (place >= 0)).nonzero()[:, 0]
-        if focal[i]:
-            camera[i] = camera[same[0]] if len(same) else first + group[i]
-            continue
-        camera[i] = second + i
-        if len(same):
-            like[camera[i]] = row[camera[i]] = camera[same[0]]
-            words[int(camera[i])] = "default"
+        if len(same) and focal[i]:
+            camera[i] = camera[same[0]]
+        elif len(same):
+            like[first + i] = row[first + i] = camera[same[0]]
+            words[first + i] = "default"
     used, index = torch.unique(camera, return_inverse=True)
     rows = row[used]
     K = torch.cat([poses.cameras.K, guessed.K])[rows]
@@ -101,7 +99,7 @@ def start_mapping(
     numbers = [one.distortion.parameters().reshape(len(one.K), kind.num_parameters).to(K) for one in both]
     cameras = Camera(K, kind.from_parameters(torch.cat(numbers)[rows]))
     own = (used >= first) & (like[used] == used)
-    alike = torch.cat((torch.full((second,), -1), group))[used]
+    alike = torch.cat((torch.full((first,), -1), group))[used]
     new = NewCameras(own, torch.searchsorted(used, like[used]), alike, {name: torch.zeros_like(own) for name in ODD})
     sigma = focal_uncertainty(words)[used].to(K.dtype)
     track = build_tracks(graph.view, graph.match, graph.fundamental_inliers[graph.match_pair])

@@ -192,7 +192,7 @@ def estimate_essential(
         carries its derivatives with respect to the inliers (see `ransac`).
 
     Raises:
-        ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
+        ValueError: A shape, dtype, device or option does not fit, or rays or threshold are in pixels.
 
     Example:
         >>> import torch, torchsfm

@@ -187,7 +187,7 @@ def estimate_upright(
         derivatives with respect to the inliers and the verticals (see `ransac`).
 
     Raises:
-        ValueError: A shape, dtype, device or option does not fit, or the threshold is in pixels.
+        ValueError: A shape, dtype, device or option does not fit, or rays or threshold are in pixels.
 
     Example:
         >>> import torch, torchsfm

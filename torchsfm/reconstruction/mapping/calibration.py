@@ -87,7 +87,7 @@ class Calibration:
             text = f"the images seem to be cropped, {whose}: their principal points were looked for far from the middle, too"
             remarks.append(text)
         if self.strained:
-            remarks.append("the lens bends the corners of the images strongly: if it is a fisheye, camera='fisheye' is right")
+            remarks.append("the lens bends the corners of the images strongly: if it is a fisheye, prescribe that")
         return "; ".join(remarks)
 
     def camera_doubts(self, camera: int) -> list[str]:
