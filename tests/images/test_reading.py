@@ -10,6 +10,21 @@ import numpy as np
 import pytest
 import torch
 from chance import seeded
+from exif_blocks import (
+    FOCAL,
+    FOCAL_35MM,
+    HEIGHT,
+    MAKE,
+    MODEL,
+    ORIENTATION,
+    UNIT,
+    WIDTH,
+    X_RESOLUTION,
+    Value,
+    encode,
+    into_jpeg,
+    tiff_block,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,55 +33,10 @@ from torchsfm.images.headers import image_size
 from torchsfm.images.heif import heif_library
 from torchsfm.images.netpbm import decode_netpbm, is_netpbm
 
-MAKE, MODEL, ORIENTATION, EXIF_OFFSET = 0x010F, 0x0110, 0x0112, 0x8769
-FOCAL, FOCAL_35MM, WIDTH, HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
-X_RESOLUTION, UNIT = 0xA20E, 0xA210
-
-Value = int | str | tuple[int, int]
-
-
-def directory(tags: dict[int, Value], order: str, offset: int) -> bytes:
-    """One TIFF directory at `offset`, its longer values right after it."""
-    body = struct.pack(order + "H", len(tags))
-    extra, place = b"", offset + 2 + 12 * len(tags) + 4
-    for tag, value in sorted(tags.items()):
-        if isinstance(value, str):
-            raw, kind, count = value.encode() + b"\0", 2, len(value.encode()) + 1
-        elif isinstance(value, tuple):
-            raw, kind, count = struct.pack(order + "2I", *value), 5, 1
-        elif tag == EXIF_OFFSET:
-            raw, kind, count = struct.pack(order + "I", value), 4, 1
-        else:
-            raw, kind, count = struct.pack(order + "H", value), 3, 1
-        if len(raw) > 4:
-            body += struct.pack(order + "HHII", tag, kind, count, place + len(extra))
-            extra += raw + b"\0" * (len(raw) % 2)
-        else:
-            body += struct.pack(order + "HHI", tag, kind, count) + raw.ljust(4, b"\0")
-    return body + b"\0\0\0\0" + extra
-
-
-def tiff_block(first: dict[int, Value], second: dict[int, Value], order: str = "<") -> bytes:
-    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", 8)
-    size = len(directory({**first, EXIF_OFFSET: 0}, order, 8))
-    start = directory({**first, EXIF_OFFSET: 8 + size}, order, 8)
-    return head + start + directory(second, order, 8 + size)
-
-
-def into_jpeg(jpeg: bytes, block: bytes) -> bytes:
-    payload = b"Exif\0\0" + block
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + jpeg[2:]
-
 
 def into_png(png: bytes, block: bytes) -> bytes:
     chunk = struct.pack(">I", len(block)) + b"eXIf" + block + struct.pack(">I", zlib.crc32(b"eXIf" + block))
     return png[:33] + chunk + png[33:]  # after IHDR
-
-
-def encode(array: np.ndarray, suffix: str) -> bytes:
-    done, data = cv2.imencode(suffix, array)
-    assert done
-    return bytes(data.tobytes())
 
 
 @pytest.fixture
