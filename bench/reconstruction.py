@@ -1,11 +1,13 @@
 """The main job, photographs to model, against COLMAP on the same photographs with the same threads.
 
     TORCHSFM_DATA=/path/to/data python -m bench.reconstruction [--sets fountain sceaux ...] [--threads 2] [--lines] [--curves]
+    python -m bench.reconstruction --rendered 16 24 32 --curves
 
-prints one markdown table; with `--lines` also of points and lines together, with `--curves` of points and curves. Each run
-is a process of its own, so that its processor time and its peak memory are its own; both programs start from the same
-knowledge: one shared camera, its focal length from the EXIF header where there is one, else unknown, or K where the set gives
-it. `pytest bench/reconstruction.py` times the whole job with pytest-benchmark instead.
+prints one markdown table, of photographs or of so many rendered ones, of which the truth is known exactly; with `--lines` also
+of points and lines together, with `--curves` of points and curves. Each run is a process of its own, so that its processor time
+and its peak memory are its own; both programs start from the same knowledge: one shared camera, its focal length from the EXIF
+header where there is one, else unknown, or K where the set gives it. `pytest bench/reconstruction.py` times the whole job with
+pytest-benchmark instead.
 """
 
 import argparse
@@ -27,9 +29,22 @@ import pytest
 import torch
 
 from bench.real_data import SETS, PhotographSet, data_folder
+from bench.scale import render, ring
 
 Result = dict[str, Any]
+RENDERED = "rendered-"
+"""Before their number, the name of photographs that are rendered."""
 STAGES = ("start", "extract", "match", "verify", "map")
+
+
+def photographs_of(name: str, data: Path) -> PhotographSet:
+    """The photographs of a name, in the folder of the data sets, or of rendered ones where they are."""
+    if not name.startswith(RENDERED):
+        return SETS[name](data)
+    paths = sorted((data / name).iterdir())
+    _, poses = ring(len(paths), torch.Generator().manual_seed(0))
+    truth = {path.name: pose.numpy() for path, pose in zip(paths, poses.matrix(), strict=True)}
+    return PhotographSet(f"{len(paths)} rendered", paths, truth)
 
 
 def run_torchsfm(photographs: PhotographSet, threads: int, seed: int, **more: bool) -> Result:
@@ -209,7 +224,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Print the table, a line as soon as it is known."""
     parser = argparse.ArgumentParser(prog="python -m bench.reconstruction", description="Photographs to model against COLMAP.")
     parser.add_argument("--data", type=Path, default=data_folder(), help="folder of the data sets (default: $TORCHSFM_DATA)")
-    parser.add_argument("--sets", nargs="+", choices=sorted(SETS), default=list(SETS))
+    parser.add_argument("--sets", nargs="+", choices=sorted(SETS), help="default: all, where none are rendered")
+    parser.add_argument("--rendered", nargs="+", type=int, default=[], metavar="N", help="so many rendered photographs")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--lines", action="store_true", help="also reconstruct with lines")
@@ -218,11 +234,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--no-torchsfm", action="store_true")
     parser.add_argument("--worker", nargs=2, metavar=("PROGRAM", "SET"), help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
-    if options.data is None:
+    sets = options.sets or ([] if options.rendered else list(SETS))
+    if options.data is None and sets:
         parser.error("name the folder of the data sets with --data or TORCHSFM_DATA")
     if options.worker:
         program, name = options.worker
-        result = PROGRAMS[program](SETS[name](options.data), options.threads, options.seed)
+        result = PROGRAMS[program](photographs_of(name, options.data), options.threads, options.seed)
         # Linux counts in kilobytes, macOS in bytes.
         unit = 2**20 if platform.system() == "Darwin" else 2**10
         used = resource.getrusage(resource.RUSAGE_SELF)
@@ -233,13 +250,21 @@ def main(arguments: list[str] | None = None) -> None:
     chosen = [program for program in PROGRAMS if wanted[program]]
     print(HEADER, "|---" * 13 + "|", sep="\n", flush=True)
     remarks = []
-    for name in options.sets:
-        photographs = SETS[name](options.data)
-        if photographs.remark:
-            remarks.append(f"{photographs.name}: {photographs.remark}.")
-        for program in chosen:
-            result = run_apart(program, name, options.data, options.threads, options.seed)
-            print(row(program, result, photographs), flush=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        places = [(name, options.data) for name in sets]
+        for number in options.rendered:
+            name = f"{RENDERED}{number}"
+            folder = Path(scratch) / name
+            folder.mkdir()
+            render(folder, number)
+            places.append((name, Path(scratch)))
+        for name, data in places:
+            photographs = photographs_of(name, data)
+            if photographs.remark:
+                remarks.append(f"{photographs.name}: {photographs.remark}.")
+            for program in chosen:
+                result = run_apart(program, name, data, options.threads, options.seed)
+                print(row(program, result, photographs), flush=True)
     print(f"\n{options.threads} threads, seed {options.seed}; mean error over observations. COLMAP verifies while it matches.")
     print(*remarks, sep="\n")
 
