@@ -21,7 +21,7 @@ from torchsfm.reconstruction.mappers.growth import Component, Growth, Wanted
 from torchsfm.reconstruction.mappers.incremental import MappingOptions
 from torchsfm.reconstruction.mappers.settle import settle
 from torchsfm.reconstruction.mapping.adjust import LOSS, adjust
-from torchsfm.reconstruction.mapping.calibration import ENOUGH_OF_FEW, calibration_of, observation_weights
+from torchsfm.reconstruction.mapping.calibration import ENOUGH, ENOUGH_OF_FEW, calibration_of, observation_weights
 from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
 from torchsfm.reconstruction.mapping.mapping import Adjustment, Mapping
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
@@ -185,10 +185,11 @@ def test_deviations_of_cameras_do_not_depend_on_where_their_covariance_comes_fro
     mapping = replace(mapping, adjustment=Adjustment(Status.OK, 3, free))
     prior = CameraPrior.of(mapping, mapping.cameras, torch.full((1,), 0.5, dtype=torch.float64))
     weights = observation_weights(mapping, LOSS)
-    known = examine(mapping, open_numbers=names, prior=prior, threshold=4.0, weights=weights).intrinsics
+    standing = examine(mapping, open_numbers=names, prior=prior, threshold=4.0, weights=weights)
+    known = standing.intrinsics
     assert known is not None
     plain, given, other = (
-        calibration_of(mapping, prior, loss=LOSS, weights=weights, covariance=covariance)
+        calibration_of(mapping, prior, loss=LOSS, weights=weights, covariance=covariance, excess=standing.excess)
         for covariance in (None, (names, known), (("focal",), torch.eye(1).double()[None]))
     )
     assert bool((plain.deviation > 0).all())
@@ -384,6 +385,28 @@ def test_scatter_tells_common_errors_from_independent_ones(generator: torch.Gene
         offset = torch.randn(int(region.max()) + 1, 2, generator=generator, dtype=torch.float64)
         bent = replace(mapping, graph=replace(graph, x=graph.x + offset[region]))
         assert excess_scatter(adjust(bent, free=None), threshold=4.0) > 2 * independent
+
+
+def test_deviations_of_cameras_know_of_errors_in_common(generator: torch.Generator) -> None:
+    mapping = scene(generator, share=0.35)
+    graph = mapping.graph
+    region = (graph.view * 16 + (graph.x[:, 0] / SIZE[0] * 4).long() * 4 + (graph.x[:, 1] / SIZE[1] * 4).long()).clamp(0)
+    offset = torch.randn(int(region.max()) + 1, 2, generator=generator, dtype=torch.float64)
+    mapping = replace(mapping, graph=replace(graph, x=graph.x + offset[region]))
+    for sigma in (0.5, 1e-6):
+        choices = MappingOptions(("focal",), mapping.cameras, torch.tensor([sigma], dtype=torch.float64))
+        prior = choices.prior(mapping)
+        adjusted = adjust(mapping, free={"focal": torch.ones(1, dtype=torch.bool)}, prior=prior, max_iterations=100)
+        growth = Mock(Growth, begun=SimpleNamespace(options=choices), taken=adjusted.registered, given_up=~adjusted.registered)
+        component = Component(adjusted, choices, off_centre=False)
+        attempt = Attempt(adjusted.graph, Wanted(free_principal_point=False), growth, (component,))
+        standing, told = attempt.judge(component)
+        weights = observation_weights(adjusted, LOSS, enough=ENOUGH)
+        alone = calibration_of(adjusted, prior, loss=LOSS, weights=weights).deviation[0, 0]
+        assert standing.excess > 2
+        # By as much as rotations and places; what was known before is not known less.
+        grown = standing.excess**0.5 if sigma > 0.1 else 1.0
+        assert float(told.deviation[0, 0] / alone) == pytest.approx(grown, rel=0.05)
 
 
 def test_what_was_held_is_still_uncertain(generator: torch.Generator) -> None:

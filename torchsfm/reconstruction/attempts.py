@@ -76,7 +76,8 @@ class Attempt:
             flat=crops_of_one_plane(model, options), rival=component.rival,
         )  # fmt: skip
         covariance = None if standing.intrinsics is None or component.off_centre else (self.wanted.free, standing.intrinsics)
-        calibration = calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance)
+        calibration = calibration_of(model, options.prior(model), loss=LOSS, weights=weights, covariance=covariance,
+                                     excess=standing.excess)  # fmt: skip
         strained = self.wanted.camera in POLYNOMIALS and may_be_fisheye(model)
         return standing, replace(calibration, strained=strained)
 

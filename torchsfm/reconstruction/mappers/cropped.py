@@ -180,11 +180,10 @@ def _one_camera(model: Mapping, options: MappingOptions) -> bool:
         return False
     prior = replace(options, alike=False).prior(model)
     far = adjust(model, free=model.adjustment.free, prior=prior, **ENOUGH)
-    excess = excess_scatter(far, threshold=options.reprojection)
-    found = calibration_of(far, prior, loss=LOSS)
+    found = calibration_of(far, prior, loss=LOSS, excess=excess_scatter(far, threshold=options.reprojection))
     used = images_of_cameras(model) > 0
     focal = found.values[used, 0].log()
-    noise = excess * (found.deviation[used, 0] / found.values[used, 0]).square()
+    noise = (found.deviation[used, 0] / found.values[used, 0]).square()
     square = (focal - focal.median()).square()
     same, other = (noise + width**2 for width in (FOCAL_FAULTS, FOCAL_SIGMA["fundamental matrices"]))
     return bool((square / same + same.log() < square / other + other.log()).all())

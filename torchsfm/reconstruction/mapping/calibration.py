@@ -54,7 +54,8 @@ class Calibration:
             distortion parameters.
         values: The numbers of each camera, pixels for focal length and principal point.
         estimated: Which of them were estimated; the others were held where they were expected or given.
-        deviation: Their standard deviations; zero where they were given.
+        deviation: Their standard deviations, as large as what matches of a pair have in common makes them (`excess_scatter`);
+            zero where they were given.
         prior: Their standard deviations before any image point was seen; zero where they were given.
         cropped: Whether the images were found to be cut out of larger ones, so that principal points lie anywhere.
         alike: Whether they were found to be of one camera then, and have its focal length and distortion in common.
@@ -110,6 +111,7 @@ def calibration_of(
     loss: Cauchy,
     weights: Float[Tensor, "m"] | None = None,
     covariance: tuple[Sequence[str], Float[Tensor, "g k k"]] | None = None,
+    excess: float = 1.0,
 ) -> Calibration:
     """How the cameras of an adjusted mapping were found.
 
@@ -118,7 +120,8 @@ def calibration_of(
         prior: What was expected of the cameras.
         loss: The loss of the adjustment.
         weights: What the observations counted in it.
-        covariance: Numbers of cameras, and their covariance by the noise of the image points, where that is known.
+        covariance: Numbers of cameras, and their covariance, where that is known (with the excess).
+        excess: By how much more the images' points scatter together than by their own noise, as a ratio of variances.
     """
     labels = intrinsic_labels(type(mapping.cameras.distortion))
     adjusted = mapping.adjustment or Adjustment(Status.OK, 0, {})
@@ -132,7 +135,7 @@ def calibration_of(
     noise = measure_noise(mapping, loss, weights)
     if adjusted.free:
         given = covariance[1] if covariance is not None and set(covariance[0]) == set(adjusted.free) else None
-        known = _information(mapping, tuple(adjusted.free), prior, loss, given, weights)
+        known = _information(mapping, tuple(adjusted.free), prior, loss, given, weights, excess)
         chosen = torch.zeros(known.prior.shape, dtype=torch.bool)
         for name, mask in adjusted.free.items():
             chosen[:, known.places(name)] = mask[:, None]
@@ -201,7 +204,6 @@ class _Information:
     names: tuple[str, ...]
     columns: tuple[int, ...]
     model: type[Distortion]
-    noise: float
     matrix: Float[Tensor, "g k k"]
     prior: Float[Tensor, "g k"]
     """Variances before any image point was seen."""
@@ -228,18 +230,23 @@ def _information(
     loss: Cauchy,
     covariance: Float[Tensor, "g k k"] | None = None,
     weights: Float[Tensor, "m"] | None = None,
+    excess: float = 1.0,
 ) -> _Information:
     used = images_of_cameras(mapping) > 0
-    noise = measure_noise(mapping, loss, weights)
     model = type(mapping.cameras.distortion)
     columns = free_columns(names, model)
     if covariance is None:
-        covariance = noise**2 * intrinsics_covariance(
-            mapping.problem(),
-            free=names,
-            weights=weights,
-            loss=loss,
-            **prior.terms(noise, names, used),
+        noise = measure_noise(mapping, loss, weights)
+        covariance = (
+            noise**2
+            * excess
+            * intrinsics_covariance(
+                mapping.problem(),
+                free=names,
+                weights=weights,
+                loss=loss,
+                **prior.against(excess).terms(noise, names, used),
+            )
         )
     before = torch.zeros(len(used), len(columns), dtype=covariance.dtype)
     for name in names:
@@ -247,7 +254,7 @@ def _information(
         for column in free_columns((name,), model):
             before[:, columns.index(column)] = (prior.sigma[name] * scale).square()
     matrix = torch.linalg.inv_ex(torch.where(used[:, None, None], covariance, torch.diag_embed(before)))[0]
-    return _Information(tuple(names), columns, model, noise, matrix, before)
+    return _Information(tuple(names), columns, model, matrix, before)
 
 
 def choose_free(
