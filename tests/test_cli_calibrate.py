@@ -66,6 +66,7 @@ def test_what_cannot_be_calibrated_ends_in_a_line(folder: Path, tmp_path: Path) 
     code, _, stderr = torchsfm("calibrate", folder / "board0.png", "--board", "5x4", "--out", tmp_path / "b")
     assert code == 1
     assert "do not determine" in stderr
+    assert "One photograph" in stderr
     assert not (tmp_path / "b" / "camera.txt").exists()
     wrong = {"--board": "5", "--camera": "fisheye-9", "--size": "0", "--free": "focal,nothing"}
     for option, value in wrong.items():

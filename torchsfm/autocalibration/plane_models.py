@@ -8,6 +8,7 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.autocalibration.board_shape import BOARD
 from torchsfm.autocalibration.calibrate_planes import PlaneCalibration, calibrate_planes
+from torchsfm.autocalibration.plane_doubts import DISAGREE
 from torchsfm.geometry import DISTORTION_MODELS
 from torchsfm.linalg import solve
 
@@ -32,7 +33,9 @@ def calibrate_unknown_planes(
             names = (*free, BOARD) if board else tuple(free)
             model = calibrate_planes(x, X, distortion=DISTORTION_MODELS[lens], free=names, **options)
             found.append(((i > 0) + (j > 0), lens, model))
-            if i == j == 0 and model.status not in (Status.OK, Status.NOT_CONVERGED):
+            # Views that contradict each other may do so for the lens or for the board.
+            fails = model.status not in (Status.OK, Status.NOT_CONVERGED)
+            if i == j == 0 and fails and float(model.disagreement) <= DISAGREE:
                 return lens, model
     sound = [one for one in found if one[2].status == Status.OK]
     if not sound:

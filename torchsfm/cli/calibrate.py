@@ -16,7 +16,8 @@ from torch import Tensor
 from torchsfm._types import Status
 from torchsfm.autocalibration import PlaneCalibration
 from torchsfm.autocalibration.board_shape import BOARD, NAMES
-from torchsfm.autocalibration.plane_models import LENSES, bend, calibrate_unknown_planes
+from torchsfm.autocalibration.plane_models import LENSES, calibrate_unknown_planes
+from torchsfm.cli.calibration_remarks import remarks
 from torchsfm.cli.job import NOTHING, Job, UserError, told
 from torchsfm.cli.output import output_folder
 from torchsfm.cli.results import VERSION
@@ -32,14 +33,15 @@ from torchsfm.images import (
     undistort_images,
     undistorted_cameras,
 )
+from torchsfm.images.board_sizes import chessboard_size, circles_grid_size
 from torchsfm.optim import Huber
 from torchsfm.reconstruction.messages import printable
 from torchsfm.reconstruction.model.files import write_whole_files
 
 _FAR = 3.0
 """How many times the median error of photographs is an error worth a remark."""
-_DISAGREE = 2.5
-"""How many times more than by noise photographs may disagree before it is worth a remark."""
+_LOOKED_AT = 8
+"""Photographs in which boards of other sizes are looked for."""
 _FREE = "focal,aspect,principal_point"
 
 
@@ -109,7 +111,7 @@ def calibrate(
             job.close()
             for p in photographs:
                 typer.echo(f"{printable(p.path.name)}: {p.problem}", err=True)
-            job.fail(f"no photograph shows the whole {board} {pattern.value} pattern")
+            job.fail(f"no photograph shows the whole {board} {pattern.value} pattern{_seen_instead(photographs, pattern)}")
             raise typer.Exit(NOTHING)
         place = torch.arange(columns * rows)
         X = size * torch.stack((place % columns, place // columns), -1).double()
@@ -140,8 +142,12 @@ def calibrate(
                 p.x, p.problem = None, f"is {printable(first.path.name)} once more"
             elif rms > _FAR * typical:
                 p.problem = f"fits badly: {rms / typical:.1f} times the median error"
-        record = _record(found, photographs, camera, seen[0].size, {"board": board, "pattern": pattern.value, "size": size})
-        record["remarks"] = [better, *record["remarks"]] if better else record["remarks"]
+        known = {name: options[name] for name in ("loss", "radius", "image_size")}
+        bent = (BOARD,) if NAMES[0] in found.parameter_names else ()
+        known |= {"distortion": DISTORTION_MODELS[camera], "free": (*options["free"], *bent)}
+        said = remarks(found, x, X, known, [printable(p.path.name) for p in seen], size)
+        pattern_said = {"board": board, "pattern": pattern.value, "size": size}
+        record = _record(found, photographs, camera, seen[0].size, pattern_said, [better, *said] if better else said)
         texts = {"calibration.json": json.dumps(record, indent=1), "calibration.md": _markdown(record)}
         if found.status == Status.OK:
             texts["camera.txt"] = _camera_file(record, found.camera.K)
@@ -153,7 +159,7 @@ def calibrate(
         job.voice.record["calibration"] = record
         typer.echo(_markdown(record))
         if found.status != Status.OK:
-            job.fail(f"the photographs do not determine the camera ({record['status']})")
+            job.fail(f"the photographs do not determine the camera ({record['status']}). {' '.join(said)}".rstrip())
             raise typer.Exit(NOTHING)
         typer.echo(f"{out / 'camera.txt'}  the matrix K, for --intrinsics")
 
@@ -197,8 +203,20 @@ def _find(job: Job, images: list[Path], pattern: Pattern, columns: int, rows: in
     usual = max(sizes, key=sizes.count, default=(0, 0))
     for p in photographs:
         if p.x is not None and p.size != usual:
-            p.x, p.problem = None, f"has {p.size[0]} x {p.size[1]} pixels, most have {usual[0]} x {usual[1]}"
+            turned = ", as if turned by a quarter" if p.size == usual[::-1] else ""
+            p.x, p.problem = None, f"has {p.size[0]} x {p.size[1]} pixels{turned}, most have {usual[0]} x {usual[1]}"
     return photographs
+
+
+def _seen_instead(photographs: list[_Photograph], pattern: Pattern) -> str:
+    """What boards the first of the photographs show, where none shows the one that was asked for."""
+    size_of = chessboard_size if pattern is Pattern.chessboard else circles_grid_size
+    readable = [p.path for p in photographs if min(p.size) >= 8][:_LOOKED_AT]
+    sizes = [size for size in (size_of(read_image(path, gray=True).pixels) for path in readable) if size is not None]
+    if not sizes:
+        return ""
+    columns, rows = max(sizes, key=lambda size: (sizes.count(size), size))
+    return f"; {sizes.count((columns, rows))} of {len(readable)} seem to show one of {columns}x{rows}: --board {columns}x{rows}"
 
 
 def _radius(seen: list[_Photograph], size: float) -> float | None:
@@ -208,7 +226,12 @@ def _radius(seen: list[_Photograph], size: float) -> float | None:
 
 
 def _record(
-    found: PlaneCalibration, photographs: list[_Photograph], camera: str, size: tuple[int, int], board: dict[str, Any]
+    found: PlaneCalibration,
+    photographs: list[_Photograph],
+    camera: str,
+    size: tuple[int, int],
+    board: dict[str, Any],
+    remarks: list[str],
 ) -> dict[str, Any]:
     K = found.camera.K
     model = DISTORTION_MODELS[camera]
@@ -227,30 +250,11 @@ def _record(
         "rms": float(found.rms),
         "disagreement": float(found.disagreement),
         "board": {name: {"value": value, "sigma": sigma[name]} for name, value in shape.items()},
-        "remarks": _remarks(found, shape, board["size"]),
+        "remarks": remarks,
         "photographs": [
             {"name": p.path.name, "used": p.x is not None, "rms": p.rms, "problem": p.problem} for p in photographs
         ],
     }
-
-
-def _remarks(found: PlaneCalibration, shape: dict[str, float], size: float) -> list[str]:
-    """What the residuals say besides noise."""
-    remarks = []
-    if shape:
-        too = "long" if shape["stretch"] > 0 else "short"
-        remarks.append(
-            f"The board is not what was said: its rows are {100 * abs(shape['stretch']):.2f} % too {too}, and its points are"
-            f" {bend(found.board):.3g} off a plane, from the lowest to the highest, where neighbours are {size:g} apart."
-            " The camera was found with that."
-        )
-    if found.status == Status.OK and found.disagreement > _DISAGREE:
-        remarks.append(
-            f"Doubtful: the photographs contradict each other {float(found.disagreement):.1f} times more than their noise lets"
-            " them, by which the standard deviations are multiplied. They may be of different cameras or zooms, one may be"
-            " mirrored, the lens may be of another kind, or the board may have moved or bent between them."
-        )
-    return remarks
 
 
 def _markdown(record: dict[str, Any]) -> str:

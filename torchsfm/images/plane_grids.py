@@ -1,5 +1,7 @@
 """Rectangular grids among points of a plane that is seen in perspective."""
 
+from collections.abc import Iterator
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -29,6 +31,22 @@ def grid_in_points(
     """
     if len(x) < rows * columns:
         return None
+    orders = (_ordered(places, columns, rows) for places in _grids(x, D))
+    return next((order for order in orders if order is not None), None)
+
+
+def grid_size(x: Float[Tensor, "n 2"], D: Float[Tensor, "n 2 2"], least: int) -> tuple[int, int] | None:
+    """Points along the longer and the shorter side of the largest full grid of ellipses, at least so many; None without one."""
+    sizes = []
+    for places in _grids(x, D):
+        short, long = sorted(max(k) - min(k) + 1 for k in zip(*places, strict=True))
+        if short >= least and len(places) == short * long:
+            sizes.append((long, short))
+    return max(sizes, key=lambda size: size[0] * size[1], default=None)
+
+
+def _grids(x: Tensor, D: Tensor) -> Iterator[dict[tuple[int, int], int]]:
+    """Points by places of one grid after the other, those around more likely points first."""
     x, D = x.cpu(), D.cpu()
     area = D.det().sqrt()
     tried = torch.zeros(len(x), dtype=torch.bool)
@@ -39,12 +57,9 @@ def grid_in_points(
         places = _grown(x, D[seed], area, seed, like)
         if places is None:
             continue
-        order = _ordered(places, columns, rows)
-        if order is not None:
-            return order
+        yield places
         # Another seed of the same grid gives the same.
         tried[list(places.values())] = True
-    return None
 
 
 def grid_homography(x: Float[Tensor, "n 2"], columns: int) -> Float[Tensor, "3 3"]:
