@@ -51,7 +51,10 @@ def test_another_board_than_was_said_is_told(tmp_path: Path) -> None:
     code, _, said = calibrated(list(photographs(TURNS[:3])), tmp_path, board="6x5")
     assert code == 1
     assert "no photograph shows the whole 6x5 chessboard" in said
-    assert "3 of 3 seem to show one of 5x4: --board 5x4" in said
+    assert said.endswith("3 of 3 seem to show what --board 5x4 stands for")
+    code, _, said = calibrated(list(photographs(TURNS[:3])), tmp_path, "--pattern", "circles")
+    assert code == 1
+    assert said.endswith("3 of 3 seem to show what --board 5x4 --pattern chessboard stands for")
 
 
 def test_why_photographs_from_one_direction_do_not_do(tmp_path: Path) -> None:

@@ -210,13 +210,16 @@ def _find(job: Job, images: list[Path], pattern: Pattern, columns: int, rows: in
 
 def _seen_instead(photographs: list[_Photograph], pattern: Pattern) -> str:
     """What boards the first of the photographs show, where none shows the one that was asked for."""
-    size_of = chessboard_size if pattern is Pattern.chessboard else circles_grid_size
-    readable = [p.path for p in photographs if min(p.size) >= 8][:_LOOKED_AT]
-    sizes = [size for size in (size_of(read_image(path, gray=True).pixels) for path in readable) if size is not None]
-    if not sizes:
-        return ""
-    columns, rows = max(sizes, key=lambda size: (sizes.count(size), size))
-    return f"; {sizes.count((columns, rows))} of {len(readable)} seem to show one of {columns}x{rows}: --board {columns}x{rows}"
+    some = [p.path for p in photographs if min(p.size) >= 8][:_LOOKED_AT]
+    readable = [read_image(path, gray=True).pixels for path in some]
+    for shown in sorted(Pattern, key=lambda other: other is not pattern):
+        size_of = chessboard_size if shown is Pattern.chessboard else circles_grid_size
+        sizes = [size for size in map(size_of, readable) if size is not None]
+        if sizes:
+            columns, rows = max(sizes, key=lambda size: (sizes.count(size), size))
+            words = f"--board {columns}x{rows}" + ("" if shown is pattern else f" --pattern {shown.value}")
+            return f"; {sizes.count((columns, rows))} of {len(readable)} seem to show what {words} stands for"
+    return ""
 
 
 def _radius(seen: list[_Photograph], size: float) -> float | None:
