@@ -87,3 +87,29 @@ def test_a_board_of_rectangles_is_not_taken_for_too_few_views(generator: torch.G
     assert found.status == Status.OK
     assert float(found.board_shape[0]) == pytest.approx(0.2, abs=1e-3)
     assert abs(float(found.camera.K[0, 0]) - 480) < 5 * float(found.deviation[0])
+
+
+def test_views_by_noise_contradict_each_other_by_as_much(generator: torch.Generator) -> None:
+    """The mean of 100 x 9 squares, each of six numbers or less, is 1 to a few hundredths."""
+    x = torch.stack([seen(generator, [480.0] * 9) for _ in range(100)])
+    found = calibrate_planes(x, X, image_size=SIZE)
+    assert float(found.view_disagreement.square().mean()) == pytest.approx(1, abs=0.15)
+
+
+def test_the_view_of_another_camera_contradicts_most(generator: torch.Generator) -> None:
+    """By what the squares shrink by where its camera is its own, which is what the others say of it without it."""
+    x = seen(generator, [480.0] * 4 + [484.0] + [480.0] * 4)
+    x = torch.cat((x, x[4:5]))
+    found = calibrate_planes(x, X, image_size=SIZE)
+    assert found.view_disagreement.argmax() == 4
+    assert found.view_disagreement[9] == found.view_disagreement[4]
+    out = torch.ones(10, len(X), dtype=torch.bool)
+    out[[4, 9]] = False
+    without = calibrate_planes(x, X, image_size=SIZE, visible=out)
+    one = torch.zeros(10, len(X), dtype=torch.bool)
+    one[4] = True
+    own = 2 * float(found.cost - without.cost)
+    # By itself the view leaves noise.
+    numbers = 2 * len(X) - 6 - 6
+    variance = 2 * float(without.cost) / (8 * (2 * len(X) - 6) - 6)
+    assert float(found.view_disagreement[4]) ** 2 == pytest.approx((own / variance - numbers) / 6, rel=0.4)

@@ -82,6 +82,9 @@ class PlaneCalibration:
     """How many times more the views contradict each other about what they share than the noise of each lets them, at least 1;
     covariances have been multiplied by its square. Much more than 1 says that they are not of one camera, that the board is
     bent or its squares are not square, or that the lens is of another kind."""
+    view_disagreement: Float[Tensor, "*batch v"]
+    """How many times more than by noise each view contradicts all others about what they share, to first order; about 1 by
+    noise. The largest is most likely of another camera, mirrored, or of another board."""
     board: Float[Tensor, "*batch n 3"]
     """Where the points of the board are, in the unit of X; X and zero where its shape is not free."""
     board_shape: Float[Tensor, "*batch 5"]
@@ -203,7 +206,7 @@ def calibrate_planes(
         trust = flat[3] if loss is None else flat[3] * loss_slope(loss, residual.square().sum(-1))
         at = (residual, J, trust, q, v, used.reshape(-1, v))
         covariance, pose_covariance = plane_covariance(*at)
-        disagreement, noise = view_disagreement(*at)
+        disagreement, noise, alone = view_disagreement(*at)
         covariance = disagreement[:, None, None] * covariance
         pose_covariance = disagreement[:, None, None, None] * pose_covariance
         units = torch.stack((torch.ones_like(unit), unit), -1).repeat_interleave(3, -1).reshape(-1, 1, 6)
@@ -223,12 +226,13 @@ def calibrate_planes(
         first = first_of_copies(flat[1], seen.reshape(-1, v, n), noise).reshape(*batch, v)
         new = first == torch.arange(v, device=x.device)
     if not bool(new.all()):
-        alone = calibrate_planes(
+        each_once = calibrate_planes(
             x, X, image_size=image_size, visible=seen & new[..., None], distortion=distortion, free=free, loss=loss,
             radius=radius, max_iterations=max_iterations,
         )  # fmt: skip
-        poses, view_rms, pose_covariance = of_first(first, (alone.poses, alone.view_rms, alone.pose_covariance))
-        return replace(alone, poses=poses, view_rms=view_rms, pose_covariance=pose_covariance, copy_of=first)
+        names = ("poses", "view_rms", "view_disagreement", "pose_covariance")
+        copied = of_first(first, {name: getattr(each_once, name) for name in names})
+        return replace(each_once, copy_of=first, **copied)
     dtype = x.dtype
     t = unit[..., None, None] * found.t - (found.R[..., :2] @ middle[..., None, :, None])[..., 0]
     board = unit[..., None, None] * shaped(X64, found.shape) + torch.nn.functional.pad(middle, (0, 1))[..., None, :]
@@ -255,6 +259,7 @@ def calibrate_planes(
         iterations=result.iterations,
         status=status,
         disagreement=disagreement.sqrt().reshape(batch).to(dtype),
+        view_disagreement=alone.sqrt().reshape(*batch, v).to(dtype),
         board=board.to(dtype),
         board_shape=torch.cat((found.shape[..., :2], bend[..., None] * found.shape[..., 2:]), -1).to(dtype),
     )

@@ -49,8 +49,10 @@ def plane_covariance(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, use
     return inverse[:, :q, :q], blocks * used[..., None, None]
 
 
-def view_disagreement(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, used: Tensor) -> tuple[Tensor, Tensor]:
-    """How much more variance than its noise each view has in what all share, at least one; and the variance of the noise.
+def view_disagreement(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How much more variance than its noise each view has in what all share, at least one.
+
+    Besides, the variance of the noise, and how much more than that each view (b, v) has against all others.
 
     Had every view the `q` shared numbers for itself, the squares of the residuals would shrink by what noise explains, or by
     more: where the views are of several cameras, the board is bent, or the lens another one. The ratio, to first order, is that
@@ -65,12 +67,32 @@ def view_disagreement(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, us
     own = own / own.norm(dim=(1, 2), keepdim=True).clamp_min(1e-300)
     values, vectors, _ = eigh(own.mT @ own)
     some = (values > _RANK * values[..., -1:]) & used[..., None]
-    explained = (vectors.mT @ (own.mT @ r[..., None]))[..., 0].square() / torch.where(some, values, 1.0)
-    explained = torch.where(some, explained, 0.0).sum((1, 2))
+    # Of each view the shift that it would take, and what remains of it by noise where the others stay.
+    root = torch.where(some, values, 1.0).sqrt()
+    pull = torch.where(some, (vectors.mT @ (own.mT @ r[..., None]))[..., 0] / root, 0.0)
+    explained = pull.square().sum((1, 2))
     count = (some.sum((1, 2)) - q).clamp_min(0)
     rest = 2 * w.sum(-1) - q - 6 * used.sum(-1) - count
     noise = (r.square().sum((1, 2)) - explained) / rest.clamp_min(1)
     tested = (count > 0) & (rest >= 1) & (noise > 0)
     ratio = explained / torch.where(tested, count * noise, 1.0)
     ratio = torch.nan_to_num(torch.where(tested, ratio, 1.0), 1.0, 1.0, 1.0).clamp_min(1.0)
-    return ratio, torch.where(rest >= 1, noise, 0.0)
+    alone = _alone(pull, vectors * (root * some)[..., None, :], some)
+    alone = torch.where(tested[:, None], alone / torch.where(tested, noise, 1.0)[:, None], 0.0)
+    return ratio, torch.where(rest >= 1, noise, 0.0), torch.nan_to_num(alone, 0.0, 0.0, 0.0)
+
+
+def _alone(pull: Tensor, root: Tensor, some: Tensor) -> Tensor:
+    """What the squares of the residuals shrink by, to first order, where a view goes by itself, over how many numbers it has.
+
+    Args:
+        pull: The gradient of each view in the axes of its information, over the roots of these (b, v, q).
+        root: Roots R of its information R R' (b, v, q, q), that of all having a diagonal of ones.
+        some: Which axes there are (b, v, q).
+    """
+    eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
+    inverse = torch.linalg.inv_ex((root @ root.mT).sum(1) + 1e-12 * eye).inverse
+    # Of an axis that one view alone has the others say nothing.
+    share = (1 + _RANK) * eye - root.mT @ inverse[:, None] @ root
+    shrunk = (pull * torch.linalg.solve_ex(share, pull[..., None]).result[..., 0]).sum(-1)
+    return shrunk.clamp_min(0) / some.sum(-1).clamp_min(1)

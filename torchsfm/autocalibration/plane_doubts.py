@@ -14,8 +14,6 @@ _LEAST = 4
 """Views that remain."""
 _PART = 3
 """One in so many views may be one that does not belong to the others."""
-_STEPS = 20
-"""Of the optimiser, each time."""
 _SOME, _MUCH = 0.9, 0.8
 """What is left of the disagreement at most where it helps to leave out a view, and where the rest agrees as it is."""
 _CENTRE = 0.01
@@ -25,7 +23,7 @@ _CENTRE = 0.01
 def foreign_views(x: Tensor, X: Tensor, found: PlaneCalibration, **options: Any) -> list[int]:
     """The views (v, n, 2) without which the others agree: they are likely of another camera. None where there are no such.
 
-    One after the other is left out, each time that without which the rest disagrees least, for as long as that helps.
+    One after the other is left out, each time the one that contradicts the others most, for as long as that helps.
 
     Args:
         x: Points of all views.
@@ -34,24 +32,19 @@ def foreign_views(x: Tensor, X: Tensor, found: PlaneCalibration, **options: Any)
         **options: What it was found with.
     """
     kept = found.used & (found.copy_of == torch.arange(len(x), device=x.device))
-    few = options | {"max_iterations": _STEPS}
     most = int(kept.sum()) // _PART
     out: list[int] = []
-    left = before = float(found.disagreement)
+    last, left, before = found, float(found.disagreement), float(found.disagreement)
     agree = False
     while int(kept.sum()) > _LEAST and len(out) <= most:
-        tried = kept.nonzero()[:, 0]
-        without = kept.repeat(len(tried), 1)
-        without[torch.arange(len(tried)), tried] = False
-        rest = calibrate_planes(x, X, visible=without[..., None].expand(*without.shape, len(X)), **few)
-        sound = (rest.status == Status.OK) | (rest.status == Status.NOT_CONVERGED)
-        apart = torch.where(sound, rest.disagreement, torch.inf)
-        best = int(apart.argmin())
-        if float(apart[best]) > (_MUCH if agree else _SOME) * left:
+        worst = int(torch.where(kept, last.view_disagreement, -1.0).argmax())
+        kept[worst] = False
+        last = calibrate_planes(x, X, visible=kept[:, None].expand(x.shape[:2]), **options)
+        apart = float(last.disagreement) if last.status in (Status.OK, Status.NOT_CONVERGED) else torch.inf
+        if apart > (_MUCH if agree else _SOME) * left:
             break
-        left = float(apart[best])
-        out.append(int(tried[best]))
-        kept[out[-1]] = False
+        left = apart
+        out.append(worst)
         agree = left <= min(DISAGREE, before / 2)
     return sorted(out) if agree and len(out) <= most else []
 
