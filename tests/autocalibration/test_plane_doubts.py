@@ -89,11 +89,15 @@ def test_a_board_of_rectangles_is_not_taken_for_too_few_views(generator: torch.G
     assert abs(float(found.camera.K[0, 0]) - 480) < 5 * float(found.deviation[0])
 
 
-def test_views_by_noise_contradict_each_other_by_as_much(generator: torch.Generator) -> None:
-    """The mean of 100 x 9 squares, each of six numbers or less, is 1 to a few hundredths."""
-    x = torch.stack([seen(generator, [480.0] * 9) for _ in range(100)])
+@pytest.mark.parametrize(("sets", "views"), [(100, 9), (400, 3)])
+def test_views_by_noise_contradict_each_other_by_as_much(generator: torch.Generator, sets: int, views: int) -> None:
+    """The mean of 900 to 1200 squares, each of six numbers or less, is 1 to a few hundredths.
+
+    Of three views each draws what they share a third of the way along, which counts.
+    """
+    x = torch.stack([seen(generator, [480.0] * views) for _ in range(sets)])
     found = calibrate_planes(x, X, image_size=SIZE)
-    assert float(found.view_disagreement.square().mean()) == pytest.approx(1, abs=0.15)
+    assert float(found.view_disagreement.square().mean()) == pytest.approx(1, abs=0.2)
 
 
 def test_the_view_of_another_camera_contradicts_most(generator: torch.Generator) -> None:
@@ -113,3 +117,16 @@ def test_the_view_of_another_camera_contradicts_most(generator: torch.Generator)
     numbers = 2 * len(X) - 6 - 6
     variance = 2 * float(without.cost) / (8 * (2 * len(X) - 6) - 6)
     assert float(found.view_disagreement[4]) ** 2 == pytest.approx((own / variance - numbers) / 6, rel=0.4)
+
+
+def test_another_lens_does_not_save_views_that_contradict_each_other(generator: torch.Generator) -> None:
+    """Of two zooms far apart a fisheye had a focal length, where the usual lens had none."""
+    x = seen(generator, [480.0, 765.0] * 4 + [480.0])
+    free = ("focal", "aspect", "principal_point")
+    usual = calibrate_planes(x, X, image_size=SIZE, free=free)
+    assert usual.status == Status.DEGENERATE
+    assert float(usual.disagreement) > DISAGREE
+    _, found = calibrate_unknown_planes(
+        x, X, lenses=["radial", "opencv", "fisheye"], boards=(False, True), free=free, image_size=SIZE
+    )
+    assert found.status == Status.DEGENERATE

@@ -33,16 +33,21 @@ def calibrate_unknown_planes(
             names = (*free, BOARD) if board else tuple(free)
             model = calibrate_planes(x, X, distortion=DISTORTION_MODELS[lens], free=names, **options)
             found.append(((i > 0) + (j > 0), lens, model))
-            # Views that contradict each other may do so for the lens or for the board.
-            fails = model.status not in (Status.OK, Status.NOT_CONVERGED)
-            if i == j == 0 and fails and float(model.disagreement) <= DISAGREE:
+            if i == j == 0 and _fails(model) and float(model.disagreement) <= DISAGREE:
                 return lens, model
     sound = [one for one in found if one[2].status == Status.OK]
+    if _fails(found[0][2]):
+        # Views that contradict each other may do so for the lens or for the board, if by another one they agree.
+        sound = [one for one in sound if float(one[2].disagreement) <= DISAGREE]
     if not sound:
         return found[0][1:]
     noise = min(_variance(model, x) for _, _, model in sound)
     _, lens, model = min(sound, key=lambda one: 2 * float(one[2].cost) + LIKELIER * one[0] * noise)
     return lens, model
+
+
+def _fails(model: PlaneCalibration) -> bool:
+    return bool(model.status not in (Status.OK, Status.NOT_CONVERGED))
 
 
 def _variance(model: PlaneCalibration, x: Tensor) -> float:

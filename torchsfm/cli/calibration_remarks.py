@@ -32,12 +32,13 @@ def remarks(
     """
     sound = found.status == Status.OK
     said = [_shape(found, pitch)] if NAMES[0] in found.parameter_names else []
-    if float(found.disagreement) > DISAGREE:
+    contradictory = float(found.disagreement) > DISAGREE
+    if contradictory:
         said.append(_contradiction(found, x, X, options, names))
     elif not sound:
         said.append(_too_little(found))
     deviation = float(found.deviation[0] / found.camera.K[0, 0])
-    if sound and deviation > _UNSURE:
+    if sound and not contradictory and deviation > _UNSURE:
         said.append(f"Doubtful: the focal length is known to {100 * deviation:.2g} % only. {_more(found)}")
     if sound and "principal_point" not in options["free"]:
         shift = shift_by_centre(x, X, found, **options)
