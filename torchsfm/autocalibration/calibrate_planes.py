@@ -230,8 +230,8 @@ def calibrate_planes(
             x, X, image_size=image_size, visible=seen & new[..., None], distortion=distortion, free=free, loss=loss,
             radius=radius, max_iterations=max_iterations,
         )  # fmt: skip
-        names = ("poses", "view_rms", "view_disagreement", "pose_covariance")
-        copied = of_first(first, {name: getattr(each_once, name) for name in names})
+        of_views = ("poses", "view_rms", "view_disagreement", "pose_covariance")
+        copied = of_first(first, {name: getattr(each_once, name) for name in of_views})
         return replace(each_once, copy_of=first, **copied)
     dtype = x.dtype
     t = unit[..., None, None] * found.t - (found.R[..., :2] @ middle[..., None, :, None])[..., 0]

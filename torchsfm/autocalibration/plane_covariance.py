@@ -95,4 +95,5 @@ def _alone(pull: Tensor, root: Tensor, some: Tensor) -> Tensor:
     # Of an axis that one view alone has the others say nothing.
     share = (1 + _RANK) * eye - root.mT @ inverse[:, None] @ root
     shrunk = (pull * torch.linalg.solve_ex(share, pull[..., None]).result[..., 0]).sum(-1)
-    return shrunk.clamp_min(0) / some.sum(-1).clamp_min(1)
+    alone: Tensor = shrunk.clamp_min(0) / some.sum(-1).clamp_min(1)
+    return alone
