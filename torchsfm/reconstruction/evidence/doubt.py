@@ -37,9 +37,9 @@ class Standing:
             grows with what the matches of a pair have in common, see `excess_scatter`.
         position_sigma: Standard deviation of each camera's place over the median depth of the points that it sees; likewise.
         doubt: Why each camera may be wrong; empty where nothing says so, and of images that are not registered.
-        intrinsics: Covariance of the numbers of each distinct camera that were open, in the order of `intrinsics_covariance`;
-            likewise. None where it was not asked for.
-        excess: The ratio of variances by which all of these have grown so.
+        intrinsics: Covariance of the numbers of each distinct camera that were open, in the order of `intrinsics_covariance`,
+            by the noise of the image points alone; None where it was not asked for.
+        excess: By how much more than by that noise image points scatter together, as a ratio of variances.
     """
 
     rotation_sigma: Float[Tensor, "v"]
@@ -84,8 +84,9 @@ def examine(
     """
     v = len(mapping.registered)
     count = int(mapping.registered.sum())
+    rotation, position, intrinsics = pose_deviations(mapping, open_numbers, prior, weights)
     excess = excess_scatter(mapping, threshold=threshold)
-    rotation, position, intrinsics = deviations(mapping, open_numbers, prior, excess, weights)
+    rotation, position = rotation * excess**0.5, position * excess**0.5
     agreement = agreement or pair_agreement(mapping, threshold=threshold)
     one = torch.ones_like(agreement.matches)
     supporting, contradicting = (agreement.per_view(s, one, v) for s in (agreement.supports, agreement.contradicts))
@@ -152,12 +153,8 @@ def examine(
     return Standing(rotation, position, tuple(doubts), intrinsics, excess)
 
 
-def deviations(
-    mapping: Mapping,
-    open_numbers: Sequence[str],
-    prior: CameraPrior,
-    excess: float,
-    weights: Float[Tensor, "m"] | None = None,
+def pose_deviations(
+    mapping: Mapping, open_numbers: Sequence[str], prior: CameraPrior, weights: Float[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"], Float[Tensor, "g k k"]]:
     """Standard deviations of rotations (degrees) and of places (over the median depth), and intrinsics, as in `Standing`."""
     problem = mapping.problem()
@@ -167,10 +164,10 @@ def deviations(
         problem,
         weights=weights,
         loss=LOSS,
-        sigma=measure_noise(mapping, LOSS, weights) * excess**0.5,
+        sigma=measure_noise(mapping, LOSS, weights),
         points=False,
         joint=False,
-        **about_cameras(mapping, uncertain, prior.against(excess), weights),
+        **about_cameras(mapping, uncertain, prior, weights),
     )
     view, depth = problem.view, problem.depths()
     seen = torch.bincount(view, minlength=len(mapping.registered))

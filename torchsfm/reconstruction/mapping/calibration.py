@@ -120,7 +120,7 @@ def calibration_of(
         prior: What was expected of the cameras.
         loss: The loss of the adjustment.
         weights: What the observations counted in it.
-        covariance: Numbers of cameras, and their covariance, where that is known (with the excess).
+        covariance: Numbers of cameras, and their covariance by the noise of the image points, where that is known.
         excess: By how much more the images' points scatter together than by their own noise, as a ratio of variances.
     """
     labels = intrinsic_labels(type(mapping.cameras.distortion))
@@ -237,16 +237,12 @@ def _information(
     columns = free_columns(names, model)
     if covariance is None:
         noise = measure_noise(mapping, loss, weights)
-        covariance = (
-            noise**2
-            * excess
-            * intrinsics_covariance(
-                mapping.problem(),
-                free=names,
-                weights=weights,
-                loss=loss,
-                **prior.against(excess).terms(noise, names, used),
-            )
+        covariance = noise**2 * intrinsics_covariance(
+            mapping.problem(),
+            free=names,
+            weights=weights,
+            loss=loss,
+            **prior.terms(noise, names, used),
         )
     before = torch.zeros(len(used), len(columns), dtype=covariance.dtype)
     for name in names:
@@ -254,6 +250,9 @@ def _information(
         for column in free_columns((name,), model):
             before[:, columns.index(column)] = (prior.sigma[name] * scale).square()
     matrix = torch.linalg.inv_ex(torch.where(used[:, None, None], covariance, torch.diag_embed(before)))[0]
+    # Errors in common are the images' alone: what was known before is not known less.
+    known = torch.diag_embed(before.reciprocal())
+    matrix = known + (matrix - known) / excess
     return _Information(tuple(names), columns, model, matrix, before)
 
 
