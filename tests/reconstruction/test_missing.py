@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchsfm.geometry import Camera, Pose, intrinsics
 from torchsfm.geometry.distortion import Radial
-from torchsfm.reconstruction.evidence.missing import SIGNIFICANCE, Conflicts, missing_correspondences
+from torchsfm.reconstruction.evidence.missing import SIGNIFICANCE, Conflicts, _scores, missing_correspondences
+from torchsfm.reconstruction.evidence.mutual_sight import CELLS, MutualSight
 from torchsfm.reconstruction.evidence.occupied import Looks, Occupied
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
@@ -139,6 +140,30 @@ def test_a_point_at_the_last_pixel_that_looks_unlike_is_none() -> None:
     assert occupied.at(view, place, torch.tensor([1])).tolist() == [True]
 
 
+def test_whatever_chance_finds_no_more_speaks_against_a_pair(generator: torch.Generator) -> None:
+    """Without what chance finds a score is the most that it can be with it, and is reached."""
+    pairs, cells = 200, CELLS[0] * CELLS[1]
+    seen = torch.randint(0, 12, (3, 2 * pairs, cells), generator=generator).double()
+    found = (seen * torch.rand(seen.shape, generator=generator, dtype=F64)).floor()
+    chance = seen * torch.rand(seen.shape, generator=generator, dtype=F64) ** 3
+    most = _scores(*torch.stack([seen, found], 1))
+    assert bool((_scores(*torch.stack([seen, found, chance], 1)) <= most).all())
+    # Chance that finds as much as is found, among so many points that its own share says nothing.
+    many = torch.stack([1e6 * seen, 1e6 * found, 1e6 * found], 1)
+    torch.testing.assert_close(_scores(*many), _scores(*many[:, :2]), rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_pairs_are_refuted_as_if_all_were_asked(folded: bool, generator: torch.Generator) -> None:
+    mapping = model(generator, folded=folded, clutter=True, described=True)
+    found = missing_correspondences(mapping)
+    every = _scores(*MutualSight.of(mapping).parts(found.pairs, by_chance=True))
+    refuted = every > found.limit
+    assert torch.equal(found.score > found.limit, refuted)
+    assert bool(refuted.any()) == folded
+    assert torch.equal(found.score[refuted], every[refuted])
+
+
 def with_a_copy(mapping: Mapping, image: int) -> Mapping:
     """The same photograph once more, all its observations again."""
     graph, again = mapping.graph, mapping.graph.view == image
@@ -177,7 +202,9 @@ def test_copies_of_a_photograph_are_one_witness(folded: bool, generator: torch.G
     once, twice = missing_correspondences(alone), missing_correspondences(with_a_copy(alone, 0))
     own = (twice.pairs < 2 * GROUP).all(1)
     torch.testing.assert_close(twice.pairs[own], once.pairs)
-    torch.testing.assert_close(twice.score[own], once.score)
+    counts = (MutualSight.of(some).parts(once.pairs, by_chance=True) for some in (alone, with_a_copy(alone, 0)))
+    for first, second in zip(*counts, strict=True):
+        torch.testing.assert_close(first, second)
     assert twice.place[-1] == twice.place[0]
     assert once.folded == twice.folded == folded
     # Two places that are refuted twice by one photograph and its copy are refuted once.
