@@ -10,6 +10,7 @@ from typing import Any
 from jaxtyping import Int
 from torch import Tensor
 
+from torchsfm.reconstruction.mappers.incremental import STANDING
 from torchsfm.reconstruction.mapping.adjust import adjust
 from torchsfm.reconstruction.mapping.calibration import images_of_cameras
 from torchsfm.reconstruction.mapping.camera_prior import CameraPrior
@@ -19,8 +20,10 @@ ANY = 1.0
 """Standard deviation of a ratio of focal lengths of which nothing is known."""
 STRETCHED, MUST_GAIN = 0.02, 0.04
 """A ratio off by less, or which lowers the cost by a smaller part, comes of other faults of a model as well."""
-ENOUGH: dict[str, Any] = {"max_iterations": 20, "tolerance": 1e-3}
+ENOUGH: dict[str, Any] = {"max_iterations": 20, "tolerance": 1e-3, "initial_damping": STANDING}
 """How far to adjust before the ratio is looked at."""
+HINT: dict[str, Any] = {**ENOUGH, "tolerance": MUST_GAIN / 10}
+"""And before that, to see whether it might gain so much."""
 
 
 def apparent_aspect(mapping: Mapping, prior: CameraPrior) -> float | None:
@@ -36,7 +39,7 @@ def apparent_aspect(mapping: Mapping, prior: CameraPrior) -> float | None:
         return None
     wide = prior.widened("aspect", ANY)
     open_: dict[str, Any] = {"free": {**free, "aspect": images > 0}, "prior": wide, **ENOUGH}
-    trial = adjust(mapping, **open_)
+    trial = adjust(mapping, **open_ | HINT)
     if trial.adjustment is None or _gained(trial, trial.adjustment.initial_cost, images) is None:
         return None
     # Now both go as far, so that what they differ by is the ratio's.

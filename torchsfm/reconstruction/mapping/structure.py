@@ -91,14 +91,17 @@ def _triangulate_rows(
     # Image points of cameras without distortion and principal point.
     image = focal[..., None] * rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
     P = poses.matrix() * torch.stack((focal, focal, torch.ones_like(focal)), -1)[..., None]
-    first, second = _widest_pairs(world, visible)
+    cosine = world @ world.mT
+    first, second = _widest_pairs(cosine, visible)
     rows = torch.arange(len(index))[:, None]
     X, angle = _midpoints(world[rows, first], world[rows, second], centre[rows, first], centre[rows, second])
 
     def errors(points: Float[Tensor, "p h 3"]) -> Float[Tensor, "p h s"]:
-        y = (P[:, None, :, :, :3] @ points[:, :, None, :, None])[..., 0] + P[:, None, :, :, 3]
-        depth = y[..., 2]
-        error = (y[..., :2] / depth.clamp(min=1e-12)[..., None] - image[:, None]).norm(dim=-1)
+        # One product a track, coordinates apart: a product for each point in each view takes several times as long.
+        y = (points @ P[..., :3].flatten(1, 2).mT).unflatten(-1, (-1, 3)) + P[:, None, :, :, 3]
+        u, v, depth = y.unbind(-1)
+        ahead = depth.clamp(min=1e-12)
+        error = torch.hypot(u / ahead - image[:, None, :, 0], v / ahead - image[:, None, :, 1])
         return torch.where((depth > 0) & visible[:, None], error, torch.inf)
 
     error = errors(X)
@@ -110,18 +113,16 @@ def _triangulate_rows(
     inlier = (error[rows[:, 0], best] < threshold) & usable[:, None]
     X = triangulate_points(image[:, :, None], P, visible=inlier[..., None]).model[:, 0]
     inlier = (errors(X[:, None])[:, 0] < threshold) & usable[:, None]
-    cosine = (world[:, :, None] * world[:, None]).sum(-1)
     wide = (inlier[:, :, None] & inlier[:, None] & (cosine < torch.cos(torch.tensor(min_angle)))).any(-1).any(-1)
     return X, inlier & wide[:, None]
 
 
-def _widest_pairs(world: Float[Tensor, "p s 3"], visible: Tensor) -> tuple[Int[Tensor, "p h"], Int[Tensor, "p h"]]:
+def _widest_pairs(cosine: Float[Tensor, "p s s"], visible: Tensor) -> tuple[Int[Tensor, "p h"], Int[Tensor, "p h"]]:
     """The pairs of slots whose rays meet at the widest angles, at most 12, as two index tensors."""
-    s = world.shape[1]
+    s = cosine.shape[1]
     i, j = torch.triu_indices(s, s, 1)
-    cosine = (world[:, i] * world[:, j]).sum(-1)
-    cosine = torch.where(visible[:, i] & visible[:, j], cosine, torch.inf)
-    chosen = cosine.topk(min(12, len(i)), dim=-1, largest=False).indices
+    apart = torch.where(visible[:, i] & visible[:, j], cosine[:, i, j], torch.inf)
+    chosen = apart.topk(min(12, len(i)), dim=-1, largest=False).indices
     return i[chosen], j[chosen]
 
 
@@ -154,10 +155,20 @@ def complete_tracks(mapping: Mapping, *, threshold: float, rounds: int = 3) -> M
 
 def _candidates(mapping: Mapping, images: Tensor) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
     """Free image points of the given images and the 3D points that their matches say they show; no pair twice."""
-    a, b = torch.cat([mapping.graph.match, mapping.graph.match.flip(1)]).unbind(1)
-    use = (mapping.point[a] < 0) & (mapping.point[b] >= 0) & images[mapping.graph.view[a]]
-    pair = torch.unique(torch.stack([a[use], mapping.point[b[use]]], 1), dim=0)
-    return pair[:, 0], pair[:, 1]
+    match, point = mapping.graph.match, mapping.point
+    free, known = (point < 0) & images[mapping.graph.view], point >= 0
+    pairs = []
+    for a, b in (match.unbind(1), match.flip(1).unbind(1)):
+        use = (free[a] & known[b]).nonzero()[:, 0]
+        pairs.append((a[use], point[b[use]]))
+    a, b = (torch.cat(side) for side in zip(*pairs, strict=True))
+    return _different(a, b, len(mapping.X))
+
+
+def _different(a: Int[Tensor, "k"], b: Int[Tensor, "k"], count: int) -> tuple[Int[Tensor, "q"], Int[Tensor, "q"]]:
+    """Pairs in ascending order, none of them twice; the second ones are less than the count."""
+    key = torch.unique(a * count + b)
+    return key.div(max(count, 1), rounding_mode="floor"), key % max(count, 1)
 
 
 def visible_points(mapping: Mapping, images: Tensor) -> tuple[Int[Tensor, "k"], Int[Tensor, "k"]]:
@@ -175,7 +186,7 @@ def merge_points(mapping: Mapping, *, threshold: float) -> Mapping:
     use = (p >= 0) & (q >= 0) & (p != q)
     if not bool(use.any()):
         return mapping
-    pair = torch.unique(torch.stack([torch.minimum(p, q)[use], torch.maximum(p, q)[use]], 1), dim=0)
+    pair = torch.stack(_different(torch.minimum(p, q)[use], torch.maximum(p, q)[use], len(mapping.X)), 1)
     node = mapping.observations()
     length = torch.bincount(mapping.point[node], minlength=len(mapping.X))
     start = length.cumsum(0) - length
