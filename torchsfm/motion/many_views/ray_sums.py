@@ -131,8 +131,9 @@ def _ahead(c: Tensor, X: Tensor, v: Tensor) -> Tensor:
 
 def _linearize_ahead(c: Tensor, X: Tensor, v: Tensor, *, out: list[Tensor | None]) -> Tensor:
     """The same, and its derivatives: those of X, and for c their negatives."""
-    along = ((X - c) * v).sum(-1)
-    J = torch.eye(3, dtype=v.dtype, device=v.device) - torch.where((along > 1)[:, None, None], v[:, :, None] * v[:, None], 0.0)
+    rows = v.mT
+    beyond = ((X - c).mT * rows).sum(0) > 1
+    J = torch.eye(3, dtype=v.dtype, device=v.device)[:, :, None] - torch.where(beyond, rows, 0.0) * rows[:, None]
     return _store(J, out, _ahead(c, X, v))
 
 
@@ -156,16 +157,16 @@ def _sine_scaled(c: Tensor, X: Tensor, scaled: Tensor, v: Tensor) -> Tensor:
 
 def _linearize_sine(c: Tensor, X: Tensor, scaled: Tensor, v: Tensor, *, out: list[Tensor | None]) -> Tensor:
     """The same, and its derivatives."""
-    D = X - c
-    length = torch.linalg.vector_norm(D, dim=-1).clamp(min=1e-12)
-    u = D / length[:, None]
-    s = (scaled * u).sum(-1)
-    ahead = (v * u).sum(-1) > 0
-    eye = torch.eye(3, dtype=v.dtype, device=v.device)
-    across = scaled - s[:, None] * u
-    J = s[:, None, None] * (eye - u[:, :, None] * u[:, None]) + u[:, :, None] * across[:, None]
-    J = torch.where(ahead[:, None, None], -J / length[:, None, None], 0.0)
-    return _store(J, out, _sine_scaled(c, X, scaled, v))
+    D, unit = (X - c).mT, scaled.mT
+    length = torch.linalg.vector_norm(D, dim=0).clamp(min=1e-12)
+    u = D / length
+    s = (unit * u).sum(0)
+    ahead = (v.mT * u).sum(0) > 0
+    across = unit - s * u
+    J = u[:, None] * (across - s * u)
+    J.diagonal().add_(s[:, None])
+    J = torch.where(ahead, -J / length, 0.0)
+    return _store(J, out, (unit - torch.where(ahead, s, 0.0) * u).mT)
 
 
 def _bend_sine(
@@ -187,10 +188,11 @@ def _bend_sine(
     return H
 
 
-def _store(J: Tensor, out: list[Tensor | None], residual: Tensor) -> Tensor:
+def _store(J: Float[Tensor, "3 3 m"], out: list[Tensor | None], residual: Tensor) -> Tensor:
     """Derivatives by X, their negatives by c."""
+    J = J.permute(2, 0, 1)
     if out[0] is not None:
-        out[0].copy_(-J)
+        torch.neg(J, out=out[0])
     if out[1] is not None:
         out[1].copy_(J)
     return residual

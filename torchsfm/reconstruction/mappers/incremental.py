@@ -50,7 +50,7 @@ STANDING = 1e-6
 left, long rows of cameras that bend as a whole."""
 
 FIRST: dict[str, Any] = {"max_iterations": 20, "tolerance": 3e-4, "initial_damping": STANDING}
-NEARLY: dict[str, Any] = {"max_iterations": LAST_ITERATIONS, "tolerance": 1e-5, "initial_damping": STANDING}
+NEARLY: dict[str, Any] = {"max_iterations": LAST_ITERATIONS, "tolerance": 3e-5, "initial_damping": STANDING}
 """How far to adjust before observations are looked for once more, at first, and then: about to the minimum, as what is asked of
 a model does not tell it from one there, and `finish` goes on to another one."""
 

@@ -182,7 +182,7 @@ def measure_noise(mapping: Mapping, loss: Cauchy, weights: Float[Tensor, "m"] | 
     fitted = (x - mapping.graph.x[node]).square().sum(-1)
     s = (fitted / redundancy).detach().requires_grad_()
     with torch.enable_grad():
-        (slope,) = torch.autograd.grad(loss(s).sum(), s, create_graph=True)
+        slope = loss.slope(s)
         (bend,) = torch.autograd.grad(slope.sum(), s)
     s, slope, weights = s.detach(), slope.detach(), torch.ones_like(fitted) if weights is None else weights
     square = (weights.square() * slope.square() * s).mean() / 2

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping as Dict
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -92,6 +93,10 @@ class Mapping:
 
     def observations(self) -> Int[Tensor, "m"]:
         """Image points that have a 3D point, sorted by it."""
+        return self._observations
+
+    @cached_property
+    def _observations(self) -> Int[Tensor, "m"]:
         node = (self.point >= 0).nonzero()[:, 0]
         return node[torch.argsort(self.point[node], stable=True)]
 
