@@ -36,10 +36,15 @@ class Runs:
 
     def squares(self, Y: Tensor) -> Tensor:
         """`Y Y'` of Y (q, c, m), summed over q: (runs, c, c)."""
+        return self.products(Y, Y)
+
+    def products(self, Y: Tensor, Z: Tensor) -> Tensor:
+        """`Y Z'` of Y (q, c, m) and Z (q, k, m), summed over q: (runs, c, k)."""
         if self.number is None:
-            return torch.stack([torch.bmm(Y[:, :, a:b], Y[:, :, a:b].mT) for a, b in self.ends]).sum(1)
+            return torch.stack([torch.bmm(Y[:, :, a:b], Z[:, :, a:b].mT) for a, b in self.ends]).sum(1)
         rows = Y.permute(2, 1, 0).contiguous()
-        return rows.new_zeros((len(self.slots), *Y.shape[1:2] * 2)).index_add_(0, self.number, rows @ rows.mT)
+        other = rows if Z is Y else Z.permute(2, 1, 0).contiguous()
+        return rows.new_zeros((len(self.slots), Y.shape[1], Z.shape[1])).index_add_(0, self.number, rows @ other.mT)
 
     def combine(self, steps: Tensor, W: Tensor) -> Tensor:
         """Rows of W (q, c, m) combined by the coefficients (runs, c) of their run: (q, m)."""

@@ -7,7 +7,7 @@ preconditioner inverts diagonal blocks of S (Schur-Jacobi), one for each cluster
 such as the pose and the intrinsics of one photograph.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
@@ -31,7 +31,7 @@ ITERATIONS = 500
 
 
 @dataclass(frozen=True)
-class _Chunk:
+class Chunk:
     """Residuals worked on at once, and the runs of one slot among them."""
 
     start: int
@@ -46,7 +46,7 @@ class RowCoupling:
         self.size, self.q, self.points = family.size, family.point_size, family.points
         coupled = [piece for piece in family.pieces if piece.coupled]
         self.width = max(piece.columns.shape[1] for piece in coupled)
-        self._chunks: dict[tuple[int, int], _Chunk] = {}
+        self._chunks: dict[tuple[int, int], Chunk] = {}
         columns, slots, points = [], [], []
         rows = count = 0
         for k, piece in enumerate(family.pieces):
@@ -59,14 +59,14 @@ class RowCoupling:
             points.append(piece.point)
             for start in range(0, piece.slots.numel(), CHUNK):
                 part = slots[-1][start : start + CHUNK]
-                self._chunks[k, start] = _Chunk(rows + start, rows + start + part.numel(), find_runs(part))
+                self._chunks[k, start] = Chunk(rows + start, rows + start + part.numel(), find_runs(part))
             rows += piece.slots.numel()
             count += piece.columns.shape[0]
         self.columns, self.slots, self.point = torch.cat(columns), torch.cat(slots), torch.cat(points)
         self._W = some.new_zeros(self.q * self.width * rows)
         self._work = Workspace(some)
 
-    def _block(self, chunk: _Chunk) -> Tensor:
+    def _block(self, chunk: Chunk) -> Tensor:
         """The part of W that belongs to a chunk, (q, c, m)."""
         size = self.q * self.width
         return self._W[size * chunk.start : size * chunk.end].view(self.q, self.width, -1)
@@ -84,19 +84,26 @@ class RowCoupling:
             for k in range(1, d):
                 out.addcmul_(J[k], P[k, a])
 
-    def squares(self, L: Triangle, z: Tensor, rows: Tensor | None = None) -> Tensor:
-        """`Y Y'` of each slot alone, with `Y = W L'^-1` and z (q, points) as one more row: (slots, c + 1, c + 1).
+    def squares(self, L: Triangle, z: Tensor) -> Tensor:
+        """`Y Y'` of each slot alone, with `Y = W L'^-1` and z (q, points) as one more row: (slots, c + 1, c + 1)."""
+        out = z.new_zeros((self.columns.shape[0], self.width + 1, self.width + 1))
+        for chunk, Y in self.whitened(L, z):
+            out.index_add_(0, chunk.runs.slots, chunk.runs.squares(Y))
+        return out
 
-        `rows (residuals, q, c)` gets Y.
+    def whitened(self, L: Triangle, z: Tensor, beside: Tensor | None = None) -> Iterator[tuple[Chunk, Tensor]]:
+        """The chunks with `Y = W L'^-1`, and z as one more row, (q, c + 1, m); each is overwritten by the next.
+
+        `beside (q, k, points)` are more rows, of each residual those of its eliminated variable.
         """
         q, c = self.q, self.width
         entries = torch.stack([entry for row in L for entry in row] + list(z))
-        out = z.new_zeros((self.columns.shape[0], c + 1, c + 1))
+        more = 0 if beside is None else beside.shape[1]
         for chunk in self._chunks.values():
             W, m = self._block(chunk), chunk.end - chunk.start
-            index = self.point[chunk.start : chunk.end].expand(len(entries), -1)
-            at = torch.gather(entries, 1, index, out=self._work.get("at", len(entries), m))
-            Y = self._work.get("Y", q, c + 1, m)
+            point = self.point[chunk.start : chunk.end]
+            at = torch.gather(entries, 1, point.expand(len(entries), -1), out=self._work.get("at", len(entries), m))
+            Y = self._work.get("Y", q, c + 1 + more, m)
             Y[:, c] = at[-q:]
             place = 0
             for a in range(q):
@@ -106,10 +113,17 @@ class RowCoupling:
                     row = Y[a, :c]
                 torch.mul(row, at[place + a], out=Y[a, :c])
                 place += a + 1
-                if rows is not None:
-                    rows[chunk.start : chunk.end, a] = Y[a, :c].mT
-            out.index_add_(0, chunk.runs.slots, chunk.runs.squares(Y))
-        return out
+                if beside is not None:
+                    Y[a, c + 1 :] = torch.gather(beside[a], 1, point.expand(more, -1), out=self._work.get("beside", more, m))
+            yield chunk, Y
+
+    def totals(self, L: Triangle, some: Tensor) -> Tensor:
+        """Of some columns of Y the sum over the residuals of each eliminated variable, (q, columns, points)."""
+        total = self._W.new_zeros((self.q * len(some), self.points))
+        for chunk in self._chunks.values():
+            rows = self._block(chunk).index_select(1, some).flatten(0, 1)
+            total.index_add_(1, self.point[chunk.start : chunk.end], rows)
+        return forward(L, total.view(self.q, len(some), -1))
 
     def product(self, kept: Tensor) -> Tensor:
         """`W' kept`, (q, points); kept has the columns of the gradient and of fixed variables too."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsfm.optim.batched_cholesky import Triangle
 from torchsfm.optim.layout import Family
-from torchsfm.optim.retained_blocks import DenseMatrix, Matrix, add_squares, find_runs
+from torchsfm.optim.retained_blocks import DenseMatrix, Matrix, add_squares
 from torchsfm.optim.schur_matrix_free import RowCoupling
 from torchsfm.optim.terms import Workspace
 
@@ -22,6 +22,8 @@ RESIDUAL = 1.3e-7
 """Seconds per residual, to divide by the Cholesky factors and sum over slots."""
 BATCH = 4096
 """Pairs multiplied at once."""
+SHORT = 2**31
+"""Numbers that half the length will do for, which take half the time to sort and to gather."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +58,9 @@ class PairCoupling:
         self._rows = RowCoupling(family, some)
         same = (self._rows.columns == self._rows.columns[:1]).all(0)
         self._common, self._own = same.nonzero()[:, 0], (~same).nonzero()[:, 0]
-        self._slots = find_runs(self._rows.slots).ends
         self._pairs: _Pairs = self._plan(self._rows.slots, self._rows.columns.shape[0]) if like is None else like._pairs
         # One row of zeros more, for padding.
-        self._Y = some.new_zeros((self._rows.slots.numel() + 1, self._rows.q, self._rows.width))
+        self._Y = some.new_zeros((self._rows.slots.numel() + 1, self._rows.q, len(self._own)))
         self._work = Workspace(some)
 
     def clear(self) -> None:
@@ -107,14 +108,11 @@ class PairCoupling:
     def reduce(self, S: Tensor, L: Triangle, z: Tensor) -> None:
         """Subtract `W V^-1 W'` from the numbers S of the matrix, with `V = L L'`, and `W L'^-1 z` from its column `size`."""
         q, c, pairs = self._rows.q, len(self._own), self._pairs
-        squares = self._rows.squares(L, z, self._Y[:-1])
-        if len(self._common):
-            self._add_common(squares)
         columns = torch.nn.functional.pad(self._rows.columns, (0, 1), value=self._rows.size)
-        add_squares(S, self._matrix, columns, squares, -1.0)
+        add_squares(S, self._matrix, columns, self._squares(L, z), -1.0)
         if not c:
             return
-        flat = (self._Y[:, :, self._own] if len(self._common) else self._Y).view(-1, q * c)
+        flat = self._Y.view(-1, q * c)
         total = S.new_zeros((pairs.places.numel() // (c * c), c * c))
         for begin in range(0, pairs.left.numel(), BATCH):
             sides = []
@@ -129,27 +127,32 @@ class PairCoupling:
         entries[pairs.twice] *= 2
         S.view(-1).index_add_(0, pairs.places, entries, alpha=-1)
 
-    def _add_common(self, squares: Tensor) -> None:
-        """Add to the squares of slots what the common columns of each variable's other residuals make with them."""
-        Y, common, own = self._Y[:-1], self._common, self._own
-        mine = Y[:, :, common]
-        total = mine.new_zeros((self._rows.points, *mine.shape[1:])).index_add_(0, self._rows.point, mine)
-        others = total[self._rows.point] - mine
-        met = torch.stack([Y[a:b].flatten(0, 1).mT @ others[a:b].flatten(0, 1) for a, b in self._slots])
+    def _squares(self, L: Triangle, z: Tensor) -> Tensor:
+        """The squares of slots, and what the common columns of each variable's other residuals make with them; keeps Y."""
+        common, own, width = self._common, self._own, self._rows.width + 1
+        total = self._rows.totals(L, common) if len(common) else None
+        found = z.new_zeros((self._rows.columns.shape[0], width, width + len(common)))
+        for chunk, Y in self._rows.whitened(L, z, total):
+            Y[:, width:] -= Y[:, common]
+            found.index_add_(0, chunk.runs.slots, chunk.runs.products(Y[:, :width], Y))
+            for a, rows in enumerate(Y):
+                self._Y[chunk.start : chunk.end, a] = rows.index_select(0, own).mT
+        squares, met = found[:, :, :width], found[:, :-1, width:]
         squares[:, :-1, common] += met
         squares[:, common[:, None], own] += met[:, own].mT
+        return squares
 
 
 def pairs_of_points(point: Tensor, slots: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
     """All pairs of residuals of one point, the one with the earlier slot on the left, and a number for the slots of each.
 
-    Residuals are sorted by slot. Numbers of half the length, where they will do, take half the time to sort and to gather.
+    Residuals are sorted by slot.
     """
     point, order = torch.sort(point, stable=True)
     at = torch.arange(order.numel(), device=order.device)
     later = torch.bincount(point).cumsum(0)[point] - at - 1
     total = int(later.sum())
-    kind = torch.int32 if max(total, count**2) < 2**31 else torch.int64
+    kind = torch.int32 if max(total, count**2) < SHORT else torch.int64
     order, at, slots = order.to(kind), at.to(kind), slots[order].to(kind)
     # Those of a point are next to each other: each meets all after it.
     left = at.repeat_interleave(later)

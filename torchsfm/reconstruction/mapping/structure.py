@@ -98,7 +98,7 @@ def _triangulate_rows(
 
     def errors(points: Float[Tensor, "p h 3"]) -> Float[Tensor, "p h s"]:
         # One product a track, coordinates apart: a product for each point in each view takes several times as long.
-        y = (points @ P[..., :3].flatten(1, 2).mT).unflatten(-1, (-1, 3)) + P[:, None, :, :, 3]
+        y = (points @ P[..., :3].flatten(1, 2).mT).reshape(*points.shape[:2], -1, 3) + P[:, None, :, :, 3]
         u, v, depth = y.unbind(-1)
         ahead = depth.clamp(min=1e-12)
         error = torch.hypot(u / ahead - image[:, None, :, 0], v / ahead - image[:, None, :, 1])
