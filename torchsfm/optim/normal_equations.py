@@ -3,7 +3,7 @@
 See `schur` for the notation. Eliminated blocks are factored elementwise, all at once: each entry of a factor is one long row.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -59,6 +59,14 @@ class Eliminated:
 
 
 @dataclass(frozen=True)
+class Factors:
+    """Of a damped system: those of each family's V, and that of the reduced system, dense."""
+
+    triangles: list[Triangle]
+    lower: Tensor
+
+
+@dataclass(frozen=True)
 class NormalEquations:
     """`U` with the gradient, and the families of eliminated variables.
 
@@ -84,12 +92,15 @@ class NormalEquations:
     """Whether eliminated variables are held that have something left to gain."""
     rest: Tensor | None = None
     """Motions of the retained variables, (size, k), of which no step has a part."""
+    last: list[Factors] = field(default_factory=list)
+    """Those of the last step, if one process factored a dense system for it."""
 
     def step(self, damping: float) -> Step:
         """The step for `damping` times the diagonal.
 
         The promise holds for steps of conjugate gradients too: their residual is orthogonal to the step.
         """
+        self.last.clear()
         weight = damping * self.precision
         metrics = [damping * measure(part.metric, part.q) for part in self.eliminated]
         factors = [factor(part.V + metric, part.q) for part, metric in zip(self.eliminated, metrics, strict=True)]
@@ -136,25 +147,44 @@ class NormalEquations:
         ranks = self.layout.ranks
         S = ranks.sum_first(S)
         if ranks.size == 1:
-            return *self._by_square(S, weight), False
+            kept, solved, bent, lower = self._by_square(S, weight)
+            if lower is not None:
+                self.last.append(Factors(triangles, lower))
+            return kept, solved, bent, False
         found = torch.nn.functional.pad(weight, (0, 2))
         if not ranks.rank:
-            kept, solved, bent = self._by_square(S, weight)
+            kept, solved, bent, _ = self._by_square(S, weight)
             found = torch.cat((kept, torch.stack((solved, torch.full_like(solved, bent)))))
         found = ranks.spread(found)
         return found[:size], found[size] > 0, bool(found[size + 1]), False
 
-    def _by_square(self, S: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, bool]:
-        """The step of the retained variables, if there is one, and whether the cost bends down, given the dense system."""
+    def _by_square(self, S: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, bool, Tensor | None]:
+        """The step of the retained variables, if there is one, whether the cost bends down, and the dense system's factor."""
         size = len(weight)
         S.diagonal()[:size] += weight
         self.hold(S[:size, :size])
         lower, info = torch.linalg.cholesky_ex(S[:size, :size])
         if self.curved and size <= LARGEST_BENT and bool(info):
-            return *self._downhill(S[:size, :size], S[:size, size]), True
+            return *self._downhill(S[:size, :size], S[:size, size]), True, None
         half = torch.linalg.solve_triangular(lower, S[:size, size:][:, :1], upper=False)
         kept = -torch.linalg.solve_triangular(lower.mT, half, upper=True)[:, 0]
-        return kept, (info == 0) & kept.isfinite().all(), False
+        return kept, (info == 0) & kept.isfinite().all(), False, lower
+
+    def again(self, other: "NormalEquations") -> dict[str, Tensor] | None:
+        """The last step as it were with the gradient of another system, by its factors; None where there are none."""
+        if not self.last:
+            return None
+        (factors,) = self.last
+        kept, halves = other.slope, []
+        for part, given, L in zip(self.eliminated, other.eliminated, factors.triangles, strict=True):
+            halves.append(forward(L, given.gradient()))
+            if part.coupling is not None:
+                kept = kept - part.coupling.lift(backward(L, halves[-1]))[: len(kept)]
+        kept = -torch.cholesky_solve(kept[:, None], factors.lower)[:, 0]
+        points = []
+        for part, L, z in zip(self.eliminated, factors.triangles, halves, strict=True):
+            points.append(-backward(L, z if part.coupling is None else z + forward(L, part.coupling.product(extend(kept)))))
+        return self.split(kept, points)
 
     def _by_fronts(
         self, fronts: Fronts, weight: Tensor, triangles: list[Triangle], right: list[Tensor]

@@ -152,10 +152,12 @@ class Elimination:
             bent.append(hold(own.V, given.V, q, FLAT if minimum else BENT).any())
             eliminated.append(replace(own, metric=given.V))
         held = bool(self.ranks.any(torch.stack(bent).any()))
-        return replace(system, eliminated=eliminated, squares=exact.squares, curved=True, held=held)
+        return replace(system, eliminated=eliminated, squares=exact.squares, curved=True, held=held, last=[])
 
-    def accelerate(self, x: dict[str, Tensor], step: dict[str, Tensor], damping: float) -> dict[str, Tensor]:
-        """What a step from `x` lacks to follow a valley of the cost that is curved.
+    def accelerate(
+        self, x: dict[str, Tensor], step: dict[str, Tensor], damping: float, system: NormalEquations
+    ) -> dict[str, Tensor]:
+        """What the last step of the system at `x` lacks to follow a valley of the cost that is curved.
 
         Half the step that the residuals' second derivatives along the given one ask for in the same damped system (geodesic
         acceleration, Transtrum & Sethna 2012). What `curve` gave is overwritten.
@@ -163,7 +165,9 @@ class Elimination:
         ends = [
             move(self.blocks, self.layout, x, {name: part * delta for name, delta in step.items()}) for part in (ALONG, -ALONG)
         ]
-        bent: dict[str, Tensor] = self._other().linearize(x, ends).step(damping).delta
+        other = self._other().linearize(x, ends)
+        # The matrices are the same, and need not be factored twice.
+        bent: dict[str, Tensor] = system.again(other) or other.step(damping).delta
         return {name: delta / 2 for name, delta in bent.items()}
 
     def _other(self) -> "Elimination":

@@ -314,7 +314,7 @@ class _SparseProblem:
     def _bent(self, here: _Place, there: _Place, step: Step) -> _Place:
         """Where a step leads that follows a curved valley, if the cost is less there."""
         engine = self.engine
-        change = engine.accelerate(here.x, step.delta, here.damping)
+        change = engine.accelerate(here.x, step.delta, here.damping, here.system)
         (straight, _), (aside, _) = here.system.join(step.delta), here.system.join(change)
         measure = here.system.diagonal.sqrt()
         if not bool((measure * aside).norm() <= SMALL / 2 * (measure * straight).norm()):
