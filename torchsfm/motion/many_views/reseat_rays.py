@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchsfm.motion.many_views.ray_sums import Rays, sine
+from torchsfm.motion.many_views.ray_sums import Rays
 from torchsfm.optim import Loss
 
 PLACES = 32
@@ -38,12 +38,15 @@ def _reseat(
     own: Tensor, ends: Tensor, owner: Tensor, v: Tensor, weights: Tensor | None, loss: Loss, reach: float
 ) -> Float[Tensor, "n 3"]:
     """Of things with lines in directions v to `ends`."""
+    # Coordinates apart: three of them side by side take several times as long.
+    far, directions = ends.mT.contiguous(), v.mT.contiguous()
 
-    def cost(place: Tensor, ray: Tensor) -> Tensor:
-        found = loss(sine(place, ends[ray], v[ray]).square().sum(-1))
+    def cost(place: Tensor, at: Tensor, ray: Tensor) -> Tensor:
+        D = far.index_select(1, ray) - place.mT.contiguous().index_select(1, at)
+        found = loss(_squared_sine(D, directions.index_select(1, ray)))
         return found if weights is None else weights[ray] * found
 
-    square = sine(own[owner], ends, v).square().sum(-1)
+    square = _squared_sine(far - own.mT[:, owner], directions)
     doubtful = torch.bincount(owner[square > reach**2], minlength=len(own)) > 0
     order = doubtful[owner].nonzero()[:, 0]
     order = order[torch.argsort(_shuffled(v[order]), stable=True)]
@@ -60,16 +63,25 @@ def _reseat(
         a, b = order[start + k % n], order[start + (k + 1 + k // n) % n]
         place = _meeting(ends[a], v[a], ends[b], v[b])
         at, judge = numbered(judges[some][of])
-        total = place.new_zeros(len(place)).index_add_(0, at, cost(place[at], order[start[at] + judge]))
+        total = place.new_zeros(len(place)).index_add_(0, at, cost(place, at, order[start[at] + judge]))
         least = total.new_full((len(some),), torch.inf).scatter_reduce_(0, of, total, "amin")
         best = (total == least[of]).nonzero()[:, 0]
         chosen = torch.full_like(some, len(of)).scatter_reduce_(0, of[best], best, "amin")
         at, judge = numbered(count)
         ray = order[first[some][at] + judge]
-        gain = cost(own[some][at], ray) - cost(place[chosen][at], ray)
+        gain = cost(own[some], at, ray) - cost(place[chosen], at, ray)
         better = gain.new_zeros(len(some)).index_add_(0, at, gain) > 0
         moved[thing[better]] = place[chosen[better]]
     return moved
+
+
+def _squared_sine(D: Float[Tensor, "3 m"], v: Float[Tensor, "3 m"]) -> Float[Tensor, "m"]:
+    """Of the angles between ways D and unit directions; one where these lead apart, as in `sine`."""
+    x, y, z = D
+    a, b, c = v
+    across = (y * c - z * b).square_().add_((z * a - x * c).square_()).add_((x * b - y * a).square_())
+    length = (x * x).addcmul_(y, y).addcmul_(z, z).clamp_(min=torch.finfo(D.dtype).tiny)
+    return torch.where(x * a + y * b + z * c > 0, across / length, 1.0)
 
 
 def numbered(count: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:

@@ -159,7 +159,8 @@ def excess_scatter(mapping: Mapping, *, threshold: float) -> float:
     influence = r.clamp(-bound, bound)
     H, g = J.new_zeros(5, 5, q), J.new_zeros(5, q).index_add_(1, pair, J * influence)
     for k in range(5):
-        H[k].index_add_(1, pair, J[k] * J)
+        H[k, k:].index_add_(1, pair, J[k] * J[k:])
+        H[k:, k] = H[k, k:].clone()
     H, g = H.permute(2, 0, 1)[enough], g.mT[enough]
     ridge = 1e-9 * H.diagonal(dim1=-2, dim2=-1).mean(-1)[:, None, None] * torch.eye(5, dtype=J.dtype)
     step, info = torch.linalg.solve_ex(H + ridge, g)
@@ -185,6 +186,8 @@ class _MatchedRays:
     """Pixels per unit of d'(t x p)."""
     ahead: Float[Tensor, "m"]
     """How far the rays are from where they would meet at infinity, in pixels; negative where they meet behind a camera."""
+    tangents: tuple[Float[Tensor, "3 q"], Float[Tensor, "3 q"]]
+    """Of the unit sphere at the baseline of each pair of images."""
 
     def agree(self, threshold: float) -> Bool[Tensor, "m"]:
         """Matches whose rays meet in front of both cameras, up to the threshold in pixels."""
@@ -194,9 +197,7 @@ class _MatchedRays:
         """The derivatives of the distance of some matches by a turn of p, and by t along two tangents of the unit sphere."""
         p, d, t = self.p[:, some], self.d[:, some], self.t[:, some]
         turn, shift = _cross(p, _cross(d, t)), _cross(p, d)
-        axis = torch.eye(3, dtype=t.dtype)[:, t.abs().argmin(0)]
-        first = torch.nn.functional.normalize(_cross(t, axis), dim=0)
-        along = [(shift * tangent).sum(0) for tangent in (first, _cross(t, first))]
+        along = [(shift * tangent.index_select(1, self.pair[some])).sum(0) for tangent in self.tangents]
         return torch.cat((turn, torch.stack(along))) * self.scale[some]
 
 
@@ -215,6 +216,9 @@ def _matched_rays(mapping: Mapping) -> Iterator[_MatchedRays]:
     # A baseline of no length leaves the rays parallel; any direction will do.
     centre = mapping.poses.centre
     baseline = torch.nn.functional.normalize(centre[i] - centre[j], dim=-1, eps=1e-30).mT.contiguous()
+    axis = torch.eye(3, dtype=d.dtype)[:, baseline.abs().argmin(0)]
+    first = torch.nn.functional.normalize(_cross(baseline, axis), dim=0)
+    tangents = first, _cross(baseline, first)
     focal = mapping.cameras.K[mapping.camera_index, 0, 0][graph.pairs].mean(-1)
     for some in torch.split(chosen, PIECE):
         pair, match = graph.match_pair[some], graph.match[some]
@@ -223,7 +227,7 @@ def _matched_rays(mapping: Mapping) -> Iterator[_MatchedRays]:
         tp, td, cosine = (t * p).sum(0), (t * d).sum(0), (p * d).sum(0)
         scale = f / (2 - tp * tp - td * td - 2 * e * e).clamp(min=1e-12).sqrt()
         ahead = f * torch.minimum(td - tp * cosine, td * cosine - tp)
-        yield _MatchedRays(pair, match, p, d, t, e * scale, scale, ahead)
+        yield _MatchedRays(pair, match, p, d, t, e * scale, scale, ahead, tangents)
 
 
 def _cross(a: Float[Tensor, "3 m"], b: Float[Tensor, "3 m"]) -> Float[Tensor, "3 m"]:
