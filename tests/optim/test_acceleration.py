@@ -46,7 +46,7 @@ def test_factors_serve_again(
 ) -> None:
     """Of a dense system, with other residuals that have the same derivatives; others keep none."""
     monkeypatch.setattr(schur, "estimate_pairs", lambda family: seconds)
-    given = random_bundle_problem(5, 40, 160, noise=0.5, generator=generator).problem
+    given = random_bundle_problem(5, 40, 100, noise=0.5, generator=generator).problem
     blocks, terms = Bundle(given, free=("focal", "k1")).problem()
     blocks, terms, _ = prepare(blocks, terms)
     noise = torch.randn(given.x.shape, generator=generator, dtype=torch.float64)
