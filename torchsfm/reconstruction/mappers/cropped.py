@@ -21,8 +21,9 @@ from torchsfm.geometry import Camera
 from torchsfm.reconstruction.evidence.consistency import excess_scatter
 from torchsfm.reconstruction.mappers.beginning import Grown
 from torchsfm.reconstruction.mappers.incremental import MappingOptions, extend_model
+from torchsfm.reconstruction.mappers.zoomed import one_focal_length
 from torchsfm.reconstruction.mapping.adjust import LOSS, adjust, support
-from torchsfm.reconstruction.mapping.calibration import calibration_of, choose_free, images_of_cameras, measure_noise
+from torchsfm.reconstruction.mapping.calibration import choose_free, images_of_cameras, measure_noise
 from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs, with_square_pixels
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS
@@ -31,8 +32,6 @@ MIN_IMAGES = 3
 """Fewer leave cameras as they were expected."""
 ODDS = math.log(100)
 """Principal points are not in the middle where that is so much more probable."""
-FOCAL_FAULTS = 0.02
-"""By how much a photograph's own faults make its focal length look another."""
 MOST, CHANGED = 4, 0.05
 """Models made with one camera, at most, from focal lengths that differ by more than this part."""
 ENOUGH: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
@@ -116,7 +115,7 @@ def map_cropped(
     found: tuple[Grown, MappingOptions] | None = None
     if len(torch.unique(family[grown.registered])) == 1:
         found = _of_one_camera(empty, grown, cropped, grow)
-    if found is None or not _one_camera(found[0][0], found[1]):
+    if found is None or not one_focal_length(found[0][0], found[1], family):
         several = extend_model(grown, elsewhere, cropped, progress), cropped
         # Several cameras explain more than one in the right place can: if they do not, the model is wrong, not the tie.
         if found is None or support(several[0][0], options.reprojection) > support(found[0][0], options.reprojection):
@@ -169,24 +168,6 @@ def _of_one_camera(
             # What was found from a wrong one, is found better from the right one.
             focals.insert(0, float(trial[0].cameras.K[images, 0, 0].median()))
     return None if best is None else best[:2]
-
-
-def _one_camera(model: Mapping, options: MappingOptions) -> bool:
-    """Whether cameras that were held to be one still have about one focal length where they are several.
-
-    Each is more probably the same, but for what a photograph's own faults make of it, than one of another camera.
-    """
-    if model.adjustment is None:
-        return False
-    prior = replace(options, alike=False).prior(model)
-    far = adjust(model, free=model.adjustment.free, prior=prior, **ENOUGH)
-    found = calibration_of(far, prior, loss=LOSS, excess=excess_scatter(far, threshold=options.reprojection))
-    used = images_of_cameras(model) > 0
-    focal = found.values[used, 0].log()
-    noise = (found.deviation[used, 0] / found.values[used, 0]).square()
-    square = (focal - focal.median()).square()
-    same, other = (noise + width**2 for width in (FOCAL_FAULTS, FOCAL_SIGMA["fundamental matrices"]))
-    return bool((square / same + same.log() < square / other + other.log()).all())
 
 
 def _focal_of_pairs(empty: Mapping) -> float | None:

@@ -194,8 +194,7 @@ class Growth:
             told = torch.tensor([focal is not None for focal in given.exif_focal])
             apart = part_zoomed(graph, together, told, wanted.aspect)
             if apart is not None:
-                own, more = apart
-                begun, first = better_beginning(begun, begin(own, body=body), more, partial(_settled, method, progress))
+                begun, first = better_beginning(begun, begin(apart, body=body), partial(_settled, method, progress))
         # Of images that do not differ but in size, one camera may have taken all, and some were cropped.
         family = group_cameras(torch.zeros_like(graph.image_size), given.labels, wanted.shared_camera)
         return cls(begun, method, family, given.track is None, progress, first)

@@ -3,11 +3,15 @@
 Images of one size share a camera, which makes it well determined. Where that is wrong most images find no place. The
 fundamental matrices of the pairs tell before anything is placed: with a focal length for each image they are essential matrices
 by more than as many further numbers bring about by chance (Schwarz, "Estimating the dimension of a model", Annals of
-Statistics 1978). Lenses that distort and principal points off the middle make them look so as well, so that models decide.
+Statistics 1978). Lenses that distort and principal points off the middle make them look so as well, so that models decide. Few
+images find their places with a wrong focal length, too, far from the right ones, and have too few pairs to tell: of these
+models are asked wherever they could.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,9 +20,11 @@ from torch import Tensor
 from torchsfm.autocalibration import calibrate_view_graph
 from torchsfm.autocalibration.focal_from_fundamentals import SCALE, WIDE
 from torchsfm.linalg import svdvals
+from torchsfm.reconstruction.evidence.consistency import excess_scatter
 from torchsfm.reconstruction.mappers.beginning import Beginning, Grown
 from torchsfm.reconstruction.mappers.incremental import MappingOptions
-from torchsfm.reconstruction.mapping.adjust import support
+from torchsfm.reconstruction.mapping.adjust import LOSS, adjust, support
+from torchsfm.reconstruction.mapping.calibration import FEW, calibration_of
 from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs, with_square_pixels
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
@@ -26,17 +32,21 @@ from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
 TRIED = 64
 """Common focal lengths that are tried."""
 MORE, MUCH_MORE = 1.01, 1.05
-"""By how much more of what is seen must be explained, as numbers of their own make up for a little of all errors: where the
-pairs say that focal lengths differ, and where so few tell of them that they cannot say."""
+"""By how much more of what is seen must be explained, as numbers of their own make up for a little of all errors: by focal
+lengths that differ, and by such as one lens has but for a photograph's own faults."""
+FOCAL_FAULTS = 0.02
+"""By how much a photograph's own faults make its focal length look another."""
+NEAR: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
+"""How far to adjust before focal lengths are compared."""
 ENOUGH = 2.0
-"""Pairs for each image, of whatever kind, by which models tell focal lengths where pairs do not."""
+"""Pairs for each image, of whatever kind, by which models tell focal lengths where pairs do not; for each of few images one."""
 MOST = 60
 """Images of one size that are asked: those of the most pairs."""
 
 
 def part_zoomed(
     graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"], aspect: float = 1.0
-) -> tuple[Int[Tensor, "v"], float] | None:
+) -> Int[Tensor, "v"] | None:
     """Give each image a camera of its own where the pairs say that those of one have several focal lengths, or cannot tell.
 
     Args:
@@ -46,29 +56,26 @@ def part_zoomed(
         aspect: Focal lengths along y over those along x.
 
     Returns:
-        Which camera took each image, numbered from 0 in the order of the images, and how many times as much models with these
-        cameras must explain to be believed; None where it stays as it is.
+        Which camera took each image, numbered from 0 in the order of the images; None where it stays as it is.
     """
     differ: dict[int, bool | None] = {
         k: _focal_lengths_differ(graph, camera_index == k, aspect)
         for k in torch.unique(camera_index[~told]).tolist()
         if not bool(told[camera_index == k].any())
     }
-    sure = [k for k, answer in differ.items() if answer]
-    several = sure or [k for k, answer in differ.items() if answer is None]
+    several = [k for k, answer in differ.items() if answer] or [k for k, answer in differ.items() if answer is None]
     if not several:
         return None
     own = torch.isin(camera_index, camera_index.new_tensor(several))
     v = len(camera_index)
     keys = torch.where(own, v + torch.arange(v), camera_index).tolist()
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
-    return camera_index.new_tensor([order[key] for key in keys]), MORE if sure else MUCH_MORE
+    return camera_index.new_tensor([order[key] for key in keys])
 
 
 def better_beginning(
     together: Beginning,
     apart: Beginning,
-    more: float,
     make: Callable[[Mapping, MappingOptions], tuple[Grown, Mapping] | None],
 ) -> tuple[Beginning, Grown | None]:
     """Cameras of their own for some images, if these explain clearly more of what is seen, else those that images share.
@@ -76,7 +83,6 @@ def better_beginning(
     Args:
         together: With cameras that images share.
         apart: With cameras of their own.
-        more: How many times as much these must explain.
         make: Makes a model, and what is left of it without images that contradict it.
 
     Returns:
@@ -85,9 +91,35 @@ def better_beginning(
     one, several = (make(begun.empty, begun.options) for begun in (together, apart))
     threshold = together.options.reprojection
     known = 0.0 if one is None else support(one[1], threshold)
-    if several is not None and support(several[1], threshold) > more * known:
+    more = 0.0 if several is None else support(several[1], threshold)
+    alike = (
+        MORE * known < more <= MUCH_MORE * known
+        and several is not None
+        and one_focal_length(several[1], apart.options, together.empty.camera_index)
+    )
+    if several is not None and more > MORE * known and not alike:
         return apart, several[0]
     return together, None if one is None else one[0]
+
+
+def one_focal_length(model: Mapping, options: MappingOptions, family: Int[Tensor, "v"]) -> bool:
+    """Whether cameras of their own have about one focal length in each family of images.
+
+    Each is more probably the same, but for what a photograph's own faults make of it, than one of another camera.
+    """
+    if model.adjustment is None:
+        return False
+    prior = replace(options, alike=False).prior(model)
+    far = adjust(model, free=model.adjustment.free, prior=prior, **NEAR)
+    found = calibration_of(far, prior, loss=LOSS, excess=excess_scatter(far, threshold=options.reprojection))
+    of, camera = torch.unique(torch.stack((family, model.camera_index))[:, model.registered], dim=1)
+    focal, variance = found.values[camera, 0].log(), (found.deviation[camera, 0] / found.values[camera, 0]).square()
+    for own in (of == k for k in torch.unique(of)):
+        square = (focal[own] - focal[own].median()).square()
+        same, other = (variance[own] + width**2 for width in (FOCAL_FAULTS, FOCAL_SIGMA["fundamental matrices"]))
+        if not bool((square / same + same.log() < square / other + other.log()).all()):
+            return False
+    return True
 
 
 def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: float) -> bool | None:
@@ -104,8 +136,9 @@ def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: f
     images, ends = torch.unique(pairs[among], return_inverse=True)
     # Fewer pairs than focal lengths always agree with some.
     if len(ends) <= len(images):
-        within = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1)
-        return None if int(within.sum()) >= ENOUGH * int(member.sum()) else False
+        within, count = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1), int(member.sum())
+        all_of_few = len(images) == count <= FEW
+        return None if int(within.sum()) >= (1 if all_of_few else ENOUGH) * count else False
     F, size, c = with_square_pixels(graph, aspect)
     F, size, c = F[telling][among].double(), size[images].double(), c[images].double()
     tried = size.max() * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()
