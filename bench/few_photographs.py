@@ -1,18 +1,22 @@
 """A few neighbouring photographs of the real sets at a time, nothing known of the camera: are they right, or doubted?
 
-`TORCHSFM_DATA=... python -m bench.few_photographs [--sets castle entry] [--sizes 3 4 5] [--step 1]`. An image's error is the
-median, the lower one, of the pose errors of its pairs: of three images of which one is wrong the other two are not.
+`TORCHSFM_DATA=... python -m bench.few_photographs [--sets castle entry] [--sizes 3 4 5] [--step 1] [--zoom]`. An image's error
+is the median, the lower one, of the pose errors of its pairs: of three images of which one is wrong the other two are not. With
+`--zoom` each photograph is as by a zoom lens, the middle of it 1 to 1.7 times as large.
 """
 
 import argparse
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numpy as np
 import torch
 
 from bench.real_data import SETS, PhotographSet, data_folder
+from bench.spoiled_folders import zoom
 from torchsfm import reconstruct
 from torchsfm.geometry import Pose
 from torchsfm.reconstruction.model.evaluation import pose_errors
@@ -53,6 +57,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=int, default=[3, 4, 5])
     parser.add_argument("--step", type=int, default=1, help="images from one window to the next")
     parser.add_argument("--side", type=int, default=768, help="of the photographs, pixels")
+    parser.add_argument("--zoom", action="store_true", help="photographs by a zoom lens")
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -62,12 +67,13 @@ def main() -> None:
     for name in options.sets:
         photographs = SETS[name](data)
         with tempfile.TemporaryDirectory() as folder:
-            paths = []
-            for path in photographs.paths:
-                image = cv2.imread(str(path))
+            paths, random = [], np.random.default_rng(3)
+            for number, path in enumerate(photographs.paths):
+                image: Any = cv2.imread(str(path))
                 scale = min(1.0, options.side / max(image.shape[:2]))
+                image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
                 paths.append(Path(folder) / f"{path.stem}.png")
-                cv2.imwrite(str(paths[-1]), cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+                cv2.imwrite(str(paths[-1]), zoom(image, number, random) if options.zoom else image)
             total = dict.fromkeys(("images", "registered", "wrong", "silently", "right but doubted"), 0)
             for size in options.sizes:
                 for begin in range(0, len(paths) - size + 1, options.step):

@@ -39,7 +39,7 @@ FOCAL_FAULTS = 0.02
 NEAR: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
 """How far to adjust before focal lengths are compared."""
 ENOUGH = 2.0
-"""Pairs for each image, of whatever kind, by which models tell focal lengths where pairs do not; for each of few images one."""
+"""Pairs for each image, of whatever kind, by which models tell focal lengths where pairs do not; of few images one for each."""
 MOST = 60
 """Images of one size that are asked: those of the most pairs."""
 
@@ -137,8 +137,10 @@ def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: f
     # Fewer pairs than focal lengths always agree with some.
     if len(ends) <= len(images):
         within, count = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1), int(member.sum())
-        all_of_few = len(images) == count <= FEW
-        return None if int(within.sum()) >= (1 if all_of_few else ENOUGH) * count else False
+        # Few images tell where they show something besides a plane.
+        beside = within & (graph.fundamental_inliers - graph.homography_inliers >= MIN_INLIERS)
+        few = count <= FEW and int(beside.sum()) >= count
+        return None if few or int(within.sum()) >= ENOUGH * count else False
     F, size, c = with_square_pixels(graph, aspect)
     F, size, c = F[telling][among].double(), size[images].double(), c[images].double()
     tried = size.max() * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()
