@@ -9,7 +9,6 @@ Mostly it was one camera, too, the images cut out at several places. That is a m
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,7 +20,7 @@ from torchsfm.geometry import Camera
 from torchsfm.reconstruction.evidence.consistency import excess_scatter
 from torchsfm.reconstruction.mappers.beginning import Grown
 from torchsfm.reconstruction.mappers.incremental import MappingOptions, extend_model
-from torchsfm.reconstruction.mappers.zoomed import one_focal_length
+from torchsfm.reconstruction.mappers.zoomed import NEAR, one_focal_length
 from torchsfm.reconstruction.mapping.adjust import LOSS, adjust, support
 from torchsfm.reconstruction.mapping.calibration import choose_free, images_of_cameras, measure_noise
 from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs, with_square_pixels
@@ -34,8 +33,6 @@ ODDS = math.log(100)
 """Principal points are not in the middle where that is so much more probable."""
 MOST, CHANGED = 4, 0.05
 """Models made with one camera, at most, from focal lengths that differ by more than this part."""
-ENOUGH: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
-"""Where adjustments that are compared end."""
 
 
 def may_be_off_centre(model: Mapping, options: MappingOptions) -> bool:
@@ -79,10 +76,10 @@ def _gain_off_centre(model: Mapping, options: MappingOptions) -> tuple[float, fl
     prior, wide = (replace(options, cropped=cropped).prior(model) for cropped in (False, True))
     free = choose_free(model, options.free, prior, loss=LOSS, faultless=1)
     free["principal_point"] = free["principal_point"] | lone
-    far = adjust(model, free=free, prior=wide, **ENOUGH)
+    far = adjust(model, free=free, prior=wide, **NEAR)
     excess = excess_scatter(far, threshold=options.reprojection)
-    near = adjust(far, free=free, prior=prior.against(excess), **ENOUGH)
-    far = adjust(near, free=free, prior=wide.against(excess), **ENOUGH)
+    near = adjust(far, free=free, prior=prior.against(excess), **NEAR)
+    far = adjust(near, free=free, prior=wide.against(excess), **NEAR)
     if near.adjustment is None or far.adjustment is None:
         return 0.0, 1.0
     return (near.adjustment.cost - far.adjustment.cost) / (measure_noise(far, LOSS) ** 2 * excess), excess

@@ -37,7 +37,7 @@ lengths that differ, and by such as one lens has but for a photograph's own faul
 FOCAL_FAULTS = 0.02
 """By how much a photograph's own faults make its focal length look another."""
 NEAR: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
-"""How far to adjust before focal lengths are compared."""
+"""Where adjustments that are compared end."""
 ENOUGH = 2.0
 """Pairs for each image, of whatever kind, by which models tell focal lengths where pairs do not; of few images one for each."""
 MOST = 60
@@ -91,14 +91,10 @@ def better_beginning(
     one, several = (make(begun.empty, begun.options) for begun in (together, apart))
     threshold = together.options.reprojection
     known = 0.0 if one is None else support(one[1], threshold)
-    more = 0.0 if several is None else support(several[1], threshold)
-    alike = (
-        MORE * known < more <= MUCH_MORE * known
-        and several is not None
-        and one_focal_length(several[1], apart.options, together.empty.camera_index)
-    )
-    if several is not None and more > MORE * known and not alike:
-        return apart, several[0]
+    if several is not None:
+        more, shared = support(several[1], threshold), together.empty.camera_index
+        if more > MUCH_MORE * known or (more > MORE * known and not one_focal_length(several[1], apart.options, shared)):
+            return apart, several[0]
     return together, None if one is None else one[0]
 
 
