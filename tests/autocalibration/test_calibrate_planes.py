@@ -142,6 +142,13 @@ def test_gradient(generator):
     assert abs(float((slope * way).sum() / numeric) - 1) < 1e-3
 
 
+def test_no_boards_have_no_cameras(generator):
+    x, X, _, _ = views(generator, 3, [0.0] * 5, batch=(2,))
+    found = calibrate_planes(x[:0], X, image_size=SIZE)
+    assert found.camera.K.shape == (0, 3, 3)
+    assert found.status.shape == (0,)
+
+
 def test_wrong_input(generator, unchecked):
     x, X, _, _ = views(generator, 3, [0.0] * 5)
     with pytest.raises(ValueError, match="X: wanted"):

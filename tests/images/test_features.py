@@ -204,6 +204,8 @@ def test_wrong_shapes_are_named() -> None:
             detect_features(torch.zeros(shape))
     with pytest.raises(ValueError, match="max_features"):
         detect_features(torch.zeros(1, 30, 30), 0)
+    with pytest.raises(ValueError, match="enough"):
+        detect_features(torch.zeros(1, 30, 30), enough=[1])  # type: ignore[arg-type]
 
 
 def test_photographs_are_rich(data: Path) -> None:

@@ -179,6 +179,18 @@ def test_a_batch_is_its_elements(shape: tuple[int, ...], dtype: torch.dtype, gen
     assert bool((segments.length.diff() <= 0).all())
 
 
+def test_one_image_is_looked_at_through_several_masks(generator: torch.Generator) -> None:
+    image = squares(1, 64, 22.0)[0][0]
+    masks = torch.ones(2, 64, 64, dtype=torch.bool)
+    masks[1, :, 32:] = False
+    segments = detect_segments(image, 6, mask=masks)
+    for number, mask in enumerate(masks):
+        alone = detect_segments(image, 6, mask=mask)
+        for name in NAMES:
+            assert torch.equal(getattr(segments, name)[number], getattr(alone, name))
+    assert segments.valid.sum(-1)[0] > segments.valid.sum(-1)[1] > 0
+
+
 def test_flat_and_broken_images_have_none_and_spoil_none() -> None:
     image = squares(3, 64, 22.0)[0]
     good = detect_segments(image, 6)

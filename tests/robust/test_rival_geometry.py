@@ -136,3 +136,16 @@ def test_rivals_are_refined_only_near_the_second_solution() -> None:
     """Two for each scene on a critical quadric; of general points the second solution is far from too many."""
     assert _refined(_rank_two, 100) >= 2 * 0.9 * SCENES
     assert _refined(_general, 100) <= 2 * 0.1 * SCENES
+
+
+@pytest.mark.parametrize("n", [30, 100])
+def test_rivals_are_found_in_any_unit(n: int) -> None:
+    """What is across F, and how far a second solution is from it, is no matter of pixels or of the focal length."""
+    x1, x2, _ = _scenes(_rank_two, n, 0.5, 0.0)
+    told = [
+        ransac(FundamentalEstimator(), x1 / unit, x2 / unit, threshold=1.5 / unit, generator=seeded(1)).degeneracy
+        for unit in (1.0, 30.0, FOCAL)
+    ]
+    for found in told:
+        assert_share(found == Degeneracy.UNDETERMINED, 0.7)
+        assert_share(found == told[-1], 0.9)

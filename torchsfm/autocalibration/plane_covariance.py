@@ -59,8 +59,8 @@ def view_disagreement(residual: Tensor, J: Tensor, w: Tensor, q: int, v: int, us
     of an F test; the variance of a mean is multiplied by it where measurements contradict each other (Birge 1932).
     """
     scale = w.sqrt()[..., None]
-    r = (residual * scale).reshape(len(w), v, -1)
-    J = (J * scale[..., None]).reshape(*r.shape, -1)
+    r = (residual * scale).reshape(len(w), v, 2 * w.shape[1] // v)
+    J = (J * scale[..., None]).reshape(*r.shape, J.shape[-1])
     poses = J[..., q:].reshape(*J.shape[:-1], v, 6).diagonal(dim1=1, dim2=3).movedim(-1, 1)
     Q, _, _ = qr(poses * used[..., None, None])
     own = J[..., :q] - Q @ (Q.mT @ J[..., :q])

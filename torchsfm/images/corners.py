@@ -34,7 +34,7 @@ class Corners:
 
 
 def detect_corners(
-    image: Float[Tensor, "*batch c h w"],
+    image: Float[Tensor, "*#batch c h w"],
     max_corners: int = 1000,
     *,
     response: Literal["gftt", "harris"] = "gftt",

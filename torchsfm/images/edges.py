@@ -62,7 +62,7 @@ class Edges:
 
 
 def detect_edges(
-    image: Float[Tensor, "*batch c h w"],
+    image: Float[Tensor, "*#batch c h w"],
     max_edgels: int = 100_000,
     *,
     blur: float = 1.0,

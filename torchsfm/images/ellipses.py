@@ -87,7 +87,7 @@ class Ellipses:
 
 
 def detect_ellipses(
-    image: Float[Tensor, "*batch c h w"],
+    image: Float[Tensor, "*#batch c h w"],
     max_ellipses: int = 200,
     *,
     min_coverage: float = 0.25,

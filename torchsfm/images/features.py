@@ -104,7 +104,7 @@ def detect_features(
 
     check_options(
         max_features=(max_features, "int >= 1"), contrast=(contrast, "float >= 0"), edge=(edge, "float > 0"),
-        max_size=(max_size, "int >= 1"),
+        max_size=(max_size, "int >= 1"), enough=(enough, "int >= 0"),
     )  # fmt: skip
     gray = gray_bytes(pixels_of(image))
     height, width = gray.shape

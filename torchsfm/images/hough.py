@@ -49,7 +49,7 @@ class HoughLines:
 
 
 def hough_lines(
-    image: Float[Tensor, "*batch c h w"],
+    image: Float[Tensor, "*#batch c h w"],
     max_lines: int = 30,
     *,
     min_count: int = 30,

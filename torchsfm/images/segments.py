@@ -74,7 +74,7 @@ class Segments:
 
 
 def detect_segments(
-    image: Float[Tensor, "*batch c h w"],
+    image: Float[Tensor, "*#batch c h w"],
     max_segments: int = 2000,
     *,
     min_length: float = 10.0,
@@ -139,7 +139,7 @@ def detect_segments(
     of_run = of_run[rows]
     wide = edges.width.reshape(-1)[place].double().square()
     wide = wide.new_zeros(number).index_add(0, runs.number, wide)[rows] / found["count"].clamp_min(1)
-    gray = to_gray(image).reshape(-1, *image.shape[-2:])
+    gray = to_gray(image)[..., 0, :, :].expand(*batch, *image.shape[-2:]).reshape(-1, *image.shape[-2:])
     found |= _on_steps(found, gray, edges.noise.reshape(-1)[of_run], of_run, (wide - blur**2 - 1 / 3).clamp_min(0.1).sqrt())
     return Segments(**lay_in_slots(found, good, found["length"], of_run, batch, max_segments, image.dtype))
 

@@ -84,6 +84,8 @@ def _of_parts(
 
 
 def _inverse_iteration(A: Float[Tensor, "*batch 9 9"], g: Float[Tensor, "*#batch 9 1"]) -> Float[Tensor, "*batch 9 1"]:
+    """One step, which makes A definite but for its rounding, in whatever units points are."""
+    A.diagonal(dim1=-2, dim2=-1).mul_(1 + 1e-12)
     g = torch.cholesky_solve(g, torch.linalg.cholesky_ex(A)[0])
     length: Tensor = torch.linalg.vector_norm(g, dim=-2, keepdim=True)
     return g / length
@@ -93,6 +95,25 @@ def _inverse_iteration(A: Float[Tensor, "*batch 9 9"], g: Float[Tensor, "*#batch
 def _constants(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "9 9"], Float[Tensor, "9 1"]]:
     """What makes a matrix definite, and a vector to begin with, across no second solution."""
     return 1e-12 * torch.eye(9, dtype=dtype, device=device), torch.linspace(1, 2, 9, dtype=dtype, device=device).cos()[:, None]
+
+
+def _of_unit_size(
+    F: Float[Tensor, "p 3 3"],
+    h1: Float[Tensor, "p 3 n"],
+    h2: Float[Tensor, "p 3 n"],
+    inliers: Bool[Tensor, "p n"],
+    limit: Float[Tensor, "p"],
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], Float[Tensor, "p 3"]]:
+    """The same with inliers about a unit from the origin, F of norm 1 again, and what a homogeneous point was multiplied by.
+
+    What is across F, and how far from it a second solution is, depends on the unit of the points.
+    """
+    square = (h1[:, :2] * h1[:, :2] + h2[:, :2] * h2[:, :2]).sum(1) * inliers
+    unit = (square.sum(-1) / inliers.sum(-1).clamp(min=1) / 4).sqrt().clamp(min=_TINY)
+    scale = torch.stack((1 / unit, 1 / unit, torch.ones_like(unit)), -1)
+    F = F / scale[:, :, None] / scale[:, None]
+    F = F / torch.linalg.matrix_norm(F, keepdim=True).clamp(min=_TINY)
+    return (F, scale[:, :, None] * h1, scale[:, :, None] * h2, limit / unit.square()), scale
 
 
 def rival_suspected(
@@ -115,6 +136,8 @@ def rival_suspected(
         spare: How many inliers need not agree.
         sphere: Whether points are unit rays.
     """
+    if not sphere:
+        (F, h1, h2, limit), _ = _of_unit_size(F, h1, h2, inliers, limit)
     _, square = _second_solution(F, h1, h2, inliers, limit, sphere, _GLANCE_ROUNDS)
     far: Tensor = (square > limit[:, None]).sum(-1)
     return far <= spare
@@ -153,6 +176,9 @@ def rank_two_members(
 
     And whether so many points are near to the second solution that one of the two may be a rival. See `rival_suspected`.
     """
+    scale = torch.ones_like(F[:, 0])
+    if not sphere:
+        (F, h1, h2, limit), scale = _of_unit_size(F, h1, h2, inliers, limit)
     g, square = _second_solution(F, h1, h2, inliers, limit, sphere)
     near = (square > limit[:, None]).sum(-1) <= torch.add(spare, inliers.sum(-1), alpha=_OFF)
     G = g.reshape(-1, 3, 3)
@@ -163,7 +189,7 @@ def rank_two_members(
     q = -0.5 * (c1 + torch.copysign(root, c1))
     # The roots b / a, as pairs: q / c2 and c0 / q.
     a, b = torch.stack((c2, q), -1)[..., None, None], torch.stack((q, c0), -1)[..., None, None]
-    both = a * G[:, None] + b * F[:, None]
+    both = (a * G[:, None] + b * F[:, None]) * scale[:, None, :, None] * scale[:, None, None]
     size: Tensor = torch.linalg.matrix_norm(both, dim=(-2, -1), keepdim=True)
     return both / size.clamp(min=_TINY), near
 
