@@ -24,16 +24,19 @@ from torchsfm.reconstruction.evidence.consistency import excess_scatter
 from torchsfm.reconstruction.mappers.beginning import Beginning, Grown
 from torchsfm.reconstruction.mappers.incremental import MappingOptions
 from torchsfm.reconstruction.mapping.adjust import LOSS, adjust, support
-from torchsfm.reconstruction.mapping.calibration import FEW, calibration_of
+from torchsfm.reconstruction.mapping.calibration import FEW, calibration_of, measure_noise
 from torchsfm.reconstruction.mapping.cameras import FOCAL_SIGMA, telling_pairs, with_square_pixels
 from torchsfm.reconstruction.mapping.mapping import Mapping
+from torchsfm.reconstruction.mapping.structure import triangulate_tracks
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
 
 TRIED = 64
 """Common focal lengths that are tried."""
-MORE, MUCH_MORE = 1.01, 1.05
+MORE, MUCH_MORE = 1.03, 1.08
 """By how much more of what is seen must be explained, as numbers of their own make up for a little of all errors: by focal
 lengths that differ, and by such as one lens has but for a photograph's own faults."""
+ANY_ANGLE = 1e-4
+"""Points count at any angle when models are compared: a wrong one may have them nearer, and explains no more by it."""
 FOCAL_FAULTS = 0.02
 """By how much a photograph's own faults make its focal length look another."""
 NEAR: dict[str, Any] = {"max_iterations": 30, "tolerance": 1e-5}
@@ -89,13 +92,19 @@ def better_beginning(
         The better one, and the model that came of it.
     """
     one, several = (make(begun.empty, begun.options) for begun in (together, apart))
+    if several is None:
+        return together, None if one is None else one[0]
+    if one is None:
+        return apart, several[0]
     threshold = together.options.reprojection
-    known = 0.0 if one is None else support(one[1], threshold)
-    if several is not None:
-        more, shared = support(several[1], threshold), together.empty.camera_index
-        if more > MUCH_MORE * known or (more > MORE * known and not one_focal_length(several[1], apart.options, shared)):
-            return apart, several[0]
-    return together, None if one is None else one[0]
+    models = [triangulate_tracks(model, threshold=threshold, min_angle=ANY_ANGLE) for _, model in (one, several)]
+    # What bends move is less than a pixel, and many times what noise does.
+    noise = min(measure_noise(model, LOSS) for model in models)
+    known, more = (support(model, threshold, noise) for model in models)
+    shared = together.empty.camera_index
+    if more > MUCH_MORE * known or (more > MORE * known and not one_focal_length(several[1], apart.options, shared)):
+        return apart, several[0]
+    return together, one[0]
 
 
 def one_focal_length(model: Mapping, options: MappingOptions, family: Int[Tensor, "v"]) -> bool:

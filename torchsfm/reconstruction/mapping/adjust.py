@@ -178,16 +178,17 @@ def neighbourhood(mapping: Mapping, new: Bool[Tensor, "v"]) -> Bool[Tensor, "v"]
     return moving
 
 
-def support(mapping: Mapping, threshold: float) -> float:
+def support(mapping: Mapping, threshold: float, noise: float = 1.0) -> float:
     """By how much the observations of a model are better than such that just do not fit, all together.
 
     Args:
         mapping: The model.
         threshold: Largest reprojection error of an inlier in pixels.
+        noise: Pixels in which errors are measured: by the noise of a good model others lose by their bends.
     """
     node = mapping.observations()
-    square = mapping.errors(mapping.point[node], node).clamp(max=threshold).square()
-    return float((LOSS(square.new_tensor(threshold**2)) - LOSS(square)).sum())
+    error = mapping.errors(mapping.point[node], node).clamp(max=threshold) / noise
+    return float((LOSS(error.new_tensor(threshold / noise).square()) - LOSS(error.square())).sum())
 
 
 def points_agree(mapping: Mapping, moved: Mapping, excess: float = 1.0) -> bool:
