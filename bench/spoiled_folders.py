@@ -94,6 +94,11 @@ def squares(image: Image, number: int, random: np.random.Generator) -> Image:
     return _image(cv2.resize(image, (640, 640), interpolation=cv2.INTER_AREA))
 
 
+def shapes(image: Image, number: int, random: np.random.Generator) -> Image:
+    """Upright and lying ones, all resized to a square."""
+    return squares(turned(image, number, random), number, random)
+
+
 def squeezed(image: Image, number: int, random: np.random.Generator) -> Image:
     """A tenth narrower, as films with pixels that are not square."""
     return _image(cv2.resize(image, None, fx=0.9, fy=1.0, interpolation=cv2.INTER_AREA))
@@ -139,8 +144,8 @@ def plain(image: Image, number: int, random: np.random.Generator) -> Image:
 
 
 SPOILS: tuple[Spoil, ...] = (
-    plain, watermark, strip, sizes, crops, crops_less, crops_more, zoom, barrel, squares, squeezed, turned, exposure, blur,
-    vignette,
+    plain, watermark, strip, sizes, crops, crops_less, crops_more, zoom, barrel, squares, shapes, squeezed, turned, exposure,
+    blur, vignette,
 )  # fmt: skip
 FOLDERS = (*(spoil.__name__ for spoil in SPOILS), "gray", "jpeg", "duplicates", "again", "mirrored", "strangers")
 WALL = "wall"
@@ -165,7 +170,7 @@ def folder(
     for number, path in enumerate(photographs.paths[images]):
         pose = photographs.poses.get(path.name)
         image = spoil(_read(path), number, random)
-        if which == "turned" and number % 3 == 1 and pose is not None:
+        if which in ("turned", "shapes") and number % 3 == 1 and pose is not None:
             pose = QUARTER @ pose
         if which == WALL:
             image = before_wall(image, wall, random)

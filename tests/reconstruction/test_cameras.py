@@ -61,9 +61,10 @@ def test_the_pairs_of_stretched_images_tell_the_focal_length(generator: torch.Ge
     back = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1 / aspect, 0.5 / aspect - 0.5], [0.0, 0.0, 1.0]]).double()
     size = torch.tensor([[SIZE[0], round(SIZE[1] * aspect)]] * 8)
     stretched = replace(graph, F=back.mT @ graph.F @ back, image_size=size)
+    nothing = {"model": "radial", "K": None, "exif_focal": [None] * 8}
     cameras = [
-        guess_cameras(one, torch.zeros(8).long(), model="radial", K=None, exif_focal=[None] * 8, aspect=ratio)[0].K[0]
-        for one, ratio in ((graph, 1.0), (stretched, aspect), (stretched, 1.0))
+        guess_cameras(one, torch.zeros(8).long(), aspect=ratio, **nothing)[0].K[0]
+        for one, ratio in ((graph, None), (stretched, torch.full((8,), aspect).double()), (stretched, None))
     ]
     assert float(cameras[1][0, 0] / cameras[0][0, 0]) == pytest.approx(1, rel=1e-2)
     assert float(cameras[1][1, 1] / cameras[1][0, 0]) == pytest.approx(aspect)

@@ -28,6 +28,7 @@ from torchsfm.reconstruction.mapping.calibration import (
 )
 from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.matching.view_graph import MIN_INLIERS, ViewGraph
+from torchsfm.reconstruction.resized import shapes_of_squares
 from torchsfm.reconstruction.stretched import apparent_aspect
 
 LEFT = 0.1
@@ -141,7 +142,7 @@ def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progr
     def made(wanted: Wanted) -> Attempt:
         return Attempt.of(given.graph, wanted, Growth.of(given, wanted, generator, progress))
 
-    attempt = made(wanted)
+    attempt = _of_two_shapes(given.graph, wanted, made) or made(wanted)
     for question in (_stretched, _fisheye):
         another = question(attempt) if attempt.components else None
         if another is not None:
@@ -158,12 +159,23 @@ def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progr
     return max(attempt, other, key=lambda one: (one.undoubted, one.registered))
 
 
+def _of_two_shapes(graph: ViewGraph, wanted: Wanted, made: Callable[[Wanted], Attempt]) -> Attempt | None:
+    """Models of images that were upright and lying before they were squares, where pixels are open and pairs say so.
+
+    The ratios are estimated, and come to one where they were none. Only where that falls apart other cameras are needed.
+    """
+    aspect = shapes_of_squares(graph) if wanted.pixels_are_open else None
+    attempt = None if aspect is None else made(replace(wanted, aspect=aspect))
+    return attempt if attempt is not None and attempt.components and not attempt.fell_apart else None
+
+
 def _stretched(attempt: Attempt) -> Wanted | None:
     """The same with pixels that are not square, where they are open and seem so."""
-    model = attempt.largest
+    model, wanted = attempt.largest, attempt.wanted
     (options,) = (component.options for component in attempt.components if component.model is model)
-    aspect = apparent_aspect(model, options.prior(model)) if attempt.wanted.pixels_are_open else None
-    return None if aspect is None else replace(attempt.wanted, aspect=aspect)
+    open_ = wanted.pixels_are_open and wanted.aspect is None
+    ratio = apparent_aspect(model, options.prior(model)) if open_ else None
+    return None if ratio is None else replace(wanted, aspect=torch.full((len(model.registered),), ratio, dtype=torch.float64))
 
 
 def _fisheye(attempt: Attempt) -> Wanted | None:

@@ -39,7 +39,7 @@ class Beginning:
         exif_focal: Sequence[float | None],
         free: tuple[str, ...],
         generator: torch.Generator,
-        aspect: float = 1.0,
+        aspect: Float[Tensor, "v"] | None = None,
         body: Int[Tensor, "v"] | None = None,
     ) -> "Beginning":
         """With the best guess of the cameras; see `guess_cameras` and `MappingOptions`, of the `body` that took each image."""

@@ -170,7 +170,7 @@ def _of_one_camera(
 def _focal_of_pairs(empty: Mapping) -> float | None:
     """The focal length that the pairs tell if all images have the same."""
     graph, K = empty.graph, empty.cameras.K
-    F, size, c = with_square_pixels(graph, float((K[:, 1, 1] / K[:, 0, 0]).median()))
+    F, size, c = with_square_pixels(graph, (K[:, 1, 1] / K[:, 0, 0])[empty.camera_index])
     good = telling_pairs(graph)
     if not bool(good.any()):
         return None

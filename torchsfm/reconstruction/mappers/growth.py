@@ -60,8 +60,8 @@ class Wanted:
         shared_camera: Whether one camera took all images of the same size.
         K: Known intrinsics.
         free_principal_point: Whether to estimate the principal point.
-        aspect: About how many times as much as along x images are stretched along y, which is estimated then; 1 where pixels
-            are square.
+        aspect: About how many times as much as along x each image is stretched along y, which is estimated then; None where
+            pixels are square.
         method: "incremental", "projective", "global", "windows", or "auto" for what `choose_mapper` and `best_attempt` say.
     """
 
@@ -70,7 +70,7 @@ class Wanted:
     K: Float[Tensor, "3 3"] | None = None
     free_principal_point: bool = True
     method: str = "auto"
-    aspect: float = 1.0
+    aspect: Float[Tensor, "v"] | None = None
 
     def __post_init__(self) -> None:
         if self.camera is not None and self.camera not in DISTORTION_MODELS:
@@ -101,7 +101,7 @@ class Wanted:
     def free(self) -> tuple[str, ...]:
         """The intrinsic parameters to estimate."""
         focal, centre = (("focal",), ("principal_point",)) if self.K is None else ((), ())
-        aspect = ("aspect",) if self.aspect != 1 else ()
+        aspect = () if self.aspect is None else ("aspect",)
         return focal + aspect + DISTORTION_MODELS[self.lens].parameter_names + (centre if self.free_principal_point else ())
 
 
@@ -183,9 +183,9 @@ class Growth:
             Beginning.of, graph, track, model=wanted.lens, K=wanted.K, exif_focal=given.exif_focal, free=wanted.free,
             generator=generator, aspect=wanted.aspect,
         )  # fmt: skip
-        together = group_cameras(graph.image_size, given.labels, wanted.shared_camera)
+        together = group_cameras(graph.image_size, given.labels, wanted.shared_camera, wanted.aspect)
         unsaid = wanted.shared_camera is None and not given.known_cameras
-        body = group_bodies(graph.image_size, given.labels) if unsaid else None
+        body = group_bodies(graph.image_size, given.labels, wanted.aspect) if unsaid else None
         begun = begin(together, body=body)
         if method == "auto":
             method = choose_mapper(graph.pairs, graph.fundamental_inliers, begun.options.focal_sigma[together])

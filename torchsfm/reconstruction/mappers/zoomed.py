@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchsfm.autocalibration import calibrate_view_graph
 from torchsfm.autocalibration.focal_from_fundamentals import SCALE, WIDE
+from torchsfm.geometry import intrinsics
 from torchsfm.linalg import svdvals
 from torchsfm.reconstruction.evidence.consistency import excess_scatter
 from torchsfm.reconstruction.mappers.beginning import Beginning, Grown
@@ -48,7 +49,7 @@ MOST = 60
 
 
 def part_zoomed(
-    graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"], aspect: float = 1.0
+    graph: ViewGraph, camera_index: Int[Tensor, "v"], told: Bool[Tensor, "v"], aspect: Float[Tensor, "v"] | None = None
 ) -> Int[Tensor, "v"] | None:
     """Give each image a camera of its own where the pairs say that those of one have several focal lengths, or cannot tell.
 
@@ -56,7 +57,7 @@ def part_zoomed(
         graph: Verified pairs.
         camera_index: Which camera took each image, as far as sizes and files tell.
         told: Images whose file states a focal length: those of one camera have the same.
-        aspect: Focal lengths along y over those along x.
+        aspect: Focal lengths along y over those along x of each image; of square pixels if None.
 
     Returns:
         Which camera took each image, numbered from 0 in the order of the images; None where it stays as it is.
@@ -127,7 +128,7 @@ def one_focal_length(model: Mapping, options: MappingOptions, family: Int[Tensor
     return True
 
 
-def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: float) -> bool | None:
+def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: Float[Tensor, "v"] | None) -> bool | None:
     """Whether a focal length for each image explains the pairs of some images so much better than one for all.
 
     None where too few pairs tell, but models of as many pairs as there are do.
@@ -149,23 +150,23 @@ def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: f
     F, size, c = with_square_pixels(graph, aspect)
     F, size, c = F[telling][among].double(), size[images].double(), c[images].double()
     tried = size.max() * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()
-    costs = _disagreement(_asymmetry(F, c[ends], tried[:, None, None]))
+    first, second = (intrinsics(tried[:, None], centre) for centre in c[ends].unbind(1))
+    costs = disagreement(pair_asymmetry(F, first, second)).sum(-1)
     common = tried[costs.argmin()].expand(len(images))
     sigma = torch.full_like(common, FOCAL_SIGMA["default"])
     found = calibrate_view_graph(F, ends, c, common, sigma)
-    gain = float(costs.min() - _disagreement(found.asymmetry))
+    gain = float(costs.min() - disagreement(found.asymmetry).sum())
     return gain > 0.5 * (len(images) - 1) * math.log(len(ends))
 
 
-def _disagreement(asymmetry: Float[Tensor, "*b p"]) -> Float[Tensor, "*b"]:
+def disagreement(asymmetry: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     """Minus the logarithm of how probable asymmetries are, some of which belong to wrong pairs."""
-    return torch.log1p((asymmetry / SCALE).square()).sum(-1) / 2
+    return torch.log1p((asymmetry / SCALE).square()) / 2
 
 
-def _asymmetry(F: Float[Tensor, "p 3 3"], c: Float[Tensor, "p 2 2"], f: Float[Tensor, "k 1 1"]) -> Float[Tensor, "k p"]:
-    """`(s1 - s2) / (s1 + s2)` of the essential matrices that pairs have with k focal lengths."""
-    K = torch.diag_embed(torch.cat((f, f, torch.ones_like(f)), -1)).repeat(1, len(F), 1, 1)
-    first, second = K.clone(), K
-    first[..., :2, 2], second[..., :2, 2] = c[:, 0], c[:, 1]
+def pair_asymmetry(
+    F: Float[Tensor, "p 3 3"], first: Float[Tensor, "k #p 3 3"], second: Float[Tensor, "k #p 3 3"]
+) -> Float[Tensor, "k p"]:
+    """`(s1 - s2) / (s1 + s2)` of the essential matrices that intrinsics make of pairs: 0 of the right ones."""
     s, _ = svdvals(second.mT @ F @ first)
     return (s[..., 0] - s[..., 1]) / (s[..., 0] + s[..., 1]).clamp(min=1e-300)

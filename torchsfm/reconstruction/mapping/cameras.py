@@ -38,29 +38,37 @@ def focal_uncertainty(source: Sequence[str]) -> Float[Tensor, "g"]:
     return torch.tensor([FOCAL_SIGMA[word] for word in source], dtype=torch.float64)
 
 
-def group_cameras(image_size: Int[Tensor, "v 2"], labels: Sequence[str], shared: bool | None) -> Int[Tensor, "v"]:
+def group_cameras(
+    image_size: Int[Tensor, "v 2"], labels: Sequence[str], shared: bool | None, aspect: Float[Tensor, "v"] | None = None
+) -> Int[Tensor, "v"]:
     """Which images were taken by one camera.
 
     Args:
         image_size: Width and height; images of different size never share a camera.
         labels: What the files say of the camera (maker, model, focal length).
         shared: True to go by size alone, False for a camera per image, None to go by size and label.
+        aspect: How many times as much as along x each image is stretched along y: by one camera all are alike.
     """
     if shared is False:
         return torch.arange(len(labels))
-    keys = [(*size, "" if shared else label) for size, label in zip(image_size.tolist(), labels, strict=True)]
+    stretched = [1.0] * len(labels) if aspect is None else aspect.tolist()
+    named = zip(image_size.tolist(), labels, stretched, strict=True)
+    keys = [(*size, "" if shared else label, ratio) for size, label, ratio in named]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return torch.tensor([order[key] for key in keys], dtype=torch.long)
 
 
-def group_bodies(image_size: Int[Tensor, "v 2"], labels: Sequence[str]) -> Int[Tensor, "v"]:
+def group_bodies(
+    image_size: Int[Tensor, "v 2"], labels: Sequence[str], aspect: Float[Tensor, "v"] | None = None
+) -> Int[Tensor, "v"]:
     """Which images one camera may have taken with all focal lengths of its zoom lens.
 
     Args:
         image_size: Width and height; cameras are not looked for among images of different size.
         labels: What the files say of the camera (maker, model, and last, after a bar, the focal length).
+        aspect: As for `group_cameras`.
     """
-    return group_cameras(image_size, [label.rpartition("|")[0] for label in labels], None)
+    return group_cameras(image_size, [label.rpartition("|")[0] for label in labels], None, aspect)
 
 
 def guess_cameras(
@@ -70,7 +78,7 @@ def guess_cameras(
     model: str,
     K: Float[Tensor, "3 3"] | None,
     exif_focal: Sequence[float | None],
-    aspect: float = 1.0,
+    aspect: Float[Tensor, "v"] | None = None,
 ) -> tuple[Camera, tuple[str, ...]]:
     """Cameras to start from: no distortion, centred principal point, and the best word on the focal length.
 
@@ -80,7 +88,7 @@ def guess_cameras(
         model: Name of the distortion model.
         K: Known intrinsics.
         exif_focal: Focal length in pixels that each file states; it counts unless the pairs refute it.
-        aspect: Of cameras that are not known: focal length along y over that along x.
+        aspect: Of cameras that are not known: focal length along y over that along x, for each image; of square pixels if None.
 
     Returns:
         The cameras, and where each focal length comes from, a key of `FOCAL_SIGMA`.
@@ -113,7 +121,8 @@ def guess_cameras(
         matrices, source = K.to(dtype).expand(g, 3, 3).clone(), ["given"] * g
     else:
         f = _focals_of_graph(graph, F, camera_index, c, torch.tensor(focal, dtype=dtype), source)
-        matrices = intrinsics(f, (graph.image_size[first].to(dtype) - 1) / 2, aspect=aspect)
+        ratio = 1.0 if aspect is None else aspect[first].to(dtype)
+        matrices = intrinsics(f, (graph.image_size[first].to(dtype) - 1) / 2, aspect=ratio)
     if model not in DISTORTION_MODELS:
         raise ReconstructionError(f"no camera model '{model}'; there are {', '.join(DISTORTION_MODELS)}")
     distortion = DISTORTION_MODELS[model]
@@ -161,12 +170,15 @@ def _focals_of_graph(
 
 
 def with_square_pixels(
-    graph: ViewGraph, aspect: float
+    graph: ViewGraph, aspect: Float[Tensor, "v"] | None
 ) -> tuple[Float[Tensor, "q 3 3"], Float[Tensor, "v 2"], Float[Tensor, "v 2"]]:
-    """Fundamental matrices, and sizes and middles of the images, had these not been stretched along y by `aspect`."""
-    stretch = torch.tensor([1.0, aspect, 1.0], dtype=graph.x.dtype)
+    """Fundamental matrices, and sizes and middles of the images, had these not been stretched along y by their `aspect`."""
     size = graph.image_size.to(graph.x.dtype)
-    return stretch[:, None] * graph.F * stretch, size / stretch[:2], (size - 1) / 2 / stretch[:2]
+    stretch = torch.ones(len(size), 3, dtype=size.dtype)
+    if aspect is not None:
+        stretch[:, 1] = aspect
+    i, j = graph.pairs.unbind(1)
+    return stretch[j, :, None] * graph.F * stretch[i, None], size / stretch[:, :2], (size - 1) / 2 / stretch[:, :2]
 
 
 def telling_pairs(graph: ViewGraph) -> Bool[Tensor, "q"]:

@@ -1,0 +1,112 @@
+"""Photographs that were upright and lying, and were all resized to one square, as they are for networks.
+
+The upright ones are stretched along x and the lying ones along y, which no ratio of focal lengths explains that all have in
+common. The pairs tell which is which before anything is placed: their fundamental matrices are essential ones only with the
+right ratio at both ends, as they are of one camera with the right focal length alone (`focal_from_fundamentals`).
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchsfm.autocalibration.focal_from_fundamentals import WIDE
+from torchsfm.reconstruction.mappers.zoomed import disagreement, pair_asymmetry
+from torchsfm.reconstruction.mapping.cameras import telling_pairs
+from torchsfm.reconstruction.matching.view_graph import ViewGraph
+
+RATIOS = 4 / 3, 3 / 2, 16 / 9
+"""Shapes that photographs have."""
+TRIED = 48
+"""Focal lengths that are tried with each."""
+SWEEPS = 4
+"""How often each image is asked again what it is, once all others have said."""
+
+
+def shapes_of_squares(graph: ViewGraph) -> Float[Tensor, "v"] | None:
+    """How many times as much as along x each image is stretched along y, if some square ones were upright and some lying.
+
+    Args:
+        graph: Verified pairs.
+
+    Returns:
+        A ratio for each image, 1 where it is not square; of a square image that no pair tells of, as if it had been lying. None
+        where the pairs do not say clearly that there are both.
+    """
+    size = graph.image_size
+    square = (size == size.mode(0).values).all(1) & (size[:, 0] == size[:, 1])
+    telling = telling_pairs(graph) & square[graph.pairs].all(1)
+    if not bool(telling.any()):
+        return None
+    images, ends = torch.unique(graph.pairs[telling], return_inverse=True)
+    F, side = graph.F[telling].double(), float(size[images[0], 0])
+    cost, ratio = _costs(F, side)
+    both = torch.arange(2)
+    # All were lying, or all upright, or none is stretched.
+    uniform = min(float(cost[:, :, both, both].sum(1).min()), float(_costs_of(F, side, 1.0)[:, :, 0, 0].sum(1).min()))
+    label, total = _told_apart(cost, ends, graph.fundamental_inliers[telling])
+    best = int(total.argmin())
+    # So much is gained by chance, by an answer of two for each image and by what is tried.
+    if uniform - float(total[best]) < len(images) * math.log(2) + math.log(len(cost)) or label[best].min() == label[best].max():
+        return None
+    lying = float(ratio[best % len(ratio)])
+    aspect = torch.where(square, lying, 1.0).double()
+    return aspect.index_copy(0, images, torch.where(label[best] == 0, lying, 1 / lying).double())
+
+
+def _costs(F: Float[Tensor, "p 3 3"], side: float) -> tuple[Float[Tensor, "t p 2 2"], Float[Tensor, "t"]]:
+    """How badly pairs fit where their images were lying (0) or upright (1), with every ratio and focal length; the ratios."""
+    ratio = torch.tensor(RATIOS, dtype=F.dtype).repeat_interleave(TRIED)
+    return torch.cat([_costs_of(F, side, a) for a in RATIOS]), ratio
+
+
+def _costs_of(F: Float[Tensor, "p 3 3"], side: float, ratio: float) -> Float[Tensor, "t p 2 2"]:
+    """The same with one ratio. The side that was longer is shortened by that much more."""
+    focal = side * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()[:, None]
+    kinds = []
+    for f, aspect in ((focal, ratio), (focal * ratio, 1 / ratio)):
+        K = torch.diag_embed(torch.cat((f, f * aspect, torch.ones_like(f)), -1))
+        K[:, :2, 2] = (side - 1) / 2
+        kinds.append(K[:, None])
+    of_first = [torch.stack([disagreement(pair_asymmetry(F, first, second)) for second in kinds], -1) for first in kinds]
+    return torch.stack(of_first, -2)
+
+
+def _told_apart(
+    cost: Float[Tensor, "t p 2 2"], ends: Int[Tensor, "p 2"], weight: Int[Tensor, "p"]
+) -> tuple[Int[Tensor, "s n"], Float[Tensor, "s"]]:
+    """For each trial, begun by either kind, what every image is so that its pairs fit best, and how badly they fit.
+
+    Along the strongest pairs, each image becomes what fits those before it; then each again what fits all others.
+    """
+    n = int(ends.max()) + 1
+    order = _by_strength(ends, weight, n)
+    begin, end = torch.cat((ends, ends.flip(1))).unbind(1)
+    # Costs by what the image is that a pair begins at, either way.
+    directed = torch.cat((cost, cost.mT), 1).repeat(2, 1, 1, 1)
+    rows = [(begin == k).nonzero()[:, 0] for k in range(n)]
+    label = torch.zeros(len(directed), n, dtype=torch.long)
+    label[len(cost) :, order[0]] = 1
+    known: Bool[Tensor, "n"] = torch.arange(n) == order[0]
+    for k in order[1:] + SWEEPS * order:
+        own, other = directed[:, rows[k]], end[rows[k]]
+        beside = label[:, other, None, None].expand(-1, -1, 2, 1)
+        label[:, k] = (own.gather(3, beside)[..., 0] * known[other, None]).sum(1).argmin(1)
+        known[k] = True
+    kind = torch.stack((label[:, ends[:, 0]], label[:, ends[:, 1]]), -1)
+    pair = torch.arange(len(ends))
+    trial = torch.arange(len(label))[:, None]
+    return label, directed[trial, pair, kind[..., 0], kind[..., 1]].sum(1)
+
+
+def _by_strength(ends: Int[Tensor, "p 2"], weight: Int[Tensor, "p"], n: int) -> list[int]:
+    """Images in the order in which those before hold them best."""
+    strength = torch.zeros(n, n, dtype=weight.dtype).index_put((ends[:, 0], ends[:, 1]), weight, accumulate=True)
+    strength = strength + strength.T
+    order = [int(strength.sum(0).argmax())]
+    while len(order) < n:
+        held = strength[order].sum(0)
+        held[order] = -1
+        order.append(int(held.argmax()))
+    return order
