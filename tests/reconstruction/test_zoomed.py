@@ -86,6 +86,17 @@ def test_models_are_asked_where_pairs_show_planes_alone(generator: torch.Generat
     assert (parted is not None) is asked
 
 
+def test_an_image_of_something_else_does_not_make_them_more(generator: torch.Generator) -> None:
+    x, view, track = see(torch.full((3,), 900.0, dtype=torch.float64), (499.5, 374.5), 0.0, generator, points=600, noise=0.2)
+    for views in (3, 4):
+        names, size = [str(i) for i in range(views)], torch.tensor([SIZE] * views)
+        graph, _ = graph_from_tracks(names, size, x, view, track, torch.zeros(len(x), 3), generator=generator)
+        one, none = torch.zeros(views, dtype=torch.long), torch.zeros(views, dtype=torch.bool)
+        assert part_zoomed(graph, one, none) is not None
+    graph = replace(graph, fundamental_inliers=torch.zeros_like(graph.fundamental_inliers))
+    assert part_zoomed(graph, one, none) is None
+
+
 @pytest.mark.parametrize("views", [3, 4])
 def test_few_photographs_by_a_zoom_lens(generator: torch.Generator, views: int) -> None:
     f = 800 * torch.tensor([1.0, 1.7, 1.3, 1.5], dtype=torch.float64)[:views]

@@ -142,11 +142,12 @@ def _focal_lengths_differ(graph: ViewGraph, member: Bool[Tensor, "v"], aspect: F
     images, ends = torch.unique(pairs[among], return_inverse=True)
     # Fewer pairs than focal lengths always agree with some.
     if len(ends) <= len(images):
-        within, count = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1), int(member.sum())
+        within = (graph.fundamental_inliers >= MIN_INLIERS) & member[graph.pairs].all(-1)
+        count = len(torch.unique(graph.pairs[within]))
         # Few images tell where they show something besides a plane.
         beside = within & (graph.fundamental_inliers - graph.homography_inliers >= MIN_INLIERS)
         few = count <= FEW and int(beside.sum()) >= count
-        return None if few or int(within.sum()) >= ENOUGH * count else False
+        return None if count and (few or int(within.sum()) >= ENOUGH * count) else False
     F, size, c = with_square_pixels(graph, aspect)
     F, size, c = F[telling][among].double(), size[images].double(), c[images].double()
     tried = size.max() * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()
