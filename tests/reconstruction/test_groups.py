@@ -15,14 +15,16 @@ def two_sides(sizes: tuple[int, int], agree_across: int, generator: torch.Genera
     matches = torch.where(agrees, torch.randint(60, 200, (len(pairs),), generator=generator), 50)
     across = (~agrees).nonzero()[:, 0]
     agrees[across[torch.randperm(len(across), generator=generator)[:agree_across]]] = True
-    return PairAgreement(pairs, matches, torch.where(agrees, matches, 0), torch.arange(len(pairs)))
+    agreeing = torch.where(agrees, matches, 0)
+    return PairAgreement(pairs, matches, agreeing, torch.arange(len(pairs)), agreeing)
 
 
 def shuffled(agreement: PairAgreement, views: int, generator: torch.Generator) -> tuple[PairAgreement, Tensor]:
     """The same with images and pairs in another order, and where each image has gone."""
     place, order = torch.randperm(views, generator=generator), torch.randperm(len(agreement.pairs), generator=generator)
     pairs = place[agreement.pairs].sort(dim=1).values[order]
-    return PairAgreement(pairs, agreement.matches[order], agreement.agreeing[order], torch.arange(len(order))), place
+    matches, agreeing = agreement.matches[order], agreement.agreeing[order]
+    return PairAgreement(pairs, matches, agreeing, torch.arange(len(order)), agreeing), place
 
 
 def test_what_most_matches_across_contradict_is_parted(generator: torch.Generator) -> None:
@@ -49,7 +51,7 @@ def test_images_of_which_nothing_is_known_are_no_group_that_is_outvoted(generato
     assert not outvoted_groups(agreement, registered).any()
     assert not outvoted_groups(agreement, torch.zeros_like(registered)).any()
     none = torch.zeros(0, dtype=torch.long)
-    assert not outvoted_groups(PairAgreement(none.reshape(0, 2), none, none, none), registered).any()
+    assert not outvoted_groups(PairAgreement(none.reshape(0, 2), none, none, none, none), registered).any()
 
 
 def test_what_a_hinge_holds_is_told(generator: torch.Generator) -> None:

@@ -1,7 +1,7 @@
 """Every camera of a model against all verified pairs of images, also those that the model made no use of."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,6 +37,13 @@ class PairAgreement:
     agreeing: Int[Tensor, "q"]
     index: Int[Tensor, "q"]
     """Which pairs of the view graph these are."""
+    by_poses: Int[Tensor, "q"]
+    """How many matches agree with the poses, wherever points lie."""
+
+    @property
+    def of_poses(self) -> "PairAgreement":
+        """How they agree with the poses alone."""
+        return replace(self, agreeing=self.by_poses)
 
     @property
     def deviation(self) -> Float[Tensor, "q"]:
@@ -79,17 +86,26 @@ def pair_agreement(mapping: Mapping, *, threshold: float, poses_alone: bool = Fa
             the other, twice as much together.
         poses_alone: Leave the points aside, for a model whose points are not what they will be.
     """
-    q = len(mapping.graph.pairs)
-    matches, agreeing = (torch.zeros(q, dtype=torch.long) for _ in range(2))
-    fit = None if poses_alone else _PointsThere.of(mapping, 2 * threshold)
+    return pair_agreements(mapping, (threshold,), poses_alone=poses_alone)[0]
+
+
+def pair_agreements(mapping: Mapping, thresholds: Sequence[float], *, poses_alone: bool = False) -> list[PairAgreement]:
+    """The same by several thresholds, for hardly more than by one."""
+    q, t = len(mapping.graph.pairs), len(thresholds)
+    matches, agreeing, by_poses = (torch.zeros(*shape, dtype=torch.long) for shape in ((q,), (t, q), (t, q)))
+    fits = [None if poses_alone else _PointsThere.of(mapping, 2 * threshold) for threshold in thresholds]
     for rays in _matched_rays(mapping):
-        agree = rays.agree(threshold)
         matches += torch.bincount(rays.pair, minlength=q)
-        if fit is not None:
-            agree &= fit.at(rays.match)
-        agreeing += torch.bincount(rays.pair[agree], minlength=q)
+        for k, (threshold, fit) in enumerate(zip(thresholds, fits, strict=True)):
+            agree = rays.agree(threshold)
+            by_poses[k] += torch.bincount(rays.pair[agree], minlength=q)
+            if fit is not None:
+                agree &= fit.at(rays.match)
+                agreeing[k] += torch.bincount(rays.pair[agree], minlength=q)
     compared = (matches > 0).nonzero()[:, 0]
-    return PairAgreement(mapping.graph.pairs[compared], matches[compared], agreeing[compared], compared)
+    both = (by_poses if poses_alone else agreeing)[:, compared], by_poses[:, compared]
+    pairs, matches = mapping.graph.pairs[compared], matches[compared]
+    return [PairAgreement(pairs, matches, own, compared, loose) for own, loose in zip(*both, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from torchsfm.geometry import Pose
 from torchsfm.motion import average_rotations, position_globally
 from torchsfm.motion.many_views.triplets import turn_angle
 from torchsfm.optim import Cauchy
-from torchsfm.reconstruction.evidence.consistency import pair_agreement
+from torchsfm.reconstruction.evidence.consistency import PairAgreement, pair_agreements
 from torchsfm.reconstruction.evidence.groups import outvoted_groups
 from torchsfm.reconstruction.mappers.incremental import STANDING, MappingOptions
 from torchsfm.reconstruction.mappers.pair_poses import relative_poses, strongest_pairs
@@ -37,9 +37,11 @@ ROUNDS = 3
 """Adjustments with poses and points alone, at most, each with a loss half as wide as the last, while that exceeds a pixel."""
 WIDEST = 16.0
 """Scale of the first of their losses in pixels, at most."""
-ROUGH, ROUGHER = 1e-3, 1e-2
-"""Part of the cost that is left to what comes after: by rotations and the first adjustment of everything; by positions, and by
-adjustments before that."""
+ROUGH, ROUGHER, ROUGHEST = 1e-3, 1e-2, 0.1
+"""Part of the cost that is left to what comes after: by rotations and the first adjustment of everything; by positions; by
+adjustments of poses and points alone, which a focal length that is not the right one keeps from the minimum anyway."""
+PLACED = 1e-5
+"""Damping of the first step of adjustments from where rays put cameras: more would hold back long rows of them."""
 RETURNS, CHANGED = 3, 0.05
 """Times that all is done again, where a focal length has changed by more than this part."""
 TEARS = 3
@@ -63,13 +65,16 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
         The mapping with poses, points and tracks of the pairs that agree; None where too little does.
     """
     sigma = options.focal_sigma
-    model = _at_once(mapping, available, sigma, options)
+    model, told = _at_once(mapping, available, sigma, options), None
     for _ in range(RETURNS):
         if model is None:
             break
         used = torch.unique(model.camera_index[model.registered])
         before, after = (m.cameras.K[used, 0, 0] for m in (mapping, model))
-        if not bool(((after / before).log().abs() > CHANGED).any()) or _holds(model, available, options.reprojection):
+        if not bool(((after / before).log().abs() > CHANGED).any()):
+            break
+        told = _agreements(model, options, poses_alone=False)
+        if _holds(model, available, told[0]):
             break
         K = mapping.cameras.K.clone()
         K[used, :2, :2] = model.cameras.K[used, :2, :2]
@@ -78,9 +83,11 @@ def global_start(mapping: Mapping, available: Bool[Tensor, "v"], options: Mappin
         again = _at_once(mapping, available, sigma, options)
         if again is None or int(again.registered.sum()) < int(model.registered.sum()):
             break
-        model = again
-    model = complete(close_tears(fill(model, options), options), options) if model is not None else None
-    return model if model is not None and len(model.X) >= MIN_POINTS else None
+        model, told = again, None
+    if model is None:
+        return None
+    model = complete(close_tears(*_filled(model, told, options), options), options)
+    return model if len(model.X) >= MIN_POINTS else None
 
 
 def _at_once(
@@ -123,13 +130,18 @@ def _at_once(
     return tighten(start, min(float(placed.scale * focal), WIDEST), options)
 
 
-def _holds(model: Mapping, available: Bool[Tensor, "v"], threshold: float) -> bool:
+def _agreements(model: Mapping, options: MappingOptions, *, poses_alone: bool) -> tuple[PairAgreement, PairAgreement]:
+    """How all pairs agree with a model, by the usual threshold and by twice that."""
+    told = pair_agreements(model, (options.reprojection, 2 * options.reprojection), poses_alone=poses_alone)
+    return told[0], told[1]
+
+
+def _holds(model: Mapping, available: Bool[Tensor, "v"], agreement: PairAgreement) -> bool:
     """Whether all images have a place, and their pairs contradict neither that of one nor how groups of them stand."""
     pairs = _related(model, available)
     linked = torch.zeros_like(available).index_fill(0, model.graph.pairs[pairs].flatten(), True)
     if not bool(model.registered[linked].all()):
         return False
-    agreement = pair_agreement(model, threshold=threshold)
     outvoted = agreement.balance(len(available)) < 0
     return not bool((outvoted | outvoted_groups(agreement, model.registered)).any())
 
@@ -159,33 +171,37 @@ def _longest_tracks(track: Int[Tensor, "n"], view: Int[Tensor, "n"], views: int)
 
 
 def tighten(model: Mapping, width: float, options: MappingOptions) -> Mapping:
-    """Adjust poses and points with losses that become narrower, then the cameras, too."""
+    """Adjust poses and points with losses that become narrower, then the cameras, too: all of them, as all images are in."""
     for k in range(ROUNDS):
         if width / 2**k <= 1:
             break
         model = _adjust(model, width / 2**k)
-    limits: dict[str, Any] = {"max_iterations": 20, "tolerance": ROUGH}
-    if width <= 1:
-        limits["initial_damping"] = STANDING
-    return options.adjust(model, **limits)
+    damping = PLACED if width > 1 else STANDING
+    return options.adjust(model, last=True, max_iterations=20, tolerance=ROUGH, initial_damping=damping)
 
 
 def fill(model: Mapping, options: MappingOptions) -> Mapping:
     """Poses with the points of all tracks of the pairs that agree with them."""
-    reach = 2 * options.reprojection
-    model = replace(model, track=_tracks(model, reach), X=model.X[:0], point=torch.full_like(model.point, -1))
-    return triangulate_tracks(model, threshold=reach, min_angle=options.min_angle)
+    return _filled(model, None, options)[0]
 
 
-def close_tears(model: Mapping, options: MappingOptions) -> Mapping:
-    """The model with its tears closed, see `join_torn`, as long as that makes more matches agree."""
-    agreement = pair_agreement(model, threshold=options.reprojection, poses_alone=True)
+def _filled(
+    model: Mapping, told: tuple[PairAgreement, PairAgreement] | None, options: MappingOptions
+) -> tuple[Mapping, PairAgreement]:
+    """The same, and how all pairs agree with the poses; both agreements are `told` or found out."""
+    told = told or _agreements(model, options, poses_alone=True)
+    strictly, loosely = (agreement.of_poses for agreement in told)
+    model = replace(model, track=_tracks(model, loosely), X=model.X[:0], point=torch.full_like(model.point, -1))
+    return triangulate_tracks(model, threshold=2 * options.reprojection, min_angle=options.min_angle), strictly
+
+
+def close_tears(model: Mapping, agreement: PairAgreement, options: MappingOptions) -> Mapping:
+    """The model with its tears closed, see `join_torn`, as long as that makes more matches agree with poses."""
     for _ in range(TEARS):
         joined = join_torn(model, agreement)
         if joined is None:
             break
-        trial = fill(tighten(joined, WIDEST, options), options)
-        tried = pair_agreement(trial, threshold=options.reprojection, poses_alone=True)
+        trial, tried = _filled(tighten(joined, WIDEST, options), None, options)
         if tried.explained <= agreement.explained:
             break
         model, agreement = trial, tried
@@ -194,15 +210,14 @@ def close_tears(model: Mapping, options: MappingOptions) -> Mapping:
 
 def complete(model: Mapping, options: MappingOptions) -> Mapping:
     """All observations that fit, and none that does not."""
-    model = filter_points(model, threshold=2 * options.reprojection, min_angle=options.min_angle)
     model = complete_tracks(model, threshold=options.reprojection)
     model = triangulate_tracks(model, threshold=options.reprojection, min_angle=options.min_angle)
     return filter_points(model, threshold=options.reprojection, min_angle=options.min_angle)
 
 
-def _tracks(model: Mapping, threshold: float) -> Int[Tensor, "n"]:
+def _tracks(model: Mapping, agreement: PairAgreement) -> Int[Tensor, "n"]:
     """Tracks of the pairs that agree with a model, and of those with images that have no place yet."""
-    graph, agreement = model.graph, pair_agreement(model, threshold=threshold, poses_alone=True)
+    graph = model.graph
     kept = torch.ones(len(graph.pairs), dtype=torch.bool).index_copy_(0, agreement.index, agreement.supports)
     own = kept[graph.match_pair]
     return build_tracks(graph.view, graph.match[own], graph.fundamental_inliers[graph.match_pair[own]])
@@ -212,7 +227,8 @@ def _adjust(model: Mapping, width: float) -> Mapping:
     """The minimum of reprojection errors, without what then lies behind a camera or far off."""
     node = model.observations()
     problem = model.problem(node)
-    result = bundle_adjust(problem, loss=Cauchy(width), free=(), max_iterations=20, tolerance=ROUGHER)
+    limits: dict[str, Any] = {"max_iterations": 20, "tolerance": ROUGHEST, "initial_damping": PLACED}
+    result = bundle_adjust(problem, loss=Cauchy(width), free=(), **limits)
     if result.status == Status.INTERRUPTED:
         raise KeyboardInterrupt
     moved = replace(model, poses=result.poses, X=result.X)

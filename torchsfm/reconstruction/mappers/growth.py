@@ -258,7 +258,7 @@ class Growth:
         """A model in which like things do not pass for the same one, as far as relations between images tell."""
         settled = component.model
         grow = partial(grow_by, self.method)
-        unfolded = unfold(self.empty, settled, self.taken, component.options, self.progress, grow)
+        unfolded = unfold(self.empty, settled, self.taken, component.options, self.progress, grow, component.agreement)
         model = unfolded.model
         self.given_up = self.given_up | (settled.registered & ~model.registered)
         # What is left is mapped without the relations that were given up.

@@ -233,7 +233,8 @@ def _drop_unsupported(model: Mapping, failed: dict[int, str]) -> Mapping:
 
 def _refine(model: Mapping, options: MappingOptions) -> Mapping:
     """Alternate global bundle adjustment with filtering, merging, completion and re-triangulation until little changes."""
-    changed, limits, rough = 1.0, FIRST, True
+    # What few observations determine of the cameras, more do.
+    changed, limits, rough = 0.0, FIRST, True
     for _ in range(4):
         model = options.adjust(model, last=True, settled=changed <= HARDLY, **limits)
         before = model.point

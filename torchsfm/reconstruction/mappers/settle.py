@@ -55,10 +55,10 @@ def settle(
 
 
 def _without_images(model: Mapping, images: Bool[Tensor, "v"]) -> Mapping:
-    """Take images and their observations out of a model."""
+    """Take images and their observations out of a model, and what they determined of its cameras."""
     node = model.observations()
     model = model.without(node[images[model.graph.view[node]]])
-    return replace(model, registered=model.registered & ~images)
+    return replace(model, registered=model.registered & ~images, adjustment=None)
 
 
 def _apart(model: Mapping, agreement: PairAgreement) -> Bool[Tensor, "v"]:

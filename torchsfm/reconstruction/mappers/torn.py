@@ -49,12 +49,14 @@ def join_torn(model: Mapping, agreement: PairAgreement) -> Mapping | None:
     whole = (track[:, :1] >= 0) & (track[:, :1] == track[:, 1:])
     point = torch.where(whole & (point < 0), point.flip(1), point)
     match, node, point = (t[(point >= 0).all(1)] for t in (match, node, point))
+    if not len(match):
+        return None
     order = torch.argsort(graph.match_pair[match], stable=True)
     node, point = node[order], point[order]
     counts = torch.unique_consecutive(graph.match_pair[match[order]], return_counts=True)[1]
     known = point_uncertainty(model)
     one = [_one(model, some, known) for some in torch.split(point, counts.tolist())]
-    if not one or not bool(torch.cat(one).any()):
+    if not bool(torch.cat(one).any()):
         return None
     node, point = node[torch.cat(one)], point[torch.cat(one)]
     # Which side comes first is not the same in all pairs, and three points may be one.

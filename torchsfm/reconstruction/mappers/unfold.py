@@ -48,6 +48,7 @@ def unfold(
     options: MappingOptions,
     progress: Callable[[int, int], None],
     grow: Grow = grow_model,
+    agreement: PairAgreement | None = None,
 ) -> Unfolded:
     """Look for a better model where missing correspondences refute one, or it contradicts its most distinctive relations.
 
@@ -62,6 +63,7 @@ def unfold(
         options: How models are grown.
         progress: Called with the number of registered images and of all.
         grow: Makes a model of the backbone, as the given one was made of all pairs.
+        agreement: How all pairs agree with the model, if that is known.
 
     Returns:
         The best of the given model and the new ones: that which is refuted least and which the most distinctive pairs support.
@@ -70,7 +72,10 @@ def unfold(
     graph, v = empty.graph, len(empty.graph.names)
     distinct = Distinctiveness.of(graph)
     backbone = Backbone.of(graph.pairs, torch.where(elsewhere[graph.pairs].any(1), 0.0, distinct.weight), v)
-    agreement = pair_agreement(replace(model, graph=graph), threshold=options.reprojection, poses_alone=True)
+    if agreement is not None and model.graph is graph:
+        agreement = agreement.of_poses
+    else:
+        agreement = pair_agreement(replace(model, graph=graph), threshold=options.reprojection, poses_alone=True)
     contradicted = agreement.index[agreement.contradicts & backbone.chosen[agreement.index]]
     uncertain = _hanging_on(backbone, contradicted, model.registered)
     first = best = Unfolded(model, uncertain, missing_correspondences(model), _support(agreement, distinct.weight), agreement)
@@ -143,7 +148,8 @@ def outvoted_by_rivals(graph: ViewGraph, model: Mapping, *, threshold: float) ->
         q, way = int(agreement.index[k]), backbone.way(*agreement.pairs[k].tolist())
         scatter = (distinct.variance[way] + distinct.variance[q]).sqrt()
         rival[k] = bool((distinct.weight[q] > distinct.weight[way] - scatter).any()) or not way
-    asked = (field[rival] for field in (agreement.pairs, agreement.matches, agreement.agreeing, agreement.index))
+    fields = agreement.pairs, agreement.matches, agreement.agreeing, agreement.index, agreement.by_poses
+    asked = (field[rival] for field in fields)
     return outvoted_groups(PairAgreement(*asked), model.registered)
 
 

@@ -103,8 +103,8 @@ def adjust_all(
         names: Numbers of the cameras that may be estimated.
         prior: What is expected of the cameras.
         faultless: Cameras that took up to so many photographs count as those of many; see `choose_free`.
-        settled: Whether the model has been adjusted so before, and has hardly changed since. Where the images determined all
-            numbers then, that is not found out again.
+        settled: Whether the model has been adjusted so before, and has grown or hardly changed since. Where the images
+            determined all numbers then, that is not found out again.
         **limits: When to stop; see `adjust`.
     """
     free = dict(mapping.adjustment.free) if settled and mapping.adjustment is not None else {}

@@ -87,6 +87,9 @@ class Mapping:
 
     def rays(self, node: Int[Tensor, "k"]) -> tuple[Float[Tensor, "k 3"], Bool[Tensor, "k"]]:
         """Directions of image points in their camera frames, and whether distortion could be removed."""
+        if len(self.cameras.K) == 1:
+            # What is found out of each camera is not found out for each image point.
+            return self.cameras[0].unproject(self.graph.x[node])
         index = self.camera_index[self.graph.view[node]]
         d, valid = self.cameras[index].unproject(self.graph.x[node, None])
         return d[:, 0], valid[:, 0]
