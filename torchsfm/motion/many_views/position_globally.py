@@ -27,6 +27,8 @@ SEATS = 4
 """How often cameras and points are at most put where more rays want them, each time under a loss of the scale then left."""
 SETTLED = 0.9
 """Part of the last scale from which on another round would change little."""
+BETWEEN = 1e-2
+"""Part of the cost that a round leaves to the next, which has another scale."""
 OPEN = 0.3
 """Standard deviation of a centre over the extent of its component from which on nothing is known of it."""
 
@@ -152,7 +154,7 @@ def position_globally(
         for _ in range(SEATS):
             before = scale
             start, scale = ranks.once(device, _reseated, rays, start, scale, lost)
-            start = rays.angular(start, GemanMcClure(REACH * scale), max_iterations, ROUGH).x
+            start = rays.angular(start, GemanMcClure(REACH * scale), max_iterations, BETWEEN).x
             scale = ranks.once(device, rays.scale, start, lost)
             if scale > SETTLED * before:
                 break

@@ -27,8 +27,8 @@ from torchsfm.optim.ranks import Group
 
 CORNER = 0.1
 """Distance from its ray, at one unit ahead of the camera, from which a point pulls with constant force."""
-ROUGH = 1e-2
-"""Part of the cost that is left where a sum only starts the next one, or sets its scale."""
+ROUGH = 1e-3
+"""Part of the cost to which sums are minimised that set the scale of the next."""
 QUARTILE = 0.5754
 """Of a squared residual of two normal components."""
 EXACT = 1e-5
@@ -39,8 +39,9 @@ HUBER = 1.5
 """Standard deviations from which a ray pulls with constant force in the second sum at first."""
 AGREES = 4.0
 """Standard deviations within which a ray agrees."""
-DAMPING = 1e-6
-"""Of the first step: more would hide how little is left to gain, and have steps tried that say so."""
+FROM_NOWHERE, DAMPING = 1e-4, 1e-6
+"""Of the first step: of the first sum, and of the second, which begins where cameras about belong. More would hold back long
+rows of them, and hide how little is left to gain."""
 REACH = 5.0
 """Scale of its last loss: where rays lose their pull, in standard deviations."""
 
@@ -67,11 +68,11 @@ class Rays:
         zero = {"c": self.v.new_zeros(self.views, 3), "X": self.v.new_zeros(self.points, 3)}
         derivatives = _linearize_ahead, _bend_ahead
         term = Term(_ahead, ("c", "X"), (self.view, self.point), (self.v,), Huber(CORNER), self.weights, *derivatives)
-        return self._minimise(zero, term, max_iterations, ROUGH).x
+        return self._minimise(zero, term, max_iterations, ROUGH, FROM_NOWHERE).x
 
     def angular(self, start: dict[str, Tensor], loss: Loss, max_iterations: int, tolerance: float) -> SparseResult:
         """The minimum of the sines of angles."""
-        return self._minimise(start, self.sines(loss), max_iterations, tolerance)
+        return self._minimise(start, self.sines(loss), max_iterations, tolerance, DAMPING)
 
     def scale(self, x: dict[str, Tensor], lost: float) -> float:
         """The standard deviation of the right rays, if a quarter of all are right.
@@ -118,11 +119,13 @@ class Rays:
         data = unit * self.v, self.v
         return Term(_sine_scaled, ("c", "X"), (self.view, self.point), data, loss, self.weights, _linearize_sine, _bend_sine)
 
-    def _minimise(self, start: dict[str, Tensor], term: Term, max_iterations: int, tolerance: float) -> SparseResult:
+    def _minimise(
+        self, start: dict[str, Tensor], term: Term, max_iterations: int, tolerance: float, damping: float
+    ) -> SparseResult:
         blocks = {name: Block(x) for name, x in start.items()}
         return minimise(
             blocks, [term], eliminate="X", max_iterations=max_iterations, function_tolerance=tolerance,
-            initial_damping=DAMPING, group=self.group,
+            initial_damping=damping, group=self.group,
         )  # fmt: skip
 
 
