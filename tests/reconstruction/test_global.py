@@ -11,8 +11,10 @@ from test_pair_poses import mapping_of
 from test_reconstruct_tracks import SIZE, Scene, make_scene, run, turning
 
 from torchsfm.geometry import Camera, Pose, intrinsics, rotation_from_rotvec
+from torchsfm.reconstruction.evidence.consistency import pair_agreement
 from torchsfm.reconstruction.mappers import global_start
 from torchsfm.reconstruction.mappers.choose_mapper import choose_mapper
+from torchsfm.reconstruction.mapping.mapping import Mapping
 from torchsfm.reconstruction.model.evaluation import pose_errors
 from torchsfm.simulation import orbit_poses, simulate_images
 
@@ -75,12 +77,16 @@ def test_a_model_that_its_pairs_contradict_does_not_hold() -> None:
     right = replace(mapping, poses=scene.poses, registered=torch.ones(views, dtype=torch.bool))
     right = global_start.fill(right, options)
     every = torch.ones(views, dtype=torch.bool)
-    assert global_start._holds(right, every, 4.0)
+
+    def holds(model: Mapping) -> bool:
+        return global_start._holds(model, every, pair_agreement(model, threshold=4.0))
+
+    assert holds(right)
     turn = rotation_from_rotvec(torch.tensor([0.0, 0.0, 0.1]).double())
     some = torch.arange(views) > 7
     turned = replace(scene.poses, R=torch.where(some[:, None, None], turn @ scene.poses.R, scene.poses.R))
-    assert not global_start._holds(replace(right, poses=turned), every, 4.0)
-    assert not global_start._holds(replace(right, registered=~(torch.arange(views) == 3)), every, 4.0)
+    assert not holds(replace(right, poses=turned))
+    assert not holds(replace(right, registered=~(torch.arange(views) == 3)))
 
 
 def test_two_unrelated_scenes_give_two_models() -> None:
