@@ -96,7 +96,7 @@ def test_work_before_cameras_stand_is_in_proportion_to_the_images(monkeypatch: p
     """However many pairs and points there are, rotations and first adjustments are of few of them."""
     pairs: list[int] = []
     points: list[int] = []
-    poses, fill = global_start.relative_poses, global_start.fill
+    poses, fill = global_start.relative_poses, global_start._filled
     adjusts = {room: room.bundle_adjust for room in (global_start, adjust)}
 
     def counted_poses(mapping: Mapping, chosen: Tensor, options: MappingOptions) -> object:
@@ -111,14 +111,14 @@ def test_work_before_cameras_stand_is_in_proportion_to_the_images(monkeypatch: p
 
         return counted_adjust
 
-    def counted_fill(model: Mapping, options: MappingOptions) -> Mapping:
+    def counted_fill(model: Mapping, *given: object) -> object:
         points.append(-1)
-        return fill(model, options)
+        return fill(model, *given)
 
     monkeypatch.setattr(global_start, "relative_poses", counted_poses)
     for room in adjusts:
         monkeypatch.setattr(room, "bundle_adjust", counted(room))
-    monkeypatch.setattr(global_start, "fill", counted_fill)
+    monkeypatch.setattr(global_start, "_filled", counted_fill)
     monkeypatch.setattr(global_start, "TRACKS_PER_VIEW", 30)
     views = 24
     scene = make_scene(orbit_poses(views, radius=5.0, sweep=2.0), points=300)
