@@ -1,5 +1,7 @@
 """Photographs that were upright and lying, and were all resized to one square."""
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 from chance import seeded
@@ -7,10 +9,12 @@ from torch import Tensor
 
 from bench.doubt import camera_errors
 from torchsfm.geometry import Camera, Pose, intrinsics
-from torchsfm.reconstruction import reconstruct_tracks
+from torchsfm.reconstruction import attempts, reconstruct_tracks
+from torchsfm.reconstruction.attempts import Attempt
+from torchsfm.reconstruction.mappers.growth import Wanted
 from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
 from torchsfm.reconstruction.matching.view_graph import ViewGraph
-from torchsfm.reconstruction.resized import shapes_of_squares
+from torchsfm.reconstruction.resized import Shapes, shapes_of_squares
 from torchsfm.simulation import look_at, random_points, simulate_images
 
 SIDE, FOCAL, RADIUS = 640, 520.0, 4.0
@@ -42,8 +46,10 @@ def graph(ratio: float, upright: Tensor = UPRIGHT) -> ViewGraph:
 
 @pytest.mark.parametrize("ratio", [4 / 3, 1.4, 16 / 9])
 def test_pairs_tell_which_were_upright(ratio: float) -> None:
-    aspect = shapes_of_squares(graph(ratio))
-    assert aspect is not None
+    told = shapes_of_squares(graph(ratio))
+    assert told is not None
+    assert told.clear
+    aspect = told.aspect
     assert torch.equal(aspect < 1, UPRIGHT)
     assert aspect.log().abs().allclose(aspect[0].log())
     assert abs(float(aspect[0]) / ratio - 1) < 0.15
@@ -72,3 +78,32 @@ def test_poses_are_right() -> None:
     ratio = K[:, 1, 1] / K[:, 0, 0]
     assert torch.allclose(ratio, torch.where(UPRIGHT, 1 / 1.5, 1.5).double(), rtol=0.01)
     assert "others" in found.report.calibrations[0].remark
+
+
+@pytest.mark.parametrize(
+    ("told", "apart", "better", "made", "kept"),
+    [
+        (None, False, True, ["plain"], "plain"),
+        (True, False, False, ["shaped"], "shaped"),
+        (True, True, False, ["shaped", "plain"], "plain"),
+        (False, False, False, ["shaped", "plain"], "plain"),
+        (False, False, True, ["shaped", "plain"], "shaped"),
+    ],
+)
+def test_models_decide_where_pairs_are_not_sure(
+    monkeypatch: pytest.MonkeyPatch, told: bool | None, apart: bool, better: bool, made: list[str], kept: str
+) -> None:
+    shapes = None if told is None else Shapes(torch.tensor([1.5, 1 / 1.5]), told)
+    monkeypatch.setattr(attempts, "shapes_of_squares", lambda graph: shapes)
+    monkeypatch.setattr(attempts, "explains_better", lambda model, other: better)
+    names: list[str] = []
+
+    def make(wanted: Wanted) -> Attempt:
+        names.append("plain" if wanted.aspect is None else "shaped")
+        one = Mock(spec=Attempt, components=(Mock(),), registered=2, fell_apart=apart, largest=Mock())
+        one.name = names[-1]
+        return one
+
+    found = attempts._of_all_shapes(Mock(spec=ViewGraph), Wanted(), make)
+    assert names == made
+    assert found.name == kept

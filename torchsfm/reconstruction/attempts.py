@@ -142,13 +142,11 @@ def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progr
     def made(wanted: Wanted) -> Attempt:
         return Attempt.of(given.graph, wanted, Growth.of(given, wanted, generator, progress))
 
-    attempt = _of_two_shapes(given.graph, wanted, made) or made(wanted)
+    attempt = _of_all_shapes(given.graph, wanted, made)
     for question in (_stretched, _fisheye):
         another = question(attempt) if attempt.components else None
-        if another is not None:
-            trial = made(another)
-            if trial.registered > (1 - LEFT) * attempt.registered and explains_better(attempt.largest, trial.largest):
-                attempt = trial
+        trial = None if another is None else made(another)
+        attempt = attempt if trial is None or not _is_better(trial, attempt) else trial
     if wanted.method != "auto" or attempt.growth.method != "incremental":
         return attempt
     if 2 * attempt.undoubted >= attempt.registered and not attempt.fell_apart:
@@ -159,14 +157,26 @@ def best_attempt(given: Given, wanted: Wanted, generator: torch.Generator, progr
     return max(attempt, other, key=lambda one: (one.undoubted, one.registered))
 
 
-def _of_two_shapes(graph: ViewGraph, wanted: Wanted, made: Callable[[Wanted], Attempt]) -> Attempt | None:
-    """Models of images that were upright and lying before they were squares, where pixels are open and pairs say so.
+def _of_all_shapes(graph: ViewGraph, wanted: Wanted, made: Callable[[Wanted], Attempt]) -> Attempt:
+    """Models of images as they are, or of square ones as they were before, upright and lying, where pairs say so.
 
-    The ratios are estimated, and come to one where they were none. Only where that falls apart other cameras are needed.
+    Where they do not say so clearly, both are made. Ratios are estimated, and come to one where images were square.
     """
-    aspect = shapes_of_squares(graph) if wanted.pixels_are_open else None
-    attempt = None if aspect is None else made(replace(wanted, aspect=aspect))
-    return attempt if attempt is not None and attempt.components and not attempt.fell_apart else None
+    told = shapes_of_squares(graph) if wanted.pixels_are_open else None
+    if told is None:
+        return made(wanted)
+    shaped = made(replace(wanted, aspect=told.aspect))
+    if told.clear and shaped.components and not shaped.fell_apart:
+        return shaped
+    plain = made(wanted)
+    return shaped if _is_better(shaped, plain) else plain
+
+
+def _is_better(trial: Attempt, attempt: Attempt) -> bool:
+    """Whether models with other cameras have hardly fewer images, and explain them better than by chance."""
+    if not attempt.components or not trial.components:
+        return bool(trial.components)
+    return trial.registered > (1 - LEFT) * attempt.registered and explains_better(attempt.largest, trial.largest)
 
 
 def _stretched(attempt: Attempt) -> Wanted | None:

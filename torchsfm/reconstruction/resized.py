@@ -6,6 +6,7 @@ right ratio at both ends, as they are of one camera with the right focal length 
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,23 +21,36 @@ RATIOS = 4 / 3, 3 / 2, 16 / 9
 """Shapes that photographs have."""
 TRIED = 48
 """Focal lengths that are tried with each."""
+SHARE = 0.85
+"""What a plane explains of a pair at most that is asked: models decide where pairs are not sure."""
+ASKED = 3.0
+"""Logarithm of how many times likelier two shapes must be to be asked for."""
 SWEEPS = 4
 """How often each image is asked again what it is, once all others have said."""
 
 
-def shapes_of_squares(graph: ViewGraph) -> Float[Tensor, "v"] | None:
-    """How many times as much as along x each image is stretched along y, if some square ones were upright and some lying.
+class Shapes(NamedTuple):
+    """What square images were before.
+
+    Attributes:
+        aspect: How many times as much as along x each image is stretched along y: 1 where it is not square; of a square image
+            that no pair tells of, as if it had been lying.
+        clear: Whether the pairs say so by more than chance and the choice explain.
+    """
+
+    aspect: Float[Tensor, "v"]
+    clear: bool
+
+
+def shapes_of_squares(graph: ViewGraph) -> Shapes | None:
+    """What the pairs say that square images were; None where as well all had one shape.
 
     Args:
         graph: Verified pairs.
-
-    Returns:
-        A ratio for each image, 1 where it is not square; of a square image that no pair tells of, as if it had been lying. None
-        where the pairs do not say clearly that there are both.
     """
     size = graph.image_size
     square = (size == size.mode(0).values).all(1) & (size[:, 0] == size[:, 1])
-    telling = telling_pairs(graph) & square[graph.pairs].all(1)
+    telling = telling_pairs(graph, SHARE) & square[graph.pairs].all(1)
     if not bool(telling.any()):
         return None
     images, ends = torch.unique(graph.pairs[telling], return_inverse=True)
@@ -47,12 +61,14 @@ def shapes_of_squares(graph: ViewGraph) -> Float[Tensor, "v"] | None:
     uniform = min(float(cost[:, :, both, both].sum(1).min()), float(_costs_of(F, side, 1.0)[:, :, 0, 0].sum(1).min()))
     label, total = _told_apart(cost, ends, graph.fundamental_inliers[telling])
     best = int(total.argmin())
-    # So much is gained by chance, by an answer of two for each image and by what is tried.
-    if uniform - float(total[best]) < len(images) * math.log(2) + math.log(len(cost)) or label[best].min() == label[best].max():
+    gain = uniform - float(total[best])
+    if gain < ASKED or label[best].min() == label[best].max():
         return None
     lying = float(ratio[best % len(ratio)])
     aspect = torch.where(square, lying, 1.0).double()
-    return aspect.index_copy(0, images, torch.where(label[best] == 0, lying, 1 / lying).double())
+    aspect = aspect.index_copy(0, images, torch.where(label[best] == 0, lying, 1 / lying).double())
+    # So much is gained by one answer of two for each image and by what is tried.
+    return Shapes(aspect, gain > len(images) * math.log(2) + math.log(len(cost)))
 
 
 def _costs(F: Float[Tensor, "p 3 3"], side: float) -> tuple[Float[Tensor, "t p 2 2"], Float[Tensor, "t"]]:

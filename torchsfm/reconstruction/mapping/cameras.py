@@ -181,7 +181,7 @@ def with_square_pixels(
     return stretch[j, :, None] * graph.F * stretch[i, None], size / stretch[:, :2], (size - 1) / 2 / stretch[:, :2]
 
 
-def telling_pairs(graph: ViewGraph) -> Bool[Tensor, "q"]:
-    """Pairs that determine F: neither a plane nor a rotation explains most of what they have in common."""
+def telling_pairs(graph: ViewGraph, share: float = 0.7) -> Bool[Tensor, "q"]:
+    """Pairs that determine F: neither a plane nor a rotation explains more than a share of what they have in common."""
     several = graph.fundamental_inliers >= 2 * MIN_INLIERS
-    return several & (graph.homography_inliers < 0.7 * graph.fundamental_inliers.double())
+    return several & (graph.homography_inliers < share * graph.fundamental_inliers.double())
