@@ -84,7 +84,7 @@ class Calibration:
             aspect = self.values[seen if len(seen) else slice(None), place]
             kinds = [kind for kind in (aspect[aspect > 1], aspect[aspect < 1]) if len(kind)]
             stretched = [f"{float(kind.median()):.3f} times as much along y as along x" for kind in kinds]
-            remarks.append(f"the images seem to be stretched, {', others '.join(stretched)}")
+            remarks += [f"the images seem to be stretched, {', others '.join(stretched)}"] if stretched else []
         if self.cropped:
             whose = "all of one camera, whose focal length they share" if self.alike else "of several cameras"
             text = f"the images seem to be cropped, {whose}: their principal points were looked for far from the middle, too"
