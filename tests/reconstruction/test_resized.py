@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.doubt import camera_errors
 from torchsfm.geometry import Camera, Pose, intrinsics
-from torchsfm.reconstruction import attempts, reconstruct_tracks
+from torchsfm.reconstruction import attempts, reconstruct_tracks, resized
 from torchsfm.reconstruction.attempts import Attempt
 from torchsfm.reconstruction.mappers.growth import Wanted
 from torchsfm.reconstruction.matching.track_graph import graph_from_tracks
@@ -44,8 +44,9 @@ def graph(ratio: float, upright: Tensor = UPRIGHT) -> ViewGraph:
     return found
 
 
-@pytest.mark.parametrize("ratio", [4 / 3, 1.4, 16 / 9])
-def test_pairs_tell_which_were_upright(ratio: float) -> None:
+@pytest.mark.parametrize(("ratio", "most"), [(4 / 3, 2000), (1.4, 2000), (16 / 9, 2000), (1.5, 12)])
+def test_pairs_tell_which_were_upright(ratio: float, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resized, "MOST", most)
     told = shapes_of_squares(graph(ratio))
     assert told is not None
     assert told.clear

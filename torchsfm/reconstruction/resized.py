@@ -23,6 +23,8 @@ TRIED = 48
 """Focal lengths that are tried with each."""
 SHARE = 0.85
 """What a plane explains of a pair at most that is asked: models decide where pairs are not sure."""
+MOST = 2000
+"""Pairs by which ratio and focal length are chosen, the strongest; all are asked with these."""
 ASKED = 3.0
 """Logarithm of how many times likelier two shapes must be to be asked for."""
 SWEEPS = 4
@@ -50,37 +52,43 @@ def shapes_of_squares(graph: ViewGraph) -> Shapes | None:
     """
     size = graph.image_size
     square = (size == size.mode(0).values).all(1) & (size[:, 0] == size[:, 1])
-    telling = telling_pairs(graph, SHARE) & square[graph.pairs].all(1)
-    if not bool(telling.any()):
+    telling = (telling_pairs(graph, SHARE) & square[graph.pairs].all(1)).nonzero()[:, 0]
+    if not len(telling):
         return None
-    images, ends = torch.unique(graph.pairs[telling], return_inverse=True)
-    F, side = graph.F[telling].double(), float(size[images[0], 0])
-    cost, ratio = _costs(F, side)
+    weight = graph.fundamental_inliers[telling]
+    order = weight.argsort(descending=True, stable=True)
+    weight, pairs, F = weight[order], graph.pairs[telling[order]], graph.F[telling[order]].double()
+    side = float(size[pairs[0, 0], 0])
+    focal = side * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()
+    images, ends = torch.unique(pairs[:MOST], return_inverse=True)
+    cost = torch.cat([_costs(F[:MOST], side, ratio, focal) for ratio in RATIOS])
     both = torch.arange(2)
     # All were lying, or all upright, or none is stretched.
-    uniform = min(float(cost[:, :, both, both].sum(1).min()), float(_costs_of(F, side, 1.0)[:, :, 0, 0].sum(1).min()))
-    label, total = _told_apart(cost, ends, graph.fundamental_inliers[telling])
+    unstretched = _costs(F[:MOST], side, 1.0, focal)[:, :, 0, 0]
+    uniform = min(float(cost[:, :, both, both].sum(1).min()), float(unstretched.sum(1).min()))
+    label, total = _told_apart(cost, ends, weight[:MOST])
     best = int(total.argmin())
     gain = uniform - float(total[best])
     if gain < ASKED or label[best].min() == label[best].max():
         return None
-    lying = float(ratio[best % len(ratio)])
-    aspect = torch.where(square, lying, 1.0).double()
-    aspect = aspect.index_copy(0, images, torch.where(label[best] == 0, lying, 1 / lying).double())
     # So much is gained by one answer of two for each image and by what is tried.
-    return Shapes(aspect, gain > len(images) * math.log(2) + math.log(len(cost)))
+    clear = gain > len(images) * math.log(2) + math.log(len(cost))
+    trial = best % len(cost)
+    lying, kind = RATIOS[trial // TRIED], label[best]
+    if len(F) > MOST:
+        images, ends = torch.unique(pairs, return_inverse=True)
+        label, total = _told_apart(_costs(F, side, lying, focal[[trial % TRIED]]), ends, weight)
+        kind = label[total.argmin()]
+    aspect = torch.where(square, lying, 1.0).double()
+    return Shapes(aspect.index_copy(0, images, torch.where(kind == 0, lying, 1 / lying).double()), clear)
 
 
-def _costs(F: Float[Tensor, "p 3 3"], side: float) -> tuple[Float[Tensor, "t p 2 2"], Float[Tensor, "t"]]:
-    """How badly pairs fit where their images were lying (0) or upright (1), with every ratio and focal length; the ratios."""
-    ratio = torch.tensor(RATIOS, dtype=F.dtype).repeat_interleave(TRIED)
-    return torch.cat([_costs_of(F, side, a) for a in RATIOS]), ratio
+def _costs(F: Float[Tensor, "p 3 3"], side: float, ratio: float, focal: Float[Tensor, "t"]) -> Float[Tensor, "t p 2 2"]:
+    """How badly pairs fit where their images were lying (0) or upright (1), with one ratio and every focal length.
 
-
-def _costs_of(F: Float[Tensor, "p 3 3"], side: float, ratio: float) -> Float[Tensor, "t p 2 2"]:
-    """The same with one ratio. The side that was longer is shortened by that much more."""
-    focal = side * torch.linspace(math.log(WIDE[0]), math.log(WIDE[1]), TRIED, dtype=F.dtype).exp()[:, None]
-    kinds = []
+    The side that was longer is shortened by that much more.
+    """
+    focal, kinds = focal[:, None], []
     for f, aspect in ((focal, ratio), (focal * ratio, 1 / ratio)):
         K = torch.diag_embed(torch.cat((f, f * aspect, torch.ones_like(f)), -1))
         K[:, :2, 2] = (side - 1) / 2
